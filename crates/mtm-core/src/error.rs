@@ -1,0 +1,356 @@
+//! The one error type of the crate: each variant is a fact with the offending index and value.
+
+use thiserror::Error;
+
+/// What went wrong, where, how much, and what to do about it.
+///
+/// Variants fall in the families of [`ErrorKind`]; wrong input is found at construction, a numerical
+/// outcome (no convergence, a mechanism) is reported by the solver with the figures reached.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[non_exhaustive]
+pub enum MtmError {
+    /// An array has no entries.
+    #[error("{what} is empty: at least one entry is needed")]
+    Empty {
+        /// The array.
+        what: &'static str,
+        /// Whose input it is.
+        kind: ErrorKind,
+    },
+    /// Two arrays that belong together have different lengths.
+    #[error("{what} has {found} entries where {expected} are needed ({why})")]
+    Length {
+        /// The array.
+        what: String,
+        /// Its length.
+        found: usize,
+        /// The length it needs.
+        expected: usize,
+        /// What fixes that length.
+        why: &'static str,
+        /// Whose input it is.
+        kind: ErrorKind,
+    },
+    /// A value is NaN or infinite.
+    #[error("{what}[{index}] is {value}: every value must be finite")]
+    NotFinite {
+        /// The array.
+        what: String,
+        /// Row of the offending value.
+        index: usize,
+        /// The value.
+        value: f64,
+        /// Whose input it is.
+        kind: ErrorKind,
+    },
+    /// A value lies outside the allowed range.
+    #[error("{what}[{index}] is {value}: allowed is {allowed}")]
+    OutOfRange {
+        /// The array or parameter.
+        what: String,
+        /// Row of the offending value (0 for a scalar).
+        index: usize,
+        /// The value.
+        value: f64,
+        /// The allowed range, in words.
+        allowed: &'static str,
+        /// Whose input it is.
+        kind: ErrorKind,
+    },
+    /// An index points past the end of what it indexes.
+    #[error("{what}[{row}] refers to {item} {index}, but there are {count} (allowed 0 to {}); is the file numbered from 1?", .count.saturating_sub(1))]
+    IndexOutOfRange {
+        /// The index array.
+        what: String,
+        /// Row of the offending index.
+        row: usize,
+        /// What is indexed.
+        item: &'static str,
+        /// The index.
+        index: usize,
+        /// How many items there are.
+        count: usize,
+        /// Whose input it is.
+        kind: ErrorKind,
+    },
+    /// A tet names the same node twice.
+    #[error("tet {tet} names node {node} twice: nodes {nodes:?}; remove the tet or mend its connectivity")]
+    DuplicateNode {
+        /// The tet.
+        tet: usize,
+        /// The repeated node.
+        node: u32,
+        /// Its four nodes.
+        nodes: [u32; 4],
+    },
+    /// A tet has negative volume.
+    #[error("tet {tet} is inverted: volume {volume:.6e}; swap two of its nodes {nodes:?} ({count} inverted tets in all)")]
+    InvertedTet {
+        /// The first inverted tet.
+        tet: usize,
+        /// Its signed volume.
+        volume: f64,
+        /// Its four nodes.
+        nodes: [u32; 4],
+        /// How many tets are inverted.
+        count: usize,
+    },
+    /// A tet has no volume to speak of.
+    #[error("tet {tet} is degenerate: volume {volume:.6e} for a longest edge of {edge:.6e}, below {limit:.1e} of its cube; remove or re-mesh it (nodes {nodes:?})")]
+    DegenerateTet {
+        /// The tet.
+        tet: usize,
+        /// Its signed volume.
+        volume: f64,
+        /// Its longest edge.
+        edge: f64,
+        /// Relative volume below which a tet counts as degenerate.
+        limit: f64,
+        /// Its four nodes.
+        nodes: [u32; 4],
+    },
+    /// The same four nodes make two tets.
+    #[error("tets {first} and {second} have the same four nodes {nodes:?}: remove one, or its stiffness counts twice")]
+    DuplicateTet {
+        /// First of the pair.
+        first: usize,
+        /// Second of the pair.
+        second: usize,
+        /// Their nodes, sorted.
+        nodes: [u32; 4],
+    },
+    /// A node belongs to no tet.
+    #[error("node {node} belongs to no tet ({count} such nodes): drop unused nodes before building the mesh")]
+    UnusedNode {
+        /// The first such node.
+        node: usize,
+        /// How many there are.
+        count: usize,
+    },
+    /// A triangle has no area.
+    #[error("triangle {triangle} of {what} is degenerate: area {area:.3e}, vertices {vertices:?}")]
+    DegenerateTriangle {
+        /// The surface.
+        what: String,
+        /// The triangle.
+        triangle: usize,
+        /// Its area.
+        area: f64,
+        /// Its vertices.
+        vertices: [u32; 3],
+    },
+    /// A stiffness matrix is not symmetric.
+    #[error("stiffness of tet {tet} is not symmetric: C[{row}][{column}] = {upper:.6e} but C[{column}][{row}] = {lower:.6e}")]
+    AsymmetricStiffness {
+        /// The tet (0 for a uniform tissue).
+        tet: usize,
+        /// Row of the entry.
+        row: usize,
+        /// Column of the entry.
+        column: usize,
+        /// Entry above the diagonal.
+        upper: f64,
+        /// Entry below the diagonal.
+        lower: f64,
+    },
+    /// A material stores negative energy for some strain.
+    #[error("material of tet {tet} is indefinite: smallest eigenvalue {eigenvalue:.6e} MPa ({constants}); no stable solution exists with it")]
+    IndefiniteMaterial {
+        /// The tet (0 for a uniform tissue).
+        tet: usize,
+        /// Smallest eigenvalue of C in Mandel form, MPa.
+        eigenvalue: f64,
+        /// The constants that made it.
+        constants: String,
+    },
+    /// A fibre direction is not a unit vector.
+    #[error("fibre[{tet}] has length {length}: it must be 1 within {tolerance:.0e}; divide it by its length")]
+    FibreNotUnit {
+        /// The tet (0 for a uniform tissue).
+        tet: usize,
+        /// Its length.
+        length: f64,
+        /// Allowed deviation.
+        tolerance: f64,
+    },
+    /// A node was given two kinds that cannot both hold.
+    #[error("node {node} is both {first} and {second}: a node has one kind")]
+    NodeOfTwoKinds {
+        /// The node.
+        node: usize,
+        /// First role.
+        first: String,
+        /// Second role.
+        second: String,
+    },
+    /// A segment has sliding nodes and no contact surface, or the other way round, or nothing at all.
+    #[error("segment \"{segment}\" {problem}")]
+    Segment {
+        /// The segment's name.
+        segment: String,
+        /// What is wrong with it, and the mend.
+        problem: String,
+    },
+    /// A plan does not fit the boundary.
+    #[error("plan for segment \"{segment}\": {problem}")]
+    Plan {
+        /// The segment's name.
+        segment: String,
+        /// What is wrong, and the mend.
+        problem: String,
+    },
+    /// Part of the body can move without deforming.
+    #[error("{what} is not held: {modes} ({nodes} nodes, for example node {node}); fix or join at least three of its nodes that are not in line, or remove it")]
+    Unconstrained {
+        /// The part of the body, in words.
+        what: String,
+        /// The free rigid modes, in words.
+        modes: String,
+        /// How many nodes it has.
+        nodes: usize,
+        /// One of them.
+        node: usize,
+    },
+    /// A contact surface cannot serve.
+    #[error("contact surface of segment \"{segment}\" {problem}")]
+    ContactSurface {
+        /// The segment's name.
+        segment: String,
+        /// What is wrong, where, and the mend.
+        problem: String,
+    },
+    /// The contact loop came back to an earlier state without settling.
+    #[error("contact does not settle: after {iterations} iterations nodes {nodes:?} still change their contact triangle or state (gap {gap:.3e} mm); smooth the contact surface there or refine the tissue")]
+    ContactCycle {
+        /// Outer iterations done.
+        iterations: usize,
+        /// The cycling nodes (the first ten).
+        nodes: Vec<usize>,
+        /// Largest gap reached, mm.
+        gap: f64,
+    },
+    /// The factorisation met a pivot that is not positive, or the system is singular to working precision.
+    #[error("the stiffness matrix is not positive definite to working precision at node {node}: {detail}")]
+    NotPositiveDefinite {
+        /// Node of the failing pivot.
+        node: usize,
+        /// What was seen.
+        detail: String,
+    },
+    /// An iterative method stopped before its error bound was met.
+    #[error("{method} did not converge: {iterations} iterations, error bound {error:.3e} mm where {tolerance:.3e} mm was asked for; {advice}")]
+    NotConverged {
+        /// The method.
+        method: &'static str,
+        /// Iterations done.
+        iterations: usize,
+        /// Error bound reached, mm.
+        error: f64,
+        /// Error bound asked for, mm.
+        tolerance: f64,
+        /// What to try.
+        advice: &'static str,
+    },
+    /// The computation would not fit in the memory allowed.
+    #[error("{what} needs about {needed_mb} MB and {limit_mb} MB are allowed: {advice}")]
+    OutOfMemory {
+        /// The step.
+        what: &'static str,
+        /// Its need, MB.
+        needed_mb: usize,
+        /// The limit, MB.
+        limit_mb: usize,
+        /// What to try.
+        advice: &'static str,
+    },
+    /// The caller asked to stop.
+    #[error("interrupted by the caller")]
+    Interrupted,
+    /// A name is not one of those known.
+    #[error("{what} \"{found}\" is unknown: use one of {known}")]
+    UnknownName {
+        /// What is named.
+        what: &'static str,
+        /// The name given.
+        found: String,
+        /// The names that exist.
+        known: &'static str,
+        /// Whose input it is.
+        kind: ErrorKind,
+    },
+}
+
+/// The family an error belongs to; the Python exceptions carry the same names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum ErrorKind {
+    /// Nodes, tets, surfaces.
+    Mesh,
+    /// Tissue constants and stiffness.
+    Material,
+    /// Node kinds, segments, plans.
+    Boundary,
+    /// Contact surfaces and the contact loop.
+    Contact,
+    /// Solver options and outcomes.
+    Solver,
+    /// The caller asked to stop.
+    Interrupted,
+}
+
+impl MtmError {
+    /// The family of the error.
+    pub fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Empty { kind, .. }
+            | Self::Length { kind, .. }
+            | Self::NotFinite { kind, .. }
+            | Self::OutOfRange { kind, .. }
+            | Self::IndexOutOfRange { kind, .. }
+            | Self::UnknownName { kind, .. } => *kind,
+            Self::DuplicateNode { .. }
+            | Self::InvertedTet { .. }
+            | Self::DegenerateTet { .. }
+            | Self::DuplicateTet { .. }
+            | Self::UnusedNode { .. }
+            | Self::DegenerateTriangle { .. } => ErrorKind::Mesh,
+            Self::AsymmetricStiffness { .. }
+            | Self::IndefiniteMaterial { .. }
+            | Self::FibreNotUnit { .. } => ErrorKind::Material,
+            Self::NodeOfTwoKinds { .. }
+            | Self::Segment { .. }
+            | Self::Plan { .. }
+            | Self::Unconstrained { .. } => ErrorKind::Boundary,
+            Self::ContactSurface { .. } | Self::ContactCycle { .. } => ErrorKind::Contact,
+            Self::NotPositiveDefinite { .. }
+            | Self::NotConverged { .. }
+            | Self::OutOfMemory { .. } => ErrorKind::Solver,
+            Self::Interrupted => ErrorKind::Interrupted,
+        }
+    }
+
+    /// Whether the input is at fault (Python: the error is also a `ValueError`), not a numerical outcome.
+    pub fn is_input(&self) -> bool {
+        !matches!(
+            self,
+            Self::ContactCycle { .. }
+                | Self::NotPositiveDefinite { .. }
+                | Self::NotConverged { .. }
+                | Self::OutOfMemory { .. }
+                | Self::Interrupted
+        )
+    }
+}
+
+/// Result of a fallible operation of this crate.
+pub type Result<T> = std::result::Result<T, MtmError>;
+
+/// Refuses NaN and infinity in rows of three, naming the row.
+pub(crate) fn check_finite_rows(what: &str, rows: &[[f64; 3]], kind: ErrorKind) -> Result<()> {
+    for (index, row) in rows.iter().enumerate() {
+        if let Some(&value) = row.iter().find(|v| !v.is_finite()) {
+            return Err(MtmError::NotFinite { what: what.to_owned(), index, value, kind });
+        }
+    }
+    Ok(())
+}

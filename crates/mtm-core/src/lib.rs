@@ -1,0 +1,3 @@
+//! Mass-tensor mechanics of soft tissue.
+pub mod blocks;
+pub mod error;
