@@ -13,6 +13,10 @@ use crate::triangle::Vec3;
 /// fields.
 const LEAF_TRIANGLES: usize = 8;
 
+/// Real part of a product of half-angles within which it may take another factor: positive, and far from
+/// over- and underflow.
+const PRODUCT_RANGE: std::ops::Range<f64> = 1e-100..1e100;
+
 /// Points a thread takes at once.
 const POINTS_PER_TASK: usize = 64;
 
@@ -39,8 +43,23 @@ impl Default for WindingOptions {
 pub struct WindingTree {
     /// Depth-first: the first child of an inner cluster follows it.
     clusters: Vec<Cluster>,
-    /// Corners of the triangles, in the order of the leaves.
-    triangles: Vec<[Vec3; 3]>,
+    /// The triangles, in the order of the leaves.
+    triangles: Vec<Sheet>,
+}
+
+/// A triangle as the exact sum needs it.
+#[derive(Debug, Clone, Copy)]
+struct Sheet {
+    corners: [Vec3; 3],
+    /// Normal of twice the triangle's area.
+    normal: Vec3,
+}
+
+impl Sheet {
+    fn new(corners: [Vec3; 3]) -> Self {
+        let [a, b, c] = &corners;
+        Self { normal: (b - a).cross(&(c - a)), corners }
+    }
 }
 
 /// A cluster of triangles and its Taylor expansion about `centre` up to the second order.
@@ -129,12 +148,13 @@ impl WindingTree {
 
     fn build(surface: &Surface, beta: f64) -> Self {
         let n = surface.triangles().len();
-        let corners: Vec<[Vec3; 3]> = (0..n).map(|t| surface.corners(t)).collect();
-        let centroids: Vec<Vec3> = corners.iter().map(|[a, b, c]| (a + b + c) / 3.0).collect();
+        let sheets: Vec<Sheet> = (0..n).map(|t| Sheet::new(surface.corners(t))).collect();
+        let centroid = |sheet: &Sheet| sheet.corners.iter().sum::<Vec3>() / 3.0;
+        let centroids: Vec<Vec3> = sheets.iter().map(centroid).collect();
         let mut order: Vec<u32> = (0..n as u32).collect();
         let mut ranges = Vec::with_capacity(n / 2 + 1);
         split(&mut order, 0, &centroids, &mut ranges);
-        let triangles: Vec<[Vec3; 3]> = order.iter().map(|&t| corners[t as usize]).collect();
+        let triangles: Vec<Sheet> = order.iter().map(|&t| sheets[t as usize]).collect();
         let clusters = ranges
             .par_iter()
             .map(|range| Cluster::new(range, &triangles[range.start..range.end], beta))
@@ -146,7 +166,7 @@ impl WindingTree {
 /// Exact winding number at each point (mm, finite): the sum over all triangles, for reference.
 pub fn winding_number_exact(surface: &Surface, points: &[[f64; 3]]) -> Vec<f64> {
     let n = surface.triangles().len();
-    let triangles: Vec<[Vec3; 3]> = (0..n).map(|t| surface.corners(t)).collect();
+    let triangles: Vec<Sheet> = (0..n).map(|t| Sheet::new(surface.corners(t))).collect();
     points
         .par_iter()
         .map(|&point| solid_angle(&Vec3::from(point), &triangles) / (4.0 * PI))
@@ -187,11 +207,11 @@ fn split(order: &mut [u32], start: usize, centroids: &[Vec3], ranges: &mut Vec<C
 }
 
 impl Cluster {
-    fn new(range: &ClusterRange, triangles: &[[Vec3; 3]], beta: f64) -> Self {
+    fn new(range: &ClusterRange, triangles: &[Sheet], beta: f64) -> Self {
         let mut centre = Vec3::zeros();
         let mut area = 0.0;
-        for [a, b, c] in triangles {
-            let triangle_area = 0.5 * (b - a).cross(&(c - a)).norm();
+        for Sheet { corners: [a, b, c], normal } in triangles {
+            let triangle_area = 0.5 * normal.norm();
             centre += (a + b + c) * (triangle_area / 3.0);
             area += triangle_area;
         }
@@ -202,11 +222,11 @@ impl Cluster {
         let mut m = [[0.0; 3]; 3];
         let mut t = [[[0.0; 3]; 3]; 3];
         for triangle in triangles {
-            let [a, b, c] = triangle.map(|corner| corner - centre);
+            let [a, b, c] = triangle.corners.map(|corner| corner - centre);
             for corner in [&a, &b, &c] {
                 radius_squared = radius_squared.max(corner.norm_squared());
             }
-            let n = 0.5 * (b - a).cross(&(c - a));
+            let n = 0.5 * triangle.normal;
             let sum = a + b + c;
             zeroth += n;
             for i in 0..3 {
@@ -298,15 +318,16 @@ fn traceless_second(t: &[[[f64; 3]; 3]; 3]) -> [f64; 10] {
 /// tan(Ω/2) = det(a, b, c) / (|a||b||c| + (a·b)|c| + (b·c)|a| + (c·a)|b|) (van Oosterom & Strackee
 /// 1983). Half-angles are added as complex products while both stay below a right angle, so that
 /// most triangles need no arctangent. A triangle with `q` on a corner counts as zero.
-fn solid_angle(q: &Vec3, triangles: &[[Vec3; 3]]) -> f64 {
+fn solid_angle(q: &Vec3, triangles: &[Sheet]) -> f64 {
     let mut half_angles = 0.0;
     let (mut re, mut im) = (1.0, 0.0);
     for triangle in triangles {
-        let [a, b, c] = triangle.map(|corner| corner - q);
+        let [a, b, c] = triangle.corners.map(|corner| corner - q);
         let (la, lb, lc) = (a.norm(), b.norm(), c.norm());
         let product = la * lb * lc;
         let x = product + a.dot(&b) * lc + b.dot(&c) * la + c.dot(&a) * lb;
-        let y = a.dot(&b.cross(&c));
+        // det(a, b, c) = a·((b − a) × (c − a)), which keeps its digits far away.
+        let y = a.dot(&triangle.normal);
         if y == 0.0 || product == 0.0 {
             continue;
         }
@@ -319,7 +340,7 @@ fn solid_angle(q: &Vec3, triangles: &[[Vec3; 3]]) -> f64 {
         // Both factors lie within a right angle of the real axis, so their angles add without a
         // turn.
         (re, im) = (re * x - im * y, re * y + im * x);
-        if re <= 0.0 {
+        if !PRODUCT_RANGE.contains(&re) {
             half_angles += im.atan2(re);
             (re, im) = (1.0, 0.0);
         }
