@@ -2,7 +2,8 @@
 pub mod blocks;
 pub mod cholesky;
 pub mod error;
-pub mod material;
-pub mod mesh;
-pub mod ordering;
-pub mod tensors;
+pub mod motion;
+pub mod surface;
+mod topology;
+pub mod triangle;
+pub mod winding;
