@@ -2,8 +2,5 @@
 pub mod blocks;
 pub mod cholesky;
 pub mod error;
-pub mod motion;
-pub mod surface;
-mod topology;
-pub mod triangle;
-pub mod winding;
+pub mod krylov;
+pub mod multigrid;
