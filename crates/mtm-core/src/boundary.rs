@@ -142,14 +142,15 @@ impl Boundary {
 
     fn check_segments(&self) -> Result<()> {
         for (i, segment) in self.segments.iter().enumerate() {
-            let fail = |problem: String| {
-                Err(MtmError::Segment { segment: segment.name.clone(), problem })
-            };
+            let fail =
+                |problem: String| Err(MtmError::Segment { segment: segment.name.clone(), problem });
             if self.segments[..i].iter().any(|s| s.name == segment.name) {
                 return fail("is named twice".into());
             }
             if segment.joined.is_empty() && segment.sliding.is_empty() {
-                return fail("has neither joined nor sliding nodes: give it some or leave it out".into());
+                return fail(
+                    "has neither joined nor sliding nodes: give it some or leave it out".into(),
+                );
             }
             if !segment.sliding.is_empty() && segment.contact.is_none() {
                 return fail(format!(
@@ -171,7 +172,10 @@ impl Boundary {
                 }
                 Gap::PerNode(values) => {
                     if let Some(index) = values.iter().position(|v| !v.is_finite()) {
-                        return fail(format!("has gap[{index}] = {}: it must be finite", values[index]));
+                        return fail(format!(
+                            "has gap[{index}] = {}: it must be finite",
+                            values[index]
+                        ));
                     }
                 }
                 _ => {}
@@ -241,15 +245,16 @@ impl Boundary {
                 self.segments.iter().map(|s| format!("\"{}\"", s.name)).collect();
             names.join(", ")
         };
-        let fail = |segment: &str, problem: String| {
-            Err(MtmError::Plan { segment: segment.to_owned(), problem })
+        let fail = |segment: &str, problem: String| MtmError::Plan {
+            segment: segment.to_owned(),
+            problem,
         };
         for (i, (name, _)) in plan.iter().enumerate() {
             if !self.segments.iter().any(|s| s.name == *name) {
-                return fail(name, format!("no such segment; the boundary has {}", known()));
+                return Err(fail(name, format!("no such segment; the boundary has {}", known())));
             }
             if plan[..i].iter().any(|(other, _)| other == name) {
-                return fail(name, "it is named twice".into());
+                return Err(fail(name, "it is named twice".into()));
             }
         }
         self.segments
@@ -257,11 +262,11 @@ impl Boundary {
             .zip(&self.given)
             .map(|(segment, given)| {
                 let Some((_, motion)) = plan.iter().find(|(name, _)| *name == segment.name) else {
-                    return fail(
+                    return Err(fail(
                         &segment.name,
                         "it is missing; a plan names every segment (the identity matrix: it stays)"
                             .into(),
-                    );
+                    ));
                 };
                 if let Motion::Nodes(rows) = motion {
                     if rows.len() != given.len() {
@@ -270,17 +275,17 @@ impl Boundary {
                             rows.len(),
                             given.len()
                         );
-                        return fail(&segment.name, problem);
+                        return Err(fail(&segment.name, problem));
                     }
                     let what = format!("plan[\"{}\"]", segment.name);
                     check_finite_rows(&what, rows, ErrorKind::Boundary)?;
                     if !segment.sliding.is_empty() {
-                        return fail(
+                        return Err(fail(
                             &segment.name,
                             "displacements of joined nodes do not say how its contact surface moves; \
                              give a rigid 4×4 matrix or a SurfaceMotion"
                                 .into(),
-                        );
+                        ));
                     }
                 }
                 Ok(motion)
@@ -299,15 +304,12 @@ impl Boundary {
         nodes: &[[f64; 3]],
     ) -> Result<Vec<(u32, [f64; 3])>> {
         let segment = &self.segments[s];
-        let at = |list: &[u32]| -> Vec<[f64; 3]> {
-            list.iter().map(|&j| nodes[j as usize]).collect()
-        };
+        let at =
+            |list: &[u32]| -> Vec<[f64; 3]> { list.iter().map(|&j| nodes[j as usize]).collect() };
         Ok(match motion {
-            Motion::Rigid(rigid) => segment
-                .joined
-                .iter()
-                .map(|&j| (j, rigid.displacement(nodes[j as usize])))
-                .collect(),
+            Motion::Rigid(rigid) => {
+                segment.joined.iter().map(|&j| (j, rigid.displacement(nodes[j as usize]))).collect()
+            }
             Motion::Surface(surface) => segment
                 .joined
                 .iter()

@@ -51,7 +51,8 @@ fn parallelism(unknowns: usize) -> Par {
 }
 
 fn buffer(need: StackReq) -> Result<MemBuffer> {
-    MemBuffer::try_new(need).map_err(|_| out_of_memory("workspace of the factorisation", need.size_bytes()))
+    MemBuffer::try_new(need)
+        .map_err(|_| out_of_memory("workspace of the factorisation", need.size_bytes()))
 }
 
 fn out_of_memory(what: &'static str, bytes: usize) -> MtmError {
@@ -143,9 +144,10 @@ impl Symbolic {
         if let Err(llt::factor::LltError::NonPositivePivot { index }) = outcome {
             return Err(MtmError::NotPositiveDefinite {
                 node: self.order[index.min(n - 1) / 3] as usize,
-                detail: "a pivot of the factorisation is not positive; a part of the body may be a \
+                detail:
+                    "a pivot of the factorisation is not positive; a part of the body may be a \
                          mechanism, or the material contrast too large for f64"
-                    .into(),
+                        .into(),
             });
         }
         drop(scalars);
@@ -367,9 +369,7 @@ impl TailFactor {
                     let column = self.flexibility.col(3 * i + a);
                     columns
                         .iter()
-                        .map(|(j, f)| {
-                            (0..3).map(|b| column[3 * j + b] * f[b]).sum::<f64>()
-                        })
+                        .map(|(j, f)| (0..3).map(|b| column[3 * j + b] * f[b]).sum::<f64>())
                         .sum()
                 })
             })

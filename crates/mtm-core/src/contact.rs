@@ -251,7 +251,8 @@ impl Sliding {
                 m.max(forces[i].abs() * norm(sub(new_feet[i].normal, normals[i])))
             });
             let changed = held.update(&forces, &gaps, gap_limit);
-            let settled = !changed && gap <= gap_limit && turned <= options.tolerance * largest_force;
+            let settled =
+                !changed && gap <= gap_limit && turned <= options.tolerance * largest_force;
             let last = ContactState {
                 displacements: response.displacements,
                 points: new_feet.iter().map(|f| f.point).collect(),
@@ -345,7 +346,8 @@ impl Sliding {
                     }
                     (Some(rest), Motion::Surface(surface)) => {
                         let u = surface.displacement(rest.vertices());
-                        let moved = rest.vertices().iter().zip(u).map(|(&x, u)| add(x, u)).collect();
+                        let moved =
+                            rest.vertices().iter().zip(u).map(|(&x, u)| add(x, u)).collect();
                         MovedSurface::Moved(rest.moved(moved)?)
                     }
                 })
@@ -389,7 +391,13 @@ impl Sliding {
         Ok(())
     }
 
-    fn cycle(&self, last: &ContactState, new: &[Foot], old: &[Foot], iterations: usize) -> MtmError {
+    fn cycle(
+        &self,
+        last: &ContactState,
+        new: &[Foot],
+        old: &[Foot],
+        iterations: usize,
+    ) -> MtmError {
         let mut order: Vec<usize> = (0..self.nodes.len()).collect();
         let badness = |i: usize| {
             let turned = last.forces[i].abs() * norm(sub(new[i].normal, old[i].normal));
@@ -401,8 +409,7 @@ impl Sliding {
         let gap = (0..order.len())
             .filter(|&i| last.active[i])
             .fold(0.0_f64, |m, i| m.max(last.gaps[i].abs()));
-        let nodes =
-            order.iter().take(NAMED_NODES).map(|&i| self.nodes[i].node as usize).collect();
+        let nodes = order.iter().take(NAMED_NODES).map(|&i| self.nodes[i].node as usize).collect();
         MtmError::ContactCycle { iterations, nodes, gap }
     }
 }
@@ -490,7 +497,9 @@ impl Held {
         }
         let before = self.active.clone();
         if self.one_at_a_time {
-            if let Some(&(i, _)) = list.iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0))) {
+            if let Some(&(i, _)) =
+                list.iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)))
+            {
                 self.active[i] = !self.active[i];
             }
         } else {

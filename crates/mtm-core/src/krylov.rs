@@ -504,7 +504,8 @@ fn dot_and_largest(r: &[[f64; 3]], z: &[[f64; 3]]) -> (f64, f64) {
         })
         .collect();
     let sum = partial.iter().map(|p| p.0).sum();
-    let largest = partial.iter().fold(0.0, |m: f64, p| if p.1 > m || p.1.is_nan() { p.1 } else { m });
+    let largest =
+        partial.iter().fold(0.0, |m: f64, p| if p.1 > m || p.1.is_nan() { p.1 } else { m });
     (sum, largest.sqrt())
 }
 

@@ -345,7 +345,8 @@ impl Tissue {
             }
         }
         check_matching(fraction.len(), fibre.len())?;
-        let needed: Vec<bool> = (0..fibre.len()).map(|t| fraction[t % fraction.len()] > 0.0).collect();
+        let needed: Vec<bool> =
+            (0..fibre.len()).map(|t| fraction[t % fraction.len()] > 0.0).collect();
         let fibre = unit_fibres(fibre, &needed)?;
         let (fat, muscle) = (preset.fat, preset.muscle);
         let mut constants = Vec::with_capacity(fraction.len());
@@ -361,8 +362,11 @@ impl Tissue {
             } else if mixing == Mixing::Moduli {
                 Spencer::from_moduli(moduli, FibreLaw::Spencer)
             } else {
-                Spencer::from_moduli(muscle, FibreLaw::Spencer)
-                    .combined(p, Lame::from(fat).into(), 1.0 - p)
+                Spencer::from_moduli(muscle, FibreLaw::Spencer).combined(
+                    p,
+                    Lame::from(fat).into(),
+                    1.0 - p,
+                )
             };
             check_definite(tet, c.eigenvalue_range(), || describe(&moduli, FibreLaw::Spencer))?;
             constants.push(c);
@@ -527,11 +531,22 @@ fn check_voigt(tet: usize, c: &Voigt) -> Result<()> {
         for column in 0..6 {
             let value = c[row][column];
             if !value.is_finite() {
-                return Err(MtmError::NotFinite { what: "stiffness".into(), index: tet, value, kind });
+                return Err(MtmError::NotFinite {
+                    what: "stiffness".into(),
+                    index: tet,
+                    value,
+                    kind,
+                });
             }
             let lower = c[column][row];
             if (value - lower).abs() > SYMMETRY_TOLERANCE * largest {
-                return Err(MtmError::AsymmetricStiffness { tet, row, column, upper: value, lower });
+                return Err(MtmError::AsymmetricStiffness {
+                    tet,
+                    row,
+                    column,
+                    upper: value,
+                    lower,
+                });
             }
         }
     }
@@ -541,8 +556,7 @@ fn check_voigt(tet: usize, c: &Voigt) -> Result<()> {
 /// Extreme eigenvalues of C in Mandel form, where shears carry √2 and strain keeps its norm.
 fn voigt_eigenvalues(c: &Voigt) -> (f64, f64) {
     let weight = |i: usize| if i < 3 { 1.0 } else { std::f64::consts::SQRT_2 };
-    let mandel =
-        Matrix6::from_fn(|i, j| 0.5 * (c[i][j] + c[j][i]) * weight(i) * weight(j));
+    let mandel = Matrix6::from_fn(|i, j| 0.5 * (c[i][j] + c[j][i]) * weight(i) * weight(j));
     let values = SymmetricEigen::new(mandel).eigenvalues;
     (values.min(), values.max())
 }

@@ -161,16 +161,18 @@ impl TetMesh {
     /// The other tet on the face `tri` of tet `t`.
     pub(crate) fn neighbour_across(&self, t: u32, tri: [u32; 3]) -> Option<u32> {
         let smallest = tri.iter().min_by_key(|&&v| self.incident.of(v as usize).len())?;
-        self.incident.of(*smallest as usize).iter().copied().find(|&other| {
-            other != t && tri.iter().all(|v| self.tets[other as usize].contains(v))
-        })
+        self.incident
+            .of(*smallest as usize)
+            .iter()
+            .copied()
+            .find(|&other| other != t && tri.iter().all(|v| self.tets[other as usize].contains(v)))
     }
 
     /// Tets that share a face with tet `t`.
     pub(crate) fn face_neighbours(&self, t: usize) -> impl Iterator<Item = u32> + '_ {
-        FACES.iter().filter_map(move |face| {
-            self.neighbour_across(t as u32, face.map(|v| self.tets[t][v]))
-        })
+        FACES
+            .iter()
+            .filter_map(move |face| self.neighbour_across(t as u32, face.map(|v| self.tets[t][v])))
     }
 
     /// Dihedral angles and edge ratio of every tet.

@@ -66,6 +66,14 @@ impl RigidMotion {
         })
     }
 
+    /// Position that the motion takes to `point`: R⁻¹ (x − t), mm, with the true inverse of R as given.
+    pub fn apply_inverse(&self, point: [f64; 3]) -> [f64; 3] {
+        let m = &self.matrix;
+        let r = Matrix3::from_fn(|i, j| m[i][j]);
+        let shifted = nalgebra::Vector3::from_fn(|i, _| point[i] - m[i][3]);
+        r.lu().solve(&shifted).map_or(point, |x| [x[0], x[1], x[2]])
+    }
+
     /// The direction `vector` turned by the motion: R v.
     pub fn rotate(&self, vector: [f64; 3]) -> [f64; 3] {
         let [x, y, z] = vector;

@@ -543,7 +543,8 @@ impl<const N: usize, const W: usize> Level<N, W> {
         let (coarse, p_transposed) = galerkin(a, scaling, &p, &lap);
         lap("galerkin");
         let coarse_scaling = Scaling::new(&coarse);
-        level.transfer = Some(Transfer::new(&p, &p_transposed, &coarse_scaling, level.rows_per_task));
+        level.transfer =
+            Some(Transfer::new(&p, &p_transposed, &coarse_scaling, level.rows_per_task));
         lap("transfer");
         let system = CoarseSystem { a: coarse, scaling: coarse_scaling, modes: coarse_modes };
         (level, Some(system))
@@ -1159,10 +1160,8 @@ fn mirror(upper: &[(Vec<u32>, Vec<ModeBlock>)]) -> CoarseMatrix {
             }
         }
     }
-    let blocks = sources
-        .par_iter()
-        .map(|&(_, row, slot)| upper[row as usize].1[slot as usize])
-        .collect();
+    let blocks =
+        sources.par_iter().map(|&(_, row, slot)| upper[row as usize].1[slot as usize]).collect();
     let mut coarse = CoarseMatrix { row_start, columns, blocks, diagonal };
     coarse.transpose_lower();
     coarse
@@ -1410,11 +1409,7 @@ fn rigid_modes(nodes: &[[f64; 3]], normals: &[(usize, [f64; 3])]) -> Vec<[[f64; 
         .iter()
         .map(|p| {
             let [x, y, z] = [0, 1, 2].map(|c| (p[c] - centre[c]) * scale);
-            [
-                [1.0, 0.0, 0.0, 0.0, z, -y],
-                [0.0, 1.0, 0.0, -z, 0.0, x],
-                [0.0, 0.0, 1.0, y, -x, 0.0],
-            ]
+            [[1.0, 0.0, 0.0, 0.0, z, -y], [0.0, 1.0, 0.0, -z, 0.0, x], [0.0, 0.0, 1.0, y, -x, 0.0]]
         })
         .collect();
     for &(row, normal) in normals {

@@ -4,7 +4,7 @@
 //! finite motion of it: nine for R − I, three for s = t + (R − I) c. With contact normals frozen the
 //! sliding constraints are affine in the same numbers.
 
-use crate::boundary::{Motion, Plan};
+use crate::boundary::{Motion, NodeKind, Plan};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::mesh::{dot, sub};
 use crate::statics::{Interrupt, NO_ROW, StaticSolver};
@@ -75,7 +75,7 @@ impl StaticSolver {
             .collect();
 
         // Prescribed fields of every column, and the constant column last if there is contact.
-        let (mut fields, mut offsets) = (Vec::new(), Vec::new());
+        let (mut fields, mut offsets, mut scales) = (Vec::new(), Vec::new(), Vec::new());
         let sliding = self.sliding.as_ref().map_or(&[][..], |s| s.nodes());
         let feet: Vec<[f64; 3]> = match &contact {
             None => Vec::new(),
@@ -94,6 +94,7 @@ impl StaticSolver {
                 for &j in &segment.joined {
                     u[j as usize] = unit_field(column, mesh.nodes()[j as usize], centres[s]);
                 }
+                scales.push(if column < 9 { mesh.diagonal() } else { 1.0 });
                 fields.push(self.coupled(&u));
                 let Some(state) = &contact else { continue };
                 offsets.push(
@@ -109,6 +110,7 @@ impl StaticSolver {
             }
         }
         if let Some(state) = &contact {
+            scales.push(1.0);
             fields.push(vec![[0.0; 3]; self.unknowns.len()]);
             offsets.push(
                 (0..sliding.len())
@@ -119,22 +121,21 @@ impl StaticSolver {
                     .collect(),
             );
         }
-        let active: Vec<usize> = contact
-            .iter()
-            .flat_map(|c| (0..c.active.len()).filter(|&i| c.active[i]))
-            .collect();
+        let active: Vec<usize> =
+            contact.iter().flat_map(|c| (0..c.active.len()).filter(|&i| c.active[i])).collect();
         let frozen = contact.as_ref().map(|c| (&active[..], &c.normals[..], &offsets[..]));
-        let solved = self.solve_frozen(fields, frozen, interrupted)?;
+        let solved = self.solve_frozen(fields, &scales, frozen, interrupted)?;
 
+        let kinds = self.boundary.kinds(n)?;
         let mut rows = vec![vec![[0.0; COLUMNS]; 3 * nodes.len()]; segments.len()];
         let mut offset = vec![0.0; 3 * nodes.len()];
         for (at, &j) in nodes.iter().enumerate() {
             let row = self.row_of[j as usize];
-            for (s, segment) in segments.iter().enumerate() {
+            for s in 0..segments.len() {
                 for column in 0..COLUMNS {
                     let u = if row != NO_ROW {
                         solved[COLUMNS * s + column][row as usize]
-                    } else if segment.joined.contains(&j) {
+                    } else if kinds[j as usize] == NodeKind::Joined(s) {
                         unit_field(column, mesh.nodes()[j as usize], centres[s])
                     } else {
                         [0.0; 3]

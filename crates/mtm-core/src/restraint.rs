@@ -74,8 +74,7 @@ fn grow(mesh: &TetMesh, grounded: &mut [bool]) {
 
 /// Face-connected groups of the tets that still have a node not grounded.
 fn parts(mesh: &TetMesh, grounded: &[bool]) -> Vec<Part> {
-    let open =
-        |t: usize| mesh.tets()[t].iter().any(|&v| !grounded[v as usize]);
+    let open = |t: usize| mesh.tets()[t].iter().any(|&v| !grounded[v as usize]);
     let mut seen = vec![false; mesh.n_tets()];
     let mut parts = Vec::new();
     for first in 0..mesh.n_tets() {
@@ -141,7 +140,10 @@ fn free_parts(
             break;
         }
     }
-    if open.len() > 1 && open.len() <= MAX_JOINT_PARTS && held_jointly(mesh, parts, &open, &grounded, &normal) {
+    if open.len() > 1
+        && open.len() <= MAX_JOINT_PARTS
+        && held_jointly(mesh, parts, &open, &grounded, &normal)
+    {
         return Ok(());
     }
     let part = &parts[open[0]];

@@ -7,9 +7,7 @@ use std::time::Instant;
 use crate::blocks::{Block, BlockMatrix};
 use crate::boundary::{Boundary, Motion, NodeKind, Plan};
 use crate::cholesky::{DenseSymmetric, Factor, Symbolic, TailFactor};
-use crate::contact::{
-    Constraints, ContactMode, ContactOptions, ContactState, Response, Sliding,
-};
+use crate::contact::{Constraints, ContactOptions, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
 use crate::krylov::{PcgOptions, pcg};
 use crate::mesh::{dot, norm, scaled, sub};
@@ -475,33 +473,29 @@ impl StaticSolver {
         };
         let clock = Clock::new();
         let options = &self.options.contact;
-        let (displacements, state, contact_seconds) = if let System::Direct {
-            symbolic,
-            factor,
-            tail: Some(tail),
-        } = &self.system
-        {
-            let mut x = symbolic.permuted(b);
-            symbolic.forward(factor, &mut x, 1);
-            let free = tail.free_displacements(&x);
-            let state = sliding
-                .settle(motions, options, interrupted, |c| self.respond(tail, &free, c))?;
-            let forces: Vec<[f64; 3]> =
-                state.normals.iter().zip(&state.forces).map(|(&n, &f)| scaled(n, f)).collect();
-            tail.add_forces(&mut x, &forces);
-            let seconds = clock.total();
-            symbolic.backward(factor, &mut x, 1);
-            (symbolic.unpermuted(&x), state, seconds)
-        } else {
-            let mut last = Vec::new();
-            let state = sliding.settle(motions, options, interrupted, |c| {
-                let (u, response) =
-                    self.solve_projected(b, c, scale, &mut effort, interrupted)?;
-                last = u;
-                Ok(response)
-            })?;
-            (last, state, clock.total())
-        };
+        let (displacements, state, contact_seconds) =
+            if let System::Direct { symbolic, factor, tail: Some(tail) } = &self.system {
+                let mut x = symbolic.permuted(b);
+                symbolic.forward(factor, &mut x, 1);
+                let free = tail.free_displacements(&x);
+                let state = sliding
+                    .settle(motions, options, interrupted, |c| self.respond(tail, &free, c))?;
+                let forces: Vec<[f64; 3]> =
+                    state.normals.iter().zip(&state.forces).map(|(&n, &f)| scaled(n, f)).collect();
+                tail.add_forces(&mut x, &forces);
+                let seconds = clock.total();
+                symbolic.backward(factor, &mut x, 1);
+                (symbolic.unpermuted(&x), state, seconds)
+            } else {
+                let mut last = Vec::new();
+                let state = sliding.settle(motions, options, interrupted, |c| {
+                    let (u, response) =
+                        self.solve_projected(b, c, scale, &mut effort, interrupted)?;
+                    last = u;
+                    Ok(response)
+                })?;
+                (last, state, clock.total())
+            };
         Ok(Unknowns {
             displacements,
             contact: Some(state),
@@ -549,11 +543,8 @@ impl StaticSolver {
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, Response)> {
         let nodes = self.sliding.as_ref().map_or(&[][..], Sliding::nodes);
-        let constraints: Vec<(usize, [f64; 3], f64)> = c
-            .active
-            .iter()
-            .map(|&i| (nodes[i].row as usize, c.normals[i], c.offsets[i]))
-            .collect();
+        let constraints: Vec<(usize, [f64; 3], f64)> =
+            c.active.iter().map(|&i| (nodes[i].row as usize, c.normals[i], c.offsets[i])).collect();
         let matrix = self.matrix();
         let system = projected(matrix, &constraints);
         let rhs = projected_rhs(matrix, b, &constraints);
@@ -611,8 +602,7 @@ impl StaticSolver {
             factor: RELAXATION_FACTOR,
             max_sweeps: self.options.max_iterations.unwrap_or(200_000),
         };
-        let found =
-            relax(matrix, b, &start, &options, interrupted).map_err(|e| self.by_node(e))?;
+        let found = relax(matrix, b, &start, &options, interrupted).map_err(|e| self.by_node(e))?;
         effort.error_bound = found.error_bound;
         effort.iterations += found.sweeps;
         effort.history.extend(found.steps);
@@ -666,7 +656,11 @@ impl StaticSolver {
     }
 
     /// Contact settled for `plan`: where the linear operator of re-planning is frozen.
-    pub(crate) fn settled(&self, plan: &Plan, interrupted: Interrupt<'_>) -> Result<Option<ContactState>> {
+    pub(crate) fn settled(
+        &self,
+        plan: &Plan,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Option<ContactState>> {
         if self.sliding.is_none() {
             return Ok(None);
         }
@@ -678,10 +672,12 @@ impl StaticSolver {
 
     /// Unknown rows for several right-hand sides with constraints n·u = g on fixed normals.
     ///
-    /// `offsets`: g of every sliding node, for each right-hand side.
+    /// `scales`: length of each prescribed field, mm; `frozen`: held nodes, normals, and g of every
+    /// sliding node for each right-hand side.
     pub(crate) fn solve_frozen(
         &self,
         columns: Vec<Vec<[f64; 3]>>,
+        scales: &[f64],
         frozen: Option<(&[usize], &[[f64; 3]], &[Vec<f64>])>,
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
@@ -694,19 +690,21 @@ impl StaticSolver {
             }
             return columns
                 .iter()
-                .map(|b| self.iterate(self.matrix(), b, 0.0, &mut effort, interrupted))
+                .zip(scales)
+                .map(|(b, &s)| self.iterate(self.matrix(), b, s, &mut effort, interrupted))
                 .collect();
         };
         columns
             .iter()
             .zip(offsets)
-            .map(|(b, offsets)| {
+            .zip(scales)
+            .map(|((b, offsets), &scale)| {
                 if interrupted() {
                     return Err(MtmError::Interrupted);
                 }
                 let c = Constraints { active, normals, offsets };
                 let System::Direct { symbolic, factor, tail: Some(tail) } = &self.system else {
-                    return Ok(self.solve_projected(b, &c, 0.0, &mut effort, interrupted)?.0);
+                    return Ok(self.solve_projected(b, &c, scale, &mut effort, interrupted)?.0);
                 };
                 let mut x = symbolic.permuted(b);
                 symbolic.forward(factor, &mut x, 1);
@@ -773,7 +771,10 @@ fn couplings(matrix: &BlockMatrix, unknowns: &[u32], kinds: &[NodeKind]) -> Vec<
 }
 
 /// P A P + k (I − P) with P = I − n⊗n on the constrained rows, k the mean diagonal of each.
-pub(crate) fn projected(matrix: &BlockMatrix, constraints: &[(usize, [f64; 3], f64)]) -> BlockMatrix {
+pub(crate) fn projected(
+    matrix: &BlockMatrix,
+    constraints: &[(usize, [f64; 3], f64)],
+) -> BlockMatrix {
     let mut normal: Vec<Option<[f64; 3]>> = vec![None; matrix.n_rows()];
     for &(row, n, _) in constraints {
         normal[row] = Some(n);

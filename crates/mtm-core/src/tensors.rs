@@ -120,14 +120,7 @@ impl MassTensors {
             .into_par_iter()
             .map(|t| {
                 let h = displacement_gradient(&self.mesh, t, displacements);
-                [
-                    h[0][0],
-                    h[1][1],
-                    h[2][2],
-                    h[1][2] + h[2][1],
-                    h[0][2] + h[2][0],
-                    h[0][1] + h[1][0],
-                ]
+                [h[0][0], h[1][1], h[2][2], h[1][2] + h[2][1], h[0][2] + h[2][0], h[0][1] + h[1][0]]
             })
             .collect())
     }
@@ -251,7 +244,8 @@ fn assemble_row(mesh: &TetMesh, tissue: &Tissue, j: usize, columns: &[u32], bloc
             let out = &mut blocks[at];
             for r in 0..3 {
                 for c in 0..3 {
-                    out[3 * r + c] += if transposed { tensor[3 * c + r] } else { tensor[3 * r + c] };
+                    out[3 * r + c] +=
+                        if transposed { tensor[3 * c + r] } else { tensor[3 * r + c] };
                 }
             }
         }
