@@ -68,8 +68,7 @@ impl Sheet {
 #[derive(Debug, Clone)]
 struct Cluster {
     centre: Vec3,
-    /// Squared distance from `centre` beyond which the expansion holds; infinite where it never
-    /// does.
+    /// Squared distance from `centre` beyond which the expansion is used, mm².
     far_squared: f64,
     /// N = ∫ n dA.
     zeroth: Vec3,
