@@ -1,1 +1,30 @@
+//! `cmfsim._core`: the binding of mtm-core. It converts, detaches and maps errors; it decides nothing.
 
+mod arrays;
+mod errors;
+mod geometry;
+mod materials;
+mod model;
+mod running;
+
+/// The compiled core of cmfsim.
+#[pyo3::pymodule]
+mod _core {
+    use pyo3::prelude::*;
+
+    #[pymodule_export]
+    use crate::geometry::{PyMeshQuality, PySurface, PySurfaceMotion, PyTetMesh};
+    #[pymodule_export]
+    use crate::materials::{PyMassTensors, PyTissue};
+    #[pymodule_export]
+    use crate::model::{PyBoundary, PyPlanOperator, PySolution, PyStaticSolver};
+
+    #[pymodule_init]
+    fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        crate::errors::register(module)?;
+        module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+        module.add("METHODS", ("auto", "cholesky", "pcg", "relaxation"))?;
+        module.add("PRESETS", ("kim2010", "kim2010-swapped"))?;
+        module.add("LAWS", ("spencer", "picinbono"))
+    }
+}

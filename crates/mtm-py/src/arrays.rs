@@ -1,0 +1,220 @@
+//! The one numpy door: shape, order, finiteness and range are checked here and nowhere else.
+//!
+//! Any real dtype, order and stride is accepted: what is not C-ordered float64 already is copied by
+//! numpy first, so that Fortran-ordered arrays and strided views arrive as the user sees them.
+
+use mtm_core::error::ErrorKind;
+use numpy::{
+    IntoPyArray, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArrayDyn,
+    PyUntypedArrayMethods,
+};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::errors;
+
+/// What an argument is called, and whose error its faults are.
+#[derive(Clone, Copy)]
+pub struct Named<'a>(pub &'a str, pub ErrorKind);
+
+impl Named<'_> {
+    fn fail(self, problem: String) -> PyErr {
+        errors::input(self.1, format!("{} {problem}", self.0))
+    }
+}
+
+/// `value` as a numpy array in C order with the given dtype; refuses what has another kind.
+fn converted<'py>(
+    value: &Bound<'py, PyAny>,
+    name: Named<'_>,
+    kinds: &str,
+    dtype: &str,
+    wanted: &str,
+) -> PyResult<Bound<'py, PyAny>> {
+    let numpy = value.py().import("numpy")?;
+    let array = numpy
+        .call_method1("asarray", (value,))
+        .map_err(|e| name.fail(format!("cannot be read as an array: {e}")))?;
+    let kind: String = array.getattr("dtype")?.getattr("kind")?.extract()?;
+    let empty = array.getattr("size")?.extract::<usize>()? == 0;
+    if !(kinds.contains(&kind) || empty && kind == "f") {
+        let found: String = array.getattr("dtype")?.str()?.extract()?;
+        let hint = match kind.as_str() {
+            "b" => "; turn a mask into indices with numpy.flatnonzero",
+            "O" => "; rows of different length?",
+            _ => "",
+        };
+        return Err(name.fail(format!("has dtype {found} where {wanted} are needed{hint}")));
+    }
+    let options = PyDict::new(value.py());
+    options.set_item("dtype", dtype)?;
+    numpy.call_method("ascontiguousarray", (array,), Some(&options))
+}
+
+fn shape_text(shape: &[usize]) -> String {
+    let parts: Vec<String> = shape.iter().map(ToString::to_string).collect();
+    format!("({}{})", parts.join(", "), if shape.len() == 1 { "," } else { "" })
+}
+
+/// C-ordered float64 values of `value` with their shape.
+fn floats(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<(Vec<usize>, Vec<f64>)> {
+    let shape: Option<Vec<usize>> =
+        value.getattr("shape").ok().and_then(|s| s.extract::<Vec<usize>>().ok());
+    let array = converted(value, name, "fiu", "float64", "real numbers")?;
+    let array: PyReadonlyArrayDyn<'_, f64> = array.extract()?;
+    // ascontiguousarray turns a scalar into one entry: its own shape is ().
+    let shape = match shape {
+        Some(shape) if shape.is_empty() => shape,
+        _ if value.is_instance_of::<pyo3::types::PyFloat>()
+            || value.is_instance_of::<pyo3::types::PyInt>() =>
+        {
+            Vec::new()
+        }
+        _ => array.shape().to_vec(),
+    };
+    let values =
+        array.as_slice().map_err(|e| name.fail(format!("is not contiguous: {e}")))?.to_vec();
+    if let Some(at) = values.iter().position(|v| !v.is_finite()) {
+        let mut rest = at;
+        let mut index = vec![0; shape.len()];
+        for (i, &n) in shape.iter().enumerate().rev() {
+            index[i] = rest % n.max(1);
+            rest /= n.max(1);
+        }
+        return Err(name.fail(format!("{index:?} is {}: every value must be finite", values[at])));
+    }
+    Ok((shape, values))
+}
+
+/// Rows of three finite values; `rows` fixes how many where it is known.
+pub fn points(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<[f64; 3]>> {
+    let (shape, values) = floats(value, name)?;
+    match shape[..] {
+        [_, 3] => Ok(values.as_chunks::<3>().0.to_vec()),
+        [3] => Err(name.fail("has shape (3,) where (k, 3) is needed; write [[x, y, z]]".into())),
+        _ => Err(name.fail(format!("has shape {} where (k, 3) is needed", shape_text(&shape)))),
+    }
+}
+
+/// One value, or one per row.
+pub fn values(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<f64>> {
+    let (shape, values) = floats(value, name)?;
+    match shape[..] {
+        [] | [_] => Ok(values),
+        [k, 1] => Err(name.fail(format!("has shape ({k}, 1) where ({k},) is needed"))),
+        _ => {
+            Err(name
+                .fail(format!("has shape {} where a number or (m,) is needed", shape_text(&shape))))
+        }
+    }
+}
+
+/// A 4×4 matrix, or nothing where the shape is another.
+pub fn matrix4(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Option<[[f64; 4]; 4]>> {
+    let array = converted(value, name, "fiu", "float64", "real numbers")?;
+    let shape: Vec<usize> = array.getattr("shape")?.extract()?;
+    if shape != [4, 4] {
+        return Ok(None);
+    }
+    let array: PyReadonlyArrayDyn<'_, f64> = array.extract()?;
+    let mut out = [[0.0; 4]; 4];
+    let flat = array.as_slice().map_err(|e| name.fail(format!("is not contiguous: {e}")))?;
+    for (i, v) in flat.iter().enumerate() {
+        out[i / 4][i % 4] = *v;
+    }
+    Ok(Some(out))
+}
+
+/// Stiffness matrices, (6, 6) or (m, 6, 6).
+pub fn stiffness(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<[[f64; 6]; 6]>> {
+    let (shape, values) = floats(value, name)?;
+    if !matches!(shape[..], [6, 6] | [_, 6, 6]) {
+        let found = shape_text(&shape);
+        return Err(name.fail(format!("has shape {found} where (6, 6) or (m, 6, 6) is needed")));
+    }
+    Ok(values
+        .chunks_exact(36)
+        .map(|c| std::array::from_fn(|i| std::array::from_fn(|j| c[6 * i + j])))
+        .collect())
+}
+
+/// Indices that fit an unsigned 32-bit integer, of the given row width (0: a flat list).
+fn indices(value: &Bound<'_, PyAny>, name: Named<'_>, width: usize) -> PyResult<Vec<u32>> {
+    let array = converted(value, name, "iu", "int64", "integers")?;
+    let shape: Vec<usize> = array.getattr("shape")?.extract()?;
+    let fits = match (width, &shape[..]) {
+        (0, [_]) => true,
+        (w, [_, k]) => w == *k,
+        (_, [0]) => true,
+        _ => false,
+    };
+    if !fits {
+        let wanted = if width == 0 { "(k,)".into() } else { format!("(k, {width})") };
+        return Err(name.fail(format!("has shape {} where {wanted} is needed", shape_text(&shape))));
+    }
+    let array: PyReadonlyArrayDyn<'_, i64> = array.extract()?;
+    let flat = array.as_slice().map_err(|e| name.fail(format!("is not contiguous: {e}")))?;
+    flat.iter()
+        .enumerate()
+        .map(|(at, &v)| {
+            u32::try_from(v).map_err(|_| {
+                name.fail(format!(
+                    "[{}] is {v}: indices run from 0 to {}",
+                    at / width.max(1),
+                    u32::MAX
+                ))
+            })
+        })
+        .collect()
+}
+
+/// Node indices.
+pub fn nodes(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<u32>> {
+    indices(value, name, 0)
+}
+
+/// Tets.
+pub fn tets(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<[u32; 4]>> {
+    Ok(indices(value, name, 4)?.as_chunks::<4>().0.to_vec())
+}
+
+/// Triangles.
+pub fn triangles(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<[u32; 3]>> {
+    Ok(indices(value, name, 3)?.as_chunks::<3>().0.to_vec())
+}
+
+/// (k, 3) float64.
+pub fn rows<'py>(py: Python<'py>, rows: Vec<[f64; 3]>) -> Bound<'py, PyArray2<f64>> {
+    table(py, rows)
+}
+
+/// (k, N) array of rows.
+pub fn table<T: numpy::Element, const N: usize>(
+    py: Python<'_>,
+    rows: Vec<[T; N]>,
+) -> Bound<'_, PyArray2<T>> {
+    let k = rows.len();
+    let flat: Bound<'_, PyArray1<T>> = rows.into_flattened().into_pyarray(py);
+    flat.reshape([k, N]).expect("k rows of N fill k×N")
+}
+
+/// (k, 3, 3) float64.
+pub fn blocks(py: Python<'_>, blocks: Vec<[f64; 9]>) -> Bound<'_, PyArray3<f64>> {
+    let k = blocks.len();
+    blocks.into_flattened().into_pyarray(py).reshape([k, 3, 3]).expect("k blocks of 9 fill k×3×3")
+}
+
+/// (m, 6, 6) float64.
+pub fn voigt(py: Python<'_>, rows: Vec<[[f64; 6]; 6]>) -> Bound<'_, PyArray3<f64>> {
+    let m = rows.len();
+    let flat = rows.into_flattened().into_flattened();
+    flat.into_pyarray(py).reshape([m, 6, 6]).expect("m matrices of 36 fill m×6×6")
+}
+
+/// `array` with writing switched off: a view of something frozen.
+pub fn frozen<'py, T: numpy::Element, D: numpy::ndarray::Dimension>(
+    array: Bound<'py, numpy::PyArray<T, D>>,
+) -> PyResult<Bound<'py, numpy::PyArray<T, D>>> {
+    array.call_method1("setflags", (false,))?;
+    Ok(array)
+}

@@ -1,0 +1,604 @@
+//! `Boundary`, `StaticSolver`, `Solution` and `PlanOperator` for Python.
+
+use std::sync::Arc;
+
+use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, Plan, Segment};
+use mtm_core::contact::{ContactMode, ContactOptions};
+use mtm_core::error::{ErrorKind, MtmError};
+use mtm_core::motion::RigidMotion;
+use mtm_core::replan::PlanOperator;
+use mtm_core::solution::{Solution, Timings};
+use mtm_core::statics::{Method, StaticOptions, StaticSolver};
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods};
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyString};
+
+use crate::arrays::{self, Named};
+use crate::errors::{self, Failure};
+use crate::geometry::{PySurface, PySurfaceMotion};
+use crate::materials::PyMassTensors;
+use crate::running::interruptible;
+
+const BOUNDARY: ErrorKind = ErrorKind::Boundary;
+/// Share of the free memory that a factor may take unless the caller says otherwise.
+const MEMORY_SHARE: f64 = 0.8;
+
+/// Kinds of the nodes: fixed, joined to a bone segment, sliding on one; all others are free.
+///
+/// Parameters
+/// ----------
+/// fixed : (k,) array_like of int, optional
+///     Nodes that do not move.
+/// joined : dict of str to (k,) array_like of int, optional
+///     Nodes that move with each segment.
+/// sliding : dict of str to (k,) array_like of int, optional
+///     Nodes that slide on the contact surface of each segment.
+/// contact : dict of str to Surface, optional
+///     Contact surface of each segment with sliding nodes, at rest, normals out of the bone.
+/// gap : dict of str to float, (k,) array_like or "rest", optional
+///     Distance along the normal that sliding nodes keep, mm; 0 puts them on the surface, "rest"
+///     keeps the distance each has at rest.
+/// conflicts : {"error", "resolve"}
+///     A node of two kinds is an error, or fixed wins over joined and joined over sliding.
+///
+/// Raises
+/// ------
+/// BoundaryError
+///     A node of two kinds, a negative index, sliding nodes without a contact surface, an empty segment.
+#[pyclass(frozen, module = "cmfsim", name = "Boundary")]
+pub struct PyBoundary {
+    pub core: Arc<Boundary>,
+}
+
+#[pymethods]
+impl PyBoundary {
+    #[new]
+    #[pyo3(signature = (
+        fixed = None, joined = None, sliding = None, contact = None, *, gap = None, conflicts = "error"
+    ))]
+    fn new(
+        fixed: Option<&Bound<'_, PyAny>>,
+        joined: Option<&Bound<'_, PyAny>>,
+        sliding: Option<&Bound<'_, PyAny>>,
+        contact: Option<&Bound<'_, PyAny>>,
+        gap: Option<&Bound<'_, PyAny>>,
+        conflicts: &str,
+    ) -> PyResult<Self> {
+        let fixed = fixed.map_or(Ok(Vec::new()), |f| arrays::nodes(f, Named("fixed", BOUNDARY)))?;
+        let mut segments: Vec<Segment> = Vec::new();
+        for (name, ids) in entries(joined, "joined")? {
+            let what = format!("joined[\"{name}\"]");
+            let ids = arrays::nodes(&ids, Named(&what, BOUNDARY))?;
+            segment(&mut segments, &name).joined = ids;
+        }
+        for (name, ids) in entries(sliding, "sliding")? {
+            let what = format!("sliding[\"{name}\"]");
+            let ids = arrays::nodes(&ids, Named(&what, BOUNDARY))?;
+            segment(&mut segments, &name).sliding = ids;
+        }
+        for (name, surface) in entries(contact, "contact")? {
+            let surface = surface.cast::<PySurface>().map_err(|_| {
+                errors::input(BOUNDARY, format!("contact[\"{name}\"] must be a cmfsim.Surface"))
+            })?;
+            segment(&mut segments, &name).contact = Some(surface.get().core.clone());
+        }
+        for (name, value) in entries(gap, "gap")? {
+            let gap = if let Ok(text) = value.cast::<PyString>() {
+                match text.to_str()? {
+                    "rest" => Gap::Rest,
+                    other => {
+                        let problem =
+                            format!("gap[\"{name}\"] is \"{other}\": give mm or \"rest\"");
+                        return Err(errors::input(BOUNDARY, problem));
+                    }
+                }
+            } else {
+                let what = format!("gap[\"{name}\"]");
+                let values = arrays::values(&value, Named(&what, BOUNDARY))?;
+                if values.len() == 1 { Gap::Uniform(values[0]) } else { Gap::PerNode(values) }
+            };
+            let Some(segment) = segments.iter_mut().find(|s| s.name == name) else {
+                let problem = format!("gap[\"{name}\"]: no such segment");
+                return Err(errors::input(BOUNDARY, problem));
+            };
+            segment.gap = gap;
+        }
+        let conflicts = match conflicts {
+            "error" => Conflicts::Refuse,
+            "resolve" => Conflicts::Resolve,
+            other => {
+                let problem = format!("conflicts is \"{other}\": use \"error\" or \"resolve\"");
+                return Err(errors::input(BOUNDARY, problem));
+            }
+        };
+        let core = Boundary::new(fixed, segments, conflicts).map_err(Failure)?;
+        Ok(Self { core: Arc::new(core) })
+    }
+
+    /// Nodes that do not move, (k,) uint32.
+    #[getter]
+    fn fixed<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u32>> {
+        self.core.fixed().to_vec().into_pyarray(py)
+    }
+
+    /// Nodes that move with each segment, dict of (k,) uint32.
+    #[getter]
+    fn joined<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        self.by_segment(py, |s| (!s.joined.is_empty()).then(|| s.joined.clone().into_pyarray(py)))
+    }
+
+    /// Nodes that slide on each segment, dict of (k,) uint32.
+    #[getter]
+    fn sliding<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        self.by_segment(py, |s| (!s.sliding.is_empty()).then(|| s.sliding.clone().into_pyarray(py)))
+    }
+
+    /// Contact surface of each segment that has one, dict of Surface.
+    #[getter]
+    fn contact<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let out = PyDict::new(py);
+        for s in self.core.segments() {
+            if let Some(surface) = &s.contact {
+                out.set_item(&s.name, PySurface::wrap(surface.as_ref().clone()))?;
+            }
+        }
+        Ok(out)
+    }
+
+    /// Names of the segments.
+    #[getter]
+    fn segments(&self) -> Vec<String> {
+        self.core.segments().iter().map(|s| s.name.clone()).collect()
+    }
+
+    /// How many nodes were given two kinds and lost one (with `conflicts="resolve"`).
+    #[getter]
+    fn conflicts(&self) -> usize {
+        self.core.conflicts()
+    }
+
+    fn __repr__(&self) -> String {
+        let parts: Vec<String> = self
+            .core
+            .segments()
+            .iter()
+            .map(|s| format!("{}: {} joined, {} sliding", s.name, s.joined.len(), s.sliding.len()))
+            .collect();
+        format!("Boundary({} fixed; {})", self.core.fixed().len(), parts.join("; "))
+    }
+}
+
+impl PyBoundary {
+    fn by_segment<'py>(
+        &self,
+        py: Python<'py>,
+        get: impl Fn(&Segment) -> Option<Bound<'py, PyArray1<u32>>>,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let out = PyDict::new(py);
+        for s in self.core.segments() {
+            if let Some(ids) = get(s) {
+                out.set_item(&s.name, ids)?;
+            }
+        }
+        Ok(out)
+    }
+}
+
+/// Items of an optional dict with text keys.
+fn entries<'py>(
+    value: Option<&Bound<'py, PyAny>>,
+    what: &str,
+) -> PyResult<Vec<(String, Bound<'py, PyAny>)>> {
+    let Some(value) = value else { return Ok(Vec::new()) };
+    let wrong = || errors::input(BOUNDARY, format!("{what} must be a dict of segment names"));
+    let dict = value.cast::<PyDict>().map_err(|_| wrong())?;
+    dict.iter().map(|(k, v)| Ok((k.extract::<String>().map_err(|_| wrong())?, v))).collect()
+}
+
+/// The segment called `name`, added where it is new.
+fn segment<'a>(segments: &'a mut Vec<Segment>, name: &str) -> &'a mut Segment {
+    let at = segments.iter().position(|s| s.name == name).unwrap_or_else(|| {
+        segments.push(Segment {
+            name: name.to_owned(),
+            joined: Vec::new(),
+            sliding: Vec::new(),
+            contact: None,
+            gap: Gap::Uniform(0.0),
+        });
+        segments.len() - 1
+    });
+    &mut segments[at]
+}
+
+/// Motions by segment: (4, 4) rigid, (k, 3) displacements of joined nodes, or a SurfaceMotion.
+fn plan(value: &Bound<'_, PyAny>) -> PyResult<Plan> {
+    entries(Some(value), "plan")?
+        .into_iter()
+        .map(|(name, motion)| {
+            if let Ok(surface) = motion.cast::<PySurfaceMotion>() {
+                return Ok((name, Motion::Surface(surface.get().core.clone())));
+            }
+            let what = format!("plan[\"{name}\"]");
+            let named = Named(&what, BOUNDARY);
+            if let Some(matrix) = arrays::matrix4(&motion, named)? {
+                let rigid = RigidMotion::new(&name, &matrix).map_err(Failure)?;
+                return Ok((name, Motion::Rigid(rigid)));
+            }
+            let rows = arrays::points(&motion, named).map_err(|e| {
+                let problem = format!(
+                    "{what} must be a (4, 4) rigid matrix, (k, 3) displacements of its joined nodes, or a \
+                     SurfaceMotion ({e})"
+                );
+                errors::input(BOUNDARY, problem)
+            })?;
+            Ok((name, Motion::Nodes(rows)))
+        })
+        .collect()
+}
+
+/// A patient's tensors and node kinds, ready for any plan; what a new plan does not change is kept.
+///
+/// Parameters
+/// ----------
+/// tensors : MassTensors
+/// boundary : Boundary
+/// method : {"auto", "cholesky", "pcg", "relaxation"}
+///     Sparse Cholesky; conjugate gradients with multigrid, stopped by an error bound; the node-wise
+///     iteration of the literature; or by size and memory.
+/// contact : {"bilateral", "unilateral"}
+///     Sliding nodes stay on the surface (the paper), or may lift off but never penetrate.
+/// tolerance : float
+///     Error bound of the iterative methods over the largest prescribed displacement.
+/// max_iterations : int, optional
+///     Of the iterative methods.
+/// contact_tolerance : float
+///     Largest gap over the diagonal of the mesh, and largest tangential share of contact forces.
+/// contact_iterations : int
+///     Outer iterations of the contact loop.
+/// memory_limit : float, optional
+///     MB that a factor may take; 80 % of the free memory by default, where that is known.
+///
+/// Raises
+/// ------
+/// BoundaryError
+///     A node index past the mesh, a body that is not held (with its free rigid modes).
+/// ContactError
+///     An inverted contact surface.
+/// SolverError
+///     Options out of range, a factor that fails or does not fit.
+#[pyclass(frozen, module = "cmfsim", name = "StaticSolver")]
+pub struct PyStaticSolver {
+    core: Arc<StaticSolver>,
+}
+
+#[pymethods]
+impl PyStaticSolver {
+    #[new]
+    #[pyo3(signature = (
+        tensors, boundary, method = "auto", *, contact = "bilateral", tolerance = 1e-9,
+        max_iterations = None, contact_tolerance = 1e-9, contact_iterations = 100, memory_limit = None
+    ))]
+    fn new(
+        py: Python<'_>,
+        tensors: &Bound<'_, PyMassTensors>,
+        boundary: &Bound<'_, PyBoundary>,
+        method: &str,
+        contact: &str,
+        tolerance: f64,
+        max_iterations: Option<usize>,
+        contact_tolerance: f64,
+        contact_iterations: usize,
+        memory_limit: Option<f64>,
+    ) -> PyResult<Self> {
+        let mode = match contact {
+            "bilateral" => ContactMode::Bilateral,
+            "unilateral" => ContactMode::Unilateral,
+            found => {
+                return Err(Failure(MtmError::UnknownName {
+                    what: "contact",
+                    found: found.into(),
+                    known: "bilateral, unilateral",
+                    kind: ErrorKind::Solver,
+                })
+                .into());
+            }
+        };
+        let memory_limit = match memory_limit {
+            Some(mb) if mb.is_finite() && mb > 0.0 => Some((mb * 1e6) as usize),
+            Some(value) => {
+                let problem =
+                    format!("memory_limit is {value}: allowed is a positive number of MB");
+                return Err(errors::input(ErrorKind::Solver, problem));
+            }
+            None => available_memory().map(|bytes| (MEMORY_SHARE * bytes) as usize),
+        };
+        let options = StaticOptions {
+            method: Method::from_name(method).map_err(Failure)?,
+            tolerance,
+            max_iterations,
+            contact: ContactOptions {
+                mode,
+                tolerance: contact_tolerance,
+                max_iterations: contact_iterations,
+                ..ContactOptions::default()
+            },
+            memory_limit,
+        };
+        let (tensors, boundary) = (tensors.get().core.clone(), boundary.get().core.clone());
+        let core =
+            interruptible(py, move |stop| StaticSolver::new(tensors, boundary, options, stop))?;
+        Ok(Self { core: Arc::new(core) })
+    }
+
+    /// Displacements under a plan; depends on its arguments alone.
+    ///
+    /// Parameters
+    /// ----------
+    /// plan : dict
+    ///     For every segment: (4, 4) rigid transform, (k, 3) displacements of its joined nodes in mm,
+    ///     or a SurfaceMotion.
+    /// loads : (n, 3) array_like, N, optional
+    ///     Forces on the nodes.
+    ///
+    /// Returns
+    /// -------
+    /// Solution
+    ///
+    /// Raises
+    /// ------
+    /// BoundaryError
+    ///     A plan that does not fit.
+    /// ContactError
+    ///     Contact that does not settle, a node that slides past the border of an open surface.
+    /// SolverError
+    ///     An iteration that does not converge.
+    #[pyo3(signature = (plan, *, loads = None))]
+    fn solve(
+        &self,
+        py: Python<'_>,
+        plan: &Bound<'_, PyAny>,
+        loads: Option<&Bound<'_, PyAny>>,
+    ) -> PyResult<PySolution> {
+        let plan = self::plan(plan)?;
+        let loads = loads.map(|l| arrays::points(l, Named("loads", BOUNDARY))).transpose()?;
+        let core = self.core.clone();
+        let solution = interruptible(py, move |stop| core.solve(&plan, loads.as_deref(), stop))?;
+        PySolution::wrap(py, solution)
+    }
+
+    /// Exact map from rigid plans to the displacements of `nodes` (all by default): 12 columns a segment.
+    ///
+    /// With sliding nodes, contact is frozen as it settles under `plan` (at rest by default).
+    #[pyo3(signature = (nodes = None, *, plan = None))]
+    fn plan_operator(
+        &self,
+        py: Python<'_>,
+        nodes: Option<&Bound<'_, PyAny>>,
+        plan: Option<&Bound<'_, PyAny>>,
+    ) -> PyResult<PyPlanOperator> {
+        let nodes = nodes.map(|n| arrays::nodes(n, Named("nodes", BOUNDARY))).transpose()?;
+        let plan = plan.map(self::plan).transpose()?;
+        let core = self.core.clone();
+        let operator =
+            interruptible(py, move |stop| core.plan_operator(nodes, plan.as_ref(), stop))?;
+        Ok(PyPlanOperator { core: operator })
+    }
+
+    /// The method in use.
+    #[getter]
+    fn method(&self) -> &'static str {
+        self.core.method().name()
+    }
+
+    /// The boundary.
+    #[getter]
+    fn boundary(&self) -> PyBoundary {
+        PyBoundary { core: self.core.boundary().clone() }
+    }
+
+    /// The tensors.
+    #[getter]
+    fn tensors(&self) -> PyMassTensors {
+        PyMassTensors::wrap(self.core.tensors().clone())
+    }
+
+    /// Number of unknowns: three per free or sliding node.
+    #[getter]
+    fn n_unknowns(&self) -> usize {
+        self.core.n_unknowns()
+    }
+
+    /// Bytes of the factor or preconditioner that is kept.
+    #[getter]
+    fn factor_bytes(&self) -> usize {
+        self.core.factor_bytes()
+    }
+
+    /// Seconds of each stage of the set-up; 0 for what the scene does not need.
+    #[getter]
+    fn timings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        timings(py, self.core.timings())
+    }
+
+    fn __repr__(&self) -> String {
+        let method = self.core.method().name();
+        format!("StaticSolver({} unknowns, method=\"{method}\")", self.core.n_unknowns())
+    }
+}
+
+/// Displacements under one plan.
+#[pyclass(frozen, module = "cmfsim", name = "Solution")]
+pub struct PySolution {
+    core: Solution,
+    displacements: Py<PyArray2<f64>>,
+    forces: Py<PyArray2<f64>>,
+}
+
+#[pymethods]
+impl PySolution {
+    /// Displacement of every node, (n, 3) float64, mm.
+    #[getter]
+    fn displacements<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+        self.displacements.bind(py).clone()
+    }
+
+    /// Internal force K u of every node, (n, 3) float64, N; zero at free nodes without loads.
+    #[getter]
+    fn forces<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+        self.forces.bind(py).clone()
+    }
+
+    /// Force out of balance over the forces that the plan brings in.
+    #[getter]
+    fn residual(&self) -> f64 {
+        self.core.residual
+    }
+
+    /// Bound of the largest nodal error of an iterative solve, mm; 0 for Cholesky.
+    #[getter]
+    fn error_bound(&self) -> f64 {
+        self.core.error_bound
+    }
+
+    /// Iterations of the linear solver, over all contact iterations; 0 for Cholesky.
+    #[getter]
+    fn iterations(&self) -> usize {
+        self.core.iterations
+    }
+
+    /// Residual (pcg) or largest step in mm (relaxation) of each iteration, (k,) float64.
+    #[getter]
+    fn residual_history<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        self.core.residual_history.clone().into_pyarray(py)
+    }
+
+    /// Largest distance of a held sliding node from its place on the moved surface, mm; 0 without any.
+    #[getter]
+    fn contact_gap(&self) -> f64 {
+        self.core.contact_gap()
+    }
+
+    /// Outer iterations of the contact loop.
+    #[getter]
+    fn contact_iterations(&self) -> usize {
+        self.core.contact_iterations
+    }
+
+    /// The sliding nodes, (s,) uint32, segment by segment.
+    #[getter]
+    fn contact_nodes<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u32>> {
+        self.core.contact.nodes.clone().into_pyarray(py)
+    }
+
+    /// Closest point of the moved contact surface to each sliding node, (s, 3) float64, mm.
+    #[getter]
+    fn contact_points<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+        arrays::rows(py, self.core.contact.points.clone())
+    }
+
+    /// Unit normal of the contact at each sliding node, out of the bone, (s, 3) float64.
+    #[getter]
+    fn contact_normals<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+        arrays::rows(py, self.core.contact.normals.clone())
+    }
+
+    /// Contact force along the normal, (s,) float64, N; positive pushes the tissue off the bone.
+    #[getter]
+    fn contact_forces<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        self.core.contact.forces.clone().into_pyarray(py)
+    }
+
+    /// Distance along the normal less the prescribed gap, (s,) float64, mm; positive where lifted off.
+    #[getter]
+    fn contact_gaps<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        self.core.contact.gaps.clone().into_pyarray(py)
+    }
+
+    /// Seconds of each stage, set-up included; exactly 0 for what the scene does not need.
+    #[getter]
+    fn timings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        timings(py, &self.core.timings)
+    }
+
+    fn __repr__(&self) -> String {
+        format!(
+            "Solution({} nodes, residual {:.1e}, contact gap {:.1e} mm)",
+            self.core.displacements.len(),
+            self.core.residual,
+            self.core.contact_gap()
+        )
+    }
+}
+
+impl PySolution {
+    fn wrap(py: Python<'_>, mut core: Solution) -> PyResult<Self> {
+        let displacements = std::mem::take(&mut core.displacements);
+        let forces = std::mem::take(&mut core.forces);
+        Ok(Self {
+            core,
+            displacements: arrays::rows(py, displacements).unbind(),
+            forces: arrays::rows(py, forces).unbind(),
+        })
+    }
+}
+
+/// Exact map from rigid plans to displacements of chosen nodes; call it with a plan.
+#[pyclass(frozen, module = "cmfsim", name = "PlanOperator")]
+pub struct PyPlanOperator {
+    core: PlanOperator,
+}
+
+#[pymethods]
+impl PyPlanOperator {
+    /// Displacements of `nodes` under a rigid plan, (k, 3) float64, mm.
+    fn __call__<'py>(
+        &self,
+        py: Python<'py>,
+        plan: &Bound<'py, PyAny>,
+    ) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let plan = self::plan(plan)?;
+        Ok(arrays::rows(py, self.core.apply(&plan).map_err(Failure)?))
+    }
+
+    /// The nodes it answers for, (k,) uint32.
+    #[getter]
+    fn nodes<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u32>> {
+        self.core.nodes().to_vec().into_pyarray(py)
+    }
+
+    /// Names of the segments, in the order of the columns.
+    #[getter]
+    fn segments(&self) -> Vec<String> {
+        self.core.segments().to_vec()
+    }
+
+    /// The columns, (3k, 12 * segments) float64: R - I row by row, then the shift of the centre.
+    #[getter]
+    fn matrix<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let shape = [3 * self.core.nodes().len(), 12 * self.core.segments().len()];
+        self.core.matrix().into_pyarray(py).reshape(shape)
+    }
+
+    fn __repr__(&self) -> String {
+        format!(
+            "PlanOperator({} nodes, segments {:?})",
+            self.core.nodes().len(),
+            self.core.segments()
+        )
+    }
+}
+
+fn timings<'py>(py: Python<'py>, laps: &Timings) -> PyResult<Bound<'py, PyDict>> {
+    let out = PyDict::new(py);
+    for (stage, seconds) in laps {
+        out.set_item(stage, seconds)?;
+    }
+    Ok(out)
+}
+
+/// Free memory of the machine in bytes, where the system tells.
+fn available_memory() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = text.lines().find(|l| l.starts_with("MemAvailable:"))?;
+    line.split_whitespace().nth(1)?.parse::<f64>().ok().map(|kb| 1024.0 * kb)
+}

@@ -1,0 +1,59 @@
+//! Long core calls on a thread of their own, so that Ctrl-C works while they run.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::time::Duration;
+
+use mtm_core::error::MtmError;
+use pyo3::prelude::*;
+
+use crate::errors::{self, Failure};
+
+/// How often signals are looked at while the core works.
+const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
+/// Stack of the worker: factorisations recurse.
+const STACK_BYTES: usize = 16 << 20;
+
+/// Result of `work`, run without the GIL; `work` is told through its argument when Python was interrupted.
+///
+/// The call returns at once on Ctrl-C. A step that cannot be stopped half-way (a numeric factorisation)
+/// ends in the background and its result is dropped.
+pub fn interruptible<T, W>(py: Python<'_>, work: W) -> PyResult<T>
+where
+    T: Send + 'static,
+    W: FnOnce(&(dyn Fn() -> bool + Sync)) -> Result<T, MtmError> + Send + 'static,
+{
+    let stop = Arc::new(AtomicBool::new(false));
+    let (sender, receiver) = channel();
+    let flag = stop.clone();
+    std::thread::Builder::new()
+        .name("cmfsim".into())
+        .stack_size(STACK_BYTES)
+        .spawn(move || {
+            // The receiver is gone after an interruption: then nobody wants the result.
+            let _ = sender.send(work(&|| flag.load(Ordering::Relaxed)));
+        })
+        .map_err(|e| errors::internal(format!("no thread could be started: {e}")))?;
+    // `Receiver` is not `Sync`: it travels into the detached closure and back.
+    let mut receiver = receiver;
+    loop {
+        let (back, outcome) = py.detach(move || {
+            let outcome = receiver.recv_timeout(SIGNAL_INTERVAL);
+            (receiver, outcome)
+        });
+        receiver = back;
+        match outcome {
+            Ok(result) => return result.map_err(|e| Failure(e).into()),
+            Err(RecvTimeoutError::Disconnected) => {
+                return Err(errors::internal("a core thread stopped without a result".into()));
+            }
+            Err(RecvTimeoutError::Timeout) => {
+                if let Err(signal) = py.check_signals() {
+                    stop.store(true, Ordering::Relaxed);
+                    return Err(signal);
+                }
+            }
+        }
+    }
+}
