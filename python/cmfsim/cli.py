@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim._core import __version__
+from cmfsim import __version__
 from cmfsim.case import CONTACTS, METHODS, Scene
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import read_plan, read_scene, result_suffixes, write_result
