@@ -6,13 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import meshes
 import numpy as np
 import pytest
 import scipy.sparse.linalg
 import skfem
 
 import cmfsim
+import meshes
 
 HERE = Path(__file__).parent
 

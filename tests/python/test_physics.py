@@ -2,11 +2,11 @@
 
 import itertools
 
-import meshes
 import numpy as np
 import pytest
 
 import cmfsim
+import meshes
 
 YOUNG, POISSON = 0.7, 0.3
 

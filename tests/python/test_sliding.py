@@ -2,11 +2,11 @@
 
 import itertools
 
-import meshes
 import numpy as np
 import pytest
 
 import cmfsim
+import meshes
 
 YOUNG, POISSON = 0.5, 0.3
 SIZE = (6.0, 5.0, 4.0)
