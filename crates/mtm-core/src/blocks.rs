@@ -22,6 +22,17 @@ pub struct BlockMatrix {
 }
 
 impl BlockMatrix {
+    /// The zero matrix on a pattern with ascending columns that holds every diagonal.
+    pub fn from_pattern(row_start: Vec<usize>, columns: Vec<u32>) -> Self {
+        let diagonal = row_start
+            .windows(2)
+            .enumerate()
+            .map(|(j, w)| w[0] + columns[w[0]..w[1]].partition_point(|&k| (k as usize) < j))
+            .collect();
+        let blocks = vec![[0.0; 9]; columns.len()];
+        Self { row_start, columns, blocks, diagonal }
+    }
+
     /// Number of block rows.
     pub fn n_rows(&self) -> usize {
         self.row_start.len() - 1

@@ -74,7 +74,9 @@ pub enum MtmError {
         kind: ErrorKind,
     },
     /// A tet names the same node twice.
-    #[error("tet {tet} names node {node} twice: nodes {nodes:?}; remove the tet or mend its connectivity")]
+    #[error(
+        "tet {tet} names node {node} twice: nodes {nodes:?}; remove the tet or mend its connectivity"
+    )]
     DuplicateNode {
         /// The tet.
         tet: usize,
@@ -84,7 +86,9 @@ pub enum MtmError {
         nodes: [u32; 4],
     },
     /// A tet has negative volume.
-    #[error("tet {tet} is inverted: volume {volume:.6e}; swap two of its nodes {nodes:?} ({count} inverted tets in all)")]
+    #[error(
+        "tet {tet} is inverted: volume {volume:.6e}; swap two of its nodes {nodes:?} ({count} inverted tets in all)"
+    )]
     InvertedTet {
         /// The first inverted tet.
         tet: usize,
@@ -96,7 +100,9 @@ pub enum MtmError {
         count: usize,
     },
     /// A tet has no volume to speak of.
-    #[error("tet {tet} is degenerate: volume {volume:.6e} for a longest edge of {edge:.6e}, below {limit:.1e} of its cube; remove or re-mesh it (nodes {nodes:?})")]
+    #[error(
+        "tet {tet} is degenerate: volume {volume:.6e} for a longest edge of {edge:.6e}, below {limit:.1e} of its cube; remove or re-mesh it (nodes {nodes:?})"
+    )]
     DegenerateTet {
         /// The tet.
         tet: usize,
@@ -110,7 +116,9 @@ pub enum MtmError {
         nodes: [u32; 4],
     },
     /// The same four nodes make two tets.
-    #[error("tets {first} and {second} have the same four nodes {nodes:?}: remove one, or its stiffness counts twice")]
+    #[error(
+        "tets {first} and {second} have the same four nodes {nodes:?}: remove one, or its stiffness counts twice"
+    )]
     DuplicateTet {
         /// First of the pair.
         first: usize,
@@ -120,7 +128,9 @@ pub enum MtmError {
         nodes: [u32; 4],
     },
     /// A node belongs to no tet.
-    #[error("node {node} belongs to no tet ({count} such nodes): drop unused nodes before building the mesh")]
+    #[error(
+        "node {node} belongs to no tet ({count} such nodes): drop unused nodes before building the mesh"
+    )]
     UnusedNode {
         /// The first such node.
         node: usize,
@@ -140,7 +150,9 @@ pub enum MtmError {
         vertices: [u32; 3],
     },
     /// A stiffness matrix is not symmetric.
-    #[error("stiffness of tet {tet} is not symmetric: C[{row}][{column}] = {upper:.6e} but C[{column}][{row}] = {lower:.6e}")]
+    #[error(
+        "stiffness of tet {tet} is not symmetric: C[{row}][{column}] = {upper:.6e} but C[{column}][{row}] = {lower:.6e}"
+    )]
     AsymmetricStiffness {
         /// The tet (0 for a uniform tissue).
         tet: usize,
@@ -154,7 +166,9 @@ pub enum MtmError {
         lower: f64,
     },
     /// A material stores negative energy for some strain.
-    #[error("material of tet {tet} is indefinite: smallest eigenvalue {eigenvalue:.6e} MPa ({constants}); no stable solution exists with it")]
+    #[error(
+        "material of tet {tet} is indefinite: smallest eigenvalue {eigenvalue:.6e} MPa ({constants}); no stable solution exists with it"
+    )]
     IndefiniteMaterial {
         /// The tet (0 for a uniform tissue).
         tet: usize,
@@ -164,7 +178,9 @@ pub enum MtmError {
         constants: String,
     },
     /// A fibre direction is not a unit vector.
-    #[error("fibre[{tet}] has length {length}: it must be 1 within {tolerance:.0e}; divide it by its length")]
+    #[error(
+        "fibre[{tet}] has length {length}: it must be 1 within {tolerance:.0e}; divide it by its length"
+    )]
     FibreNotUnit {
         /// The tet (0 for a uniform tissue).
         tet: usize,
@@ -200,7 +216,9 @@ pub enum MtmError {
         problem: String,
     },
     /// Part of the body can move without deforming.
-    #[error("{what} is not held: {modes} ({nodes} nodes, for example node {node}); fix or join at least three of its nodes that are not in line, or remove it")]
+    #[error(
+        "{what} is not held: {modes} ({nodes} nodes, for example node {node}); fix or join at least three of its nodes that are not in line, or remove it"
+    )]
     Unconstrained {
         /// The part of the body, in words.
         what: String,
@@ -220,7 +238,9 @@ pub enum MtmError {
         problem: String,
     },
     /// The contact loop came back to an earlier state without settling.
-    #[error("contact does not settle: after {iterations} iterations nodes {nodes:?} still change their contact triangle or state (gap {gap:.3e} mm); smooth the contact surface there or refine the tissue")]
+    #[error(
+        "contact does not settle: after {iterations} iterations nodes {nodes:?} still change their contact triangle or state (gap {gap:.3e} mm); smooth the contact surface there or refine the tissue"
+    )]
     ContactCycle {
         /// Outer iterations done.
         iterations: usize,
@@ -230,7 +250,9 @@ pub enum MtmError {
         gap: f64,
     },
     /// The factorisation met a pivot that is not positive, or the system is singular to working precision.
-    #[error("the stiffness matrix is not positive definite to working precision at node {node}: {detail}")]
+    #[error(
+        "the stiffness matrix is not positive definite to working precision at node {node}: {detail}"
+    )]
     NotPositiveDefinite {
         /// Node of the failing pivot.
         node: usize,
@@ -238,7 +260,9 @@ pub enum MtmError {
         detail: String,
     },
     /// An iterative method stopped before its error bound was met.
-    #[error("{method} did not converge: {iterations} iterations, error bound {error:.3e} mm where {tolerance:.3e} mm was asked for; {advice}")]
+    #[error(
+        "{method} did not converge: {iterations} iterations, error bound {error:.3e} mm where {tolerance:.3e} mm was asked for; {advice}"
+    )]
     NotConverged {
         /// The method.
         method: &'static str,

@@ -1,3 +1,22 @@
 //! Mass-tensor mechanics of soft tissue.
 pub mod blocks;
+pub mod boundary;
+pub mod cholesky;
+pub mod contact;
 pub mod error;
+pub mod krylov;
+pub mod material;
+pub mod mesh;
+pub mod motion;
+pub mod multigrid;
+pub mod ordering;
+pub mod relaxation;
+pub mod replan;
+pub mod restraint;
+pub mod solution;
+pub mod statics;
+pub mod surface;
+pub mod tensors;
+mod topology;
+mod triangle;
+pub mod winding;

@@ -1,0 +1,343 @@
+//! Node kinds, bone segments and plans: what is fixed, what moves with bone, what slides on it.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
+use crate::motion::{RigidMotion, SurfaceMotion};
+use crate::surface::Surface;
+
+/// Prescribed distance of sliding nodes from their contact surface along its normal, mm.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum Gap {
+    /// The same for every sliding node; 0 puts them on the surface.
+    Uniform(f64),
+    /// One per sliding node, in the order they were given.
+    PerNode(Vec<f64>),
+    /// The distance each node has at rest.
+    Rest,
+}
+
+/// What happens when a node is given two kinds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Conflicts {
+    /// Refuse, naming the node.
+    Refuse,
+    /// Fixed wins over joined, joined over sliding; the losers are counted.
+    Resolve,
+}
+
+/// One bone segment and the tissue nodes that depend on it.
+#[derive(Debug, Clone)]
+pub struct Segment {
+    /// Its name, as plans use it.
+    pub name: String,
+    /// Nodes that move with it.
+    pub joined: Vec<u32>,
+    /// Nodes that slide on its contact surface.
+    pub sliding: Vec<u32>,
+    /// The surface they slide on, at rest.
+    pub contact: Option<Arc<Surface>>,
+    /// Their prescribed distance from it.
+    pub gap: Gap,
+}
+
+/// Kinds of the nodes: every node not named is free, each node has one kind.
+#[derive(Debug, Clone)]
+pub struct Boundary {
+    fixed: Vec<u32>,
+    segments: Vec<Segment>,
+    /// Joined nodes as the caller gave them: rows of a plan's displacements follow this order.
+    given: Vec<Vec<u32>>,
+    conflicts: usize,
+}
+
+/// How a segment moves.
+#[derive(Debug, Clone)]
+#[non_exhaustive]
+pub enum Motion {
+    /// As a rigid body.
+    Rigid(RigidMotion),
+    /// Its joined nodes by these displacements, mm, in the order they were given.
+    Nodes(Vec<[f64; 3]>),
+    /// As a surface whose vertices have new positions.
+    Surface(Arc<SurfaceMotion>),
+}
+
+/// A motion for each segment, by name.
+pub type Plan = Vec<(String, Motion)>;
+
+/// Kind of a node, with the index of its segment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NodeKind {
+    /// Moves as the forces say.
+    Free,
+    /// Does not move.
+    Fixed,
+    /// Moves with a segment.
+    Joined(usize),
+    /// Slides on the contact surface of a segment.
+    Sliding(usize),
+}
+
+impl Boundary {
+    /// The checked boundary.
+    ///
+    /// # Errors
+    /// A node of two kinds (unless resolved), a node joined to two segments, segments of the same name,
+    /// with nothing attached, sliding without a contact surface, a wrong number of gaps, gaps that are
+    /// not finite.
+    pub fn new(fixed: Vec<u32>, segments: Vec<Segment>, conflicts: Conflicts) -> Result<Self> {
+        let mut boundary = Self {
+            fixed: unique(&fixed),
+            given: segments.iter().map(|s| s.joined.clone()).collect(),
+            segments,
+            conflicts: 0,
+        };
+        boundary.check_segments()?;
+        let mut taken: HashMap<u32, String> = HashMap::new();
+        for &node in &boundary.fixed {
+            taken.insert(node, "fixed".into());
+        }
+        let mut lost = 0;
+        let mut claim = |nodes: &mut Vec<u32>, role: String| -> Result<Vec<usize>> {
+            let (mut kept, mut rows) = (Vec::new(), Vec::new());
+            for (row, &node) in nodes.iter().enumerate() {
+                match taken.get(&node) {
+                    None => {
+                        taken.insert(node, role.clone());
+                        kept.push(node);
+                        rows.push(row);
+                    }
+                    Some(owner) if *owner == role => {}
+                    Some(owner) => {
+                        let rival = owner.starts_with("joined") && role.starts_with("joined");
+                        if conflicts == Conflicts::Refuse || rival {
+                            let (node, first, second) =
+                                (node as usize, owner.clone(), role.clone());
+                            return Err(MtmError::NodeOfTwoKinds { node, first, second });
+                        }
+                        lost += 1;
+                    }
+                }
+            }
+            *nodes = kept;
+            Ok(rows)
+        };
+        for segment in &mut boundary.segments {
+            let role = format!("joined to \"{}\"", segment.name);
+            claim(&mut segment.joined, role)?;
+        }
+        for segment in &mut boundary.segments {
+            let role = format!("sliding on \"{}\"", segment.name);
+            let rows = claim(&mut segment.sliding, role)?;
+            if let Gap::PerNode(values) = &mut segment.gap {
+                *values = rows.iter().map(|&row| values[row]).collect();
+            }
+        }
+        boundary.conflicts = lost;
+        Ok(boundary)
+    }
+
+    fn check_segments(&self) -> Result<()> {
+        for (i, segment) in self.segments.iter().enumerate() {
+            let fail =
+                |problem: String| Err(MtmError::Segment { segment: segment.name.clone(), problem });
+            if self.segments[..i].iter().any(|s| s.name == segment.name) {
+                return fail("is named twice".into());
+            }
+            if segment.joined.is_empty() && segment.sliding.is_empty() {
+                return fail(
+                    "has neither joined nor sliding nodes: give it some or leave it out".into(),
+                );
+            }
+            if !segment.sliding.is_empty() && segment.contact.is_none() {
+                return fail(format!(
+                    "has {} sliding nodes but no contact surface: pass contact={{\"{}\": surface}}",
+                    segment.sliding.len(),
+                    segment.name
+                ));
+            }
+            match &segment.gap {
+                Gap::Uniform(value) if !value.is_finite() => {
+                    return fail(format!("has a gap of {value}: it must be finite (mm)"));
+                }
+                Gap::PerNode(values) if values.len() != segment.sliding.len() => {
+                    return fail(format!(
+                        "has {} gaps for {} sliding nodes: give one value, or one per sliding node",
+                        values.len(),
+                        segment.sliding.len()
+                    ));
+                }
+                Gap::PerNode(values) => {
+                    if let Some(index) = values.iter().position(|v| !v.is_finite()) {
+                        return fail(format!(
+                            "has gap[{index}] = {}: it must be finite",
+                            values[index]
+                        ));
+                    }
+                }
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// Nodes that do not move.
+    pub fn fixed(&self) -> &[u32] {
+        &self.fixed
+    }
+
+    /// The segments, in the order given.
+    pub fn segments(&self) -> &[Segment] {
+        &self.segments
+    }
+
+    /// How many nodes were given two kinds and lost one of them.
+    pub fn conflicts(&self) -> usize {
+        self.conflicts
+    }
+
+    /// Whether any node slides.
+    pub fn has_sliding(&self) -> bool {
+        self.segments.iter().any(|s| !s.sliding.is_empty())
+    }
+
+    /// Kind of each of `n` nodes.
+    ///
+    /// # Errors
+    /// A node index of `n` or more.
+    pub fn kinds(&self, n: usize) -> Result<Vec<NodeKind>> {
+        let mut kinds = vec![NodeKind::Free; n];
+        let mut set = |what: String, nodes: &[u32], kind: NodeKind| -> Result<()> {
+            for (row, &node) in nodes.iter().enumerate() {
+                let Some(slot) = kinds.get_mut(node as usize) else {
+                    return Err(MtmError::IndexOutOfRange {
+                        what,
+                        row,
+                        item: "node",
+                        index: node as usize,
+                        count: n,
+                        kind: ErrorKind::Boundary,
+                    });
+                };
+                *slot = kind;
+            }
+            Ok(())
+        };
+        set("fixed".into(), &self.fixed, NodeKind::Fixed)?;
+        for (s, segment) in self.segments.iter().enumerate() {
+            set(format!("joined[\"{}\"]", segment.name), &segment.joined, NodeKind::Joined(s))?;
+            set(format!("sliding[\"{}\"]", segment.name), &segment.sliding, NodeKind::Sliding(s))?;
+        }
+        Ok(kinds)
+    }
+
+    /// The motions of `plan` in the order of the segments.
+    ///
+    /// # Errors
+    /// A segment that the plan lacks or names twice, a name that is no segment, displacements of the
+    /// wrong number or not finite, displacements for a segment with sliding nodes.
+    pub fn motions<'a>(&self, plan: &'a Plan) -> Result<Vec<&'a Motion>> {
+        let known = || {
+            let names: Vec<String> =
+                self.segments.iter().map(|s| format!("\"{}\"", s.name)).collect();
+            names.join(", ")
+        };
+        let fail = |segment: &str, problem: String| MtmError::Plan {
+            segment: segment.to_owned(),
+            problem,
+        };
+        for (i, (name, _)) in plan.iter().enumerate() {
+            if !self.segments.iter().any(|s| s.name == *name) {
+                return Err(fail(name, format!("no such segment; the boundary has {}", known())));
+            }
+            if plan[..i].iter().any(|(other, _)| other == name) {
+                return Err(fail(name, "it is named twice".into()));
+            }
+        }
+        self.segments
+            .iter()
+            .zip(&self.given)
+            .map(|(segment, given)| {
+                let Some((_, motion)) = plan.iter().find(|(name, _)| *name == segment.name) else {
+                    return Err(fail(
+                        &segment.name,
+                        "it is missing; a plan names every segment (the identity matrix: it stays)"
+                            .into(),
+                    ));
+                };
+                if let Motion::Nodes(rows) = motion {
+                    if rows.len() != given.len() {
+                        let problem = format!(
+                            "{} displacements for its {} joined nodes",
+                            rows.len(),
+                            given.len()
+                        );
+                        return Err(fail(&segment.name, problem));
+                    }
+                    let what = format!("plan[\"{}\"]", segment.name);
+                    check_finite_rows(&what, rows, ErrorKind::Boundary)?;
+                    if !segment.sliding.is_empty() {
+                        return Err(fail(
+                            &segment.name,
+                            "displacements of joined nodes do not say how its contact surface moves; \
+                             give a rigid 4×4 matrix or a SurfaceMotion"
+                                .into(),
+                        ));
+                    }
+                }
+                Ok(motion)
+            })
+            .collect()
+    }
+
+    /// Joined nodes of segment `s` with their displacements under `motion`, mm.
+    ///
+    /// # Errors
+    /// A node listed twice with different displacements.
+    pub fn joined_displacements(
+        &self,
+        s: usize,
+        motion: &Motion,
+        nodes: &[[f64; 3]],
+    ) -> Result<Vec<(u32, [f64; 3])>> {
+        let segment = &self.segments[s];
+        let at =
+            |list: &[u32]| -> Vec<[f64; 3]> { list.iter().map(|&j| nodes[j as usize]).collect() };
+        Ok(match motion {
+            Motion::Rigid(rigid) => {
+                segment.joined.iter().map(|&j| (j, rigid.displacement(nodes[j as usize]))).collect()
+            }
+            Motion::Surface(surface) => segment
+                .joined
+                .iter()
+                .copied()
+                .zip(surface.displacement(&at(&segment.joined)))
+                .collect(),
+            Motion::Nodes(rows) => {
+                let mut seen: HashMap<u32, [f64; 3]> = HashMap::new();
+                for (row, (&node, &u)) in self.given[s].iter().zip(rows).enumerate() {
+                    if let Some(before) = seen.insert(node, u)
+                        && before != u
+                    {
+                        return Err(MtmError::Plan {
+                            segment: segment.name.clone(),
+                            problem: format!(
+                                "row {row} moves node {node} by {u:?}, an earlier row by {before:?}"
+                            ),
+                        });
+                    }
+                }
+                segment.joined.iter().map(|&j| (j, seen[&j])).collect()
+            }
+        })
+    }
+}
+
+/// `nodes` without repetitions, first occurrences kept in order.
+fn unique(nodes: &[u32]) -> Vec<u32> {
+    let mut seen = std::collections::HashSet::new();
+    nodes.iter().copied().filter(|&j| seen.insert(j)).collect()
+}

@@ -1,0 +1,315 @@
+//! Tetrahedral mesh: checks at construction, volumes, shape gradients, neighbours, boundary, quality.
+
+use rayon::prelude::*;
+
+use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
+
+/// Volume over longest edge cubed below which a tet counts as degenerate. A sliver with a smallest
+/// dihedral angle of 0.1° is near 2e-4; f64 geometry keeps about three digits at this limit.
+pub const DEGENERATE_RELATIVE_VOLUME: f64 = 1e-12;
+
+/// The four faces of a tet, outward when the tet is positively oriented.
+const FACES: [[usize; 3]; 4] = [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]];
+/// The six edges of a tet with the two vertices opposite each.
+const EDGES: [[usize; 4]; 6] =
+    [[0, 1, 2, 3], [0, 2, 1, 3], [0, 3, 1, 2], [1, 2, 0, 3], [1, 3, 0, 2], [2, 3, 0, 1]];
+
+/// Checked tetrahedral mesh; lengths in mm.
+#[derive(Debug, Clone)]
+pub struct TetMesh {
+    nodes: Vec<[f64; 3]>,
+    tets: Vec<[u32; 4]>,
+    volumes: Vec<f64>,
+    incident: Incidence,
+}
+
+/// Tets round each node, ascending.
+#[derive(Debug, Clone)]
+struct Incidence {
+    start: Vec<u32>,
+    tets: Vec<u32>,
+}
+
+/// Shape gradients and volume of one tet.
+#[derive(Debug, Clone, Copy)]
+pub struct TetGeometry {
+    /// Gradient of each linear shape function, 1/mm.
+    pub gradients: [[f64; 3]; 4],
+    /// Volume, mm³.
+    pub volume: f64,
+}
+
+/// Shape measures of every tet.
+#[derive(Debug, Clone)]
+pub struct MeshQuality {
+    /// Smallest dihedral angle of each tet, radians.
+    pub min_dihedral: Vec<f64>,
+    /// Largest dihedral angle of each tet, radians.
+    pub max_dihedral: Vec<f64>,
+    /// Longest over shortest edge of each tet.
+    pub edge_ratio: Vec<f64>,
+}
+
+impl TetMesh {
+    /// The mesh of positively oriented tets on `nodes` (mm).
+    ///
+    /// # Errors
+    /// Empty arrays, values that are not finite, node indices out of range, tets that repeat a node,
+    /// are inverted or degenerate, two tets on the same nodes, nodes that no tet uses.
+    pub fn new(nodes: Vec<[f64; 3]>, tets: Vec<[u32; 4]>) -> Result<Self> {
+        if nodes.is_empty() {
+            return Err(MtmError::Empty { what: "nodes", kind: ErrorKind::Mesh });
+        }
+        if tets.is_empty() {
+            return Err(MtmError::Empty { what: "tets", kind: ErrorKind::Mesh });
+        }
+        check_finite_rows("nodes", &nodes, ErrorKind::Mesh)?;
+        for (row, tet) in tets.iter().enumerate() {
+            if let Some(&node) = tet.iter().find(|&&v| v as usize >= nodes.len()) {
+                return Err(MtmError::IndexOutOfRange {
+                    what: "tets".into(),
+                    row,
+                    item: "node",
+                    index: node as usize,
+                    count: nodes.len(),
+                    kind: ErrorKind::Mesh,
+                });
+            }
+            for a in 0..3 {
+                if tet[a + 1..].contains(&tet[a]) {
+                    return Err(MtmError::DuplicateNode { tet: row, node: tet[a], nodes: *tet });
+                }
+            }
+        }
+        let volumes: Vec<f64> = tets.par_iter().map(|t| signed_volume(&nodes, t)).collect();
+        check_volumes(&nodes, &tets, &volumes)?;
+        let incident = Incidence::new(nodes.len(), &tets);
+        let mut unused = (0..nodes.len()).filter(|&j| incident.of(j).is_empty());
+        if let Some(node) = unused.next() {
+            return Err(MtmError::UnusedNode { node, count: 1 + unused.count() });
+        }
+        check_duplicates(&tets, &incident)?;
+        Ok(Self { nodes, tets, volumes, incident })
+    }
+
+    /// Node positions, mm.
+    pub fn nodes(&self) -> &[[f64; 3]] {
+        &self.nodes
+    }
+
+    /// Node indices of each tet.
+    pub fn tets(&self) -> &[[u32; 4]] {
+        &self.tets
+    }
+
+    /// Volume of each tet, mm³, positive.
+    pub fn volumes(&self) -> &[f64] {
+        &self.volumes
+    }
+
+    /// Number of nodes.
+    pub fn n_nodes(&self) -> usize {
+        self.nodes.len()
+    }
+
+    /// Number of tets.
+    pub fn n_tets(&self) -> usize {
+        self.tets.len()
+    }
+
+    /// Tets that use node `j`, ascending.
+    pub fn tets_of_node(&self, j: usize) -> &[u32] {
+        self.incident.of(j)
+    }
+
+    /// Length of the diagonal of the bounding box, mm: the length that relative tolerances refer to.
+    pub fn diagonal(&self) -> f64 {
+        let (lo, hi) = bounds(&self.nodes);
+        norm(sub(hi, lo))
+    }
+
+    /// Shape gradients and volume of tet `t`.
+    ///
+    /// g_j is the inward normal of the face opposite j over the height of j: with edges e_k from
+    /// vertex 0 and V the volume, g_1 = e_2 × e_3 / 6V and cyclic, g_0 = −(g_1 + g_2 + g_3).
+    pub fn geometry(&self, t: usize) -> TetGeometry {
+        let tet = &self.tets[t];
+        let x0 = self.nodes[tet[0] as usize];
+        let [e1, e2, e3] = [1, 2, 3].map(|k| sub(self.nodes[tet[k] as usize], x0));
+        let volume = self.volumes[t];
+        let scale = 1.0 / (6.0 * volume);
+        let g1 = cross(e2, e3).map(|v| v * scale);
+        let g2 = cross(e3, e1).map(|v| v * scale);
+        let g3 = cross(e1, e2).map(|v| v * scale);
+        let g0 = [0, 1, 2].map(|i| -(g1[i] + g2[i] + g3[i]));
+        TetGeometry { gradients: [g0, g1, g2, g3], volume }
+    }
+
+    /// Triangles that belong to one tet only, outward, in mesh node indices, in order of their tet.
+    pub fn boundary_triangles(&self) -> Vec<[u32; 3]> {
+        (0..self.tets.len())
+            .into_par_iter()
+            .flat_map_iter(|t| {
+                FACES.iter().filter_map(move |face| {
+                    let tri = face.map(|v| self.tets[t][v]);
+                    (self.neighbour_across(t as u32, tri).is_none()).then_some(tri)
+                })
+            })
+            .collect()
+    }
+
+    /// The other tet on the face `tri` of tet `t`.
+    pub(crate) fn neighbour_across(&self, t: u32, tri: [u32; 3]) -> Option<u32> {
+        let smallest = tri.iter().min_by_key(|&&v| self.incident.of(v as usize).len())?;
+        self.incident
+            .of(*smallest as usize)
+            .iter()
+            .copied()
+            .find(|&other| other != t && tri.iter().all(|v| self.tets[other as usize].contains(v)))
+    }
+
+    /// Tets that share a face with tet `t`.
+    pub(crate) fn face_neighbours(&self, t: usize) -> impl Iterator<Item = u32> + '_ {
+        FACES
+            .iter()
+            .filter_map(move |face| self.neighbour_across(t as u32, face.map(|v| self.tets[t][v])))
+    }
+
+    /// Dihedral angles and edge ratio of every tet.
+    pub fn quality(&self) -> MeshQuality {
+        let rows: Vec<[f64; 3]> =
+            (0..self.tets.len()).into_par_iter().map(|t| self.tet_quality(t)).collect();
+        MeshQuality {
+            min_dihedral: rows.iter().map(|r| r[0]).collect(),
+            max_dihedral: rows.iter().map(|r| r[1]).collect(),
+            edge_ratio: rows.iter().map(|r| r[2]).collect(),
+        }
+    }
+
+    fn tet_quality(&self, t: usize) -> [f64; 3] {
+        let x = self.tets[t].map(|v| self.nodes[v as usize]);
+        let (mut lo, mut hi) = (f64::INFINITY, 0.0_f64);
+        let (mut shortest, mut longest) = (f64::INFINITY, 0.0_f64);
+        for [a, b, c, d] in EDGES {
+            let e = sub(x[b], x[a]);
+            let length = norm(e);
+            shortest = shortest.min(length);
+            longest = longest.max(length);
+            // Angle between the two faces at the edge, from their in-plane perpendiculars.
+            let n1 = cross(e, sub(x[c], x[a]));
+            let n2 = cross(e, sub(x[d], x[a]));
+            let angle = norm(cross(n1, n2)).atan2(dot(n1, n2));
+            lo = lo.min(angle);
+            hi = hi.max(angle);
+        }
+        [lo, hi, longest / shortest]
+    }
+}
+
+impl Incidence {
+    fn new(n_nodes: usize, tets: &[[u32; 4]]) -> Self {
+        let mut start = vec![0_u32; n_nodes + 1];
+        for &v in tets.iter().flatten() {
+            start[v as usize + 1] += 1;
+        }
+        for j in 0..n_nodes {
+            start[j + 1] += start[j];
+        }
+        let mut next = start.clone();
+        let mut list = vec![0_u32; 4 * tets.len()];
+        for (t, tet) in tets.iter().enumerate() {
+            for &v in tet {
+                list[next[v as usize] as usize] = t as u32;
+                next[v as usize] += 1;
+            }
+        }
+        Self { start, tets: list }
+    }
+
+    fn of(&self, j: usize) -> &[u32] {
+        &self.tets[self.start[j] as usize..self.start[j + 1] as usize]
+    }
+}
+
+fn check_volumes(nodes: &[[f64; 3]], tets: &[[u32; 4]], volumes: &[f64]) -> Result<()> {
+    let longest = |t: usize| {
+        EDGES.iter().fold(0.0_f64, |m, e| {
+            m.max(norm(sub(nodes[tets[t][e[1]] as usize], nodes[tets[t][e[0]] as usize])))
+        })
+    };
+    let worst = (0..tets.len()).into_par_iter().find_map_first(|t| {
+        let edge = longest(t);
+        let limit = DEGENERATE_RELATIVE_VOLUME * edge * edge * edge;
+        (volumes[t].is_nan() || volumes[t] <= limit).then_some((t, edge, limit))
+    });
+    let Some((tet, edge, limit)) = worst else { return Ok(()) };
+    if volumes[tet] < -limit {
+        let count = volumes.iter().filter(|&&v| v < 0.0).count();
+        return Err(MtmError::InvertedTet { tet, volume: volumes[tet], nodes: tets[tet], count });
+    }
+    Err(MtmError::DegenerateTet {
+        tet,
+        volume: volumes[tet],
+        edge,
+        limit: DEGENERATE_RELATIVE_VOLUME,
+        nodes: tets[tet],
+    })
+}
+
+fn check_duplicates(tets: &[[u32; 4]], incident: &Incidence) -> Result<()> {
+    let found = (0..tets.len()).into_par_iter().find_map_first(|t| {
+        let tet = &tets[t];
+        // Any duplicate shares every node: the node with the fewest tets is the cheapest place to look.
+        let node = tet.iter().min_by_key(|&&v| incident.of(v as usize).len())?;
+        incident
+            .of(*node as usize)
+            .iter()
+            .find(|&&o| o as usize > t && tet.iter().all(|v| tets[o as usize].contains(v)))
+            .map(|&o| (t, o as usize))
+    });
+    match found {
+        None => Ok(()),
+        Some((first, second)) => {
+            let mut nodes = tets[first];
+            nodes.sort_unstable();
+            Err(MtmError::DuplicateTet { first, second, nodes })
+        }
+    }
+}
+
+fn signed_volume(nodes: &[[f64; 3]], tet: &[u32; 4]) -> f64 {
+    let x0 = nodes[tet[0] as usize];
+    let [e1, e2, e3] = [1, 2, 3].map(|k| sub(nodes[tet[k] as usize], x0));
+    dot(cross(e1, e2), e3) / 6.0
+}
+
+/// Smallest and largest coordinate along each axis.
+pub(crate) fn bounds(points: &[[f64; 3]]) -> ([f64; 3], [f64; 3]) {
+    points.iter().fold(([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]), |(lo, hi), p| {
+        ([0, 1, 2].map(|i| lo[i].min(p[i])), [0, 1, 2].map(|i| hi[i].max(p[i])))
+    })
+}
+
+pub(crate) fn sub(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+
+pub(crate) fn add(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+}
+
+pub(crate) fn scaled(a: [f64; 3], s: f64) -> [f64; 3] {
+    [a[0] * s, a[1] * s, a[2] * s]
+}
+
+pub(crate) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+pub(crate) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+pub(crate) fn norm(a: [f64; 3]) -> f64 {
+    dot(a, a).sqrt()
+}

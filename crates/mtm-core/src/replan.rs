@@ -1,0 +1,247 @@
+//! Exact re-planning: the answer to any rigid plan from columns solved once.
+//!
+//! A rigid motion is affine, u_b = (R − I)(x − c) + s, so twelve unit fields per segment span every
+//! finite motion of it: nine for R − I, three for s = t + (R − I) c. With contact normals frozen the
+//! sliding constraints are affine in the same numbers.
+
+use crate::boundary::{Motion, NodeKind, Plan};
+use crate::error::{ErrorKind, MtmError, Result};
+use crate::mesh::{dot, sub};
+use crate::statics::{Interrupt, NO_ROW, StaticSolver};
+
+/// Unit fields per segment.
+pub const COLUMNS: usize = 12;
+
+/// Linear map from rigid plans to the displacements of chosen nodes.
+#[derive(Debug, Clone)]
+pub struct PlanOperator {
+    nodes: Vec<u32>,
+    segments: Vec<String>,
+    /// Centre c of each segment's motion, mm.
+    centres: Vec<[f64; 3]>,
+    /// Row i of segment s: coefficients of the twelve numbers for component i of the nodes.
+    rows: Vec<Vec<[f64; COLUMNS]>>,
+    /// Displacement that does not depend on the plan: rest gaps that contact closes.
+    offset: Vec<f64>,
+}
+
+impl StaticSolver {
+    /// The operator for `nodes` (all of them if `None`).
+    ///
+    /// Without sliding nodes it equals `solve` for every rigid plan. With them, contact points, normals
+    /// and the set of held nodes are those of `reference` (at rest if `None`).
+    ///
+    /// # Errors
+    /// Node indices out of range, a reference plan that does not fit or settle, a linear solve that
+    /// fails.
+    pub fn plan_operator(
+        &self,
+        nodes: Option<Vec<u32>>,
+        reference: Option<&Plan>,
+        interrupted: Interrupt<'_>,
+    ) -> Result<PlanOperator> {
+        let mesh = self.tensors.mesh();
+        let n = mesh.n_nodes();
+        let nodes = nodes.unwrap_or_else(|| (0..n as u32).collect());
+        if let Some(row) = nodes.iter().position(|&j| j as usize >= n) {
+            return Err(MtmError::IndexOutOfRange {
+                what: "nodes".into(),
+                row,
+                item: "node",
+                index: nodes[row] as usize,
+                count: n,
+                kind: ErrorKind::Boundary,
+            });
+        }
+        let segments = self.boundary.segments();
+        let rest: Plan = segments
+            .iter()
+            .map(|s| (s.name.clone(), Motion::Rigid(crate::motion::RigidMotion::identity())))
+            .collect();
+        let reference = reference.unwrap_or(&rest);
+        rigid_plan(reference)?;
+        let contact = self.settled(reference, interrupted)?;
+        let centres: Vec<[f64; 3]> = segments
+            .iter()
+            .map(|s| {
+                let members = s.joined.iter().chain(&s.sliding);
+                let count = (s.joined.len() + s.sliding.len()) as f64;
+                let mut c = [0.0; 3];
+                for &j in members {
+                    c = [0, 1, 2].map(|i| c[i] + mesh.nodes()[j as usize][i] / count);
+                }
+                c
+            })
+            .collect();
+
+        // Prescribed fields of every column, and the constant column last if there is contact.
+        let (mut fields, mut offsets, mut scales) = (Vec::new(), Vec::new(), Vec::new());
+        let sliding = self.sliding.as_ref().map_or(&[][..], |s| s.nodes());
+        let feet: Vec<[f64; 3]> = match &contact {
+            None => Vec::new(),
+            Some(state) => sliding
+                .iter()
+                .zip(&state.points)
+                .map(|(node, &point)| match &find(reference, &segments[node.segment].name) {
+                    Some(rigid) => rigid.apply_inverse(point),
+                    None => point,
+                })
+                .collect(),
+        };
+        for (s, segment) in segments.iter().enumerate() {
+            for column in 0..COLUMNS {
+                let mut u = vec![[0.0; 3]; n];
+                for &j in &segment.joined {
+                    u[j as usize] = unit_field(column, mesh.nodes()[j as usize], centres[s]);
+                }
+                scales.push(if column < 9 { mesh.diagonal() } else { 1.0 });
+                fields.push(self.coupled(&u));
+                let Some(state) = &contact else { continue };
+                offsets.push(
+                    (0..sliding.len())
+                        .map(|i| {
+                            if sliding[i].segment != s {
+                                return 0.0;
+                            }
+                            dot(state.normals[i], unit_field(column, feet[i], centres[s]))
+                        })
+                        .collect::<Vec<f64>>(),
+                );
+            }
+        }
+        if let Some(state) = &contact {
+            scales.push(1.0);
+            fields.push(vec![[0.0; 3]; self.unknowns.len()]);
+            offsets.push(
+                (0..sliding.len())
+                    .map(|i| {
+                        let x = mesh.nodes()[sliding[i].node as usize];
+                        dot(state.normals[i], sub(feet[i], x)) + sliding[i].gap
+                    })
+                    .collect(),
+            );
+        }
+        let active: Vec<usize> =
+            contact.iter().flat_map(|c| (0..c.active.len()).filter(|&i| c.active[i])).collect();
+        let frozen = contact.as_ref().map(|c| (&active[..], &c.normals[..], &offsets[..]));
+        let solved = self.solve_frozen(fields, &scales, frozen, interrupted)?;
+
+        let kinds = self.boundary.kinds(n)?;
+        let mut rows = vec![vec![[0.0; COLUMNS]; 3 * nodes.len()]; segments.len()];
+        let mut offset = vec![0.0; 3 * nodes.len()];
+        for (at, &j) in nodes.iter().enumerate() {
+            let row = self.row_of[j as usize];
+            for s in 0..segments.len() {
+                for column in 0..COLUMNS {
+                    let u = if row != NO_ROW {
+                        solved[COLUMNS * s + column][row as usize]
+                    } else if kinds[j as usize] == NodeKind::Joined(s) {
+                        unit_field(column, mesh.nodes()[j as usize], centres[s])
+                    } else {
+                        [0.0; 3]
+                    };
+                    for i in 0..3 {
+                        rows[s][3 * at + i][column] = u[i];
+                    }
+                }
+            }
+            if contact.is_some() && row != NO_ROW {
+                let u = solved[COLUMNS * segments.len()][row as usize];
+                offset[3 * at..3 * at + 3].copy_from_slice(&u);
+            }
+        }
+        let segments = segments.iter().map(|s| s.name.clone()).collect();
+        Ok(PlanOperator { nodes, segments, centres, rows, offset })
+    }
+}
+
+impl PlanOperator {
+    /// The nodes it answers for.
+    pub fn nodes(&self) -> &[u32] {
+        &self.nodes
+    }
+
+    /// The segments, in the order of its columns.
+    pub fn segments(&self) -> &[String] {
+        &self.segments
+    }
+
+    /// The twelve columns of each segment, (3k, 12·segments) row by row.
+    pub fn matrix(&self) -> Vec<f64> {
+        (0..self.offset.len())
+            .flat_map(|i| self.rows.iter().flat_map(move |rows| rows[i]))
+            .collect()
+    }
+
+    /// Displacements of the nodes under a rigid plan, mm.
+    ///
+    /// # Errors
+    /// A plan that does not name every segment once, or moves one otherwise than rigidly.
+    pub fn apply(&self, plan: &Plan) -> Result<Vec<[f64; 3]>> {
+        rigid_plan(plan)?;
+        let fail = |segment: &str, problem: &str| {
+            Err(MtmError::Plan { segment: segment.to_owned(), problem: problem.to_owned() })
+        };
+        for (i, (name, _)) in plan.iter().enumerate() {
+            if !self.segments.contains(name) {
+                return fail(name, "no such segment");
+            }
+            if plan[..i].iter().any(|(other, _)| other == name) {
+                return fail(name, "it is named twice");
+            }
+        }
+        let mut out = self.offset.clone();
+        for (s, name) in self.segments.iter().enumerate() {
+            let Some(rigid) = find(plan, name) else {
+                return fail(
+                    name,
+                    "it is missing; a plan names every segment (the identity matrix: it stays)",
+                );
+            };
+            // (R − I)(x − c) + s with s the displacement of the centre.
+            let mut numbers = [0.0; COLUMNS];
+            for r in 0..3 {
+                for c in 0..3 {
+                    let unit = f64::from(u8::from(r == c));
+                    numbers[3 * r + c] = rigid.matrix()[r][c] - unit;
+                }
+            }
+            numbers[9..].copy_from_slice(&rigid.displacement(self.centres[s]));
+            for (out, row) in out.iter_mut().zip(&self.rows[s]) {
+                *out += row.iter().zip(&numbers).map(|(a, b)| a * b).sum::<f64>();
+            }
+        }
+        Ok(out.chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect())
+    }
+}
+
+/// Displacement of `x` in unit field `column`: entry (r, c) of R − I, or component of the shift.
+fn unit_field(column: usize, x: [f64; 3], centre: [f64; 3]) -> [f64; 3] {
+    let mut u = [0.0; 3];
+    if column < 9 {
+        u[column / 3] = x[column % 3] - centre[column % 3];
+    } else {
+        u[column - 9] = 1.0;
+    }
+    u
+}
+
+fn find<'a>(plan: &'a Plan, name: &str) -> Option<&'a crate::motion::RigidMotion> {
+    plan.iter().find_map(|(segment, motion)| match motion {
+        Motion::Rigid(rigid) if segment == name => Some(rigid),
+        _ => None,
+    })
+}
+
+fn rigid_plan(plan: &Plan) -> Result<()> {
+    for (segment, motion) in plan {
+        if !matches!(motion, Motion::Rigid(_)) {
+            return Err(MtmError::Plan {
+                segment: segment.clone(),
+                problem: "the operator takes rigid 4×4 matrices only; use solve for other motions"
+                    .into(),
+            });
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,52 @@
+//! What a solve returns: displacements, forces, how exact they are and where the time went.
+
+/// Seconds by stage; a stage that the scene does not need stays at exactly zero.
+pub type Timings = Vec<(&'static str, f64)>;
+
+/// Contact at the sliding nodes after a solve.
+#[derive(Debug, Clone, Default)]
+pub struct ContactResult {
+    /// The sliding nodes, segment by segment.
+    pub nodes: Vec<u32>,
+    /// Closest point of the moved contact surface, mm.
+    pub points: Vec<[f64; 3]>,
+    /// Unit normal that the contact force follows, out of the bone.
+    pub normals: Vec<[f64; 3]>,
+    /// Contact force along the normal, N; positive pushes the tissue away from the bone.
+    pub forces: Vec<f64>,
+    /// Distance along the normal less the prescribed gap, mm.
+    pub gaps: Vec<f64>,
+    /// Whether the node is held to the surface.
+    pub active: Vec<bool>,
+}
+
+/// Displacements under one plan.
+#[derive(Debug, Clone)]
+pub struct Solution {
+    /// Displacement of every node, mm.
+    pub displacements: Vec<[f64; 3]>,
+    /// Internal force K u of every node, N; zero at free nodes, the bone's load at the others.
+    pub forces: Vec<[f64; 3]>,
+    /// ‖f − loads − contact‖ over the unknown nodes, relative to the forces that the plan brings in.
+    pub residual: f64,
+    /// Bound of the largest nodal error of the linear solve, mm.
+    pub error_bound: f64,
+    /// Iterations of the linear solver (0 for Cholesky), over all contact iterations.
+    pub iterations: usize,
+    /// Residual measure of each linear iteration.
+    pub residual_history: Vec<f64>,
+    /// Contact at the sliding nodes.
+    pub contact: ContactResult,
+    /// Outer iterations of the contact loop.
+    pub contact_iterations: usize,
+    /// Seconds by stage.
+    pub timings: Timings,
+}
+
+impl Solution {
+    /// Largest |gap| of the held sliding nodes, mm; 0 without any.
+    pub fn contact_gap(&self) -> f64 {
+        let c = &self.contact;
+        c.gaps.iter().zip(&c.active).filter(|(_, a)| **a).fold(0.0, |m, (g, _)| m.max(g.abs()))
+    }
+}
