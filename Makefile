@@ -1,0 +1,73 @@
+# What a newcomer types: make test, make lint, make demo, make bench.
+# Everything happens in .venv and target/; a stamp file marks each finished step.
+
+VENV ?= .venv
+# A Python to build the environment with; empty: the first one from 3.10 on that works.
+PYTHON ?=
+# Set to --offline to build from the local crate cache alone.
+CARGO_FLAGS ?= --locked
+
+export PATH := $(HOME)/.cargo/bin:$(PATH)
+VENV_PATH := $(abspath $(VENV))
+BIN := $(VENV_PATH)/bin
+PY := $(BIN)/python
+# One interpreter for every build of the binding, whatever shims the PATH holds.
+export PYO3_PYTHON := $(PY)
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+ENV_STAMP := $(VENV)/.cmfsim-env
+BUILD_STAMP := $(VENV)/.cmfsim-build
+RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 'Cargo.toml')
+PYTHON_DIRS := python tests/python scripts examples
+CORE_FEATURES := --features mtm-core/metis
+
+.DEFAULT_GOAL := help
+.PHONY: help build test test-rust test-python lint format bench demo clean
+
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*## ' Makefile | sort | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 16
+
+# The script keeps an environment that works and replaces one whose Python is gone or too old.
+$(ENV_STAMP): pyproject.toml scripts/make_venv.sh
+	sh scripts/make_venv.sh "$(VENV)" "$(PYTHON)"
+	"$(PY)" -m pip install --quiet --upgrade pip "maturin>=1.16,<2"
+	@touch $@
+
+$(BUILD_STAMP): $(ENV_STAMP) $(RUST_SOURCES)
+	VIRTUAL_ENV="$(VENV_PATH)" "$(BIN)/maturin" develop --release $(CARGO_FLAGS) --extras dev
+	@touch $@
+
+build: $(BUILD_STAMP) ## create .venv, compile the core and install cmfsim into it
+
+test: test-rust test-python ## build, then run every test of the project
+
+test-rust: $(ENV_STAMP)
+	cargo test --workspace --release $(CARGO_FLAGS) $(CORE_FEATURES)
+
+test-python: $(BUILD_STAMP)
+	"$(PY)" -m pytest
+
+lint: $(BUILD_STAMP) ## rustfmt, clippy, ruff, mypy, stubtest and the import rules
+	cargo fmt --all --check
+	cargo clippy --workspace --all-targets $(CARGO_FLAGS) $(CORE_FEATURES) -- -D warnings
+	"$(BIN)/ruff" check $(PYTHON_DIRS)
+	"$(BIN)/ruff" format --check $(PYTHON_DIRS)
+	"$(BIN)/mypy" --strict
+	cd python && "$(BIN)/stubtest" cmfsim._core
+	"$(PY)" scripts/check_imports.py
+
+format: $(BUILD_STAMP) ## rewrite the sources in the project's format
+	cargo fmt --all
+	"$(BIN)/ruff" check --fix $(PYTHON_DIRS)
+	"$(BIN)/ruff" format $(PYTHON_DIRS)
+
+bench: $(BUILD_STAMP) ## run the benches (minutes; close other programs first)
+	cargo bench --workspace $(CARGO_FLAGS) $(CORE_FEATURES)
+
+demo: $(BUILD_STAMP) ## solve the first example
+	"$(PY)" examples/first_solve.py
+
+clean: ## remove everything that make has made
+	rm -rf "$(VENV)" target .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist
+	find python tests scripts examples -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -f python/cmfsim/_core*.so python/cmfsim/_core*.pyd

@@ -1,0 +1,41 @@
+"""The exception family, and how Python code of the package raises it.
+
+The classes are defined by the extension, so that an error means the same wherever it is found.
+Where the input is at fault the error is a `ValueError` too.
+"""
+
+from cmfsim._core import (
+    BoundaryError,
+    CaseError,
+    CmfsimError,
+    ContactError,
+    ImageError,
+    LandmarkError,
+    MaterialError,
+    MeshError,
+    RegistrationError,
+    SolverError,
+)
+
+__all__ = [
+    "BoundaryError",
+    "BoundaryInputError",
+    "CaseError",
+    "CaseInputError",
+    "CmfsimError",
+    "ContactError",
+    "ImageError",
+    "LandmarkError",
+    "MaterialError",
+    "MeshError",
+    "RegistrationError",
+    "SolverError",
+]
+
+
+class BoundaryInputError(BoundaryError, ValueError):
+    """A motion, plan or boundary that cannot be meant."""
+
+
+class CaseInputError(CaseError, ValueError):
+    """A scene or case, in memory or on disk, that cannot be meant."""

@@ -1,0 +1,206 @@
+"""Checks who may import whom: check_imports.py [FOLDER of the project].
+
+A case walks downhill through the files, and each outside library stays behind one of them. The
+tables below are the rules; a new file gets a line here, with the least that it needs.
+"""
+
+import ast
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+# What each file of crates/mtm-core/src may name of the crate. All may name `error`; lib.rs is free.
+CORE: Mapping[str, frozenset[str]] = {
+    name: frozenset(allowed.split())
+    for name, allowed in {
+        "error": "",
+        "mesh": "",
+        "blocks": "",
+        "ordering": "blocks",
+        "triangle": "",
+        "topology": "triangle",
+        "surface": "mesh topology triangle",
+        "winding": "surface mesh triangle",
+        "stuffing": "mesh",
+        "material": "mesh",
+        "fibre": "surface mesh",
+        "equivalent": "mesh surface winding material",
+        "tensors": "blocks mesh material",
+        "motion": "surface mesh triangle",
+        "registration": "surface motion mesh",
+        "boundary": "surface motion mesh",
+        "restraint": "boundary mesh",
+        "contact": "surface boundary motion mesh",
+        "constraints": "blocks boundary contact mesh",
+        "cholesky": "blocks ordering constraints tensors boundary",
+        "krylov": "blocks constraints tensors mesh",
+        "multigrid": "blocks krylov mesh tensors constraints",
+        "relaxation": "blocks constraints tensors boundary mesh",
+        "solution": "mesh material tensors",
+        "statics": (
+            "blocks boundary cholesky constraints contact krylov mesh motion multigrid ordering "
+            "relaxation restraint solution surface tensors"
+        ),
+        "replan": (
+            "blocks boundary cholesky constraints contact krylov mesh motion relaxation restraint "
+            "solution statics surface tensors"
+        ),
+    }.items()
+}
+# The one place, below crates/, that may name each outside crate.
+CRATES: Mapping[str, str] = {
+    "parry3d_f64": "mtm-core/src/surface.rs",
+    "faer": "mtm-core/src/cholesky.rs",
+    "metis_sys": "mtm-core/src/ordering.rs",
+    "pyo3": "mtm-py/",
+    "numpy": "mtm-py/",
+}
+# What each module of python/cmfsim may import of the package.
+PYTHON: Mapping[str, frozenset[str]] = {
+    name: frozenset(allowed.split())
+    for name, allowed in {
+        "errors": "_core",
+        "case": "errors",
+        "io": "case errors planning",
+        "imaging": "case errors",
+        "meshing": "case errors _core",
+        "template": "case errors _core",
+        "phantom": "case errors",
+        "planning": "case errors _core",
+        "simulation": "case errors _core",
+        "evaluation": "case errors _core",
+        "study": "case errors imaging meshing template phantom planning simulation evaluation",
+        "report": "case errors",
+        "doctor": "case errors io",
+        "cli": "cmfsim case errors io simulation study report doctor",
+        "__init__": (
+            "_core case errors io imaging meshing template phantom planning simulation evaluation "
+            "study"
+        ),
+    }.items()
+}
+# Outside packages that a module may import at its top: `import cmfsim` needs numpy alone.
+PYTHON_PACKAGES = frozenset({"numpy"})
+# A file is called after its subject.
+NAMELESS = frozenset({"utils", "util", "helpers", "helper", "common", "misc"})
+
+COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
+TEST_MODULE = re.compile(r"^#\[cfg\(test\)\]\s*mod\s.*", re.DOTALL | re.MULTILINE)
+CRATE_PATH = re.compile(r"\bcrate::(\w+)")
+CRATE_GROUP = re.compile(r"\bcrate::\{")
+
+
+def main(root: Path) -> int:
+    """Prints each broken rule; 1 if there is one."""
+    problems = [*check_rust(root), *check_python(root), *check_names(root)]
+    for problem in problems:
+        print(problem)
+    files = sum(1 for _ in _sources(root))
+    print(f"import rules: {files} files, {len(problems) or 'no'} broken")
+    return 1 if problems else 0
+
+
+def check_rust(root: Path) -> Iterator[str]:
+    """The broken rules of the crates."""
+    for path in sorted((root / "crates").rglob("*.rs")):
+        place = path.relative_to(root / "crates").as_posix()
+        text = COMMENT.sub(_blank, path.read_text(encoding="utf-8"))
+        for crate, home in CRATES.items():
+            if place.startswith(home):
+                continue
+            for match in re.finditer(rf"\b{crate}\s*::|\buse\s+{crate}\b", text):
+                yield f"{_at(path, root, text, match.start())}: {crate} belongs in crates/{home}"
+        if path.parent == root / "crates/mtm-core/src" and path.name != "lib.rs":
+            yield from _check_core_file(path, root, TEST_MODULE.sub(_blank, text))
+
+
+def _check_core_file(path: Path, root: Path, text: str) -> Iterator[str]:
+    if path.stem not in CORE:
+        yield f"{path.relative_to(root)}: add it to CORE in scripts/check_imports.py"
+        return
+    for match in CRATE_GROUP.finditer(text):
+        yield f"{_at(path, root, text, match.start())}: write one `use crate::…` per module"
+    allowed = CORE[path.stem] | {"error", path.stem}
+    for match in CRATE_PATH.finditer(text):
+        if match[1] not in allowed:
+            yield (
+                f"{_at(path, root, text, match.start())}: {path.stem} may not import {match[1]} "
+                f"(may: {', '.join(sorted(allowed - {path.stem}))})"
+            )
+
+
+def check_python(root: Path) -> Iterator[str]:
+    """The broken rules of the Python package."""
+    package = root / "python/cmfsim"
+    for path in sorted(package.glob("*.py")):
+        place = path.relative_to(root)
+        if path.stem not in PYTHON:
+            yield f"{place}: add it to PYTHON in scripts/check_imports.py"
+            continue
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for line, module in _package_imports(tree):
+            if module not in PYTHON[path.stem]:
+                may = ", ".join(sorted(PYTHON[path.stem]))
+                yield f"{place}:{line}: {path.stem} may not import {module} (may: {may})"
+        for line, module in _top_imports(tree):
+            if module not in PYTHON_PACKAGES | {"cmfsim"} | sys.stdlib_module_names:
+                yield f"{place}:{line}: import {module} inside the function that needs it"
+
+
+def _package_imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Line and module of each import from the package, wherever it stands."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                parts = alias.name.split(".")
+                if parts[0] == "cmfsim":
+                    yield node.lineno, parts[1] if len(parts) > 1 else "cmfsim"
+        elif isinstance(node, ast.ImportFrom):
+            parts = (node.module or "").split(".")
+            if node.level:
+                parts = ["cmfsim", *filter(None, parts)]
+            if parts[0] != "cmfsim":
+                continue
+            if len(parts) > 1:
+                yield node.lineno, parts[1]
+                continue
+            for alias in node.names:
+                is_module = alias.name in PYTHON or alias.name == "_core"
+                yield node.lineno, alias.name if is_module else "cmfsim"
+
+
+def _top_imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    for node in tree.body:
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, alias.name.split(".")[0]
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            yield node.lineno, (node.module or "").split(".")[0]
+
+
+def check_names(root: Path) -> Iterator[str]:
+    """The files whose name says no subject."""
+    for path in _sources(root):
+        if path.stem in NAMELESS:
+            yield f"{path.relative_to(root)}: name the file after its subject"
+
+
+def _sources(root: Path) -> Iterator[Path]:
+    for folder in ("crates", "python", "tests", "benches", "examples", "scripts", "fuzz"):
+        for path in sorted((root / folder).rglob("*")):
+            if path.suffix in {".rs", ".py", ".pyi"} and "target" not in path.parts:
+                yield path
+
+
+def _blank(match: re.Match[str]) -> str:
+    """As many lines as the match, so that line numbers stay right."""
+    return "\n" * match[0].count("\n")
+
+
+def _at(path: Path, root: Path, text: str, offset: int) -> str:
+    return f"{path.relative_to(root)}:{text.count(chr(10), 0, offset) + 1}"
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[1]))
