@@ -95,6 +95,7 @@ class Clock:
     """Seconds spent in named stages: wall, and CPU over all threads and child processes."""
 
     def __init__(self) -> None:
+        """No stage timed yet."""
         self.wall: dict[str, float] = {}
         self.cpu: dict[str, float] = {}
 

@@ -12,7 +12,7 @@ SEGMENT = "maxilla"
 
 
 def solve(case: Case, clock: Clock, method: str, threads: int, scratch: Path) -> Result:
-    """`method` is one of `StaticSolver`; a factor made inside the first solve counts as "factor"."""
+    """`method` is one of `StaticSolver`; a factor made inside the first solve counts as such."""
     try:
         with clock("import"):
             import cmfsim

@@ -33,8 +33,8 @@ DEBIAN_PYTHON = "/usr/bin/python3"
 """The interpreter that Debian's Python packages belong to."""
 TIMEOUT = 1800.0
 """Seconds after which a measurement is stopped."""
-LOG_TAIL = 300
-"""Characters of a failed process's output that are kept."""
+LOG_LINE = 200
+"""Characters kept of the last line that a failed process wrote."""
 THREAD_VARIABLES = (
     "RAYON_NUM_THREADS",
     "OMP_NUM_THREADS",
@@ -95,16 +95,20 @@ def measure(peer: Peer, case: Path, cores: list[int], debian_python: str, out: P
         timer = threading.Timer(TIMEOUT, os.killpg, (process.pid, signal.SIGKILL))
         timer.start()
         try:
-            _, _, usage = os.wait4(process.pid, 0)  # unlike Popen.wait it tells the peak memory
+            _, status, usage = os.wait4(process.pid, 0)  # unlike Popen.wait it tells peak memory
+            process.returncode = os.waitstatus_to_exitcode(status)
         finally:
             timer.cancel()
+            if process.returncode is None:  # interrupted: leave nothing running
+                os.killpg(process.pid, signal.SIGKILL)
     elapsed = time.perf_counter() - start
     if report_path.exists():
         report = json.loads(report_path.read_text())
     elif elapsed >= TIMEOUT:
         report = {"status": f"stopped after {TIMEOUT:.0f} s"}
     else:
-        report = {"status": "failed", "log": log_path.read_text(errors="replace")[-LOG_TAIL:]}
+        last = log_path.read_text(errors="replace").strip().rpartition("\n")[2]
+        report = {"status": f"failed ({process.returncode}): {last[:LOG_LINE]}"}
     # ru_maxrss is in KiB on Linux and in bytes on macOS
     unit = 1 if platform.system() == "Darwin" else 1024
     report |= {"process_s": elapsed, "process_cpu_s": usage.ru_utime + usage.ru_stime}

@@ -15,13 +15,13 @@ from pathlib import Path
 
 
 def loaded_blas() -> list[str]:
-    """File names of the BLAS libraries in this process, which decide the speed of direct solvers."""
+    """File names of the BLAS libraries in this process: they decide the speed of direct solvers."""
     try:
         lines = Path("/proc/self/maps").read_text().splitlines()
     except OSError:
         return []
-    names = {os.path.basename(line.split()[-1]) for line in lines if "/" in line}
-    return sorted(n for n in names if any(k in n for k in ("blas", "mkl_core", "mkl_rt")))
+    names = {Path(line.split()[-1]).name for line in lines if "/" in line}
+    return sorted(n for n in names if n.startswith(("libblas", "libopenblas", "libmkl_core")))
 
 
 def main() -> None:
