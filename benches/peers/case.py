@@ -91,6 +91,12 @@ class Result:
     notes: dict[str, object] = field(default_factory=dict)
 
 
+def cpu_seconds() -> float:
+    """CPU seconds of this process, all threads, and of its finished children."""
+    times = os.times()
+    return time.process_time() + times.children_user + times.children_system
+
+
 class Clock:
     """Seconds spent in named stages: wall, and CPU over all threads and child processes."""
 
@@ -102,9 +108,9 @@ class Clock:
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
         """Adds the time of the `with` block to `stage`."""
-        wall, cpu = time.perf_counter(), sum(os.times()[:4])
+        wall, cpu = time.perf_counter(), cpu_seconds()
         try:
             yield
         finally:
             self.wall[stage] = self.wall.get(stage, 0.0) + time.perf_counter() - wall
-            self.cpu[stage] = self.cpu.get(stage, 0.0) + sum(os.times()[:4]) - cpu
+            self.cpu[stage] = self.cpu.get(stage, 0.0) + cpu_seconds() - cpu

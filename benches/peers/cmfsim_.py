@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +39,9 @@ def solve(case: Case, clock: Clock, method: str, threads: int, scratch: Path) ->
         clock.wall["factor"] += late
         clock.wall["solve"] -= late
     notes = {"timings": timings, "iterations": first.iterations}
-    return Result(
-        np.asarray(first.displacements), version("cmfsim"), np.asarray(second.displacements), notes
-    )
+    try:
+        release = version("cmfsim")
+    except PackageNotFoundError:  # imported from a source folder
+        release = "unreleased"
+    u, u_next = np.asarray(first.displacements), np.asarray(second.displacements)
+    return Result(u, release, u_next, notes)

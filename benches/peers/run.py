@@ -76,16 +76,29 @@ def generate(n_tets: int, folder: Path) -> None:
     subprocess.run([*command, "--", str(n_tets), str(folder)], cwd=WORKSPACE, check=True)
 
 
+def busy_seconds() -> float | None:
+    """CPU seconds the whole machine has worked since it started; None where it does not tell."""
+    try:
+        fields = Path("/proc/stat").read_text().split(maxsplit=9)
+    except OSError:
+        return None
+    user, nice, system, _idle, _wait, irq, softirq, steal = map(int, fields[1:9])
+    return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
+
+
 def measure(peer: Peer, case: Path, cores: list[int], debian_python: str, out: Path) -> dict:
     """Report of one fresh process, displacements left in `out`.npz."""
     environment = dict(os.environ) | dict.fromkeys(THREAD_VARIABLES, str(len(cores)))
     environment["OMP_WAIT_POLICY"] = "PASSIVE"
-    interpreter = debian_python if peer.debian else sys.executable
-    if peer.debian and not Path(interpreter).exists():
-        return {"status": f"not installed: no interpreter {interpreter}"}
+    interpreter = sys.executable
+    if peer.debian:
+        interpreter = debian_python
+        environment.pop("PYTHONPATH", None)  # meant for the other interpreter
+        if not Path(interpreter).exists():
+            return {"status": "not installed: apt packages python3 python3-dolfinx"}
     command = [interpreter, str(HERE / "worker.py"), str(case), "--adapter", peer.adapter]
     command += ["--method", peer.method, "--cores", ",".join(map(str, cores)), "--out", str(out)]
-    load, start = os.getloadavg()[0], time.perf_counter()
+    busy, start = busy_seconds(), time.perf_counter()
     log_path, report_path = out.with_suffix(".log"), out.with_suffix(".json")
     report_path.unlink(missing_ok=True)
     with open(log_path, "w") as log:
@@ -102,6 +115,8 @@ def measure(peer: Peer, case: Path, cores: list[int], debian_python: str, out: P
             if process.returncode is None:  # interrupted: leave nothing running
                 os.killpg(process.pid, signal.SIGKILL)
     elapsed = time.perf_counter() - start
+    used = usage.ru_utime + usage.ru_stime
+    others = None if busy is None else max(0.0, busy_seconds() - busy - used) / elapsed
     if report_path.exists():
         report = json.loads(report_path.read_text())
     elif elapsed >= TIMEOUT:
@@ -111,8 +126,8 @@ def measure(peer: Peer, case: Path, cores: list[int], debian_python: str, out: P
         report = {"status": f"failed ({process.returncode}): {last[:LOG_LINE]}"}
     # ru_maxrss is in KiB on Linux and in bytes on macOS
     unit = 1 if platform.system() == "Darwin" else 1024
-    report |= {"process_s": elapsed, "process_cpu_s": usage.ru_utime + usage.ru_stime}
-    return report | {"peak_mb": usage.ru_maxrss * unit / 1e6, "load_before": load}
+    report |= {"process_s": elapsed, "process_cpu_s": used, "other_cores": others}
+    return report | {"peak_mb": usage.ru_maxrss * unit / 1e6}
 
 
 def largest_difference(result: Path, reference: Path) -> float:
@@ -153,6 +168,12 @@ def measure_size(n_tets: int, args: argparse.Namespace, cores: list[int], folder
 MESH_ARRAYS = ("nodes", "tets", "fixed", "joined")
 
 
+def git(*arguments: str) -> str:
+    """What git says about the workspace; empty outside a repository."""
+    command = ["git", "-C", str(WORKSPACE), *arguments]
+    return subprocess.run(command, check=False, capture_output=True, text=True).stdout.strip()
+
+
 def machine(threads: int) -> dict:
     """What a reader needs to judge the numbers; neither host name nor paths."""
     model = platform.processor() or platform.machine()
@@ -163,15 +184,12 @@ def machine(threads: int) -> dict:
         )
     except (OSError, StopIteration):
         pass
-    git = ["git", "-C", str(WORKSPACE)]
-    commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
-    changes = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True)
-    edited = " with uncommitted changes" if changes.stdout.strip() else ""
+    edited = " with uncommitted changes" if git("status", "--porcelain") else ""
     return {
         "cpu": model,
         "cores": os.cpu_count(),
         "threads": threads,
-        "commit": (commit.stdout.strip() or "unknown") + edited,
+        "commit": (git("rev-parse", "--short", "HEAD") or "unknown") + edited,
         "date": datetime.date.today().isoformat(),
     }
 

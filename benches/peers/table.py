@@ -21,6 +21,8 @@ HEADINGS = (
     "difference mm",
 )
 DASH = "–"
+IDLE = 0.1
+"""Cores that others may keep busy on a machine that still counts as idle."""
 
 
 def total(run: dict, clock: str = "wall") -> float:
@@ -90,21 +92,25 @@ def all_runs(study: dict) -> list[tuple[str, dict]]:
 def markdown(study: dict) -> str:
     """Header, one table for each size, growth over the sizes, versions."""
     machine, runs = study["machine"], all_runs(study)
-    loads = [run["load_before"] for _, run in runs if "load_before" in run] or [0.0]
+    rounds = study["repeat"]
     text = [
-        f"{machine['cpu']}, {machine['threads']} of {machine['cores']} cores, "
-        f"commit {machine['commit']}, {machine['date']}; median of {study['repeat']} interleaved "
-        f"runs; load average before a run {min(loads):.1f}–{max(loads):.1f}.",
+        f"{machine['cpu']}, {machine['threads']} of {machine['cores']} cores, commit "
+        + f"{machine['commit']}, {machine['date']}; "
+        + (f"median of {rounds} interleaved runs." if rounds > 1 else "one run, not a median.")
     ]
-    if max(loads) > 1.0:
-        text += ["", "The machine was not idle: wall times are disturbed, CPU times less so."]
+    others = [run["other_cores"] for _, run in runs if run.get("other_cores") is not None]
+    if others:
+        text[0] += f" Other processes kept {median(others):.2f} cores busy"
+        text[0] += f" (median of the runs; {max(others):.2f} at most)."
+        if median(others) > IDLE:
+            text += ["", "The machine was not idle: wall times are disturbed, CPU times less so."]
     for size in study["sizes"]:
         mesh, reference = size["mesh"], size["reference"]
         base = [r for r in size["rounds"].get(reference, []) if r["status"] == "ok"]
         text += [
             "",
-            f"### {mesh['tets']} tets, {mesh['nodes']} nodes, "
-            f"{mesh['fixed']} fixed, {mesh['joined']} joined",
+            f"### {mesh['tets']} tets, {mesh['nodes']} nodes, {mesh['fixed']} fixed, "
+            + f"{mesh['joined']} joined",
             "",
             f"Ratio and difference against {reference}."
             if reference
