@@ -53,7 +53,7 @@ pub struct MultigridOptions {
 impl Default for MultigridOptions {
     fn default() -> Self {
         Self {
-            strength: 0.05,
+            strength: 0.08,
             smoother_degree: 2,
             prolongator_damping: 4.0 / 3.0,
             coarsest_rows: 64,
@@ -514,17 +514,9 @@ impl<const N: usize, const W: usize> Level<N, W> {
         options: &MultigridOptions,
         depth: usize,
     ) -> (Self, Option<CoarseSystem>) {
-        let clock = std::time::Instant::now();
-        let lap = |what: &str| {
-            if std::env::var("MG_TIME").is_ok() {
-                eprintln!("    {depth} {what} {:.4}", clock.elapsed().as_secs_f64());
-            }
-        };
         let mut level = Self::smoother_only(a, scaling);
-        lap("scaled");
         let strength = options.strength * 0.5_f64.powi(depth.try_into().unwrap_or(i32::MAX));
         let aggregates = level.aggregate(strength);
-        lap("aggregated");
         if aggregates.count == 0 || aggregates.count as f64 > STALL * level.n_rows() as f64 {
             return (level, None);
         }
@@ -535,16 +527,13 @@ impl<const N: usize, const W: usize> Level<N, W> {
             *m = out;
         });
         let coarse_modes = orthonormalise(&aggregates, &mut modes);
-        lap("orthonormal");
         let damping = options.prolongator_damping / level.largest_eigenvalue;
         let p = level.smoothed_prolongator(&aggregates, &modes, damping);
-        lap("prolongator");
         drop(modes);
-        let (coarse, p_transposed) = galerkin(a, scaling, &p, &lap);
-        lap("galerkin");
+        let (coarse, p_transposed) = galerkin(a, scaling, &p);
         let coarse_scaling = Scaling::new(&coarse);
-        level.transfer = Some(Transfer::new(&p, &p_transposed, &coarse_scaling, level.rows_per_task));
-        lap("transfer");
+        level.transfer =
+            Some(Transfer::new(&p, &p_transposed, &coarse_scaling, level.rows_per_task));
         let system = CoarseSystem { a: coarse, scaling: coarse_scaling, modes: coarse_modes };
         (level, Some(system))
     }
@@ -988,7 +977,6 @@ fn galerkin<const N: usize>(
     a: &impl SystemRows<N>,
     scaling: &Scaling<N>,
     p: &Prolongator<N>,
-    lap: &dyn Fn(&str),
 ) -> (CoarseMatrix, TransposedIndex) {
     let n = a.n_rows();
     let rows_per_task = (ENTRIES_PER_TASK / (N * N * 64)).max(1);
@@ -1006,7 +994,6 @@ fn galerkin<const N: usize>(
             }
         }
     });
-    lap(" unscaled P");
 
     // A P', pattern first.
     let markers = || vec![UNASSIGNED; p.n_coarse];
@@ -1022,7 +1009,6 @@ fn galerkin<const N: usize>(
         )
         .collect();
     let ap_start = running_sum(&counts);
-    lap(" AP pattern");
     let mut ap_columns = vec![0_u32; ap_start[n]];
     let mut ap_blocks = vec![[[0.0; MODES]; N]; ap_start[n]];
     split_rows(&mut ap_columns, &ap_start, rows_per_task)
@@ -1054,10 +1040,8 @@ fn galerkin<const N: usize>(
                 }
             },
         );
-    lap(" AP");
 
     let transposed = TransposedIndex::new(&p.row_start, &p.columns, p.n_coarse);
-    lap(" index");
     let upper: Vec<(Vec<u32>, Vec<ModeBlock>)> = (0..p.n_coarse)
         .into_par_iter()
         .with_min_len(16)
@@ -1087,9 +1071,7 @@ fn galerkin<const N: usize>(
             (columns, blocks)
         })
         .collect();
-    lap(" upper");
     let coarse = mirror(&upper);
-    lap(" mirror");
     (coarse, transposed)
 }
 
@@ -1159,10 +1141,8 @@ fn mirror(upper: &[(Vec<u32>, Vec<ModeBlock>)]) -> CoarseMatrix {
             }
         }
     }
-    let blocks = sources
-        .par_iter()
-        .map(|&(_, row, slot)| upper[row as usize].1[slot as usize])
-        .collect();
+    let blocks =
+        sources.par_iter().map(|&(_, row, slot)| upper[row as usize].1[slot as usize]).collect();
     let mut coarse = CoarseMatrix { row_start, columns, blocks, diagonal };
     coarse.transpose_lower();
     coarse
@@ -1410,11 +1390,7 @@ fn rigid_modes(nodes: &[[f64; 3]], normals: &[(usize, [f64; 3])]) -> Vec<[[f64; 
         .iter()
         .map(|p| {
             let [x, y, z] = [0, 1, 2].map(|c| (p[c] - centre[c]) * scale);
-            [
-                [1.0, 0.0, 0.0, 0.0, z, -y],
-                [0.0, 1.0, 0.0, -z, 0.0, x],
-                [0.0, 0.0, 1.0, y, -x, 0.0],
-            ]
+            [[1.0, 0.0, 0.0, 0.0, z, -y], [0.0, 1.0, 0.0, -z, 0.0, x], [0.0, 0.0, 1.0, y, -x, 0.0]]
         })
         .collect();
     for &(row, normal) in normals {
@@ -1545,4 +1521,141 @@ fn times(s: &[[f64; 3]; 3], r: &[f64; 3]) -> [f64; 3] {
 #[inline]
 fn transposed_times(s: &[[f64; 3]; 3], x: &[f64; 3]) -> [f64; 3] {
     [0, 1, 2].map(|i| s[0][i] * x[0] + s[1][i] * x[1] + s[2][i] * x[2])
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Matrix3;
+
+    use super::*;
+    use crate::krylov::test_systems::*;
+    use crate::krylov::{PcgOptions, PcgOutcome, pcg};
+
+    /// Small enough that even the test boxes get three levels.
+    fn deep() -> MultigridOptions {
+        MultigridOptions { coarsest_rows: 6, ..MultigridOptions::default() }
+    }
+
+    fn solve(s: &System, relative: f64) -> PcgOutcome {
+        let mg = Multigrid::new(&s.a, &s.nodes, &s.normals, &deep()).unwrap();
+        let size = largest_difference(&dense_solution(&s.a, &s.b), &vec![[0.0; 3]; s.b.len()]);
+        let options = PcgOptions { tolerance: relative * size, ..PcgOptions::default() };
+        pcg(&s.a, &s.b, &vec![[0.0; 3]; s.b.len()], &mg, &options, &|| false).unwrap()
+    }
+
+    #[test]
+    fn true_error_stays_below_the_bound_at_every_contrast() {
+        for contrast in [1.0, 263.0, 1e4, 1e6, 1e8] {
+            for (nu, sliding) in [(0.3, false), (0.46, true), (0.499, false)] {
+                let s = elastic_box(BoxCase { contrast, nu, sliding, ..BoxCase::default() });
+                let exact = dense_solution(&s.a, &s.b);
+                let size = largest_difference(&exact, &vec![[0.0; 3]; exact.len()]);
+                let out = solve(&s, 1e-6);
+                let error = largest_difference(&out.solution, &exact);
+                // What double precision leaves of a stiff part afloat in a soft one.
+                let round_off = 1e-14 * contrast * size;
+                println!(
+                    "{contrast:e} {nu} {sliding}: {} iterations, error {error:e}, bound {:e}",
+                    out.iterations, out.error_bound_mm
+                );
+                assert!(error <= out.error_bound_mm + round_off, "{contrast} {nu}: {error:e}");
+                assert!(out.error_bound_mm <= PcgOptions::default().slack * 1e-6 * size);
+                // Linear tets lock towards nu = 0.5, and slow the cycle as they do.
+                let most = if nu > 0.49 { 250 } else { 60 };
+                assert!(out.iterations < most, "{contrast} {nu}: {} iterations", out.iterations);
+            }
+        }
+    }
+
+    #[test]
+    fn cycle_is_symmetric_and_positive() {
+        for contrast in [263.0, 1e8] {
+            let case = BoxCase { contrast, sliding: true, ..BoxCase::default() };
+            let s = elastic_box(case);
+            let mg = Multigrid::new(&s.a, &s.nodes, &s.normals, &deep()).unwrap();
+            assert!(mg.level_rows().len() >= 3, "{:?}", mg.level_rows());
+            let n = s.b.len();
+            let (mut mr, mut ms) = (vec![[0.0; 3]; n], vec![[0.0; 3]; n]);
+            for seed in 0..4 {
+                let (r, t) = (scattered(n, seed), scattered(n, seed + 10));
+                mg.apply(&r, &mut mr);
+                mg.apply(&t, &mut ms);
+                let (left, right) = (dot(&mr, &t), dot(&r, &ms));
+                let scale = (dot(&mr, &r) * dot(&ms, &t)).sqrt();
+                assert!(dot(&mr, &r) > 0.0);
+                assert!((left - right).abs() <= 1e-12 * scale, "{left:e} {right:e}");
+            }
+        }
+    }
+
+    #[test]
+    fn bits_do_not_depend_on_threads() {
+        let s = elastic_box(BoxCase { cells: [14, 14, 14], sliding: true, ..BoxCase::default() });
+        let run = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                let mg = Multigrid::new(&s.a, &s.nodes, &s.normals, &deep()).unwrap();
+                let options = PcgOptions { tolerance: 1e-6, ..PcgOptions::default() };
+                pcg(&s.a, &s.b, &vec![[0.0; 3]; s.b.len()], &mg, &options, &|| false).unwrap()
+            })
+        };
+        let one = run(1);
+        assert_eq!(one, run(2));
+        assert_eq!(one, run(5));
+    }
+
+    #[test]
+    fn sliding_nodes_stay_on_their_plane() {
+        let s = elastic_box(BoxCase { sliding: true, ..BoxCase::default() });
+        let out = solve(&s, 1e-8);
+        for &(row, n) in &s.normals {
+            let along: f64 = (0..3).map(|c| n[c] * out.solution[row][c]).sum();
+            assert!(along.abs() < 1e-12, "{along:e}");
+        }
+    }
+
+    #[test]
+    fn single_nodes_and_islands_are_solved() {
+        let k = Matrix3::new(4.0, 1.0, 0.0, 1.0, 3.0, 0.5, 0.0, 0.5, 2.0);
+        for n in [1_usize, 2, 500] {
+            let rows: Vec<_> =
+                (0..n).map(|i| [(i, k * (1.0 + i as f64))].into_iter().collect()).collect();
+            let a = block_matrix(&rows);
+            let nodes: Vec<_> = (0..n).map(|i| [i as f64, 0.0, 0.0]).collect();
+            let b = scattered(n, 1);
+            let mg = Multigrid::new(&a, &nodes, &[], &MultigridOptions::default()).unwrap();
+            let options = PcgOptions { tolerance: 1e-12, ..PcgOptions::default() };
+            let out = pcg(&a, &b, &vec![[0.0; 3]; n], &mg, &options, &|| false).unwrap();
+            assert!(largest_difference(&out.solution, &dense_solution(&a, &b)) < 1e-12);
+        }
+        let s = elastic_box(BoxCase { cells: [4, 4, 4], islands: 3, ..BoxCase::default() });
+        let out = solve(&s, 1e-8);
+        let exact = dense_solution(&s.a, &s.b);
+        assert!(largest_difference(&out.solution, &exact) <= out.error_bound_mm);
+    }
+
+    #[test]
+    fn flat_and_thin_bodies_are_solved() {
+        for cells in [[1, 1, 1], [1, 1, 8], [7, 1, 1], [8, 8, 1]] {
+            let s = elastic_box(BoxCase { cells, contrast: 1.0, ..BoxCase::default() });
+            let out = solve(&s, 1e-8);
+            let exact = dense_solution(&s.a, &s.b);
+            assert!(largest_difference(&out.solution, &exact) <= out.error_bound_mm, "{cells:?}");
+        }
+    }
+
+    #[test]
+    fn wrong_input_is_named() {
+        let s = elastic_box(BoxCase::default());
+        let options = MultigridOptions::default();
+        let short = Multigrid::new(&s.a, &s.nodes[1..], &[], &options);
+        assert!(matches!(short, Err(MtmError::Length { .. })));
+        let past = Multigrid::new(&s.a, &s.nodes, &[(9999, [1.0, 0.0, 0.0])], &options);
+        assert!(matches!(past, Err(MtmError::IndexOutOfRange { index: 9999, .. })));
+        let mut a = s.a.clone();
+        let position = a.diagonal[3];
+        a.blocks[position] = [0.0; 9];
+        let singular = Multigrid::new(&a, &s.nodes, &[], &options);
+        assert!(matches!(singular, Err(MtmError::NotPositiveDefinite { node: 3, .. })));
+    }
 }
