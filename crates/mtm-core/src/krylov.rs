@@ -567,6 +567,7 @@ fn advance(
 
 /// Small elastic systems for the tests of the iterative methods.
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 pub(crate) mod test_systems {
     use std::collections::BTreeMap;
 
@@ -783,6 +784,7 @@ pub(crate) mod test_systems {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
 

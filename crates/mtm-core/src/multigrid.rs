@@ -24,6 +24,8 @@ const MODES: usize = 6;
 const ENTRIES_PER_TASK: usize = 64 * 1024;
 /// Lanczos steps for the largest eigenvalue of a scaled matrix.
 const LANCZOS_STEPS: usize = 10;
+/// Length of a Lanczos vector, for eigenvalues of order one, at which the space is exhausted.
+const LANCZOS_BREAKDOWN: f64 = 1e-10;
 /// Margin on that eigenvalue: Lanczos approaches it from below.
 const EIGENVALUE_SAFETY: f64 = 1.05;
 /// Length of a rigid mode, relative to what it was, below which an aggregate cannot carry it.
@@ -70,8 +72,8 @@ impl Default for MultigridOptions {
 pub struct Multigrid {
     /// S of the finest level: r̃ = S r, z = Sᵀ z̃.
     scaling: Vec<[[f64; 3]; 3]>,
-    finest: Level<3, 4>,
-    coarse: Vec<Level<MODES, MODES>>,
+    finest: Level<3>,
+    coarse: Vec<Level<MODES>>,
     coarsest: Option<DenseCholesky>,
     smoother: Vec<SmootherStep>,
     workspaces: Mutex<Vec<Workspace>>,
@@ -422,7 +424,8 @@ fn factor<const N: usize>(a: &[[f64; N]; N]) -> ([[f64; N]; N], [[f64; N]; N], b
         for m in 0..k {
             pivot -= l[k][m] * l[k][m];
         }
-        if !(pivot > PIVOT_TOLERANCE * a[k][k]) || !pivot.is_finite() {
+        let independent = pivot > PIVOT_TOLERANCE * a[k][k] && pivot.is_finite();
+        if !independent {
             dependent = true;
             // Column k of L and row k of S stay zero; row k of L keeps what it shares with others.
             continue;
@@ -447,27 +450,27 @@ fn factor<const N: usize>(a: &[[f64; N]; N]) -> ([[f64; N]; N], [[f64; N]; N], b
     (l, s, dependent)
 }
 
-/// A level of the cycle: the scaled matrix in single precision, blocks by columns, padded to W rows.
+/// A level of the cycle: the scaled matrix in single precision, blocks by columns.
 #[derive(Debug)]
-struct Level<const N: usize, const W: usize> {
+struct Level<const N: usize> {
     row_start: Vec<usize>,
     columns: Vec<u32>,
-    blocks: Vec<[[f32; W]; N]>,
+    blocks: Vec<[[f32; N]; N]>,
     largest_eigenvalue: f64,
     rows_per_task: usize,
-    transfer: Option<Transfer<N, W>>,
+    transfer: Option<Transfer<N>>,
 }
 
-impl<const N: usize, const W: usize> Level<N, W> {
+impl<const N: usize> Level<N> {
     fn n_rows(&self) -> usize {
         self.row_start.len() - 1
     }
 
     fn memory_bytes(&self) -> usize {
         self.row_start.len() * 8
-            + self.columns.len() * (4 + 4 * N * W)
+            + self.columns.len() * (4 + 4 * N * N)
             + self.transfer.as_ref().map_or(0, |t| {
-                t.fine_columns.len() * (8 + 4 * MODES * (N + W))
+                t.fine_columns.len() * (8 + 8 * MODES * N)
                     + (t.fine_start.len() + t.coarse_start.len()) * 8
             })
     }
@@ -478,7 +481,7 @@ impl<const N: usize, const W: usize> Level<N, W> {
         let entries = a.columns().len() * N * N;
         let rows_per_task = (ENTRIES_PER_TASK * a.n_rows() / entries.max(1)).max(1);
         let columns = a.columns().to_vec();
-        let mut blocks = vec![[[0.0_f32; W]; N]; columns.len()];
+        let mut blocks = vec![[[0.0_f32; N]; N]; columns.len()];
         let s = &scaling.inverse_factors;
         split_rows(&mut blocks, &row_start, rows_per_task).into_par_iter().for_each(|part| {
             for i in part.rows.clone() {
@@ -540,18 +543,9 @@ impl<const N: usize, const W: usize> Level<N, W> {
 
     /// Row `i` of A x.
     #[inline]
-    fn row_product(&self, i: usize, x: &[[f64; N]]) -> [f64; W] {
+    fn row_product(&self, i: usize, x: &[[f64; N]]) -> [f64; N] {
         let range = self.row_start[i]..self.row_start[i + 1];
-        let mut sum = [0.0; W];
-        for (&j, block) in self.columns[range.clone()].iter().zip(&self.blocks[range]) {
-            let x = &x[j as usize];
-            for c in 0..N {
-                for r in 0..W {
-                    sum[r] += f64::from(block[c][r]) * x[c];
-                }
-            }
-        }
-        sum
+        block_row_product(&self.columns[range.clone()], &self.blocks[range], x)
     }
 
     /// Largest eigenvalue of the scaled matrix by a few Lanczos steps from a fixed start.
@@ -574,7 +568,8 @@ impl<const N: usize, const W: usize> Level<N, W> {
         let (mut diagonal, mut off_squared) = (Vec::new(), Vec::new());
         let mut beta = 0.0;
         for step in 0..LANCZOS_STEPS {
-            if !(norm > 1e-10) {
+            let exhausted = norm.is_nan() || norm <= LANCZOS_BREAKDOWN;
+            if exhausted {
                 break;
             }
             if step > 0 {
@@ -922,7 +917,7 @@ fn gram_schmidt<const N: usize>(q: &mut [[[f64; MODES]; N]]) -> ModeBlock {
             }
         }
         let norm = product(q, c, c).sqrt();
-        let dependent = !(norm > RANK_TOLERANCE * before.sqrt());
+        let dependent = norm.is_nan() || norm <= RANK_TOLERANCE * before.sqrt();
         let scale = if dependent { 0.0 } else { 1.0 / norm };
         r[c][c] = if dependent { 0.0 } else { norm };
         for row in q.iter_mut().flatten() {
@@ -1178,11 +1173,11 @@ impl CoarseMatrix {
 
 /// Prolongation and restriction between two levels, both in scaled unknowns.
 #[derive(Debug)]
-struct Transfer<const N: usize, const W: usize> {
+struct Transfer<const N: usize> {
     fine_start: Vec<usize>,
     fine_columns: Vec<u32>,
-    /// Blocks of P by columns, padded to W rows.
-    fine_blocks: Vec<[[f32; W]; MODES]>,
+    /// Blocks of P by columns.
+    fine_blocks: Vec<[[f32; N]; MODES]>,
     coarse_start: Vec<usize>,
     coarse_columns: Vec<u32>,
     /// Blocks of Pᵀ by columns.
@@ -1191,7 +1186,7 @@ struct Transfer<const N: usize, const W: usize> {
     coarse_per_task: usize,
 }
 
-impl<const N: usize, const W: usize> Transfer<N, W> {
+impl<const N: usize> Transfer<N> {
     /// P Sᵀ with the coarse scaling S.
     fn new(
         p: &Prolongator<N>,
@@ -1199,14 +1194,14 @@ impl<const N: usize, const W: usize> Transfer<N, W> {
         scaling: &Scaling<MODES>,
         rows_per_task: usize,
     ) -> Self {
-        let fine_blocks: Vec<[[f32; W]; MODES]> = p
+        let fine_blocks: Vec<[[f32; N]; MODES]> = p
             .blocks
             .par_iter()
             .zip(&p.columns)
             .with_min_len(1024)
             .map(|(block, &column)| {
                 let s = &scaling.inverse_factors[column as usize];
-                let mut out = [[0.0; W]; MODES];
+                let mut out = [[0.0; N]; MODES];
                 for c in 0..MODES {
                     for r in 0..N {
                         // Row c of the lower triangular S.
@@ -1255,18 +1250,11 @@ impl<const N: usize, const W: usize> Transfer<N, W> {
             for (offset, out) in rows.iter_mut().enumerate() {
                 let i = chunk * self.coarse_per_task + offset;
                 let range = self.coarse_start[i]..self.coarse_start[i + 1];
-                let mut sum = [0.0; MODES];
-                for (&j, block) in
-                    self.coarse_columns[range.clone()].iter().zip(&self.coarse_blocks[range])
-                {
-                    let x = &fine[j as usize];
-                    for c in 0..N {
-                        for r in 0..MODES {
-                            sum[r] += f64::from(block[c][r]) * x[c];
-                        }
-                    }
-                }
-                *out = sum;
+                *out = block_row_product(
+                    &self.coarse_columns[range.clone()],
+                    &self.coarse_blocks[range],
+                    fine,
+                );
             }
         });
     }
@@ -1277,18 +1265,11 @@ impl<const N: usize, const W: usize> Transfer<N, W> {
             for (offset, out) in rows.iter_mut().enumerate() {
                 let i = chunk * self.rows_per_task + offset;
                 let range = self.fine_start[i]..self.fine_start[i + 1];
-                let mut sum = [0.0; W];
-                for (&j, block) in
-                    self.fine_columns[range.clone()].iter().zip(&self.fine_blocks[range])
-                {
-                    let x = &coarse[j as usize];
-                    for c in 0..MODES {
-                        for r in 0..W {
-                            sum[r] += f64::from(block[c][r]) * x[c];
-                        }
-                    }
-                }
-                out.copy_from_slice(&sum[..N]);
+                *out = block_row_product(
+                    &self.fine_columns[range.clone()],
+                    &self.fine_blocks[range],
+                    coarse,
+                );
             }
         });
     }
@@ -1430,6 +1411,30 @@ fn split_rows<'a, T>(
     parts
 }
 
+/// Sum of the products of a row of blocks, stored by columns, with the rows of `x` they meet.
+#[inline]
+fn block_row_product<const C: usize, const R: usize>(
+    columns: &[u32],
+    blocks: &[[[f32; R]; C]],
+    x: &[[f64; C]],
+) -> [f64; R] {
+    // Three sums at once: one alone would wait for its own last addition, three times a block.
+    let mut sums = [[0.0; R]; 3];
+    for (&j, block) in columns.iter().zip(blocks) {
+        let x = &x[j as usize];
+        for c in 0..C {
+            for r in 0..R {
+                sums[c % 3][r] += f64::from(block[c][r]) * x[c];
+            }
+        }
+    }
+    let mut sum = sums[0];
+    for r in 0..R {
+        sum[r] += sums[1][r] + sums[2][r];
+    }
+    sum
+}
+
 /// 0, c₀, c₀ + c₁, …
 fn running_sum(counts: &[usize]) -> Vec<usize> {
     let mut sums = Vec::with_capacity(counts.len() + 1);
@@ -1524,6 +1529,7 @@ fn transposed_times(s: &[[f64; 3]; 3], x: &[f64; 3]) -> [f64; 3] {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod tests {
     use nalgebra::Matrix3;
 
