@@ -1037,37 +1037,77 @@ fn galerkin<const N: usize>(
         );
 
     let transposed = TransposedIndex::new(&p.row_start, &p.columns, p.n_coarse);
-    let upper: Vec<(Vec<u32>, Vec<ModeBlock>)> = (0..p.n_coarse)
+    // Pattern first again: growing the rows one by one would go through the allocator's locks.
+    let counts: Vec<usize> = (0..p.n_coarse)
         .into_par_iter()
         .with_min_len(16)
-        .map_init(markers, |marker, coarse| {
-            let mut columns = Vec::with_capacity(32);
-            let mut blocks: Vec<ModeBlock> = Vec::with_capacity(32);
-            for t in transposed.start[coarse]..transposed.start[coarse + 1] {
-                let i = transposed.rows[t] as usize;
-                let block = &unscaled[transposed.positions[t] as usize];
-                for k in ap_start[i]..ap_start[i + 1] {
-                    let c = ap_columns[k];
-                    if (c as usize) < coarse {
-                        continue;
-                    }
-                    let slot = &mut marker[c as usize];
-                    if *slot == UNASSIGNED {
-                        *slot = row_index(columns.len());
-                        columns.push(c);
-                        blocks.push([[0.0; MODES]; MODES]);
-                    }
-                    add_transposed_product(&mut blocks[*slot as usize], block, &ap_blocks[k]);
-                }
-            }
-            for &c in &columns {
-                marker[c as usize] = UNASSIGNED;
-            }
-            (columns, blocks)
-        })
+        .map_init(
+            || (markers(), Vec::<u32>::new()),
+            |(marker, row), coarse| {
+                collect_upper(&transposed, &ap_start, &ap_columns, coarse, marker, row);
+                row.len()
+            },
+        )
         .collect();
-    let coarse = mirror(&upper);
-    (coarse, transposed)
+    let row_start = running_sum(&counts);
+    let mut columns = vec![0_u32; row_start[p.n_coarse]];
+    let mut blocks = vec![[[0.0; MODES]; MODES]; columns.len()];
+    split_rows(&mut columns, &row_start, 32)
+        .into_par_iter()
+        .zip(split_rows(&mut blocks, &row_start, 32))
+        .for_each_init(
+            || (markers(), Vec::new()),
+            |(marker, row), (columns, blocks)| {
+                let first = row_start[columns.rows.start];
+                for coarse in columns.rows.clone() {
+                    collect_upper(&transposed, &ap_start, &ap_columns, coarse, marker, row);
+                    let base = row_start[coarse] - first;
+                    columns.data[base..base + row.len()].copy_from_slice(row);
+                    for (slot, &c) in row.iter().enumerate() {
+                        marker[c as usize] = row_index(slot);
+                    }
+                    let out = &mut blocks.data[base..base + row.len()];
+                    for t in transposed.start[coarse]..transposed.start[coarse + 1] {
+                        let i = transposed.rows[t] as usize;
+                        let block = &unscaled[transposed.positions[t] as usize];
+                        for k in ap_start[i]..ap_start[i + 1] {
+                            let c = ap_columns[k] as usize;
+                            if c >= coarse {
+                                let slot = marker[c] as usize;
+                                add_transposed_product(&mut out[slot], block, &ap_blocks[k]);
+                            }
+                        }
+                    }
+                    for &c in row.iter() {
+                        marker[c as usize] = UNASSIGNED;
+                    }
+                }
+            },
+        );
+    (mirror(&row_start, &columns, &blocks), transposed)
+}
+
+/// The distinct columns of row `coarse` of Pᵀ A P on and above the diagonal; leaves `marker` clean.
+fn collect_upper(
+    transposed: &TransposedIndex,
+    ap_start: &[usize],
+    ap_columns: &[u32],
+    coarse: usize,
+    marker: &mut [u32],
+    row: &mut Vec<u32>,
+) {
+    row.clear();
+    for &i in &transposed.rows[transposed.start[coarse]..transposed.start[coarse + 1]] {
+        for &c in &ap_columns[ap_start[i as usize]..ap_start[i as usize + 1]] {
+            if c as usize >= coarse && marker[c as usize] == UNASSIGNED {
+                marker[c as usize] = 0;
+                row.push(c);
+            }
+        }
+    }
+    for &c in row.iter() {
+        marker[c as usize] = UNASSIGNED;
+    }
 }
 
 /// The distinct coarse columns that row `i` of A P reaches; leaves `marker` clean.
@@ -1093,28 +1133,32 @@ fn collect_row<const N: usize>(
 }
 
 /// The full matrix, columns ascending, from its upper triangle in any column order.
-fn mirror(upper: &[(Vec<u32>, Vec<ModeBlock>)]) -> CoarseMatrix {
-    let n = upper.len();
-    let mut sizes: Vec<usize> = upper.iter().map(|u| u.0.len()).collect();
-    for (i, (columns, _)) in upper.iter().enumerate() {
-        for &j in columns {
+fn mirror(
+    upper_start: &[usize],
+    upper_columns: &[u32],
+    upper_blocks: &[ModeBlock],
+) -> CoarseMatrix {
+    let n = upper_start.len() - 1;
+    let mut sizes = vec![0; n];
+    for i in 0..n {
+        sizes[i] += upper_start[i + 1] - upper_start[i];
+        for &j in &upper_columns[upper_start[i]..upper_start[i + 1]] {
             if j as usize != i {
                 sizes[j as usize] += 1;
             }
         }
     }
     let row_start = running_sum(&sizes);
-    let total = row_start[n];
-    // Source of each block: row of the upper triangle and slot there.
-    let mut sources = vec![(0_u32, 0_u32, 0_u32); total];
+    // Column of each block and where it stands in the upper triangle.
+    let mut sources = vec![(0_u32, 0_u32); row_start[n]];
     let mut next = row_start.clone();
-    for (i, (columns, _)) in upper.iter().enumerate() {
-        for (slot, &j) in columns.iter().enumerate() {
-            let source = (row_index(i), row_index(slot));
-            sources[next[i]] = (j, source.0, source.1);
+    for i in 0..n {
+        for k in upper_start[i]..upper_start[i + 1] {
+            let j = upper_columns[k];
+            sources[next[i]] = (j, row_index(k));
             next[i] += 1;
             if j as usize != i {
-                sources[next[j as usize]] = (row_index(i), source.0, source.1);
+                sources[next[j as usize]] = (row_index(i), row_index(k));
                 next[j as usize] += 1;
             }
         }
@@ -1136,8 +1180,7 @@ fn mirror(upper: &[(Vec<u32>, Vec<ModeBlock>)]) -> CoarseMatrix {
             }
         }
     }
-    let blocks =
-        sources.par_iter().map(|&(_, row, slot)| upper[row as usize].1[slot as usize]).collect();
+    let blocks = sources.par_iter().map(|&(_, position)| upper_blocks[position as usize]).collect();
     let mut coarse = CoarseMatrix { row_start, columns, blocks, diagonal };
     coarse.transpose_lower();
     coarse
