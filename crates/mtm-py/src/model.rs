@@ -5,10 +5,11 @@ use std::sync::Arc;
 use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, Plan, Segment};
 use mtm_core::contact::{ContactMode, ContactOptions};
 use mtm_core::error::{ErrorKind, MtmError};
+use mtm_core::method::{Method, StaticOptions};
 use mtm_core::motion::RigidMotion;
 use mtm_core::replan::PlanOperator;
 use mtm_core::solution::{Solution, Timings};
-use mtm_core::statics::{Method, StaticOptions, StaticSolver};
+use mtm_core::statics::StaticSolver;
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyString};
@@ -275,7 +276,7 @@ pub struct PyStaticSolver {
 impl PyStaticSolver {
     #[new]
     #[pyo3(signature = (
-        tensors, boundary, method = "auto", *, contact = "bilateral", tolerance = 1e-9,
+        tensors, boundary, method = "auto", *, contact = "bilateral", tolerance = 1e-8,
         max_iterations = None, contact_tolerance = 1e-9, contact_iterations = 100, memory_limit = None
     ))]
     fn new(
@@ -576,7 +577,7 @@ impl PyPlanOperator {
     #[getter]
     fn matrix<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let shape = [3 * self.core.nodes().len(), 12 * self.core.segments().len()];
-        self.core.matrix().into_pyarray(py).reshape(shape)
+        self.core.matrix().to_vec().into_pyarray(py).reshape(shape)
     }
 
     fn __repr__(&self) -> String {
