@@ -199,7 +199,7 @@ class StaticSolver:
         tolerance: float = 1e-9,
         max_iterations: int | None = None,
         contact_tolerance: float = 1e-9,
-        contact_iterations: int = 60,
+        contact_iterations: int = 100,
         memory_limit: float | None = None,
     ) -> StaticSolver: ...
     @property
