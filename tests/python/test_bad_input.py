@@ -177,7 +177,7 @@ def test_lengths_must_agree():
 
 def test_indefinite_laws_are_refused_with_tet_constants_and_eigenvalue():
     """C_iso(E_t) + (Δλ + 2Δμ) A⊗A with the paper's Table 1 has a negative eigenvalue (3.2)."""
-    with refused(cmfsim.MaterialError, r"tet 0 .*eigenvalue -0\.02"):
+    with refused(cmfsim.MaterialError, r"tet 0 .*eigenvalue -2\.6\d*e-2"):
         cmfsim.Tissue.transversely_isotropic(0.5, 0.79, 0.43, [1, 0, 0], law="picinbono")
     stiffness = cmfsim.Tissue.isotropic(1.0, 0.3).stiffness()[0]
     bad = stiffness.copy()
@@ -273,7 +273,7 @@ def test_bad_node_indices_are_refused(ids):
 
 def test_a_free_body_names_its_rigid_modes():
     """Nothing held: three translations and three rotations are free."""
-    with refused(cmfsim.BoundaryError, r"not held.*translation.*rotation"):
+    with refused(cmfsim.BoundaryError, r"not held: all six rigid modes are free"):
         solver(cmfsim.Boundary())
 
 
@@ -320,7 +320,7 @@ def test_a_body_that_only_slides_is_not_held():
 def test_unilateral_contact_holds_nothing():
     """A body that may lift off must be held without its sliding nodes."""
     boundary = cmfsim.Boundary(
-        joined={"a": [18]}, sliding={"floor": LOW}, contact={"floor": floor()}
+        joined={"a": [20]}, sliding={"floor": LOW}, contact={"floor": floor()}
     )
     with pytest.raises(cmfsim.CmfsimError):
         solver(boundary, contact="unilateral").solve(
