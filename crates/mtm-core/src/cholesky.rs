@@ -76,7 +76,7 @@ impl Symbolic {
             in_tail[j as usize] = true;
         }
         let (graph, rows) = NodeGraph::of_rows(matrix, |j| !in_tail[j]);
-        let inner = match nested_dissection(&graph) {
+        let inner = match nested_dissection(&graph)? {
             Some(order) => order,
             None => minimum_degree(&graph)?,
         };

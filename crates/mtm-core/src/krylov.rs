@@ -15,15 +15,21 @@ const ROWS_PER_SUM: usize = 1024;
 /// Fraction of the smallest Ritz value taken as a lower bound of the spectrum (Ritz values approach
 /// it from above).
 const RITZ_SAFETY: f64 = 0.5;
-/// Relative change of the smallest Ritz value, over [`RITZ_WINDOW`] iterations, below which it counts
-/// as resolved.
+/// Relative change of the smallest Ritz value, over the last [`RITZ_WINDOW`] of all iterations, below
+/// which it counts as resolved.
 const RITZ_SETTLED: f64 = 0.1;
-/// Iterations over which the smallest Ritz value must stay put.
-const RITZ_WINDOW: usize = 3;
-/// Fewest iterations without any decrease of the error bound that count as stagnation.
-const STAGNATION_ITERATIONS: usize = 50;
-/// How often the residual may be replaced by `b − A x` before the round-off floor is accepted as such.
-const MAX_REPLACEMENTS: usize = 2;
+/// Share of all iterations over which the smallest Ritz value must stay put. A share, not a number: a
+/// weak preconditioner lets it rest on plateaus for long before the slowest motion shows.
+const RITZ_WINDOW: f64 = 0.3;
+/// Fewest iterations over which it must.
+const RITZ_WINDOW_MIN: usize = 3;
+/// Fewest iterations without any decrease of the error bound that count as stagnation; the block-Jacobi
+/// method may need hundreds before the bound first falls.
+const STAGNATION_ITERATIONS: usize = 500;
+/// How often the iteration may restart from the true residual.
+const MAX_REPLACEMENTS: usize = 5;
+/// Share of the last true bound that a restart must get below, or the round-off floor is reached.
+const FLOOR_PROGRESS: f64 = 0.5;
 /// Relative energy `√(rᵀz / r₀ᵀz₀)` at which nothing but round-off is left.
 const ROUND_OFF: f64 = 1e-15;
 /// Bisection steps for an extreme eigenvalue of a tridiagonal matrix.
@@ -179,19 +185,21 @@ pub fn pcg(
         });
     }
 
-    let mut state = State::new(a, b, x0, preconditioner, b_norm);
+    let mut state = State::new(a, b, x0, preconditioner);
     in_pool(|| state.replace_residual());
+    state.restart();
     let first_rz = state.rz;
     let mut iterations = 0;
     let mut history = Vec::new();
     let mut replacements = 0;
+    let mut verified = f64::INFINITY;
     let mut best = (f64::INFINITY, 0);
     loop {
         if interrupted() {
             return Err(MtmError::Interrupted);
         }
-        let zero_residual = state.rz == 0.0 && state.largest_z == 0.0;
-        if !zero_residual {
+        let exact = state.rz == 0.0 && state.largest_z == 0.0;
+        if !exact {
             in_pool(|| state.step())?;
             iterations += 1;
             history.push(state.r_norm / b_norm);
@@ -205,15 +213,18 @@ pub fn pcg(
         }
         let stagnant = iterations - best.1 >= STAGNATION_ITERATIONS.max(iterations / 2);
         let exhausted = iterations >= options.max_iterations;
-        let met = resolved && state.within(options, 1.0);
+        let met = resolved && bound <= options.tolerance && state.excess(options) <= 1.0;
         if !(met || floor || stagnant || exhausted) {
             continue;
         }
 
         // The recurrence drifts from b − A x at the round-off floor: only the true residual counts.
         in_pool(|| state.replace_residual());
-        let slack = if replacements == MAX_REPLACEMENTS || exhausted { options.slack } else { 1.0 };
-        if resolved && state.within(options, slack) {
+        let excess = state.excess(options);
+        // Two restarts in a row from the same true residual: round-off lets it go no lower.
+        let at_floor = replacements >= MAX_REPLACEMENTS || excess > FLOOR_PROGRESS * verified;
+        let allowed = if at_floor && !exhausted { options.slack } else { 1.0 };
+        if resolved && excess <= allowed {
             return Ok(PcgOutcome {
                 error_bound_mm: state.error_mm(),
                 energy_error: state.energy_error(),
@@ -224,7 +235,7 @@ pub fn pcg(
                 residual_history: history,
             });
         }
-        if exhausted || replacements == MAX_REPLACEMENTS {
+        if exhausted || at_floor {
             return Err(MtmError::NotConverged {
                 method: "pcg",
                 iterations,
@@ -233,7 +244,9 @@ pub fn pcg(
                 advice: "use the Cholesky method, or allow a larger tolerance",
             });
         }
+        state.restart();
         replacements += 1;
+        verified = excess;
         best = (state.error_mm(), iterations);
     }
 }
@@ -243,7 +256,6 @@ struct State<'a> {
     a: &'a BlockMatrix,
     b: &'a [[f64; 3]],
     preconditioner: &'a dyn Preconditioner,
-    b_norm: f64,
     x: Vec<[f64; 3]>,
     r: Vec<[f64; 3]>,
     z: Vec<[f64; 3]>,
@@ -261,14 +273,12 @@ impl<'a> State<'a> {
         b: &'a [[f64; 3]],
         x0: &[[f64; 3]],
         preconditioner: &'a dyn Preconditioner,
-        b_norm: f64,
     ) -> Self {
         let zeros = vec![[0.0; 3]; b.len()];
         Self {
             a,
             b,
             preconditioner,
-            b_norm,
             x: x0.to_vec(),
             r: zeros.clone(),
             z: zeros.clone(),
@@ -281,7 +291,7 @@ impl<'a> State<'a> {
         }
     }
 
-    /// Starts afresh from the current `x`: `r = b − A x`, `z = M⁻¹ r`, `p = z`.
+    /// Recomputes `r = b − A x` and `z = M⁻¹ r`.
     fn replace_residual(&mut self) {
         self.a.multiply_into(&self.x, &mut self.q);
         let (b, q) = (self.b, &self.q);
@@ -295,6 +305,10 @@ impl<'a> State<'a> {
         self.r_norm = dot(&self.r, &self.r).sqrt();
         self.preconditioner.apply(&self.r, &mut self.z);
         (self.rz, self.largest_z) = dot_and_largest(&self.r, &self.z);
+    }
+
+    /// Forgets the search directions: the next step follows z alone.
+    fn restart(&mut self) {
         self.p.copy_from_slice(&self.z);
         self.spectrum.restart();
     }
@@ -350,11 +364,11 @@ impl<'a> State<'a> {
         if error == 0.0 { 0.0 } else { (error / energy).sqrt() }
     }
 
-    fn within(&self, options: &PcgOptions, slack: f64) -> bool {
-        // The cheap test first: the energy needs a dot product.
-        self.b_norm > 0.0
-            && self.error_mm() <= slack * options.tolerance
-            && self.energy_error() <= slack * options.energy_tolerance
+    /// The bounds over their tolerances, the larger of the two; infinite if not a number.
+    fn excess(&self, options: &PcgOptions) -> f64 {
+        let excess = (self.error_mm() / options.tolerance)
+            .max(self.energy_error() / options.energy_tolerance);
+        if excess.is_nan() { f64::INFINITY } else { excess }
     }
 }
 
@@ -399,7 +413,8 @@ impl Spectrum {
     }
 
     fn settled(&self) -> bool {
-        match self.recent.len().checked_sub(RITZ_WINDOW + 1) {
+        let window = RITZ_WINDOW_MIN.max((RITZ_WINDOW * self.recent.len() as f64) as usize);
+        match self.recent.len().checked_sub(window + 1) {
             None => false,
             Some(before) => self.recent[before] <= (1.0 + RITZ_SETTLED) * self.smallest,
         }
@@ -548,4 +563,354 @@ fn advance(
         })
         .collect();
     partial.iter().sum()
+}
+
+/// Small elastic systems for the tests of the iterative methods.
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+pub(crate) mod test_systems {
+    use std::collections::BTreeMap;
+
+    use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+
+    use crate::blocks::BlockMatrix;
+
+    /// A reduced elastic system.
+    pub(crate) struct System {
+        pub(crate) a: BlockMatrix,
+        pub(crate) b: Vec<[f64; 3]>,
+        pub(crate) nodes: Vec<[f64; 3]>,
+        pub(crate) normals: Vec<(usize, [f64; 3])>,
+    }
+
+    /// What to build: a box of cubes of 1 mm, six tets each, held at z = 0 and pulled at the top.
+    #[derive(Clone, Copy)]
+    pub(crate) struct BoxCase {
+        pub(crate) cells: [usize; 3],
+        /// Stiffness of two inclusions (one afloat, one held) over that of the rest.
+        pub(crate) contrast: f64,
+        pub(crate) nu: f64,
+        /// Whether the nodes at x = 0 slide on a tilted plane.
+        pub(crate) sliding: bool,
+        /// Copies of the box far apart.
+        pub(crate) islands: usize,
+    }
+
+    impl Default for BoxCase {
+        fn default() -> Self {
+            Self { cells: [6, 5, 6], contrast: 263.0, nu: 0.46, sliding: false, islands: 1 }
+        }
+    }
+
+    const YOUNG: f64 = 0.003;
+    const NORMAL: [f64; 3] = [0.8, 0.6, 0.0];
+
+    pub(crate) fn block_matrix(rows: &[BTreeMap<usize, Matrix3<f64>>]) -> BlockMatrix {
+        let mut a = BlockMatrix {
+            row_start: vec![0],
+            columns: Vec::new(),
+            blocks: Vec::new(),
+            diagonal: Vec::new(),
+        };
+        for (i, row) in rows.iter().enumerate() {
+            for (&j, block) in row {
+                if i == j {
+                    a.diagonal.push(a.blocks.len());
+                }
+                a.columns.push(u32::try_from(j).unwrap());
+                let mut flat = [0.0; 9];
+                flat.copy_from_slice(block.transpose().as_slice());
+                a.blocks.push(flat);
+            }
+            a.row_start.push(a.blocks.len());
+        }
+        a
+    }
+
+    pub(crate) fn elastic_box(case: BoxCase) -> System {
+        let [nx, ny, nz] = case.cells;
+        let per_island = (nx + 1) * (ny + 1) * (nz + 1);
+        let id = |i: usize, j: usize, k: usize| (i * (ny + 1) + j) * (nz + 1) + k;
+        let mut nodes = vec![Vector3::zeros(); per_island * case.islands];
+        let mut tets = Vec::new();
+        for island in 0..case.islands {
+            let offset = island * per_island;
+            for i in 0..=nx {
+                for j in 0..=ny {
+                    for k in 0..=nz {
+                        nodes[offset + id(i, j, k)] =
+                            Vector3::new(i as f64 + 1000.0 * island as f64, j as f64, k as f64);
+                    }
+                }
+            }
+            for i in 0..nx {
+                for j in 0..ny {
+                    for k in 0..nz {
+                        for path in
+                            [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]]
+                        {
+                            let mut at = [i, j, k];
+                            let mut tet = [offset + id(i, j, k); 4];
+                            for (corner, axis) in path.into_iter().enumerate() {
+                                at[axis] += 1;
+                                tet[corner + 1] = offset + id(at[0], at[1], at[2]);
+                            }
+                            let afloat = i > 0 && i < 3 && j > 0 && j < 3 && k > 1 && k < 4;
+                            let held = i > 3 && j > 2 && k < 3;
+                            tets.push((tet, afloat || held));
+                        }
+                    }
+                }
+            }
+        }
+        let mut full = vec![BTreeMap::<usize, Matrix3<f64>>::new(); nodes.len()];
+        for (tet, stiff) in tets {
+            let young = if stiff { YOUNG * case.contrast } else { YOUNG };
+            let mu = young / (2.0 * (1.0 + case.nu));
+            let lambda = young * case.nu / ((1.0 + case.nu) * (1.0 - 2.0 * case.nu));
+            let x = tet.map(|n| nodes[n]);
+            let edges = Matrix3::from_columns(&[x[1] - x[0], x[2] - x[0], x[3] - x[0]]);
+            let volume = edges.determinant().abs() / 6.0;
+            let inverse = edges.try_inverse().unwrap();
+            let mut g = [Vector3::zeros(); 4];
+            for c in 0..3 {
+                g[c + 1] = inverse.row(c).transpose();
+                g[0] -= g[c + 1];
+            }
+            for p in 0..4 {
+                for q in 0..4 {
+                    let block = (g[p] * g[q].transpose() * lambda
+                        + g[q] * g[p].transpose() * mu
+                        + Matrix3::identity() * (mu * g[p].dot(&g[q])))
+                        * volume;
+                    *full[tet[p]].entry(tet[q]).or_insert_with(Matrix3::zeros) += block;
+                }
+            }
+        }
+        let free: Vec<usize> = (0..nodes.len()).filter(|&n| nodes[n].z > 0.5).collect();
+        let mut row_of = vec![usize::MAX; nodes.len()];
+        for (row, &n) in free.iter().enumerate() {
+            row_of[n] = row;
+        }
+        let normal = Vector3::from(NORMAL);
+        let slides = |n: usize| case.sliding && nodes[n].x % 1000.0 < 0.5;
+        let projector = |n: usize| {
+            if slides(n) {
+                Matrix3::identity() - normal * normal.transpose()
+            } else {
+                Matrix3::identity()
+            }
+        };
+        let mut rows = vec![BTreeMap::new(); free.len()];
+        let mut b = vec![[0.0; 3]; free.len()];
+        for (row, &n) in free.iter().enumerate() {
+            for (&m, block) in &full[n] {
+                if row_of[m] == usize::MAX {
+                    continue;
+                }
+                let mut projected = projector(n) * block * projector(m);
+                if n == m && slides(n) {
+                    projected += normal * normal.transpose() * (block.trace() / 3.0);
+                }
+                rows[row].insert(row_of[m], projected);
+            }
+            if nodes[n].z > nz as f64 - 0.5 {
+                let pull = projector(n) * Vector3::new(3e-4, 1e-4, 5e-4 + 1e-4 * nodes[n].y);
+                b[row] = pull.into();
+            }
+        }
+        let normals = free
+            .iter()
+            .enumerate()
+            .filter(|(_, n)| slides(**n))
+            .map(|(row, _)| (row, NORMAL))
+            .collect();
+        System {
+            a: block_matrix(&rows),
+            b,
+            nodes: free.iter().map(|&n| nodes[n].into()).collect(),
+            normals,
+        }
+    }
+
+    /// The solution by a dense Cholesky factor with two steps of iterative refinement.
+    pub(crate) fn dense_solution(a: &BlockMatrix, b: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let n = 3 * a.n_rows();
+        let mut dense = DMatrix::zeros(n, n);
+        for i in 0..a.n_rows() {
+            let (columns, blocks) = a.row(i);
+            for (&j, block) in columns.iter().zip(blocks) {
+                for c in 0..9 {
+                    dense[(3 * i + c / 3, 3 * j as usize + c % 3)] = block[c];
+                }
+            }
+        }
+        let factor = nalgebra::Cholesky::new(dense).unwrap();
+        let mut x = vec![[0.0; 3]; a.n_rows()];
+        for _ in 0..3 {
+            let ax = a.multiply(&x);
+            let r = DVector::from_iterator(
+                n,
+                b.as_flattened().iter().zip(ax.as_flattened()).map(|(b, y)| b - y),
+            );
+            let dx = factor.solve(&r);
+            for (x, dx) in x.as_flattened_mut().iter_mut().zip(dx.iter()) {
+                *x += dx;
+            }
+        }
+        x
+    }
+
+    /// Largest distance between rows.
+    pub(crate) fn largest_difference(x: &[[f64; 3]], y: &[[f64; 3]]) -> f64 {
+        x.iter()
+            .zip(y)
+            .map(|(x, y)| (Vector3::from(*x) - Vector3::from(*y)).norm())
+            .fold(0.0, f64::max)
+    }
+
+    /// A vector that looks random and is the same everywhere.
+    pub(crate) fn scattered(n: usize, seed: usize) -> Vec<[f64; 3]> {
+        (0..n)
+            .map(|i| {
+                [0, 1, 2].map(|c| {
+                    let t =
+                        ((3 * i + c + 1) as f64 * (seed as f64 + 0.618_033_988_75)).sin() * 43758.5;
+                    t - t.floor() - 0.5
+                })
+            })
+            .collect()
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use super::test_systems::*;
+    use super::*;
+
+    fn solve(s: &System, options: &PcgOptions) -> Result<PcgOutcome> {
+        let x0 = vec![[0.0; 3]; s.b.len()];
+        pcg(&s.a, &s.b, &x0, &BlockJacobi::new(&s.a)?, options, &|| false)
+    }
+
+    #[test]
+    fn block_jacobi_reaches_the_dense_solution_within_its_bound() {
+        for (contrast, nu) in [(1.0, 0.3), (263.0, 0.46), (1e6, 0.46), (263.0, 0.499)] {
+            let s = elastic_box(BoxCase { contrast, nu, ..BoxCase::default() });
+            let exact = dense_solution(&s.a, &s.b);
+            let size = largest_difference(&exact, &vec![[0.0; 3]; exact.len()]);
+            let out =
+                solve(&s, &PcgOptions { tolerance: 1e-7 * size, ..Default::default() }).unwrap();
+            let error = largest_difference(&out.solution, &exact);
+            println!(
+                "{contrast:e} {nu} {}: {error:e} {:e}",
+                out.iterations,
+                out.error_bound_mm / size
+            );
+            assert!(out.error_bound_mm <= 1e-6 * size);
+            assert!(
+                error <= out.error_bound_mm + 1e-13 * contrast * size,
+                "{contrast} {nu} {error:e}"
+            );
+        }
+    }
+
+    #[test]
+    fn energy_bound_holds() {
+        let s = elastic_box(BoxCase { contrast: 1e4, ..BoxCase::default() });
+        let exact = dense_solution(&s.a, &s.b);
+        for tolerance in [1e-1, 1e-2, 1e-3, 1e-4] {
+            let options =
+                PcgOptions { tolerance: 1e9, energy_tolerance: tolerance, ..Default::default() };
+            let out = solve(&s, &options).unwrap();
+            let e: Vec<[f64; 3]> = out
+                .solution
+                .iter()
+                .zip(&exact)
+                .map(|(x, y)| [x[0] - y[0], x[1] - y[1], x[2] - y[2]])
+                .collect();
+            let error = (dot(&e, &s.a.multiply(&e)) / dot(&s.b, &exact)).sqrt();
+            assert!(error <= out.energy_error, "{error:e} > {:e}", out.energy_error);
+            assert!(out.energy_error <= tolerance);
+        }
+    }
+
+    #[test]
+    fn a_start_near_the_solution_saves_iterations() {
+        let s = elastic_box(BoxCase { contrast: 10.0, ..BoxCase::default() });
+        let exact = dense_solution(&s.a, &s.b);
+        let jacobi = BlockJacobi::new(&s.a).unwrap();
+        let options = PcgOptions { tolerance: 1e-6, ..Default::default() };
+        let out = pcg(&s.a, &s.b, &exact, &jacobi, &options, &|| false).unwrap();
+        let cold = solve(&s, &options).unwrap();
+        assert!(out.iterations < cold.iterations, "{} {}", out.iterations, cold.iterations);
+        assert!(largest_difference(&out.solution, &exact) <= 1e-6);
+    }
+
+    #[test]
+    fn nothing_to_solve_gives_zero() {
+        let s = elastic_box(BoxCase::default());
+        let zero = vec![[0.0; 3]; s.b.len()];
+        let jacobi = BlockJacobi::new(&s.a).unwrap();
+        let out = pcg(&s.a, &zero, &s.b, &jacobi, &PcgOptions::default(), &|| false).unwrap();
+        assert_eq!(out.solution, zero);
+    }
+
+    #[test]
+    fn unreachable_tolerance_is_an_error_and_never_nan() {
+        let s = elastic_box(BoxCase::default());
+        let options = PcgOptions { tolerance: 1e-40, ..Default::default() };
+        assert!(matches!(solve(&s, &options), Err(MtmError::NotConverged { .. })));
+        let few = PcgOptions { max_iterations: 3, tolerance: 1e-12, ..Default::default() };
+        assert!(matches!(solve(&s, &few), Err(MtmError::NotConverged { .. })));
+    }
+
+    #[test]
+    fn indefinite_matrix_is_refused() {
+        let mut s = elastic_box(BoxCase::default());
+        let position = s.a.diagonal[10];
+        s.a.blocks[position][0] = 1e-9;
+        s.a.blocks[position][4] = 1e-9;
+        s.a.blocks[position][8] = 1e-9;
+        let outcome = solve(&s, &PcgOptions::default());
+        assert!(matches!(outcome, Err(MtmError::NotPositiveDefinite { .. })), "{outcome:?}");
+    }
+
+    #[test]
+    fn mechanism_never_gives_nan() {
+        // Two blocks tied to one another and to nothing else, pulled apart and along.
+        let k = nalgebra::Matrix3::identity();
+        let a = block_matrix(&[
+            [(0, k), (1, -k)].into_iter().collect(),
+            [(0, -k), (1, k)].into_iter().collect(),
+        ]);
+        let b = [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]];
+        let jacobi = BlockJacobi::new(&a).unwrap();
+        let out = pcg(&a, &b, &[[0.0; 3]; 2], &jacobi, &PcgOptions::default(), &|| false);
+        assert!(out.is_err(), "{out:?}");
+    }
+
+    #[test]
+    fn caller_can_stop_it() {
+        let s = elastic_box(BoxCase::default());
+        let calls = AtomicUsize::new(0);
+        let stop = || calls.fetch_add(1, Ordering::Relaxed) >= 4;
+        let x0 = vec![[0.0; 3]; s.b.len()];
+        let jacobi = BlockJacobi::new(&s.a).unwrap();
+        let out = pcg(&s.a, &s.b, &x0, &jacobi, &PcgOptions::default(), &stop);
+        assert_eq!(out, Err(MtmError::Interrupted));
+    }
+
+    #[test]
+    fn extremes_of_a_known_tridiagonal_matrix() {
+        // 2 on the diagonal, −1 beside it: eigenvalues 2 − 2 cos(kπ/(n+1)).
+        let n = 50;
+        let [low, high] = tridiagonal_extremes(&vec![2.0; n], &vec![1.0; n - 1]);
+        let angle = std::f64::consts::PI / (n + 1) as f64;
+        assert!((low / (2.0 - 2.0 * angle.cos()) - 1.0).abs() < 1e-8);
+        assert!((high / (2.0 + 2.0 * angle.cos()) - 1.0).abs() < 1e-8);
+    }
 }

@@ -2,6 +2,9 @@
 //! a chosen set of nodes last. The only file that names METIS.
 
 use crate::blocks::BlockMatrix;
+#[cfg(feature = "metis")]
+use crate::error::MtmError;
+use crate::error::Result;
 
 /// Node graph in compressed rows, without loops.
 #[derive(Debug, Clone)]
@@ -40,26 +43,21 @@ impl NodeGraph {
 
 /// Nested-dissection order (position → node) by METIS (Karypis & Kumar 1998), the same on every call.
 #[cfg(feature = "metis")]
-pub fn nested_dissection(graph: &NodeGraph) -> Option<Vec<u32>> {
+pub fn nested_dissection(graph: &NodeGraph) -> Result<Option<Vec<u32>>> {
     use std::sync::{Mutex, PoisonError};
     // METIS draws from C's rand(), seeded at each call: two calls at once would share the sequence and
     // the order would depend on timing.
     static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
-    /// Position of the numbering base and of the seed in METIS's option array (metis.h 5.2).
-    const OPTION_SEED: usize = 8;
-    const OPTION_NUMBERING: usize = 17;
+    const OPTION_SEED: usize = metis_sys::moptions_et_METIS_OPTION_SEED as usize;
+    const OPTION_NUMBERING: usize = metis_sys::moptions_et_METIS_OPTION_NUMBERING as usize;
     const SEED: i32 = 1;
-    const METIS_OK: i32 = 1;
 
     let n = graph.n_nodes();
-    if n == 0 {
-        return Some(Vec::new());
+    if graph.neighbours.is_empty() {
+        return Ok(Some((0..n as u32).collect()));
     }
-    let mut count = i32::try_from(n).ok()?;
+    let mut count = n as i32;
     let (mut start, mut neighbours) = (graph.start.clone(), graph.neighbours.clone());
-    if neighbours.is_empty() {
-        return Some((0..n as u32).collect());
-    }
     let mut options = [0_i32; metis_sys::METIS_NOPTIONS as usize];
     let (mut order, mut position) = (vec![0_i32; n], vec![0_i32; n]);
     let _guard = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
@@ -81,13 +79,22 @@ pub fn nested_dissection(graph: &NodeGraph) -> Option<Vec<u32>> {
             position.as_mut_ptr(),
         )
     };
-    (status == METIS_OK).then(|| order.iter().map(|&j| j as u32).collect())
+    if status != metis_sys::rstatus_et_METIS_OK {
+        // The graph is well formed, so memory is all that can fail.
+        return Err(MtmError::OutOfMemory {
+            what: "nested dissection",
+            needed_mb: (64 * neighbours.len()) >> 20,
+            limit_mb: 0,
+            advice: "use method=\"pcg\", which needs no elimination order",
+        });
+    }
+    Ok(Some(order.iter().map(|&j| j as u32).collect()))
 }
 
 /// Without METIS there is no nested dissection; the caller falls back to minimum degree.
 #[cfg(not(feature = "metis"))]
-pub fn nested_dissection(_graph: &NodeGraph) -> Option<Vec<u32>> {
-    None
+pub fn nested_dissection(_graph: &NodeGraph) -> Result<Option<Vec<u32>>> {
+    Ok(None)
 }
 
 /// Postorder of a forest given by parents (`usize::MAX` for roots): children before parents, each
