@@ -18,7 +18,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 ENV_STAMP := $(VENV)/.cmfsim-env
 BUILD_STAMP := $(VENV)/.cmfsim-build
 RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 'Cargo.toml')
-PYTHON_DIRS := python tests/python scripts examples
+PYTHON_DIRS := python tests/python scripts examples benches
 CORE_FEATURES := --features mtm-core/metis
 
 .DEFAULT_GOAL := help

@@ -296,3 +296,22 @@ def test_import_needs_numpy_alone():
         [sys.executable, "-c", script], check=True, capture_output=True, text=True
     ).stdout
     assert out.strip() == "[]"
+
+
+def test_a_boundary_gives_back_what_it_was_given():
+    """Segments in order, nodes, surfaces and gaps by name."""
+    surface = cmfsim.Surface(ONE_NODES, [[0, 1, 2]])
+    boundary = cmfsim.Boundary(
+        fixed=[0],
+        joined={"b": [1]},
+        sliding={"a": [2, 3], "c": [4], "d": [5, 6]},
+        contact={"a": surface, "c": surface, "d": surface},
+        gap={"a": [0.1, 0.2], "c": "rest"},
+    )
+    assert boundary.segments == ["b", "a", "c", "d"]
+    assert boundary.joined.keys() == {"b"}
+    assert boundary.sliding["a"].tolist() == [2, 3]
+    assert boundary.contact.keys() == {"a", "c", "d"}
+    assert boundary.gap["a"].tolist() == [0.1, 0.2]
+    assert boundary.gap["c"] == "rest"
+    assert boundary.gap["d"].tolist() == [0.0, 0.0]
