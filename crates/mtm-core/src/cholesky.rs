@@ -114,11 +114,12 @@ impl Symbolic {
         let n = 3 * self.order.len();
         let par = parallelism(n);
         let bytes = self.factor_bytes();
-        let mut values = Vec::new();
-        values
+        // Asked for first, so that too little memory is an error and not an abort; then taken zeroed
+        // from the system, which touches each page once.
+        Vec::<f64>::new()
             .try_reserve_exact(self.structure.len_val())
             .map_err(|_| out_of_memory("the Cholesky factor", bytes))?;
-        values.resize(self.structure.len_val(), 0.0);
+        let mut values = vec![0.0; self.structure.len_val()];
         let need = supernodal::factorize_supernodal_numeric_llt_scratch::<usize, f64>(
             &self.structure,
             par,

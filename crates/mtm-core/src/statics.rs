@@ -4,6 +4,8 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use rayon::prelude::*;
+
 use crate::blocks::{Block, BlockMatrix};
 use crate::boundary::{Boundary, Motion, NodeKind, Plan};
 use crate::cholesky::{DenseSymmetric, Factor, Symbolic, TailFactor};
@@ -739,21 +741,29 @@ fn slid(sliding: &Sliding) -> Vec<(u32, [f64; 3])> {
 
 /// Rows and columns of `matrix` that belong to unknown nodes.
 fn submatrix(matrix: &BlockMatrix, unknowns: &[u32], row_of: &[u32]) -> BlockMatrix {
-    let (mut row_start, mut columns) = (Vec::with_capacity(unknowns.len() + 1), Vec::new());
-    let mut blocks = Vec::new();
+    let kept = |j: u32| {
+        let (columns, blocks) = matrix.row(j as usize);
+        columns.iter().map(|&k| row_of[k as usize]).zip(blocks).filter(|(row, _)| *row != NO_ROW)
+    };
+    let lengths: Vec<usize> = unknowns.par_iter().map(|&j| kept(j).count()).collect();
+    let mut row_start = Vec::with_capacity(unknowns.len() + 1);
     row_start.push(0);
-    for &j in unknowns {
-        let (cols, values) = matrix.row(j as usize);
-        for (&k, block) in cols.iter().zip(values) {
-            if row_of[k as usize] != NO_ROW {
-                columns.push(row_of[k as usize]);
-                blocks.push(*block);
-            }
-        }
-        row_start.push(columns.len());
+    for length in lengths {
+        row_start.push(row_start[row_start.len() - 1] + length);
     }
+    let columns = unknowns.par_iter().flat_map_iter(|&j| kept(j).map(|(row, _)| row)).collect();
     let mut out = BlockMatrix::from_pattern(row_start, columns);
-    out.blocks = blocks;
+    out.row_tasks().into_par_iter().for_each(|task| {
+        let (first, mut blocks) = (task.first, task.blocks);
+        for &j in &unknowns[first..first + task.start.len() - 1] {
+            let row: Vec<&Block> = kept(j).map(|(_, block)| block).collect();
+            let (head, tail) = blocks.split_at_mut(row.len());
+            for (out, block) in head.iter_mut().zip(row) {
+                *out = *block;
+            }
+            blocks = tail;
+        }
+    });
     out
 }
 
