@@ -1,5 +1,6 @@
 """The border between numpy and the core: dtypes, orders, strides, errors, threads."""
 
+import _thread
 import subprocess
 import sys
 import threading
@@ -258,6 +259,23 @@ def test_the_interpreter_runs_on_while_the_core_works():
         counter.join()
     during = [t for t in ticks if started < t < ended]
     assert len(during) >= 3, f"{len(during)} ticks in {ended - started:.3f} s"
+
+
+def test_ctrl_c_stops_a_long_solve():
+    """A keyboard interrupt ends a relaxation that would run for minutes."""
+    nodes, tets = meshes.box((20, 20, 20), (50.0, 50.0, 50.0))
+    tensors = cmfsim.MassTensors(cmfsim.TetMesh(nodes, tets), cmfsim.Tissue.isotropic(0.1, 0.499))
+    x = nodes[:, 0]
+    boundary = cmfsim.Boundary(meshes.nodes_where(x == 0.0), {"tip": meshes.nodes_where(x == 50.0)})
+    solver = cmfsim.StaticSolver(
+        tensors, boundary, "relaxation", tolerance=1e-15, max_iterations=10**9
+    )
+    timer = threading.Timer(0.3, _thread.interrupt_main)
+    started = time.perf_counter()
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        solver.solve({"tip": cmfsim.rigid_motion((0, 0, 1))})
+    assert time.perf_counter() - started < 10.0
 
 
 def test_one_solver_serves_many_threads():
