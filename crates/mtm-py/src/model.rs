@@ -146,6 +146,22 @@ impl PyBoundary {
         Ok(out)
     }
 
+    /// Prescribed gap of the sliding nodes of each segment, dict of (k,) float64, mm, or "rest".
+    #[getter]
+    fn gap<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let out = PyDict::new(py);
+        for s in self.core.segments().iter().filter(|s| !s.sliding.is_empty()) {
+            match &s.gap {
+                Gap::Uniform(value) => {
+                    out.set_item(&s.name, vec![*value; s.sliding.len()].into_pyarray(py))?;
+                }
+                Gap::PerNode(values) => out.set_item(&s.name, values.clone().into_pyarray(py))?,
+                _ => out.set_item(&s.name, "rest")?,
+            }
+        }
+        Ok(out)
+    }
+
     /// Names of the segments.
     #[getter]
     fn segments(&self) -> Vec<String> {
@@ -437,13 +453,13 @@ pub struct PySolution {
 
 #[pymethods]
 impl PySolution {
-    /// Displacement of every node, (n, 3) float64, mm.
+    /// Displacement of every node, (n, 3) float64, mm, read-only.
     #[getter]
     fn displacements<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
         self.displacements.bind(py).clone()
     }
 
-    /// Internal force K u of every node, (n, 3) float64, N; zero at free nodes without loads.
+    /// Internal force K u of every node, (n, 3) float64, N, read-only; zero at free nodes without loads.
     #[getter]
     fn forces<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
         self.forces.bind(py).clone()
@@ -537,8 +553,8 @@ impl PySolution {
         let forces = std::mem::take(&mut core.forces);
         Ok(Self {
             core,
-            displacements: arrays::rows(py, displacements).unbind(),
-            forces: arrays::rows(py, forces).unbind(),
+            displacements: arrays::frozen(arrays::rows(py, displacements))?.unbind(),
+            forces: arrays::frozen(arrays::rows(py, forces))?.unbind(),
         })
     }
 }
