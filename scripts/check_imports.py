@@ -30,22 +30,23 @@ CORE: Mapping[str, frozenset[str]] = {
         "motion": "surface mesh triangle",
         "registration": "surface motion mesh",
         "boundary": "surface motion mesh",
-        "restraint": "boundary mesh",
-        "contact": "surface boundary motion mesh",
-        "constraints": "blocks boundary contact mesh",
-        "cholesky": "blocks ordering constraints tensors boundary",
-        "krylov": "blocks constraints tensors mesh",
-        "multigrid": "blocks krylov mesh tensors constraints",
-        "relaxation": "blocks constraints tensors boundary mesh",
-        "solution": "mesh material tensors",
+        "restraint": "mesh",
+        "contact": "boundary mesh motion surface",
+        "constraints": "blocks mesh",
+        "cholesky": "blocks ordering",
+        "krylov": "blocks",
+        "multigrid": "blocks krylov mesh",
+        "relaxation": "blocks",
+        "method": "contact",
+        "solution": "",
+        "system": (
+            "blocks boundary cholesky constraints contact krylov mesh method multigrid relaxation "
+            "restraint solution"
+        ),
         "statics": (
-            "blocks boundary cholesky constraints contact krylov mesh motion multigrid ordering "
-            "relaxation restraint solution surface tensors"
+            "blocks boundary contact mesh method restraint solution system tensors"
         ),
-        "replan": (
-            "blocks boundary cholesky constraints contact krylov mesh motion relaxation restraint "
-            "solution statics surface tensors"
-        ),
+        "replan": "boundary mesh method motion statics system",
     }.items()
 }
 # The one place, below crates/, that may name each outside crate.
