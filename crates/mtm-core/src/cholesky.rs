@@ -59,7 +59,7 @@ fn out_of_memory(what: &'static str, bytes: usize) -> MtmError {
     MtmError::OutOfMemory {
         what,
         needed_mb: bytes >> 20,
-        limit_mb: 0,
+        limit_mb: None,
         advice: "use method=\"pcg\", which keeps no factor",
     }
 }
