@@ -30,22 +30,21 @@ CORE: Mapping[str, frozenset[str]] = {
         "motion": "surface mesh triangle",
         "registration": "surface motion mesh",
         "boundary": "surface motion mesh",
-        "restraint": "boundary mesh",
+        "restraint": "mesh",
         "contact": "surface boundary motion mesh",
-        "constraints": "blocks boundary contact mesh",
-        "cholesky": "blocks ordering constraints tensors boundary",
-        "krylov": "blocks constraints tensors mesh",
-        "multigrid": "blocks krylov mesh tensors constraints",
-        "relaxation": "blocks constraints tensors boundary mesh",
-        "solution": "mesh material tensors",
-        "statics": (
-            "blocks boundary cholesky constraints contact krylov mesh motion multigrid ordering "
-            "relaxation restraint solution surface tensors"
+        "constraints": "blocks mesh",
+        "cholesky": "blocks ordering",
+        "krylov": "blocks",
+        "multigrid": "blocks krylov",
+        "relaxation": "blocks",
+        "solution": "",
+        "method": "contact",
+        "system": (
+            "blocks boundary cholesky constraints contact krylov mesh method multigrid relaxation "
+            "restraint solution"
         ),
-        "replan": (
-            "blocks boundary cholesky constraints contact krylov mesh motion relaxation restraint "
-            "solution statics surface tensors"
-        ),
+        "statics": "blocks boundary contact mesh method restraint solution system tensors",
+        "replan": "boundary mesh method motion statics system",
     }.items()
 }
 # The one place, below crates/, that may name each outside crate.
