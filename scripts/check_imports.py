@@ -31,19 +31,19 @@ CORE: Mapping[str, frozenset[str]] = {
         "registration": "surface motion mesh",
         "boundary": "surface motion mesh",
         "restraint": "mesh",
-        "contact": "surface boundary motion mesh",
+        "contact": "boundary mesh motion surface",
         "constraints": "blocks mesh",
         "cholesky": "blocks ordering",
         "krylov": "blocks",
-        "multigrid": "blocks krylov",
+        "multigrid": "blocks krylov mesh",
         "relaxation": "blocks",
-        "solution": "",
         "method": "contact",
+        "solution": "",
         "system": (
             "blocks boundary cholesky constraints contact krylov mesh method multigrid relaxation "
             "restraint solution"
         ),
-        "statics": "blocks boundary contact mesh method restraint solution system tensors",
+        "statics": ("blocks boundary contact mesh method restraint solution system tensors"),
         "replan": "boundary mesh method motion statics system",
     }.items()
 }

@@ -4,6 +4,8 @@
 //! finite motion of it: nine for R − I, three for s = t + (R − I) c. With contact normals frozen the
 //! sliding constraints are affine in the same numbers.
 
+use rayon::prelude::*;
+
 use crate::boundary::{Motion, NodeKind, Plan};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::mesh::{dot, sub};
@@ -13,6 +15,10 @@ use crate::system::Frozen;
 
 /// Unit fields per segment.
 pub const COLUMNS: usize = 12;
+/// Nodes from which an operator's rows exceed a core's own cache, so that a second core helps.
+const NODES_FOR_THREADS: usize = 8192;
+/// Nodes a thread takes at once.
+const NODES_PER_TASK: usize = 2048;
 
 /// Linear map from rigid plans to the displacements of chosen nodes.
 #[derive(Debug, Clone)]
@@ -229,9 +235,18 @@ impl PlanOperator {
             own[9..].copy_from_slice(&rigid.displacement(centre));
             numbers.push(own);
         }
-        let rows = self.rows.chunks_exact(self.segments.len().max(1));
-        for (out, rows) in out.as_flattened_mut().iter_mut().zip(rows) {
-            *out = rows.iter().zip(&numbers).map(|(row, own)| dot12(row, own)).sum();
+        let width = self.segments.len().max(1);
+        let fill = |out: &mut [[f64; 3]], rows: &[[f64; COLUMNS]]| {
+            for (out, rows) in out.as_flattened_mut().iter_mut().zip(rows.chunks_exact(width)) {
+                *out = rows.iter().zip(&numbers).map(|(row, own)| dot12(row, own)).sum();
+            }
+        };
+        if out.len() < NODES_FOR_THREADS {
+            fill(out, &self.rows);
+        } else {
+            out.par_chunks_mut(NODES_PER_TASK)
+                .zip(self.rows.par_chunks(3 * width * NODES_PER_TASK))
+                .for_each(|(out, rows)| fill(out, rows));
         }
         for (out, offset) in out.as_flattened_mut().iter_mut().zip(self.offset.iter().flatten()) {
             *out += offset;
