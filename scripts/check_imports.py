@@ -43,9 +43,7 @@ CORE: Mapping[str, frozenset[str]] = {
             "blocks boundary cholesky constraints contact krylov mesh method multigrid relaxation "
             "restraint solution"
         ),
-        "statics": (
-            "blocks boundary contact mesh method restraint solution system tensors"
-        ),
+        "statics": ("blocks boundary contact mesh method restraint solution system tensors"),
         "replan": "boundary mesh method motion statics system",
     }.items()
 }
