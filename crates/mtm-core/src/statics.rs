@@ -82,7 +82,6 @@ impl StaticSolver {
             &positions,
             sliding.as_ref(),
             held,
-            mesh.diagonal(),
             &options,
             &mut clock,
             interrupted,

@@ -7,7 +7,7 @@ use crate::cholesky::{Factor, Symbolic, TailFactor};
 use crate::constraints::{Constraint, add_offsets, projected, projected_rhs};
 use crate::contact::{Constraints, ContactState, Response, Sliding};
 use crate::error::{MtmError, Result};
-use crate::krylov::{PcgOptions, pcg};
+use crate::krylov::{PcgOptions, Preconditioner, pcg};
 use crate::mesh::{dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
 use crate::multigrid::{Multigrid, MultigridOptions};
@@ -26,8 +26,8 @@ const MAX_SWEEPS: usize = 200_000;
 
 /// Share of the tolerance to which the error left by the sweeps is measured.
 const MEASURED_SHARE: f64 = 0.1;
-/// Share of the mesh's diagonal that stands for a length where nothing moves but loads act.
-const LOAD_LENGTH: f64 = 1e-3;
+/// Multiple of a factor's trial error that stands for the error of any solution by it.
+const TRIAL_SAFETY: f64 = 10.0;
 
 /// Counters of the iterative solves of one plan.
 #[derive(Default)]
@@ -57,8 +57,6 @@ pub(crate) struct System {
     kept: Kept,
     tolerance: f64,
     max_iterations: Option<usize>,
-    /// Diagonal of the mesh, mm.
-    diagonal: f64,
 }
 
 /// Contact constraints that do not change, for several right-hand sides.
@@ -80,7 +78,6 @@ impl System {
         positions: &[[f64; 3]],
         sliding: Option<&Sliding>,
         held: Held,
-        diagonal: f64,
         options: &StaticOptions,
         clock: &mut Clock,
         interrupted: Interrupt<'_>,
@@ -95,7 +92,6 @@ impl System {
             kept,
             tolerance: options.tolerance,
             max_iterations: options.max_iterations,
-            diagonal,
         };
         if method == Method::Cholesky {
             let slide_rows: Vec<u32> =
@@ -176,7 +172,11 @@ impl System {
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         match &self.kept {
-            Kept::Direct { symbolic, factor, .. } => Ok(symbolic.solve(factor, b)),
+            Kept::Direct { symbolic, factor, .. } => {
+                let x = symbolic.solve(factor, b);
+                effort.error_bound = direct_error(factor, &x);
+                Ok(x)
+            }
             Kept::Refactored { symbolic, matrix } => {
                 Ok(symbolic.solve(&symbolic.factor(matrix)?, b))
             }
@@ -207,7 +207,9 @@ impl System {
             tail.add_forces(&mut x, &pushes(&state.normals, &state.forces));
             let seconds = clock.total();
             symbolic.backward(factor, &mut x, 1);
-            return Ok((symbolic.unpermuted(&x), state, seconds));
+            let x = symbolic.unpermuted(&x);
+            effort.error_bound = direct_error(factor, &x);
+            return Ok((x, state, seconds));
         }
         let mut last = Vec::new();
         let state = sliding.settle(motions, &options.contact, interrupted, |c| {
@@ -283,7 +285,12 @@ impl System {
         let system = projected(matrix, &constraints);
         let rhs = projected_rhs(matrix, b, &constraints);
         let mut x = match &self.kept {
-            Kept::Refactored { symbolic, .. } => symbolic.solve(&symbolic.factor(&system)?, &rhs),
+            Kept::Refactored { symbolic, .. } => {
+                let factor = symbolic.factor(&system)?;
+                let x = symbolic.solve(&factor, &rhs);
+                effort.error_bound = direct_error(&factor, &x);
+                x
+            }
             _ => {
                 let reach = constraints.iter().fold(scale, |m, c| m.max(c.offset.abs()));
                 self.iterate(&system, &rhs, reach, effort, interrupted)?
@@ -311,10 +318,15 @@ impl System {
             return Ok(vec![[0.0; 3]; b.len()]);
         }
         let start = vec![[0.0; 3]; b.len()];
-        let scale = if scale > 0.0 { scale } else { LOAD_LENGTH * self.diagonal };
-        let tolerance = self.tolerance * scale;
+        // Loads move the body where bone does not: one cycle tells how far, to the order of magnitude.
+        let tolerance = |multigrid: &Multigrid| {
+            let mut first = start.clone();
+            multigrid.apply(b, &mut first);
+            self.tolerance * first.iter().fold(scale, |m, v| m.max(norm(*v)))
+        };
         match &self.kept {
             Kept::Pcg { multigrid, .. } => {
+                let tolerance = tolerance(multigrid);
                 let defaults = PcgOptions::default();
                 let max_iterations = self.max_iterations.unwrap_or(defaults.max_iterations);
                 let options = PcgOptions { tolerance, max_iterations, ..defaults };
@@ -325,6 +337,7 @@ impl System {
                 Ok(found.solution)
             }
             Kept::Relaxation { multigrid, .. } => {
+                let tolerance = tolerance(multigrid);
                 self.relax_to_bound(matrix, multigrid, b, tolerance, effort, interrupted)
             }
             Kept::Direct { .. } | Kept::Refactored { .. } => {
@@ -355,7 +368,8 @@ impl System {
                 factor: RELAXATION_FACTOR,
                 max_sweeps: most - sweeps,
             };
-            let found = relax(matrix, b, &x, &options, interrupted)?;
+            let found = relax(matrix, b, &x, &options, interrupted)
+                .map_err(|e| gave_up(e, most, tolerance))?;
             (x, sweeps) = (found.solution, sweeps + found.sweeps);
             effort.iterations += found.sweeps;
             effort.history.extend(found.steps);
@@ -367,7 +381,8 @@ impl System {
                 ..PcgOptions::default()
             };
             let start = vec![[0.0; 3]; b.len()];
-            let left = pcg(matrix, &rest, &start, multigrid, &options, interrupted)?;
+            let left = pcg(matrix, &rest, &start, multigrid, &options, interrupted)
+                .map_err(|e| gave_up(e, sweeps, tolerance))?;
             let largest = left.solution.iter().fold(0.0_f64, |m, e| m.max(norm(*e)));
             let error = largest + left.error_bound_mm;
             if error <= tolerance {
@@ -375,17 +390,29 @@ impl System {
                 return Ok(x);
             }
             if sweeps >= most {
-                return Err(MtmError::NotConverged {
-                    method: "relaxation",
-                    iterations: sweeps,
-                    error,
-                    tolerance,
-                    advice: "use method=\"cholesky\" or \"pcg\"; node-wise relaxation is kept for \
-                             comparison",
-                });
+                return Err(no_rest(most, error, tolerance));
             }
             goal *= (0.5 * tolerance / error).min(0.5);
         }
+    }
+}
+
+/// That the sweeps ended before the error was within the tolerance.
+fn no_rest(sweeps: usize, error: f64, tolerance: f64) -> MtmError {
+    MtmError::NotConverged {
+        method: "relaxation",
+        iterations: sweeps,
+        error,
+        tolerance,
+        advice: "use method=\"cholesky\" or \"pcg\"; node-wise relaxation is kept for comparison",
+    }
+}
+
+/// An error of a step of the relaxation, in the terms that the caller asked in.
+fn gave_up(error: MtmError, sweeps: usize, tolerance: f64) -> MtmError {
+    match error {
+        MtmError::NotConverged { error, .. } => no_rest(sweeps, error, tolerance),
+        other => other,
     }
 }
 
@@ -405,6 +432,11 @@ fn respond(tail: &TailFactor, free: &[[f64; 3]], c: &Constraints<'_>) -> Result<
         .map(|(r, f)| [0, 1, 2].map(|i| r[i] + f[i]))
         .collect();
     Ok(Response { displacements, forces })
+}
+
+/// Estimate of the largest nodal error of a solution by factor, mm.
+fn direct_error(factor: &Factor, x: &[[f64; 3]]) -> f64 {
+    TRIAL_SAFETY * factor.trial_error() * x.iter().fold(0.0_f64, |m, v| m.max(norm(*v)))
 }
 
 /// Force vector of each sliding node.

@@ -447,6 +447,7 @@ impl PyStaticSolver {
 #[pyclass(frozen, module = "cmfsim", name = "Solution")]
 pub struct PySolution {
     core: Solution,
+    n_nodes: usize,
     displacements: Py<PyArray2<f64>>,
     forces: Py<PyArray2<f64>>,
 }
@@ -471,7 +472,10 @@ impl PySolution {
         self.core.residual
     }
 
-    /// Bound of the largest nodal error of an iterative solve, mm; 0 for Cholesky.
+    /// Largest nodal error of the linear solve, mm.
+    ///
+    /// The bound that stopped an iterative method; for Cholesky ten times the error with which the
+    /// factor recovered a known solution. Rounding of the stiffness itself is not in it.
     #[getter]
     fn error_bound(&self) -> f64 {
         self.core.error_bound
@@ -540,7 +544,7 @@ impl PySolution {
     fn __repr__(&self) -> String {
         format!(
             "Solution({} nodes, residual {:.1e}, contact gap {:.1e} mm)",
-            self.core.displacements.len(),
+            self.n_nodes,
             self.core.residual,
             self.core.contact_gap()
         )
@@ -551,8 +555,10 @@ impl PySolution {
     fn wrap(py: Python<'_>, mut core: Solution) -> PyResult<Self> {
         let displacements = std::mem::take(&mut core.displacements);
         let forces = std::mem::take(&mut core.forces);
+        let n_nodes = displacements.len();
         Ok(Self {
             core,
+            n_nodes,
             displacements: arrays::frozen(arrays::rows(py, displacements))?.unbind(),
             forces: arrays::frozen(arrays::rows(py, forces))?.unbind(),
         })
