@@ -31,10 +31,10 @@ CORE: Mapping[str, frozenset[str]] = {
         "motion": "surface mesh triangle",
         "registration": "surface motion mesh",
         "boundary": "surface motion mesh",
-        "restraint": "boundary mesh",
-        "contact": "surface boundary motion mesh",
-        "constraints": "blocks boundary contact mesh",
-        "cholesky": "blocks ordering constraints tensors boundary",
+        "restraint": "mesh",
+        "contact": "boundary mesh motion surface",
+        "constraints": "blocks mesh",
+        "cholesky": "blocks ordering",
         "row_sums": "blocks",
         "error_bound": "",
         "krylov": "blocks error_bound row_sums",
@@ -62,16 +62,15 @@ CORE: Mapping[str, frozenset[str]] = {
             "multigrid/block_rows multigrid/galerkin multigrid/rigid_modes multigrid/scaling"
         ),
         "multigrid": "blocks krylov row_sums",
-        "relaxation": "blocks constraints tensors boundary mesh",
-        "solution": "mesh material tensors",
-        "statics": (
-            "blocks boundary cholesky constraints contact krylov mesh motion multigrid ordering "
-            "relaxation restraint solution surface tensors"
+        "relaxation": "blocks",
+        "method": "contact",
+        "solution": "",
+        "system": (
+            "blocks boundary cholesky constraints contact krylov mesh method multigrid relaxation "
+            "restraint solution"
         ),
-        "replan": (
-            "blocks boundary cholesky constraints contact krylov mesh motion relaxation restraint "
-            "solution statics surface tensors"
-        ),
+        "statics": ("blocks boundary contact mesh method restraint solution system tensors"),
+        "replan": "boundary mesh method motion statics system",
     }.items()
 }
 # The one place, below crates/, that may name each outside crate.

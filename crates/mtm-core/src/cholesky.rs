@@ -59,7 +59,7 @@ fn out_of_memory(what: &'static str, bytes: usize) -> MtmError {
     MtmError::OutOfMemory {
         what,
         needed_mb: bytes >> 20,
-        limit_mb: 0,
+        limit_mb: None,
         advice: "use method=\"pcg\", which keeps no factor",
     }
 }
@@ -310,7 +310,8 @@ impl Symbolic {
                 flexibility[(r, c)] = flexibility[(c, r)];
             }
         }
-        TailFactor { lower, flexibility, first }
+        let rows = self.order[self.order.len() - self.n_tail..].to_vec();
+        TailFactor { lower, flexibility, first, rows }
     }
 }
 
@@ -322,9 +323,16 @@ pub struct TailFactor {
     flexibility: Mat<f64>,
     /// First tail unknown in elimination order.
     first: usize,
+    /// Row of the system of each tail node.
+    rows: Vec<u32>,
 }
 
 impl TailFactor {
+    /// Row of the system of tail node `i`.
+    pub fn row(&self, i: usize) -> usize {
+        self.rows[i] as usize
+    }
+
     /// Bytes held.
     pub fn bytes(&self) -> usize {
         16 * self.lower.nrows() * self.lower.nrows()

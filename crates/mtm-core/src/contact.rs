@@ -342,7 +342,7 @@ impl Sliding {
                 Ok(match (surface, motion) {
                     (None, _) | (_, Motion::Nodes(_)) => MovedSurface::Unused,
                     (Some(rest), Motion::Rigid(rigid)) => {
-                        MovedSurface::Rigid(rest.clone(), rigid.clone())
+                        MovedSurface::Rigid(rest.clone(), *rigid)
                     }
                     (Some(rest), Motion::Surface(surface)) => {
                         let u = surface.displacement(rest.vertices());

@@ -1,5 +1,7 @@
 //! What a solve returns: displacements, forces, how exact they are and where the time went.
 
+use std::time::Instant;
+
 /// Seconds by stage; a stage that the scene does not need stays at exactly zero.
 pub type Timings = Vec<(&'static str, f64)>;
 
@@ -48,5 +50,33 @@ impl Solution {
     pub fn contact_gap(&self) -> f64 {
         let c = &self.contact;
         c.gaps.iter().zip(&c.active).filter(|(_, a)| **a).fold(0.0, |m, (g, _)| m.max(g.abs()))
+    }
+}
+
+/// Stop-watch with named laps.
+pub(crate) struct Clock {
+    begin: Instant,
+    last: Instant,
+    /// Laps so far.
+    pub laps: Timings,
+}
+
+impl Clock {
+    pub fn new() -> Self {
+        let now = Instant::now();
+        Self { begin: now, last: now, laps: Vec::new() }
+    }
+
+    /// Books the time since the last lap under `stage`; exactly zero where the stage was not needed.
+    pub fn lap(&mut self, stage: &'static str, needed: bool) {
+        let now = Instant::now();
+        let seconds = if needed { (now - self.last).as_secs_f64() } else { 0.0 };
+        self.laps.push((stage, seconds));
+        self.last = now;
+    }
+
+    /// Seconds since the start.
+    pub fn total(&self) -> f64 {
+        self.begin.elapsed().as_secs_f64()
     }
 }
