@@ -91,10 +91,7 @@ impl Shell {
         let tets = grid.tets(&nodes, &triangles);
         let (fraction, fibre) = muscles::sample_muscles(&nodes, &tets, &muscles::muscle_boxes());
         let mix = |fat: f64, muscle: f64| {
-            fraction
-                .iter()
-                .map(|p| fat * (1.0 - p) + muscle * p)
-                .collect::<Vec<f64>>()
+            fraction.iter().map(|p| fat * (1.0 - p) + muscle * p).collect::<Vec<f64>>()
         };
 
         let (mut fixed, mut joined, mut sliding, mut skin) = (vec![], vec![], vec![], vec![]);
@@ -121,10 +118,7 @@ impl Shell {
         };
         let mut vertex_of_column = vec![u32::MAX; grid.n_columns()];
         let (mut contact_vertices, mut contact_triangles) = (vec![], vec![]);
-        for triangle in triangles
-            .iter()
-            .filter(|t| t.iter().all(|&column| on_contact(column)))
-        {
+        for triangle in triangles.iter().filter(|t| t.iter().all(|&column| on_contact(column))) {
             contact_triangles.push(triangle.map(|column| {
                 let vertex = &mut vertex_of_column[column as usize];
                 if *vertex == u32::MAX {
@@ -162,26 +156,12 @@ impl Shell {
     pub fn write(&self, folder: &Path) -> io::Result<()> {
         fs::create_dir_all(folder)?;
         let floats = |name: &str, shape: &[usize], values: &[f64]| {
-            write_npy(
-                &folder.join(name),
-                "<f8",
-                shape,
-                values.iter().map(|v| v.to_le_bytes()),
-            )
+            write_npy(&folder.join(name), "<f8", shape, values.iter().map(|v| v.to_le_bytes()))
         };
         let indices = |name: &str, shape: &[usize], values: &[u32]| {
-            write_npy(
-                &folder.join(name),
-                "<u4",
-                shape,
-                values.iter().map(|v| v.to_le_bytes()),
-            )
+            write_npy(&folder.join(name), "<u4", shape, values.iter().map(|v| v.to_le_bytes()))
         };
-        floats(
-            "nodes.npy",
-            &[self.nodes.len(), 3],
-            self.nodes.as_flattened(),
-        )?;
+        floats("nodes.npy", &[self.nodes.len(), 3], self.nodes.as_flattened())?;
         indices("tets.npy", &[self.tets.len(), 4], self.tets.as_flattened())?;
         for (name, values) in [
             ("young.npy", &self.young),
@@ -192,11 +172,7 @@ impl Shell {
         ] {
             floats(name, &[values.len()], values)?;
         }
-        floats(
-            "fibre.npy",
-            &[self.fibre.len(), 3],
-            self.fibre.as_flattened(),
-        )?;
+        floats("fibre.npy", &[self.fibre.len(), 3], self.fibre.as_flattened())?;
         for (name, nodes) in [
             ("fixed.npy", &self.fixed),
             ("joined.npy", &self.joined),
@@ -234,11 +210,7 @@ impl Grid {
         let n_quads = n_tets as f64 / (6 * layers) as f64;
         let n_lon = ((n_quads * width / height).sqrt().round() as usize).max(4);
         let n_lat = ((n_quads / n_lon as f64).round() as usize).max(4);
-        Grid {
-            n_lon,
-            n_lat,
-            layers,
-        }
+        Grid { n_lon, n_lat, layers }
     }
 
     fn n_columns(&self) -> usize {
@@ -253,10 +225,7 @@ impl Grid {
     fn angles(&self, column: usize) -> [f64; 2] {
         let (i, j) = (column / (self.n_lat + 1), column % (self.n_lat + 1));
         let lon = LONGITUDE_MAX * (2.0 * i as f64 / self.n_lon as f64 - 1.0);
-        [
-            lon,
-            LATITUDE[0] + (LATITUDE[1] - LATITUDE[0]) * j as f64 / self.n_lat as f64,
-        ]
+        [lon, LATITUDE[0] + (LATITUDE[1] - LATITUDE[0]) * j as f64 / self.n_lat as f64]
     }
 
     /// Whether the column stands on the hairline or the posterior border, where the model is cut.
@@ -296,11 +265,8 @@ impl Grid {
                 let a = (i * (self.n_lat + 1) + j) as u32;
                 let (b, d) = (a + self.n_lat as u32 + 1, a + 1);
                 let c = b + 1;
-                let pair = if (i + j) % 2 == 0 {
-                    [[a, b, c], [a, c, d]]
-                } else {
-                    [[a, b, d], [b, c, d]]
-                };
+                let pair =
+                    if (i + j) % 2 == 0 { [[a, b, c], [a, c, d]] } else { [[a, b, d], [b, c, d]] };
                 triangles.extend(pair);
             }
         }
@@ -316,11 +282,7 @@ impl Grid {
             columns.sort_unstable();
             for level in 0..self.layers {
                 let [a, b, c] = columns.map(|column| self.node(column, level));
-                for mut tet in [
-                    [a, b, c, c + 1],
-                    [a, b, b + 1, c + 1],
-                    [a, a + 1, b + 1, c + 1],
-                ] {
+                for mut tet in [[a, b, c, c + 1], [a, b, b + 1, c + 1], [a, a + 1, b + 1, c + 1]] {
                     if signed_volume(nodes, &tet) < 0.0 {
                         tet.swap(2, 3);
                     }
@@ -363,11 +325,7 @@ fn thickness(lon: f64, lat: f64) -> f64 {
 fn skull_point(lon: f64, lat: f64) -> Vec3 {
     let ((sin_lon, cos_lon), (sin_lat, cos_lat)) =
         (lon.to_radians().sin_cos(), lat.to_radians().sin_cos());
-    [
-        SKULL[0] * sin_lon * cos_lat,
-        -SKULL[1] * cos_lon * cos_lat,
-        SKULL[2] * sin_lat,
-    ]
+    [SKULL[0] * sin_lon * cos_lat, -SKULL[1] * cos_lon * cos_lat, SKULL[2] * sin_lat]
 }
 
 /// Outward unit normal of the skull ellipsoid.
@@ -378,29 +336,18 @@ fn skull_normal(lon: f64, lat: f64) -> Vec3 {
 
 /// A point at `depth` of the tissue: 0 on the bone, 1 on the skin.
 fn tissue_point(lon: f64, lat: f64, depth: f64) -> Vec3 {
-    add_scaled(
-        skull_point(lon, lat),
-        depth * thickness(lon, lat),
-        skull_normal(lon, lat),
-    )
+    add_scaled(skull_point(lon, lat), depth * thickness(lon, lat), skull_normal(lon, lat))
 }
 
 /// x ↦ R (x − c) + c + t, with c the centroid of the joined nodes.
 fn maxilla_motion(nodes: &[Vec3], joined: &[u32]) -> [[f64; 4]; 4] {
-    let sum = joined.iter().fold([0.0; 3], |sum, &node| {
-        add_scaled(sum, 1.0, nodes[node as usize])
-    });
+    let sum = joined.iter().fold([0.0; 3], |sum, &node| add_scaled(sum, 1.0, nodes[node as usize]));
     let centre = sum.map(|s| s / joined.len() as f64);
     let (sin, cos) = PITCH.to_radians().sin_cos();
     let rotation = [[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]];
     let row = |axis: usize| {
         let [a, b, c] = rotation[axis];
-        [
-            a,
-            b,
-            c,
-            centre[axis] + ADVANCEMENT[axis] - dot(rotation[axis], centre),
-        ]
+        [a, b, c, centre[axis] + ADVANCEMENT[axis] - dot(rotation[axis], centre)]
     };
     [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
 }
@@ -450,11 +397,7 @@ fn dot(a: Vec3, b: Vec3) -> f64 {
 }
 
 fn cross(a: Vec3, b: Vec3) -> Vec3 {
-    [
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    ]
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 fn unit(a: Vec3) -> Vec3 {

@@ -17,12 +17,7 @@ struct Band {
 }
 
 const fn band(course: &'static [(f64, f64)], width: f64, thickness: f64, depth: f64) -> Band {
-    Band {
-        course,
-        width,
-        thickness,
-        depth,
-    }
+    Band { course, width, thickness, depth }
 }
 
 /// Muscles of one side of the face; the other side mirrors them.
@@ -78,11 +73,7 @@ pub(super) fn muscle_boxes() -> Vec<MuscleBox> {
             boxes.push(MuscleBox {
                 centre: add_scaled(start, 0.5, run),
                 axes: [along, cross(through, along), through],
-                half: [
-                    dot(run, along) / 2.0,
-                    band.width / 2.0,
-                    band.thickness / 2.0,
-                ],
+                half: [dot(run, along) / 2.0, band.width / 2.0, band.thickness / 2.0],
             });
         }
     }
@@ -101,15 +92,10 @@ pub(super) fn sample_muscles(
     let sample = |tet: &[u32; 4]| {
         let corners = tet.map(|node| nodes[node as usize]);
         let centre = weighted(&corners, &[0.25; 4]);
-        let radius = corners
-            .iter()
-            .map(|&x| distance(x, centre))
-            .fold(0.0, f64::max);
+        let radius = corners.iter().map(|&x| distance(x, centre)).fold(0.0, f64::max);
         let (mut hit, mut most, mut fibre) = ([false; SAMPLES], 0, [0.0, 0.0, 1.0]);
-        for (muscle, _) in boxes
-            .iter()
-            .zip(&reach)
-            .filter(|(b, r)| distance(b.centre, centre) < radius + **r)
+        for (muscle, _) in
+            boxes.iter().zip(&reach).filter(|(b, r)| distance(b.centre, centre) < radius + **r)
         {
             let mut count = 0;
             for (sample, weight) in weights.iter().enumerate() {
@@ -123,10 +109,7 @@ pub(super) fn sample_muscles(
                 (most, fibre) = (count, muscle.axes[0]);
             }
         }
-        (
-            hit.iter().filter(|&&h| h).count() as f64 / SAMPLES as f64,
-            fibre,
-        )
+        (hit.iter().filter(|&&h| h).count() as f64 / SAMPLES as f64, fibre)
     };
     tets.iter().map(sample).unzip()
 }
@@ -143,10 +126,7 @@ fn sample_weights() -> [[f64; 4]; SAMPLES] {
 }
 
 fn weighted(corners: &[Vec3; 4], weights: &[f64; 4]) -> Vec3 {
-    corners
-        .iter()
-        .zip(weights)
-        .fold([0.0; 3], |sum, (&x, &w)| add_scaled(sum, w, x))
+    corners.iter().zip(weights).fold([0.0; 3], |sum, (&x, &w)| add_scaled(sum, w, x))
 }
 
 fn distance(a: Vec3, b: Vec3) -> f64 {

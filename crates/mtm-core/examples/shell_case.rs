@@ -13,9 +13,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let [n_tets, folder] = arguments.as_slice() else {
         return Err("expected two arguments: the number of tets and the output folder".into());
     };
-    let n_tets: usize = n_tets
-        .parse()
-        .map_err(|e| format!("number of tets '{n_tets}': {e}"))?;
+    let n_tets: usize = n_tets.parse().map_err(|e| format!("number of tets '{n_tets}': {e}"))?;
     let case = shell::Shell::generate(n_tets);
     case.write(&PathBuf::from(folder))?;
     println!(

@@ -341,9 +341,7 @@ impl Sliding {
             .map(|(surface, motion)| {
                 Ok(match (surface, motion) {
                     (None, _) | (_, Motion::Nodes(_)) => MovedSurface::Unused,
-                    (Some(rest), Motion::Rigid(rigid)) => {
-                        MovedSurface::Rigid(rest.clone(), rigid.clone())
-                    }
+                    (Some(rest), Motion::Rigid(rigid)) => MovedSurface::Rigid(rest.clone(), *rigid),
                     (Some(rest), Motion::Surface(surface)) => {
                         let u = surface.displacement(rest.vertices());
                         let moved =

@@ -166,6 +166,9 @@ pub struct StaticSolver {
     timings: Timings,
 }
 
+/// Held nodes, the normal of every sliding node, and its offset for each right-hand side.
+type FrozenContact<'a> = (&'a [usize], &'a [[f64; 3]], &'a [Vec<f64>]);
+
 /// Solution of the unknown rows for one right-hand side, with contact settled.
 struct Unknowns {
     displacements: Vec<[f64; 3]>,
@@ -678,7 +681,7 @@ impl StaticSolver {
         &self,
         columns: Vec<Vec<[f64; 3]>>,
         scales: &[f64],
-        frozen: Option<(&[usize], &[[f64; 3]], &[Vec<f64>])>,
+        frozen: Option<FrozenContact<'_>>,
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
         let mut effort = Effort::default();
