@@ -873,10 +873,9 @@ def _cases() -> Iterator[Case]:
     yield Case("large moves", "one segment moved", "1e-9 mm", bind(moved, 0.0, 1e-9), ALL)
     for shift in (0.0, 1e-15):
         text = f"segment moved by {_number(shift)} mm"
-        faults = unscaled if shift else ()
-        yield Case("loads", "random inclusions", text, bind(loaded, shift), ALL, faults=faults)
+        yield Case("loads", "random inclusions", text, bind(loaded, shift), ALL)
     yield Case("loads", "cantilever 1:3", "1e-03 N", bind(slender, 3, 1e-3), ALL)
-    yield Case("loads", "cantilever 1:3", "1e+06 N", bind(slender, 3, 1e6), ALL, faults=unscaled)
+    yield Case("loads", "cantilever 1:3", "1e+06 N", bind(slender, 3, 1e6), ALL)
     for load in (1e-3, 1e-12):
         yield Case("loads", "cantilever 1:20", f"{load:.0e} N", bind(slender, 20, load), ALL)
     yield Case("loads", "cantilever 1:200", "1e-03 N", bind(slender, 200, 1e-3), ALL)
@@ -903,9 +902,8 @@ def _cases() -> Iterator[Case]:
         ("rotation about",) * 3,
     )
     for count in (1, 30, 31):
-        faults = joint if count > 30 else ()
         text = f"{count} apart from one another"
-        yield Case("holding", "three-hinged arches", text, bind(arches, count), ALL, faults=faults)
+        yield Case("holding", "three-hinged arches", text, bind(arches, count), ALL)
     yield Case("holding", "two islands", "both held", bind(islands, second_held=True), ALL)
     free = "all six rigid modes are free"
     yield Case(
@@ -1070,7 +1068,7 @@ def _compared(case: Case, method: str, row: Row, result: cmfsim.Solution, second
     rounding, true_residual = _residual(case, u)
     round_off = min(CONDITION_FACTOR * EPS * known.condition, WORTHLESS)
     if method == "cholesky":
-        allowed = max(ERROR_LIMIT, round_off)
+        allowed = min(max(ERROR_LIMIT, round_off), bound + round_off)
     else:
         allowed = BOUND_FACTOR * bound + round_off
     floor = RESIDUAL_FACTOR * rounding
@@ -1136,7 +1134,8 @@ runs the same cases. Numbers near 1e-15 differ from machine to machine.
   It is checked against the residual in 32 digits. It says little about the error where κ is large.
 - **error** is the largest distance of a node from its reference position over the largest
   displacement.
-- **bound** is `result.error_bound` over the largest displacement. Cholesky reports none.
+- **bound** is `result.error_bound` over the largest displacement; for Cholesky an estimate, ten
+  times the error with which the factor recovered a known solution.
 - **verdict**: *ok*, *refused* with the error raised, or **WRONG**, with what is known of the cause.
   The tests hold each known fault as an expected failure, so that its mend cannot pass unnoticed.
 
@@ -1153,12 +1152,10 @@ tets lock as ν nears 0.5 however exactly their equations are solved.
 
 ## Where a method must not be used
 
-- **cholesky**: it loses log10 κ of its 16 digits and does not say how many, so an answer at κ of
-  1e12 (a bar 1000 times as long as thick) has four. Not far above, it is refused.
+- **cholesky**: it loses log10 κ of its 16 digits, so an answer at κ of 1e12 (a bar 1000 times as
+  long as thick) has four; `result.error_bound` says so. Not far above, it is refused.
 - **pcg**: where κ is above about 1e7: stiff tissue that soft tissue holds with a contrast above
-  1e6, slender bodies. Rounding then keeps it from its tolerance, and it raises `SolverError`. Under
-  loads the tolerance is measured on the prescribed displacement, or without any on a thousandth of
-  the size of the mesh; where the loads move the body much further, it raises `SolverError` as well.
+  1e6, slender bodies. Rounding then keeps it from its tolerance, and it raises `SolverError`.
 - **relaxation**: stiff bodies in soft tissue with a contrast above 1e2, ν above 0.49, slivers: it
   runs out of sweeps and raises `SolverError`. It measures its error by conjugate gradients, so it
   is refused wherever these are.

@@ -6,8 +6,7 @@ use std::f64::consts::PI;
 
 use mtm_core::error::{ErrorKind, MtmError};
 use mtm_core::motion::{RigidMotion, SurfaceMotion};
-use mtm_core::surface::{Closest, Surface};
-use mtm_core::triangle::Feature;
+use mtm_core::surface::{Closest, Feature, Surface};
 use mtm_core::winding::{WindingOptions, WindingTree, winding_number_exact};
 use nalgebra::{Matrix4, Rotation3, Vector3};
 

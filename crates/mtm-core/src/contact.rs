@@ -22,6 +22,8 @@ const REVERSAL: f64 = 0.5;
 const NAMED_NODES: usize = 10;
 /// Share of sliding nodes that may face away from the contact surface before it counts as inverted.
 const MOSTLY: f64 = 0.5;
+/// Rounding of the area vector round a node, relative to the areas summed: less has no direction.
+const FACING_ROUNDING: f64 = 1e-12;
 
 /// Whether nodes may lift off.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -532,15 +534,19 @@ fn check_facing(
         .iter()
         .zip(normals)
         .filter(|&(&j, &n)| {
-            let x = mesh.nodes()[j as usize];
-            let mut into_tissue = [0.0; 3];
+            // Σ_t V_t ∇φ_j = ∫ φ_j dA over the boundary round j: a third of its area vector, out of the
+            // tissue, whatever the shape of the tets; zero but for rounding inside the body.
+            let (mut out, mut size) = ([0.0; 3], 0.0);
             for &t in mesh.tets_of_node(j as usize) {
-                for &v in &mesh.tets()[t as usize] {
-                    let edge = sub(mesh.nodes()[v as usize], x);
-                    into_tissue = add(into_tissue, scaled(edge, mesh.volumes()[t as usize]));
-                }
+                let Some(a) = mesh.tets()[t as usize].iter().position(|&v| v == j) else {
+                    continue;
+                };
+                let geometry = mesh.geometry(t as usize);
+                let part = scaled(geometry.gradients[a], geometry.volume);
+                out = add(out, part);
+                size += norm(part);
             }
-            dot(into_tissue, n) < 0.0
+            dot(out, n) > FACING_ROUNDING * size
         })
         .map(|(&j, _)| j)
         .collect();

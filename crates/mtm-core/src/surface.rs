@@ -14,7 +14,8 @@ use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
 use crate::topology::{NO_TRIANGLE, Topology};
-use crate::triangle::{self, Facet, Feature, TrianglePoint, Vec3};
+use crate::triangle::{self, Facet, TrianglePoint, Vec3};
+pub use crate::triangle::{DEGENERATE_AREA, Feature};
 
 /// Angle between facet normals above which an edge is a crease, rad (60°): box and tooth edges stay
 /// sharp, coarse round shapes stay smooth.
@@ -96,7 +97,7 @@ impl Surface {
     /// # Errors
     /// [`MtmError::Empty`], [`MtmError::NotFinite`], [`MtmError::IndexOutOfRange`], and
     /// [`MtmError::DegenerateTriangle`] for a triangle that names a vertex twice or has an area
-    /// below [`triangle::DEGENERATE_AREA`] of its longest edge squared.
+    /// below [`DEGENERATE_AREA`] of its longest edge squared.
     pub fn new(vertices: Vec<[f64; 3]>, triangles: Vec<[u32; 3]>) -> Result<Self> {
         Self::with_crease_angle(vertices, triangles, CREASE_ANGLE)
     }
