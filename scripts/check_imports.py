@@ -34,7 +34,9 @@ CORE: Mapping[str, frozenset[str]] = {
         "restraint": "mesh",
         "contact": "boundary mesh motion surface",
         "constraints": "blocks mesh",
-        "cholesky": "blocks ordering",
+        "cholesky": "blocks ordering cholesky/dense cholesky/structure",
+        "cholesky/dense": "cholesky",
+        "cholesky/structure": "blocks cholesky ordering",
         "row_sums": "blocks",
         "error_bound": "",
         "krylov": "blocks error_bound row_sums",
@@ -76,7 +78,7 @@ CORE: Mapping[str, frozenset[str]] = {
 # The one place, below crates/, that may name each outside crate.
 CRATES: Mapping[str, str] = {
     "parry3d_f64": "mtm-core/src/surface.rs",
-    "faer": "mtm-core/src/cholesky.rs",
+    "faer": "mtm-core/src/cholesky/",
     "metis_sys": "mtm-core/src/ordering.rs",
     "pyo3": "mtm-py/",
     "numpy": "mtm-py/",

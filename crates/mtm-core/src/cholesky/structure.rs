@@ -1,0 +1,148 @@
+//! Elimination order without METIS, the supernodes of the factor, and the permuted matrix in scalars.
+
+use faer::dyn_stack::{MemStack, StackReq};
+use faer::sparse::SymbolicSparseColMatRef;
+use faer::sparse::linalg::cholesky::{simplicial, supernodal};
+use faer::sparse::linalg::{SymbolicSupernodalParams, amd};
+use rayon::prelude::*;
+
+use super::buffer;
+use super::out_of_memory;
+use crate::blocks::BlockMatrix;
+use crate::error::Result;
+use crate::ordering::NodeGraph;
+
+/// Approximate minimum degree order of a graph (Amestoy, Davis & Duff 1996).
+pub fn minimum_degree(graph: &NodeGraph) -> Result<Vec<u32>> {
+    let n = graph.n_nodes();
+    let start: Vec<usize> = graph.start.iter().map(|&v| v as usize).collect();
+    let rows: Vec<usize> = graph.neighbours.iter().map(|&v| v as usize).collect();
+    let (mut order, mut position) = (vec![0_usize; n], vec![0_usize; n]);
+    let mut memory = buffer(amd::order_maybe_unsorted_scratch::<usize>(n, rows.len()))?;
+    amd::order_maybe_unsorted(
+        &mut order,
+        &mut position,
+        SymbolicSparseColMatRef::new_unsorted_checked(n, n, &start, None, &rows),
+        Default::default(),
+        MemStack::new(&mut memory),
+    )
+    .map_err(|_| out_of_memory("the elimination order", 8 * rows.len()))?;
+    Ok(order.iter().map(|&j| j as u32).collect())
+}
+
+/// Supernodes of the factor in the order `order`.
+pub fn supernodal_structure(
+    matrix: &BlockMatrix,
+    order: &[u32],
+) -> Result<supernodal::SymbolicSupernodalCholesky<usize>> {
+    let n = 3 * order.len();
+    let (start, rows) = upper_pattern(matrix, order);
+    let pattern = SymbolicSparseColMatRef::new_unsorted_checked(n, n, &start, None, &rows);
+    let (mut tree, mut counts) = (vec![0_isize; n], vec![0_usize; n]);
+    let need = StackReq::any_of(&[
+        simplicial::prefactorize_symbolic_cholesky_scratch::<usize>(n, rows.len()),
+        supernodal::factorize_supernodal_symbolic_cholesky_scratch::<usize>(n),
+    ]);
+    let mut memory = buffer(need)?;
+    let tree = simplicial::prefactorize_symbolic_cholesky(
+        &mut tree,
+        &mut counts,
+        pattern,
+        MemStack::new(&mut memory),
+    );
+    supernodal::factorize_supernodal_symbolic_cholesky(
+        pattern,
+        tree,
+        &counts,
+        MemStack::new(&mut memory),
+        SymbolicSupernodalParams::default(),
+    )
+    .map_err(|_| out_of_memory("the structure of the factor", 8 * rows.len()))
+}
+
+fn positions(order: &[u32]) -> Vec<u32> {
+    let mut position = vec![0_u32; order.len()];
+    for (p, &j) in order.iter().enumerate() {
+        position[j as usize] = p as u32;
+    }
+    position
+}
+
+/// Upper triangle of the permuted pattern in scalar columns: start and rows.
+fn upper_pattern(matrix: &BlockMatrix, order: &[u32]) -> (Vec<usize>, Vec<usize>) {
+    let position = positions(order);
+    let (mut start, mut rows) = (vec![0], Vec::new());
+    let mut above = Vec::new();
+    for (p, &j) in order.iter().enumerate() {
+        let (columns, _) = matrix.row(j as usize);
+        above.clear();
+        above.extend(columns.iter().map(|&k| position[k as usize] as usize).filter(|&q| q < p));
+        above.sort_unstable();
+        for axis in 0..3 {
+            rows.extend(above.iter().flat_map(|&q| [3 * q, 3 * q + 1, 3 * q + 2]));
+            rows.extend((0..=axis).map(|a| 3 * p + a));
+            start.push(rows.len());
+        }
+    }
+    (start, rows)
+}
+
+/// Lower triangle of P A Pᵀ in scalar columns.
+pub struct Scalars {
+    /// First entry of each column; one more than columns.
+    pub start: Vec<usize>,
+    /// Row of each entry.
+    pub rows: Vec<usize>,
+    /// Value of each entry.
+    pub values: Vec<f64>,
+}
+
+/// Lower triangle of the permuted matrix in scalar columns, filled in parallel.
+pub fn lower_scalars(matrix: &BlockMatrix, order: &[u32]) -> Scalars {
+    let (n, position) = (order.len(), positions(order));
+    let mut start = Vec::with_capacity(3 * n + 1);
+    start.push(0_usize);
+    for (p, &j) in order.iter().enumerate() {
+        let below =
+            matrix.row(j as usize).0.iter().filter(|&&k| position[k as usize] as usize > p).count();
+        for axis in 0..3 {
+            start.push(start[start.len() - 1] + 3 * below + 3 - axis);
+        }
+    }
+    let total = start[3 * n];
+    let (mut rows, mut values) = (vec![0_usize; total], vec![0.0; total]);
+    const NODES_PER_TASK: usize = 512;
+    let (mut tasks, mut rest_rows, mut rest_values) = (Vec::new(), &mut rows[..], &mut values[..]);
+    for first in (0..n).step_by(NODES_PER_TASK) {
+        let last = n.min(first + NODES_PER_TASK);
+        let length = start[3 * last] - start[3 * first];
+        let (r, tail_r) = rest_rows.split_at_mut(length);
+        let (v, tail_v) = rest_values.split_at_mut(length);
+        (rest_rows, rest_values) = (tail_r, tail_v);
+        tasks.push((first, last, r, v));
+    }
+    tasks.into_par_iter().for_each(|(first, last, rows, values)| {
+        let mut at = 0;
+        for p in first..last {
+            let (columns, blocks) = matrix.row(order[p] as usize);
+            let diagonal = matrix.diagonal_block(order[p] as usize);
+            for axis in 0..3 {
+                for a in axis..3 {
+                    (rows[at], values[at]) = (3 * p + a, diagonal[3 * a + axis]);
+                    at += 1;
+                }
+                for (&k, block) in columns.iter().zip(blocks) {
+                    let q = position[k as usize] as usize;
+                    if q > p {
+                        // Entry (q, p) of the matrix is the transpose of the stored block (p, q).
+                        for a in 0..3 {
+                            (rows[at], values[at]) = (3 * q + a, block[3 * axis + a]);
+                            at += 1;
+                        }
+                    }
+                }
+            }
+        }
+    });
+    Scalars { start, rows, values }
+}
