@@ -18,7 +18,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 ENV_STAMP := $(VENV)/.cmfsim-env
 BUILD_STAMP := $(VENV)/.cmfsim-build
 RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 'Cargo.toml')
-PYTHON_DIRS := python tests/python scripts examples
+PYTHON_DIRS := python tests/python scripts examples benches
 CORE_FEATURES := --features mtm-core/metis
 
 .DEFAULT_GOAL := help
@@ -34,7 +34,7 @@ $(ENV_STAMP): pyproject.toml scripts/make_venv.sh
 	@touch $@
 
 $(BUILD_STAMP): $(ENV_STAMP) $(RUST_SOURCES)
-	VIRTUAL_ENV="$(VENV_PATH)" "$(BIN)/maturin" develop --release $(CARGO_FLAGS) --extras dev
+	VIRTUAL_ENV="$(VENV_PATH)" "$(BIN)/maturin" develop --release $(CARGO_FLAGS) --extras test,lint
 	@touch $@
 
 build: $(BUILD_STAMP) ## create .venv, compile the core and install cmfsim into it

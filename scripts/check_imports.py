@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 # What each file of crates/mtm-core/src may name of the crate. All may name `error`; lib.rs is free.
+# A folder stands for its mod.rs, which may name every file beside it.
 CORE: Mapping[str, frozenset[str]] = {
     name: frozenset(allowed.split())
     for name, allowed in {
@@ -30,22 +31,46 @@ CORE: Mapping[str, frozenset[str]] = {
         "motion": "surface mesh triangle",
         "registration": "surface motion mesh",
         "boundary": "surface motion mesh",
-        "restraint": "boundary mesh",
-        "contact": "surface boundary motion mesh",
-        "constraints": "blocks boundary contact mesh",
-        "cholesky": "blocks ordering constraints tensors boundary",
-        "krylov": "blocks constraints tensors mesh",
-        "multigrid": "blocks krylov mesh tensors constraints",
-        "relaxation": "blocks constraints tensors boundary mesh",
-        "solution": "mesh material tensors",
-        "statics": (
-            "blocks boundary cholesky constraints contact krylov mesh motion multigrid ordering "
-            "relaxation restraint solution surface tensors"
+        "restraint": "mesh",
+        "contact": "boundary mesh motion surface",
+        "constraints": "blocks mesh",
+        "cholesky": "blocks ordering",
+        "row_sums": "blocks",
+        "error_bound": "",
+        "krylov": "blocks error_bound row_sums",
+        "multigrid/block_rows": "blocks",
+        "multigrid/small_blocks": "",
+        "multigrid/scaling": "multigrid/block_rows multigrid/small_blocks",
+        "multigrid/scaled_matrix": (
+            "error_bound row_sums multigrid/block_rows multigrid/scaling multigrid/small_blocks"
         ),
-        "replan": (
-            "blocks boundary cholesky constraints contact krylov mesh motion relaxation restraint "
-            "solution statics surface tensors"
+        "multigrid/smoother": "multigrid/scaled_matrix",
+        "multigrid/aggregation": "multigrid/block_rows multigrid/scaled_matrix",
+        "multigrid/rigid_modes": "multigrid/aggregation",
+        "multigrid/prolongator": (
+            "multigrid/aggregation multigrid/block_rows multigrid/rigid_modes "
+            "multigrid/scaled_matrix"
         ),
+        "multigrid/galerkin": (
+            "multigrid/block_rows multigrid/prolongator multigrid/rigid_modes multigrid/scaling "
+            "multigrid/small_blocks"
+        ),
+        "multigrid/transfer": (
+            "multigrid/prolongator multigrid/rigid_modes multigrid/scaling multigrid/small_blocks"
+        ),
+        "multigrid/coarsest": (
+            "multigrid/block_rows multigrid/galerkin multigrid/rigid_modes multigrid/scaling"
+        ),
+        "multigrid": "blocks krylov row_sums",
+        "relaxation": "blocks",
+        "method": "contact",
+        "solution": "",
+        "system": (
+            "blocks boundary cholesky constraints contact krylov mesh method multigrid relaxation "
+            "restraint solution"
+        ),
+        "statics": ("blocks boundary contact mesh method restraint solution system tensors"),
+        "replan": "boundary mesh method motion statics system",
     }.items()
 }
 # The one place, below crates/, that may name each outside crate.
@@ -87,8 +112,8 @@ NAMELESS = frozenset({"utils", "util", "helpers", "helper", "common", "misc"})
 
 COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 TEST_MODULE = re.compile(r"^#\[cfg\(test\)\]\s*mod\s.*", re.DOTALL | re.MULTILINE)
-CRATE_PATH = re.compile(r"\bcrate::(\w+)")
-CRATE_GROUP = re.compile(r"\bcrate::\{")
+CRATE_PATH = re.compile(r"\b(crate|super)::(\w+)(?:::(\w+))?")
+CRATE_GROUP = re.compile(r"\b(?:crate|super)::\{")
 
 
 def main(root: Path) -> int:
@@ -111,23 +136,36 @@ def check_rust(root: Path) -> Iterator[str]:
                 continue
             for match in re.finditer(rf"\b{crate}\s*::|\buse\s+{crate}\b", text):
                 yield f"{_at(path, root, text, match.start())}: {crate} belongs in crates/{home}"
-        if path.parent == root / "crates/mtm-core/src" and path.name != "lib.rs":
+        if place.startswith("mtm-core/src/") and place != "mtm-core/src/lib.rs":
             yield from _check_core_file(path, root, TEST_MODULE.sub(_blank, text))
 
 
 def _check_core_file(path: Path, root: Path, text: str) -> Iterator[str]:
-    if path.stem not in CORE:
+    source = root / "crates/mtm-core/src"
+    name = path.relative_to(source).with_suffix("").as_posix().removesuffix("/mod")
+    if name not in CORE:
         yield f"{path.relative_to(root)}: add it to CORE in scripts/check_imports.py"
         return
     for match in CRATE_GROUP.finditer(text):
-        yield f"{_at(path, root, text, match.start())}: write one `use crate::…` per module"
-    allowed = CORE[path.stem] | {"error", path.stem}
+        yield f"{_at(path, root, text, match.start())}: write one `use {match[0][:-1]}…` per module"
     for match in CRATE_PATH.finditer(text):
-        if match[1] not in allowed:
+        module = _module(source, path, *match.groups())
+        if module not in CORE[name] | {"error", name}:
             yield (
-                f"{_at(path, root, text, match.start())}: {path.stem} may not import {match[1]} "
-                f"(may: {', '.join(sorted(allowed - {path.stem}))})"
+                f"{_at(path, root, text, match.start())}: {name} may not import {module} "
+                f"(may: {', '.join(sorted(CORE[name] | {'error'}))})"
             )
+
+
+def _module(source: Path, path: Path, start: str, first: str, second: str | None) -> str:
+    """The file, as CORE names it, that `start::first::second` in the file at `path` lies in."""
+    folder = "" if path.parent == source else path.parent.relative_to(source).as_posix()
+    if start == "super" and path.name != "mod.rs" and folder:
+        inside = (source / folder / first).with_suffix(".rs")
+        return f"{folder}/{first}" if inside.exists() else folder
+    if start == "crate" and second and (source / first / second).with_suffix(".rs").exists():
+        return f"{first}/{second}"
+    return first
 
 
 def check_python(root: Path) -> Iterator[str]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from shutil import which
 
 import numpy as np
+
 from case import Case, Clock, NotInstalled, Result
 
 COMPONENT_COLUMNS = (slice(13, 25), slice(25, 37), slice(37, 49))

@@ -6,6 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
+
 from case import Case, Clock, NotInstalled, Result
 
 SEGMENT = "maxilla"

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
 from table import markdown
 
 HERE = Path(__file__).resolve().parent

@@ -7,6 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+
 from case import Case, Clock, NotInstalled, Result
 
 SPD = 2

@@ -38,6 +38,7 @@ def main() -> None:
         os.sched_setaffinity(0, cores)  # before any library counts the cores
 
     import numpy as np
+
     from case import Case, Clock, NotInstalled
 
     case, clock = Case.load(args.case), Clock()

@@ -181,7 +181,7 @@ class Boundary:
     @property
     def contact(self) -> dict[str, Surface]: ...
     @property
-    def gap(self) -> dict[str, _Floats]: ...
+    def gap(self) -> dict[str, _Floats | Literal["rest"]]: ...
     @property
     def segments(self) -> list[str]: ...
     @property
@@ -199,7 +199,7 @@ class StaticSolver:
         tolerance: float = 1e-9,
         max_iterations: int | None = None,
         contact_tolerance: float = 1e-9,
-        contact_iterations: int = 60,
+        contact_iterations: int = 100,
         memory_limit: float | None = None,
     ) -> StaticSolver: ...
     @property

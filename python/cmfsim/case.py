@@ -266,7 +266,7 @@ class SolverOptions:
     tolerance: float = 1e-9
     max_iterations: int | None = None
     contact_tolerance: float = 1e-9
-    contact_iterations: int = 60
+    contact_iterations: int = 100
     memory_limit: float | None = None
 
     def __post_init__(self) -> None:

@@ -14,6 +14,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
@@ -493,9 +494,14 @@ def _motion(name: str, plans: Mapping[str, Any], folder: Path) -> NDArray[Any] |
         return np.asarray(_known_keys(where, table, ("matrix",))["matrix"])
     if "moved_surface" in table:
         files = _known_keys(where, table, ("surface", "moved_surface"))
-        before = _read_surface(_beside(folder, f"{where}.surface", files.get("surface")))
-        after = _read_surface(_beside(folder, f"{where}.moved_surface", files["moved_surface"]))
-        return MovedSurface(before, after.vertices)
+        before, weld = _read_triangles(_beside(folder, f"{where}.surface", files.get("surface")))
+        after = _beside(folder, f"{where}.moved_surface", files["moved_surface"])
+        moved = np.asarray(_read_mesh(after).points)
+        if len(moved) != weld.n_read:
+            raise CaseInputError(
+                f"{after.name} has {len(moved)} vertices, {files.get('surface')} {weld.n_read}"
+            )
+        return MovedSurface(before, moved[weld.kept])
     return rigid_motion(**_known_keys(where, table, ("translation", "angle", "axis", "centre")))
 
 
@@ -535,13 +541,34 @@ def _refuse_entities(path: Path) -> None:
         raise CaseInputError(f"{path.name}: XML in UTF-16 is not read")
 
 
+@dataclass(frozen=True)
+class _Weld:
+    """Which vertices of a file were kept when equal ones became one."""
+
+    n_read: int
+    kept: NDArray[np.intp]
+
+
 def _read_surface(path: Path, crease_angle: float = 60.0) -> SurfaceData:
+    return _read_triangles(path, crease_angle)[0]
+
+
+def _read_triangles(path: Path, crease_angle: float = 60.0) -> tuple[SurfaceData, _Weld]:
+    """A surface with vertices in the same place made one: STL repeats them for each triangle."""
     mesh = _read_mesh(path)
     triangles = [b.data for b in mesh.cells if b.type == "triangle"]
     if not triangles or any(b.type not in {"triangle", "vertex", "line"} for b in mesh.cells):
         found = ", ".join(sorted({b.type for b in mesh.cells})) or "nothing"
         raise CaseInputError(f"{path.name}: a surface of triangles is needed, found {found}")
-    return SurfaceData(mesh.points, np.concatenate(triangles), crease_angle)
+    points = np.asarray(mesh.points)
+    _, first, back = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    # In the order of the file, so that a surface without repetitions keeps its numbers.
+    order = np.argsort(first)
+    number = np.empty(len(first), dtype=np.int64)
+    number[order] = np.arange(len(first))
+    kept = first[order]
+    welded = number[back.reshape(-1)][np.concatenate(triangles)]
+    return SurfaceData(points[kept], welded, crease_angle), _Weld(len(points), kept)
 
 
 def _tets(mesh: Any, path: Path) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:

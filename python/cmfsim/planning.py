@@ -159,7 +159,9 @@ def decompose_motion(matrix: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> 
     if theta == 0.0:
         axis = np.array([1.0, 0.0, 0.0])
     elif twice_cosine >= 0.0:
-        axis = twice_sine_axis / twice_sine
+        # Scaled by its largest entry first: squares of angles below 1e-154 would lose their digits.
+        axis = twice_sine_axis / np.abs(twice_sine_axis).max()
+        axis = axis / float(np.linalg.norm(axis))
     else:
         # R + Rᵀ − 2 cos θ I = 2 (1 − cos θ) k⊗k: its longest column is along k.
         outer = rotation + rotation.T - twice_cosine * np.eye(3)

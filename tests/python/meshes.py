@@ -259,7 +259,7 @@ def l2_error(nodes: Floats, tets: Indices, u: Floats, exact) -> float:
 
 
 def surface_loads(nodes: Floats, triangles: Indices, traction: Floats) -> Floats:
-    """Consistent nodal forces of a uniform traction (MPa) on triangles: a third of each to a node."""
+    """Consistent nodal forces of a uniform traction (MPa) on triangles: a third to each node."""
     a, b, c = (nodes[triangles[:, i]] for i in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     loads = np.zeros_like(nodes)

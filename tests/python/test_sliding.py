@@ -196,7 +196,7 @@ def test_pressed_unilateral_equals_bilateral():
 
 
 def shell_on_sphere(level, layers, contact_level):
-    """A spherical shell whose inner nodes slide on a finely cut sphere and whose outer are joined."""
+    """A spherical shell whose inner nodes slide on a fine sphere and whose outer are joined."""
     nodes, tets, inner, outer = meshes.spherical_shell(level, layers, 10.0, 20.0)
     tensors = cmfsim.MassTensors(
         cmfsim.TetMesh(nodes, tets), cmfsim.Tissue.isotropic(YOUNG, POISSON)

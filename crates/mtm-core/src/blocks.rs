@@ -21,6 +21,18 @@ pub struct BlockMatrix {
     pub diagonal: Vec<usize>,
 }
 
+/// A run of rows whose blocks one thread may write.
+pub struct RowTask<'a> {
+    /// First row of the run.
+    pub first: usize,
+    /// Row starts of the run, one more than rows, as in the whole matrix.
+    pub start: &'a [usize],
+    /// Columns of the run.
+    pub columns: &'a [u32],
+    /// Blocks of the run.
+    pub blocks: &'a mut [Block],
+}
+
 impl BlockMatrix {
     /// The zero matrix on a pattern with ascending columns that holds every diagonal.
     pub fn from_pattern(row_start: Vec<usize>, columns: Vec<u32>) -> Self {
@@ -31,6 +43,20 @@ impl BlockMatrix {
             .collect();
         let blocks = vec![[0.0; 9]; columns.len()];
         Self { row_start, columns, blocks, diagonal }
+    }
+
+    /// Runs of rows that cover the matrix, to be filled in parallel.
+    pub fn row_tasks(&mut self) -> Vec<RowTask<'_>> {
+        let n = self.row_start.len() - 1;
+        let (mut tasks, mut rest) = (Vec::new(), &mut self.blocks[..]);
+        for first in (0..n).step_by(ROWS_PER_TASK) {
+            let start = &self.row_start[first..=n.min(first + ROWS_PER_TASK)];
+            let (begin, end) = (start[0], start[start.len() - 1]);
+            let (blocks, tail) = rest.split_at_mut(end - begin);
+            rest = tail;
+            tasks.push(RowTask { first, start, columns: &self.columns[begin..end], blocks });
+        }
+        tasks
     }
 
     /// Number of block rows.

@@ -14,10 +14,7 @@ use crate::blocks::BlockMatrix;
 use crate::error::{MtmError, Result};
 use crate::ordering::{NodeGraph, elimination_tree, nested_dissection, postorder};
 
-/// A pivot below this share of its diagonal entry lost so many digits that the factor is tried on a
-/// known solution before it is trusted.
-const SUSPECT_PIVOT: f64 = 1e-10;
-/// Relative error of that trial above which the system counts as singular to working precision.
+/// Relative error of a known solution above which the system counts as singular to working precision.
 const TRIAL_ERROR: f64 = 1e-5;
 /// Below this many unknowns threads cost more than they bring.
 const PARALLEL_UNKNOWNS: usize = 3000;
@@ -37,6 +34,16 @@ pub struct Symbolic {
 /// L of P A Pᵀ = L Lᵀ.
 pub struct Factor {
     values: Vec<f64>,
+    /// Relative error with which a known solution came back.
+    trial_error: f64,
+}
+
+impl Factor {
+    /// Relative error, in the largest component, with which the factor recovered a known solution: an
+    /// estimate of the digits that the condition of the system leaves.
+    pub fn trial_error(&self) -> f64 {
+        self.trial_error
+    }
 }
 
 /// Lower triangle of P A Pᵀ in scalar columns.
@@ -59,7 +66,7 @@ fn out_of_memory(what: &'static str, bytes: usize) -> MtmError {
     MtmError::OutOfMemory {
         what,
         needed_mb: bytes >> 20,
-        limit_mb: 0,
+        limit_mb: None,
         advice: "use method=\"pcg\", which keeps no factor",
     }
 }
@@ -107,18 +114,18 @@ impl Symbolic {
     /// The factor of `matrix`, which must have the pattern this structure was made for.
     ///
     /// # Errors
-    /// `NotPositiveDefinite` where a pivot is not positive, or where pivots lost so many digits that a
-    /// known solution is not recovered.
+    /// `NotPositiveDefinite` where a pivot is not positive or a known solution is not recovered.
     pub fn factor(&self, matrix: &BlockMatrix) -> Result<Factor> {
         let scalars = lower_scalars(matrix, &self.order);
         let n = 3 * self.order.len();
         let par = parallelism(n);
         let bytes = self.factor_bytes();
-        let mut values = Vec::new();
-        values
+        // Asked for first, so that too little memory is an error and not an abort; then taken zeroed
+        // from the system, which touches each page once.
+        Vec::<f64>::new()
             .try_reserve_exact(self.structure.len_val())
             .map_err(|_| out_of_memory("the Cholesky factor", bytes))?;
-        values.resize(self.structure.len_val(), 0.0);
+        let mut values = vec![0.0; self.structure.len_val()];
         let need = supernodal::factorize_supernodal_numeric_llt_scratch::<usize, f64>(
             &self.structure,
             par,
@@ -151,13 +158,39 @@ impl Symbolic {
             });
         }
         drop(scalars);
-        let factor = Factor { values };
-        self.try_factor(matrix, &factor)?;
-        Ok(factor)
+        self.tried(matrix, Factor { values, trial_error: 0.0 })
     }
 
-    /// Recovers a known solution if some pivot lost nearly all its digits.
-    fn try_factor(&self, matrix: &BlockMatrix, factor: &Factor) -> Result<()> {
+    /// `factor` after it recovered a known solution.
+    ///
+    /// The residual of a solve does not tell its error; a solution that is known does, at the price of
+    /// one product and one solve per factor.
+    fn tried(&self, matrix: &BlockMatrix, factor: Factor) -> Result<Factor> {
+        let known: Vec<[f64; 3]> = (0..self.order.len())
+            .map(|j| [0, 1, 2].map(|i| 1.0 + 0.5 * ((3 * j + i) as f64 * 0.7).sin()))
+            .collect();
+        let found = self.solve(&factor, &matrix.multiply(&known));
+        let trial_error = known
+            .iter()
+            .zip(&found)
+            .flat_map(|(a, b)| (0..3).map(move |i| (a[i] - b[i]).abs()))
+            .fold(0.0_f64, |m, e| if e.is_nan() { f64::INFINITY } else { m.max(e) });
+        if trial_error <= TRIAL_ERROR {
+            return Ok(Factor { trial_error, ..factor });
+        }
+        let (worst, at) = self.smallest_pivot(matrix, &factor);
+        Err(MtmError::NotPositiveDefinite {
+            node: at,
+            detail: format!(
+                "the smallest pivot keeps {worst:.1e} of its diagonal and a known solution comes back \
+                 with relative error {trial_error:.1e}; a part of the body is almost a mechanism, or \
+                 the material contrast is too large for f64"
+            ),
+        })
+    }
+
+    /// Smallest share of its diagonal entry that a pivot keeps, and its row.
+    fn smallest_pivot(&self, matrix: &BlockMatrix, factor: &Factor) -> (f64, usize) {
         let l = supernodal::SupernodalLltRef::new(&self.structure, &factor.values);
         let (mut worst, mut at) = (f64::INFINITY, 0);
         for s in 0..self.structure.n_supernodes() {
@@ -167,35 +200,12 @@ impl Symbolic {
                 let row = self.order[(first + i) / 3] as usize;
                 let diagonal = matrix.diagonal_block(row)[4 * ((first + i) % 3)];
                 let pivot = val[(i, i)] * val[(i, i)] / diagonal;
-                // A NaN pivot must not pass as large.
                 if pivot.is_nan() || pivot < worst {
                     (worst, at) = (if pivot.is_nan() { 0.0 } else { pivot }, row);
                 }
             }
         }
-        if worst >= SUSPECT_PIVOT {
-            return Ok(());
-        }
-        let known: Vec<[f64; 3]> = (0..self.order.len())
-            .map(|j| [0, 1, 2].map(|i| 1.0 + 0.5 * ((3 * j + i) as f64 * 0.7).sin()))
-            .collect();
-        let found = self.solve(factor, &matrix.multiply(&known));
-        let error = known
-            .iter()
-            .zip(&found)
-            .flat_map(|(a, b)| (0..3).map(move |i| (a[i] - b[i]).abs()))
-            .fold(0.0_f64, |m, e| if e.is_nan() { f64::INFINITY } else { m.max(e) });
-        if error <= TRIAL_ERROR {
-            return Ok(());
-        }
-        Err(MtmError::NotPositiveDefinite {
-            node: at,
-            detail: format!(
-                "the smallest pivot keeps {worst:.1e} of its diagonal and a known solution comes back \
-                 with relative error {error:.1e}; a part of the body is almost a mechanism, or the \
-                 material contrast is too large for f64"
-            ),
-        })
+        (worst, at)
     }
 
     /// A⁻¹ b.
@@ -312,7 +322,8 @@ impl Symbolic {
                 flexibility[(r, c)] = flexibility[(c, r)];
             }
         }
-        TailFactor { lower, flexibility, first }
+        let rows = self.order[self.order.len() - self.n_tail..].to_vec();
+        TailFactor { lower, flexibility, first, rows }
     }
 }
 
@@ -324,9 +335,16 @@ pub struct TailFactor {
     flexibility: Mat<f64>,
     /// First tail unknown in elimination order.
     first: usize,
+    /// Row of the system of each tail node.
+    rows: Vec<u32>,
 }
 
 impl TailFactor {
+    /// Row of the system of tail node `i`.
+    pub fn row(&self, i: usize) -> usize {
+        self.rows[i] as usize
+    }
+
     /// Bytes held.
     pub fn bytes(&self) -> usize {
         16 * self.lower.nrows() * self.lower.nrows()

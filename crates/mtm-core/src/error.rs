@@ -275,15 +275,15 @@ pub enum MtmError {
         /// What to try.
         advice: &'static str,
     },
-    /// The computation would not fit in the memory allowed.
-    #[error("{what} needs about {needed_mb} MB and {limit_mb} MB are allowed: {advice}")]
+    /// The computation does not fit in memory.
+    #[error("{what} needs about {needed_mb} MB, {}: {advice}", .limit_mb.map_or("which the system does not give".into(), |mb| format!("and {mb} MB are allowed")))]
     OutOfMemory {
         /// The step.
         what: &'static str,
         /// Its need, MB.
         needed_mb: usize,
-        /// The limit, MB.
-        limit_mb: usize,
+        /// The limit that the caller set, MB; none where the system refused.
+        limit_mb: Option<usize>,
         /// What to try.
         advice: &'static str,
     },

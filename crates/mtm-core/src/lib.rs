@@ -1,22 +1,92 @@
-//! Mass-tensor mechanics of soft tissue.
+//! Mass-tensor mechanics of soft tissue: materials, tensors, sliding contact, exact re-planning.
+//!
+//! # The way of a scene
+//!
+//! ```text
+//! nodes, tets ─ TetMesh ─┐
+//! constants ─── Tissue ──┴─ MassTensors ─┐
+//! node kinds, contact surfaces ─ Boundary ┴─ StaticSolver ─ solve(plan) ─ Solution
+//!                                                         └ plan_operator ─ PlanOperator(plan)
+//! ```
+//!
+//! One value per stage, each built from the ones before, none changed afterwards.
+//!
+//! # Units and signs
+//!
+//! mm, N, MPa; radians. Unknown 3·node + axis. Internal force = K u: the force that deformation needs at
+//! a node, zero at free nodes in equilibrium, and at joined nodes the force that the bone exerts. Voigt
+//! order xx, yy, zz, yz, xz, xy with engineering shears. Surfaces have outward normals; those of contact
+//! surfaces point out of the bone, into the tissue.
+//!
+//! # Bits
+//!
+//! The same input gives the same bits for any number of threads.
+//!
+//! # Example
+//!
+//! ```
+//! use std::sync::Arc;
+//! use mtm_core::{Boundary, Conflicts, Elastic, Gap, MassTensors, Motion, Segment, StaticOptions,
+//!                StaticSolver, TetMesh, Tissue};
+//!
+//! # fn main() -> mtm_core::Result<()> {
+//! let nodes = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+//! let mesh = Arc::new(TetMesh::new(nodes, vec![[0, 1, 2, 3]])?);
+//! let tissue = Arc::new(Tissue::isotropic(&[Elastic { young: 0.003, poisson: 0.46 }])?);
+//! let tensors = Arc::new(MassTensors::new(mesh, tissue)?);
+//! let bone = Segment {
+//!     name: "maxilla".into(),
+//!     joined: vec![0, 1, 2],
+//!     sliding: vec![],
+//!     contact: None,
+//!     gap: Gap::Uniform(0.0),
+//! };
+//! let boundary = Arc::new(Boundary::new(vec![], vec![bone], Conflicts::Refuse)?);
+//! let solver = StaticSolver::new(tensors, boundary, StaticOptions::default(), &|| false)?;
+//! let plan = vec![("maxilla".to_string(), Motion::Nodes(vec![[0.0, 0.0, 2.0]; 3]))];
+//! let solution = solver.solve(&plan, None, &|| false)?;
+//! assert!((solution.displacements[3][2] - 2.0).abs() < 1e-12);
+//! # Ok(())
+//! # }
+//! ```
+
 pub mod blocks;
 pub mod boundary;
 pub mod cholesky;
+pub mod constraints;
 pub mod contact;
 pub mod error;
+mod error_bound;
 pub mod krylov;
 pub mod material;
 pub mod mesh;
+pub mod method;
 pub mod motion;
 pub mod multigrid;
 pub mod ordering;
 pub mod relaxation;
 pub mod replan;
 pub mod restraint;
+mod row_sums;
 pub mod solution;
 pub mod statics;
 pub mod surface;
+mod system;
 pub mod tensors;
 mod topology;
-mod triangle;
+pub mod triangle;
 pub mod winding;
+
+pub use boundary::{Boundary, Conflicts, Gap, Motion, NodeKind, Plan, Segment};
+pub use contact::{ContactMode, ContactOptions};
+pub use error::{ErrorKind, MtmError, Result};
+pub use material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
+pub use mesh::{MeshQuality, TetMesh};
+pub use method::{Interrupt, Method, StaticOptions};
+pub use motion::{RigidMotion, SurfaceMotion};
+pub use replan::PlanOperator;
+pub use solution::{ContactResult, Solution, Timings};
+pub use statics::StaticSolver;
+pub use surface::{Closest, Surface};
+pub use tensors::MassTensors;
+pub use winding::WindingTree;

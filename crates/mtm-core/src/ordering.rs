@@ -84,7 +84,7 @@ pub fn nested_dissection(graph: &NodeGraph) -> Result<Option<Vec<u32>>> {
         return Err(MtmError::OutOfMemory {
             what: "nested dissection",
             needed_mb: (64 * neighbours.len()) >> 20,
-            limit_mb: 0,
+            limit_mb: None,
             advice: "use method=\"pcg\", which needs no elimination order",
         });
     }

@@ -17,7 +17,7 @@ const LEAST_PROGRESS: f64 = 1e-9;
 /// Parameters of the iteration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RelaxationOptions {
-    /// Largest error of a node at the end, mm.
+    /// Estimate of the largest nodal error at which the sweeps end, mm.
     pub tolerance: f64,
     /// Over-relaxation ω, 0 < ω < 2; 1 is the plain iteration.
     pub factor: f64,
@@ -32,7 +32,8 @@ pub struct RelaxationOutcome {
     pub solution: Vec<[f64; 3]>,
     /// Sweeps done.
     pub sweeps: usize,
-    /// Bound of the error, mm: ρ/(1−ρ) times the last step, with ρ the measured contraction.
+    /// Estimate of the error, mm: ρ/(1−ρ) times the last step, with ρ the measured contraction. Not a
+    /// bound: a slow mode that has hardly moved yet does not show in the steps.
     pub error_bound: f64,
     /// Largest step of each sweep, mm.
     pub steps: Vec<f64>,

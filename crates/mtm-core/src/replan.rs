@@ -4,13 +4,21 @@
 //! finite motion of it: nine for R − I, three for s = t + (R − I) c. With contact normals frozen the
 //! sliding constraints are affine in the same numbers.
 
+use rayon::prelude::*;
+
 use crate::boundary::{Motion, NodeKind, Plan};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::mesh::{dot, sub};
-use crate::statics::{Interrupt, NO_ROW, StaticSolver};
+use crate::method::Interrupt;
+use crate::statics::{NO_ROW, StaticSolver};
+use crate::system::Frozen;
 
 /// Unit fields per segment.
 pub const COLUMNS: usize = 12;
+/// Nodes from which an operator's rows exceed a core's own cache, so that a second core helps.
+const NODES_FOR_THREADS: usize = 8192;
+/// Nodes a thread takes at once.
+const NODES_PER_TASK: usize = 2048;
 
 /// Linear map from rigid plans to the displacements of chosen nodes.
 #[derive(Debug, Clone)]
@@ -19,10 +27,10 @@ pub struct PlanOperator {
     segments: Vec<String>,
     /// Centre c of each segment's motion, mm.
     centres: Vec<[f64; 3]>,
-    /// Row i of segment s: coefficients of the twelve numbers for component i of the nodes.
-    rows: Vec<Vec<[f64; COLUMNS]>>,
+    /// Coefficients of the twelve numbers of each segment: component i of the nodes, then segment.
+    rows: Vec<[f64; COLUMNS]>,
     /// Displacement that does not depend on the plan: rest gaps that contact closes.
-    offset: Vec<f64>,
+    offset: Option<Vec<f64>>,
 }
 
 impl StaticSolver {
@@ -123,12 +131,16 @@ impl StaticSolver {
         }
         let active: Vec<usize> =
             contact.iter().flat_map(|c| (0..c.active.len()).filter(|&i| c.active[i])).collect();
-        let frozen = contact.as_ref().map(|c| (&active[..], &c.normals[..], &offsets[..]));
-        let solved = self.solve_frozen(fields, &scales, frozen, interrupted)?;
+        let frozen = contact.as_ref().map(|c| Frozen {
+            active: &active,
+            normals: &c.normals,
+            offsets: &offsets,
+        });
+        let solved = self.solve_columns(fields, &scales, frozen, interrupted)?;
 
         let kinds = self.boundary.kinds(n)?;
-        let mut rows = vec![vec![[0.0; COLUMNS]; 3 * nodes.len()]; segments.len()];
-        let mut offset = vec![0.0; 3 * nodes.len()];
+        let mut rows = vec![[0.0; COLUMNS]; 3 * nodes.len() * segments.len()];
+        let mut offset = contact.as_ref().map(|_| vec![0.0; 3 * nodes.len()]);
         for (at, &j) in nodes.iter().enumerate() {
             let row = self.row_of[j as usize];
             for s in 0..segments.len() {
@@ -141,11 +153,11 @@ impl StaticSolver {
                         [0.0; 3]
                     };
                     for i in 0..3 {
-                        rows[s][3 * at + i][column] = u[i];
+                        rows[(3 * at + i) * segments.len() + s][column] = u[i];
                     }
                 }
             }
-            if contact.is_some() && row != NO_ROW {
+            if let (Some(offset), true) = (&mut offset, row != NO_ROW) {
                 let u = solved[COLUMNS * segments.len()][row as usize];
                 offset[3 * at..3 * at + 3].copy_from_slice(&u);
             }
@@ -167,10 +179,8 @@ impl PlanOperator {
     }
 
     /// The twelve columns of each segment, (3k, 12·segments) row by row.
-    pub fn matrix(&self) -> Vec<f64> {
-        (0..self.offset.len())
-            .flat_map(|i| self.rows.iter().flat_map(move |rows| rows[i]))
-            .collect()
+    pub fn matrix(&self) -> &[f64] {
+        self.rows.as_flattened()
     }
 
     /// Displacements of the nodes under a rigid plan, mm.
@@ -178,6 +188,22 @@ impl PlanOperator {
     /// # Errors
     /// A plan that does not name every segment once, or moves one otherwise than rigidly.
     pub fn apply(&self, plan: &Plan) -> Result<Vec<[f64; 3]>> {
+        let mut out = vec![[0.0; 3]; self.nodes.len()];
+        self.apply_into(plan, &mut out)?;
+        Ok(out)
+    }
+
+    /// [`apply`](Self::apply) into a buffer of one row per node.
+    pub fn apply_into(&self, plan: &Plan, out: &mut [[f64; 3]]) -> Result<()> {
+        if out.len() != self.nodes.len() {
+            return Err(MtmError::Length {
+                what: "output".into(),
+                found: out.len(),
+                expected: self.nodes.len(),
+                why: "one row per node of the operator",
+                kind: ErrorKind::Boundary,
+            });
+        }
         rigid_plan(plan)?;
         let fail = |segment: &str, problem: &str| {
             Err(MtmError::Plan { segment: segment.to_owned(), problem: problem.to_owned() })
@@ -190,8 +216,8 @@ impl PlanOperator {
                 return fail(name, "it is named twice");
             }
         }
-        let mut out = self.offset.clone();
-        for (s, name) in self.segments.iter().enumerate() {
+        let mut numbers = Vec::with_capacity(self.segments.len());
+        for (name, &centre) in self.segments.iter().zip(&self.centres) {
             let Some(rigid) = find(plan, name) else {
                 return fail(
                     name,
@@ -199,20 +225,45 @@ impl PlanOperator {
                 );
             };
             // (R − I)(x − c) + s with s the displacement of the centre.
-            let mut numbers = [0.0; COLUMNS];
+            let mut own = [0.0; COLUMNS];
             for r in 0..3 {
                 for c in 0..3 {
                     let unit = f64::from(u8::from(r == c));
-                    numbers[3 * r + c] = rigid.matrix()[r][c] - unit;
+                    own[3 * r + c] = rigid.matrix()[r][c] - unit;
                 }
             }
-            numbers[9..].copy_from_slice(&rigid.displacement(self.centres[s]));
-            for (out, row) in out.iter_mut().zip(&self.rows[s]) {
-                *out += row.iter().zip(&numbers).map(|(a, b)| a * b).sum::<f64>();
-            }
+            own[9..].copy_from_slice(&rigid.displacement(centre));
+            numbers.push(own);
         }
-        Ok(out.chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect())
+        let width = self.segments.len().max(1);
+        let fill = |out: &mut [[f64; 3]], rows: &[[f64; COLUMNS]]| {
+            for (out, rows) in out.as_flattened_mut().iter_mut().zip(rows.chunks_exact(width)) {
+                *out = rows.iter().zip(&numbers).map(|(row, own)| dot12(row, own)).sum();
+            }
+        };
+        if out.len() < NODES_FOR_THREADS {
+            fill(out, &self.rows);
+        } else {
+            out.par_chunks_mut(NODES_PER_TASK)
+                .zip(self.rows.par_chunks(3 * width * NODES_PER_TASK))
+                .for_each(|(out, rows)| fill(out, rows));
+        }
+        for (out, offset) in out.as_flattened_mut().iter_mut().zip(self.offset.iter().flatten()) {
+            *out += offset;
+        }
+        Ok(())
     }
+}
+
+/// Scalar product in four interleaved sums, which the compiler keeps in vector registers.
+fn dot12(a: &[f64; COLUMNS], b: &[f64; COLUMNS]) -> f64 {
+    let mut sums = [0.0; 4];
+    for (a, b) in a.as_chunks::<4>().0.iter().zip(b.as_chunks::<4>().0) {
+        for lane in 0..4 {
+            sums[lane] += a[lane] * b[lane];
+        }
+    }
+    (sums[0] + sums[2]) + (sums[1] + sums[3])
 }
 
 /// Displacement of `x` in unit field `column`: entry (r, c) of R − I, or component of the shift.

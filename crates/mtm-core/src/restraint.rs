@@ -10,8 +10,8 @@ use crate::mesh::{TetMesh, cross, dot, norm, scaled, sub};
 
 /// Share of the largest eigenvalue of a part's restraint below which a rigid mode counts as free.
 const FREE_MODE: f64 = 1e-10;
-/// Most parts that hold one another whose joint motion is analysed (six unknowns each).
-const MAX_JOINT_PARTS: usize = 60;
+/// Most parts in one chain of touching parts whose joint motion is analysed (six unknowns each).
+const MAX_JOINT_PARTS: usize = 150;
 
 /// How the body is held.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -140,13 +140,14 @@ fn free_parts(
             break;
         }
     }
-    if open.len() > 1
-        && open.len() <= MAX_JOINT_PARTS
-        && held_jointly(mesh, parts, &open, &grounded, &normal)
-    {
+    let Some(first) = touching(mesh, parts, &open, &grounded).into_iter().find(|chain| {
+        chain.len() == 1
+            || chain.len() > MAX_JOINT_PARTS
+            || !held_jointly(mesh, parts, chain, &grounded, &normal)
+    }) else {
         return Ok(());
-    }
-    let part = &parts[open[0]];
+    };
+    let part = &parts[first[0]];
     let modes = free_modes(&restraint(mesh, part, &grounded, &normal));
     let what = if parts.len() == 1 && part.nodes.len() == mesh.n_nodes() {
         "the body".to_owned()
@@ -201,6 +202,38 @@ fn free_modes(gram: &Matrix6<f64>) -> Vec<Vector6<f64>> {
         .filter(|&i| eigen.eigenvalues[i] <= limit)
         .map(|i| eigen.eigenvectors.column(i).into_owned())
         .collect()
+}
+
+/// The open parts in chains that share nodes, each chain and the parts in it ascending.
+fn touching(mesh: &TetMesh, parts: &[Part], open: &[usize], grounded: &[bool]) -> Vec<Vec<usize>> {
+    let mut chain_of: Vec<usize> = (0..open.len()).collect();
+    let mut owner: Vec<Option<usize>> = vec![None; mesh.n_nodes()];
+    for (at, &p) in open.iter().enumerate() {
+        for &j in parts[p].nodes.iter().filter(|&&j| !grounded[j as usize]) {
+            match owner[j as usize] {
+                None => owner[j as usize] = Some(at),
+                Some(other) => {
+                    let (a, b) = (root(&mut chain_of, at), root(&mut chain_of, other));
+                    chain_of[a.max(b)] = a.min(b);
+                }
+            }
+        }
+    }
+    let mut chains: Vec<Vec<usize>> = vec![Vec::new(); open.len()];
+    for (at, &p) in open.iter().enumerate() {
+        chains[root(&mut chain_of, at)].push(p);
+    }
+    chains.retain(|chain| !chain.is_empty());
+    chains
+}
+
+/// The smallest member of the chain of `i`, halving paths on the way.
+fn root(chain_of: &mut [usize], mut i: usize) -> usize {
+    while chain_of[i] != i {
+        chain_of[i] = chain_of[chain_of[i]];
+        i = chain_of[i];
+    }
+    i
 }
 
 /// Whether parts that share nodes hold one another: six unknowns a part, equal motion at shared nodes.
@@ -268,9 +301,9 @@ fn describe(modes: &[Vector6<f64>], part: &Part) -> String {
             words.push(format!(
                 "rotation about {} through ({:.4}, {:.4}, {:.4})",
                 direction(w),
-                p[0],
-                p[1],
-                p[2]
+                shown(p[0]),
+                shown(p[1]),
+                shown(p[2])
             ));
         }
     }
@@ -285,5 +318,10 @@ fn direction(v: [f64; 3]) -> String {
             return (*name).to_owned();
         }
     }
-    format!("({:.3}, {:.3}, {:.3})", unit[0], unit[1], unit[2])
+    format!("({:.3}, {:.3}, {:.3})", shown(unit[0]), shown(unit[1]), shown(unit[2]))
+}
+
+/// `value` without the sign of a zero that rounding left.
+fn shown(value: f64) -> f64 {
+    if value.abs() < 5e-5 { 0.0 } else { value }
 }

@@ -51,11 +51,12 @@ impl MassTensors {
             });
         }
         let mut matrix = pattern(&mesh);
-        let tasks = row_tasks(&mut matrix);
-        tasks.into_par_iter().for_each(|(first, columns, start, blocks)| {
-            for (offset, window) in start.windows(2).enumerate() {
-                let (lo, hi) = (window[0] - start[0], window[1] - start[0]);
-                assemble_row(&mesh, &tissue, first + offset, &columns[lo..hi], &mut blocks[lo..hi]);
+        matrix.row_tasks().into_par_iter().for_each(|task| {
+            let origin = task.start[0];
+            for (offset, window) in task.start.windows(2).enumerate() {
+                let row = window[0] - origin..window[1] - origin;
+                let (columns, blocks) = (&task.columns[row.clone()], &mut task.blocks[row]);
+                assemble_row(&mesh, &tissue, task.first + offset, columns, blocks);
             }
         });
         Ok(Self { mesh, tissue, matrix })
@@ -210,22 +211,6 @@ fn pattern(mesh: &TetMesh) -> BlockMatrix {
         columns.extend(part);
     }
     BlockMatrix::from_pattern(row_start, columns)
-}
-
-type RowTask<'a> = (usize, &'a [u32], &'a [usize], &'a mut [Block]);
-
-/// Runs of rows with their first row, columns, row starts and blocks, for threads to fill.
-fn row_tasks(matrix: &mut BlockMatrix) -> Vec<RowTask<'_>> {
-    let n = matrix.row_start.len() - 1;
-    let (mut tasks, mut rest) = (Vec::new(), &mut matrix.blocks[..]);
-    for first in (0..n).step_by(NODES_PER_TASK) {
-        let last = n.min(first + NODES_PER_TASK);
-        let start = &matrix.row_start[first..=last];
-        let (blocks, tail) = rest.split_at_mut(start[start.len() - 1] - start[0]);
-        rest = tail;
-        tasks.push((first, &matrix.columns[start[0]..start[start.len() - 1]], start, blocks));
-    }
-    tasks
 }
 
 fn assemble_row(mesh: &TetMesh, tissue: &Tissue, j: usize, columns: &[u32], blocks: &mut [Block]) {

@@ -48,7 +48,12 @@ fn converted<'py>(
     }
     let options = PyDict::new(value.py());
     options.set_item("dtype", dtype)?;
-    numpy.call_method("ascontiguousarray", (array,), Some(&options))
+    let array = numpy.call_method("ascontiguousarray", (array,), Some(&options))?;
+    // A view into packed records is contiguous and yet at an odd address: a copy is not.
+    if array.getattr("flags")?.getattr("aligned")?.extract()? {
+        return Ok(array);
+    }
+    array.call_method0("copy")
 }
 
 fn shape_text(shape: &[usize]) -> String {

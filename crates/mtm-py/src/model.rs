@@ -5,10 +5,11 @@ use std::sync::Arc;
 use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, Plan, Segment};
 use mtm_core::contact::{ContactMode, ContactOptions};
 use mtm_core::error::{ErrorKind, MtmError};
+use mtm_core::method::{Method, StaticOptions};
 use mtm_core::motion::RigidMotion;
 use mtm_core::replan::PlanOperator;
 use mtm_core::solution::{Solution, Timings};
-use mtm_core::statics::{Method, StaticOptions, StaticSolver};
+use mtm_core::statics::StaticSolver;
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyString};
@@ -145,6 +146,22 @@ impl PyBoundary {
         Ok(out)
     }
 
+    /// Prescribed gap of the sliding nodes of each segment, dict of (k,) float64, mm, or "rest".
+    #[getter]
+    fn gap<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let out = PyDict::new(py);
+        for s in self.core.segments().iter().filter(|s| !s.sliding.is_empty()) {
+            match &s.gap {
+                Gap::Uniform(value) => {
+                    out.set_item(&s.name, vec![*value; s.sliding.len()].into_pyarray(py))?;
+                }
+                Gap::PerNode(values) => out.set_item(&s.name, values.clone().into_pyarray(py))?,
+                _ => out.set_item(&s.name, "rest")?,
+            }
+        }
+        Ok(out)
+    }
+
     /// Names of the segments.
     #[getter]
     fn segments(&self) -> Vec<String> {
@@ -275,7 +292,7 @@ pub struct PyStaticSolver {
 impl PyStaticSolver {
     #[new]
     #[pyo3(signature = (
-        tensors, boundary, method = "auto", *, contact = "bilateral", tolerance = 1e-9,
+        tensors, boundary, method = "auto", *, contact = "bilateral", tolerance = 1e-8,
         max_iterations = None, contact_tolerance = 1e-9, contact_iterations = 100, memory_limit = None
     ))]
     fn new(
@@ -430,19 +447,20 @@ impl PyStaticSolver {
 #[pyclass(frozen, module = "cmfsim", name = "Solution")]
 pub struct PySolution {
     core: Solution,
+    n_nodes: usize,
     displacements: Py<PyArray2<f64>>,
     forces: Py<PyArray2<f64>>,
 }
 
 #[pymethods]
 impl PySolution {
-    /// Displacement of every node, (n, 3) float64, mm.
+    /// Displacement of every node, (n, 3) float64, mm, read-only.
     #[getter]
     fn displacements<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
         self.displacements.bind(py).clone()
     }
 
-    /// Internal force K u of every node, (n, 3) float64, N; zero at free nodes without loads.
+    /// Internal force K u of every node, (n, 3) float64, N, read-only; zero at free nodes without loads.
     #[getter]
     fn forces<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
         self.forces.bind(py).clone()
@@ -454,7 +472,10 @@ impl PySolution {
         self.core.residual
     }
 
-    /// Bound of the largest nodal error of an iterative solve, mm; 0 for Cholesky.
+    /// Largest nodal error of the linear solve, mm.
+    ///
+    /// The bound that stopped an iterative method; for Cholesky ten times the error with which the
+    /// factor recovered a known solution. Rounding of the stiffness itself is not in it.
     #[getter]
     fn error_bound(&self) -> f64 {
         self.core.error_bound
@@ -523,7 +544,7 @@ impl PySolution {
     fn __repr__(&self) -> String {
         format!(
             "Solution({} nodes, residual {:.1e}, contact gap {:.1e} mm)",
-            self.core.displacements.len(),
+            self.n_nodes,
             self.core.residual,
             self.core.contact_gap()
         )
@@ -534,10 +555,12 @@ impl PySolution {
     fn wrap(py: Python<'_>, mut core: Solution) -> PyResult<Self> {
         let displacements = std::mem::take(&mut core.displacements);
         let forces = std::mem::take(&mut core.forces);
+        let n_nodes = displacements.len();
         Ok(Self {
             core,
-            displacements: arrays::rows(py, displacements).unbind(),
-            forces: arrays::rows(py, forces).unbind(),
+            n_nodes,
+            displacements: arrays::frozen(arrays::rows(py, displacements))?.unbind(),
+            forces: arrays::frozen(arrays::rows(py, forces))?.unbind(),
         })
     }
 }
@@ -576,7 +599,7 @@ impl PyPlanOperator {
     #[getter]
     fn matrix<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let shape = [3 * self.core.nodes().len(), 12 * self.core.segments().len()];
-        self.core.matrix().into_pyarray(py).reshape(shape)
+        self.core.matrix().to_vec().into_pyarray(py).reshape(shape)
     }
 
     fn __repr__(&self) -> String {

@@ -1,0 +1,114 @@
+//! Options of a solver: which method, how exact, how contact behaves, how much memory.
+
+use crate::contact::ContactOptions;
+use crate::error::{ErrorKind, MtmError, Result};
+
+/// Asked now and then whether to stop.
+pub type Interrupt<'a> = &'a (dyn Fn() -> bool + Sync);
+
+/// How the linear system is solved.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Method {
+    /// By size and memory: Cholesky up to about 300 000 unknowns, else conjugate gradients.
+    Auto,
+    /// Sparse Cholesky factor, kept for new plans.
+    Cholesky,
+    /// Conjugate gradients with multigrid, stopped by an error bound.
+    Pcg,
+    /// The node-wise iteration of the literature.
+    Relaxation,
+}
+
+/// Names of the methods.
+pub const METHODS: &str = "auto, cholesky, pcg, relaxation";
+
+/// Options of a solver.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StaticOptions {
+    /// How the linear system is solved.
+    pub method: Method,
+    /// Error bound of the iterative methods over the largest prescribed displacement.
+    pub tolerance: f64,
+    /// Most iterations of the iterative methods; their own default if `None`.
+    pub max_iterations: Option<usize>,
+    /// The contact loop.
+    pub contact: ContactOptions,
+    /// Memory that a factor may take, bytes; without limit if `None`.
+    pub memory_limit: Option<usize>,
+}
+
+impl Default for StaticOptions {
+    fn default() -> Self {
+        Self {
+            method: Method::Auto,
+            tolerance: 1e-8,
+            max_iterations: None,
+            contact: ContactOptions::default(),
+            memory_limit: None,
+        }
+    }
+}
+
+impl Method {
+    /// The method called `name`.
+    pub fn from_name(name: &str) -> Result<Self> {
+        match name {
+            "auto" => Ok(Self::Auto),
+            "cholesky" => Ok(Self::Cholesky),
+            "pcg" => Ok(Self::Pcg),
+            "relaxation" => Ok(Self::Relaxation),
+            _ => Err(MtmError::UnknownName {
+                what: "method",
+                found: name.to_owned(),
+                known: METHODS,
+                kind: ErrorKind::Solver,
+            }),
+        }
+    }
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Auto => "auto",
+            Self::Cholesky => "cholesky",
+            Self::Pcg => "pcg",
+            Self::Relaxation => "relaxation",
+        }
+    }
+}
+
+impl StaticOptions {
+    pub(crate) fn check(&self) -> Result<()> {
+        let positive = |what: &str, value: f64| {
+            if value.is_finite() && value > 0.0 && value < 1.0 {
+                return Ok(());
+            }
+            Err(MtmError::OutOfRange {
+                what: what.into(),
+                index: 0,
+                value,
+                allowed: "above 0 and below 1 (relative)",
+                kind: ErrorKind::Solver,
+            })
+        };
+        positive("tolerance", self.tolerance)?;
+        positive("contact_tolerance", self.contact.tolerance)?;
+        let counts = [
+            ("max_iterations", self.max_iterations),
+            ("contact_iterations", Some(self.contact.max_iterations)),
+        ];
+        for (what, value) in counts {
+            if value == Some(0) {
+                return Err(MtmError::OutOfRange {
+                    what: what.into(),
+                    index: 0,
+                    value: 0.0,
+                    allowed: "1 or more",
+                    kind: ErrorKind::Solver,
+                });
+            }
+        }
+        Ok(())
+    }
+}

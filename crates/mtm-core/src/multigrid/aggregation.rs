@@ -1,0 +1,120 @@
+//! Aggregates of strongly connected rows: the coarse rows.
+
+use rayon::prelude::*;
+
+use super::block_rows::{row_index, running_sum, split_rows};
+use super::scaled_matrix::ScaledMatrix;
+
+/// No aggregate.
+pub(super) const UNASSIGNED: u32 = u32::MAX;
+
+/// Which aggregate each row belongs to, and the rows of each aggregate.
+#[derive(Debug)]
+pub(super) struct Aggregates {
+    pub(super) of_row: Vec<u32>,
+    pub(super) count: usize,
+    pub(super) member_start: Vec<usize>,
+    pub(super) members: Vec<u32>,
+}
+
+impl Aggregates {
+    /// The aggregates over connections stronger than `strength`: the norm of a scaled block over that
+    /// of a diagonal one.
+    pub(super) fn new<const N: usize>(a: &ScaledMatrix<N>, strength: f64) -> Self {
+        // Scaled diagonal blocks are identities of norm √N.
+        let threshold = (strength * strength * N as f64) as f32;
+        let mut weights = vec![0.0_f32; a.columns.len()];
+        split_rows(&mut weights, &a.row_start, a.rows_per_task).into_par_iter().for_each(|part| {
+            let first = a.row_start[part.rows.start];
+            for i in part.rows.clone() {
+                for k in a.row_start[i]..a.row_start[i + 1] {
+                    if a.columns[k] as usize == i {
+                        continue;
+                    }
+                    let square: f32 = a.blocks[k].iter().flatten().map(|v| v * v).sum();
+                    if square > threshold {
+                        part.data[k - first] = square;
+                    }
+                }
+            }
+        });
+        Self::from_weights(&a.row_start, &a.columns, &weights)
+    }
+
+    /// Greedy, in row order: a row whose strong neighbours are all free founds an aggregate with them;
+    /// rows left over join the neighbour they are most strongly tied to; what is still left founds
+    /// aggregates of its own. Rows without any strong connection stay outside: the smoother suffices.
+    fn from_weights(row_start: &[usize], columns: &[u32], weights: &[f32]) -> Self {
+        let n = row_start.len() - 1;
+        let mut of_row = vec![UNASSIGNED; n];
+        let mut count = 0_u32;
+        let strong = |i: usize| {
+            let range = row_start[i]..row_start[i + 1];
+            columns[range.clone()]
+                .iter()
+                .zip(&weights[range])
+                .filter(|(_, w)| **w > 0.0)
+                .map(|(j, w)| (*j as usize, *w))
+        };
+        for i in 0..n {
+            if of_row[i] != UNASSIGNED || strong(i).any(|(j, _)| of_row[j] != UNASSIGNED) {
+                continue;
+            }
+            let mut founded = false;
+            for (j, _) in strong(i) {
+                of_row[j] = count;
+                founded = true;
+            }
+            if founded {
+                of_row[i] = count;
+                count += 1;
+            }
+        }
+        let founders = of_row.clone();
+        for i in 0..n {
+            if founders[i] != UNASSIGNED {
+                continue;
+            }
+            let mut best = (0.0, UNASSIGNED);
+            for (j, weight) in strong(i) {
+                if founders[j] != UNASSIGNED && weight > best.0 {
+                    best = (weight, founders[j]);
+                }
+            }
+            of_row[i] = best.1;
+        }
+        for i in 0..n {
+            if of_row[i] != UNASSIGNED {
+                continue;
+            }
+            let mut founded = false;
+            for (j, _) in strong(i) {
+                if of_row[j] == UNASSIGNED {
+                    of_row[j] = count;
+                }
+                founded = true;
+            }
+            if founded {
+                of_row[i] = count;
+                count += 1;
+            }
+        }
+        let count = count as usize;
+        let mut sizes = vec![0; count];
+        for &aggregate in &of_row {
+            if aggregate != UNASSIGNED {
+                sizes[aggregate as usize] += 1;
+            }
+        }
+        let member_start = running_sum(&sizes);
+        let mut next = member_start.clone();
+        let mut members = vec![0; member_start[count]];
+        for (i, &aggregate) in of_row.iter().enumerate() {
+            if aggregate != UNASSIGNED {
+                members[next[aggregate as usize]] = row_index(i);
+                next[aggregate as usize] += 1;
+            }
+        }
+        Self { of_row, count, member_start, members }
+    }
+}

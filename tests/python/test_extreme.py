@@ -1,0 +1,165 @@
+"""Stiff and extreme cases: the suite of benches/stability.py, and the references it rests on."""
+
+import itertools
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+import cmfsim
+import extended
+import stability
+
+CASES = stability.cases()
+SOLVED = [
+    pytest.param(
+        case,
+        method,
+        id=f"{case.key} [{method}]",
+        # Strict: mending the fault makes the mark fail, and the entry in stability.py goes.
+        marks=[pytest.mark.xfail(reason=dict(case.faults)[method])]
+        if method in dict(case.faults)
+        else [],
+    )
+    for case in CASES
+    for method in case.methods
+]
+CLOSED = [case for case in CASES if not case.refusal and stability.problem(case).exact is not None]
+
+
+@pytest.mark.parametrize(("case", "method"), SOLVED)
+def test_a_case_is_solved_to_its_condition_or_refused(case, method):
+    """‖u − u_ref‖∞ / ‖u_ref‖∞ ≤ max(1e-9, 10 ε κ) for Cholesky (κ of the equilibrated matrix: van
+    der Sluis 1969; Demmel 1989), ≤ the reported bound + 10 ε κ for the iterative methods; else
+    SolverError, and for mechanisms BoundaryError with the free modes. Never a quiet wrong answer,
+    hang or panic.
+    """
+    row = stability.judge(case, method)
+    assert row.passed, row.verdict
+
+
+@pytest.mark.parametrize("case", CLOSED, ids=lambda c: c.key)
+def test_the_reference_equals_the_closed_form(case):
+    """32-digit refinement (Demmel et al. 2006) against fields that linear tets hold exactly: affine
+    (patch test, Irons 1972), rigid u = (R − I)x + t, series bar σ = E u′, layers σ_n continuous.
+    """
+    exact = stability.problem(case).exact
+    found = stability.reference(case)
+    assert found.uncertainty <= 1e-18
+    # The closed form itself is rounded to float64 on the boundary.
+    assert np.abs(found.displacements - exact).max() <= 1e-13 * np.abs(exact).max()
+
+
+def test_the_reference_of_one_free_node_is_the_rational_solution():
+    """K_ff u_f = −Σ K_fk u_k with K_jk = V [λ g_j⊗g_k + μ g_k⊗g_j + μ (g_j·g_k) I] in exact
+    fractions (Cotin 2000), on a tet with integer nodes, E = 1, ν = 1/4 and three prescribed nodes.
+    """
+    nodes = [[0, 0, 0], [10, 0, 0], [2, 9, 0], [3, 2, 8]]
+    u = [[Fraction(v, 4) for v in row] for row in ([1, 0, 2], [0, -3, 1], [5, 1, -2])]
+    edges = [[Fraction(nodes[k][i] - nodes[0][i]) for i in range(3)] for k in (1, 2, 3)]
+
+    def cross(a, b):
+        return [a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3] for i in range(3)]
+
+    six_v = sum(p * q for p, q in zip(edges[0], cross(edges[1], edges[2]), strict=True))
+    g = [[v / six_v for v in cross(edges[(k + 1) % 3], edges[(k + 2) % 3])] for k in range(3)]
+    g.insert(0, [-sum(row[i] for row in g) for i in range(3)])
+    lame, mu = Fraction(2, 5), Fraction(2, 5)
+
+    def tensor(j, k):
+        inner = sum(p * q for p, q in zip(g[j], g[k], strict=True))
+        return [
+            [
+                lame * g[j][a] * g[k][b] + mu * g[k][a] * g[j][b] + mu * inner * (a == b)
+                for b in range(3)
+            ]
+            for a in range(3)
+        ]
+
+    k_ff = tensor(3, 3)
+    rhs = [-sum(tensor(3, k)[a][b] * u[k][b] for k in range(3) for b in range(3)) for a in range(3)]
+
+    def determinant(m):
+        return sum(p * q for p, q in zip(m[0], cross(m[1], m[2]), strict=True))
+
+    exact = []
+    for a in range(3):
+        swapped = [[rhs[i] if j == a else k_ff[i][j] for j in range(3)] for i in range(3)]
+        exact.append(determinant(swapped) / determinant(k_ff))
+
+    model = extended.ExtendedModel(
+        np.array(nodes, dtype=np.float64),
+        np.array([[0, 1, 2, 3]], dtype=np.uint32),
+        [extended.isotropic(1.0, 0.25)],
+        np.zeros(1, dtype=np.uint32),
+    )
+    motion = np.array([[float(v) for v in row] for row in u] + [[0.0] * 3])
+    mask = np.array([True, True, True, False])
+    found = extended.solve(model, mask, extended.Twofold(motion)).displacements[3]
+    assert found.tolist() == [float(v) for v in exact]
+
+
+def test_twofold_arithmetic_keeps_thirty_digits():
+    """Sum, product and quotient of unevaluated pairs (Dekker 1971) against exact fractions."""
+    rng = np.random.default_rng(0)
+    high = rng.normal(size=(4, 50)) * 10.0 ** rng.integers(-8, 8, (4, 50))
+    a = extended.Twofold(high[0], high[0] * rng.uniform(-1, 1, 50) * 1e-17)
+    b = extended.Twofold(high[1], high[1] * rng.uniform(-1, 1, 50) * 1e-17)
+    results = {"+": a + b, "-": a - b, "*": a * b, "/": a / b}
+    for i in range(50):
+        p = Fraction(a.hi[i]) + Fraction(a.lo[i])
+        q = Fraction(b.hi[i]) + Fraction(b.lo[i])
+        for sign, exact in (("+", p + q), ("-", p - q), ("*", p * q), ("/", p / q)):
+            found = Fraction(results[sign].hi[i]) + Fraction(results[sign].lo[i])
+            assert abs(found - exact) <= Fraction(1, 10**30) * (abs(p) + abs(q) + abs(exact))
+
+
+def test_elasticity_of_equal_moduli_is_isotropic_for_any_fibre():
+    """C_ijkl = λ δδ + μ (δδ + δδ): the turned inverse compliance with E_l = E_t (Saint-Venant)."""
+    young, nu = 0.5, 0.25
+    lame, mu = 0.2, 0.2
+    found = extended.elasticity(extended.Material(young, young, nu, (0.6, 0.0, 0.8)))
+    expected = np.diag([2 * mu] * 3 + [mu] * 3)
+    expected[:3, :3] += lame
+    for p, q in itertools.product(range(6), repeat=2):
+        assert float(found[p][q]) == pytest.approx(expected[p, q], abs=1e-15)
+
+
+@pytest.mark.parametrize("method", stability.ALL)
+@pytest.mark.parametrize("power", [-60, -20, 20, 60])
+def test_units_by_powers_of_two_change_no_bit(method, power):
+    """u(s x; s t) = s u(x; t) and u(s E) = u(E): with s = 2^k every float64 operation scales
+    exactly, so an absolute tolerance anywhere would show.
+    """
+
+    def solved(length, modulus):
+        p = stability.scaled(length, modulus)
+        case = replace(CASES[0], build=lambda: p)
+        return stability.run_cmfsim(case, method).displacements
+
+    s = 2.0**power
+    base = solved(1.0, 1.0)
+    np.testing.assert_array_equal(solved(s, 1.0), s * base)
+    np.testing.assert_array_equal(solved(1.0, s), base)
+
+
+@pytest.mark.parametrize("method", stability.FAST)
+@pytest.mark.parametrize("angle", [30.0, 90.0, 180.0])
+def test_the_plan_operator_is_exact_for_large_turns_at_contrast(method, angle):
+    """u_b = (R − I)x + t is affine in (R, t), so 12 columns a segment hold for any turn; contrast
+    1e4, against 32 digits.
+    """
+    p = replace(stability.checkerboard(1e4), plan={"maxilla": stability.advance(angle, 50.0)})
+    model = extended.ExtendedModel(p.nodes, p.tets, p.materials, p.material_of)
+    exact = extended.solve(model, *p.prescribed())
+    young = np.array([m.along for m in p.materials])[p.material_of]
+    tensors = cmfsim.MassTensors(
+        cmfsim.TetMesh(p.nodes, p.tets), cmfsim.Tissue.isotropic(young, stability.NU)
+    )
+    boundary = cmfsim.Boundary(fixed=p.fixed, joined=p.joined)
+    operator = cmfsim.StaticSolver(tensors, boundary, method=method).plan_operator()
+    error = np.abs(operator(p.plan) - exact.displacements).max()
+    # Columns of an iterative method carry its tolerance, 1e-9 of each affine field of the segment.
+    allowed = 1e-9 if method == "cholesky" else 1e-8
+    assert error <= allowed * np.abs(exact.displacements).max()
