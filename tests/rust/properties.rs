@@ -14,8 +14,8 @@ use meshes::{
 use mtm_core::boundary::{Boundary, Motion};
 use mtm_core::material::{Elastic, FibreElastic, FibreLaw, Spencer, Tissue};
 use mtm_core::mesh::TetMesh;
+use mtm_core::method::Method;
 use mtm_core::motion::RigidMotion;
-use mtm_core::statics::Method;
 use mtm_core::surface::Surface;
 use mtm_core::tensors::MassTensors;
 use nalgebra::Matrix3;
