@@ -310,7 +310,7 @@ impl Bytes<'_> {
 }
 
 fn finite(what: &str, values: &[f64]) {
-    assert!(values.iter().all(|v| v.is_finite()), "{what} holds a value that is not finite");
+    assert!(values.iter().all(|v| v.is_finite()), "{what} is not finite: {values:?}");
 }
 
 /// An error must name itself in words and a family.
