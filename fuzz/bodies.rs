@@ -3,6 +3,8 @@
 //! Bytes become small meshes, tissues, surfaces, boundaries and plans, many of them wrong. Each must be
 //! refused with an error or give finite numbers; nothing may panic or hang.
 
+#![allow(dead_code)] // each target uses one of the bodies
+
 use std::sync::Arc;
 
 use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, Plan, Segment};
