@@ -263,7 +263,7 @@ class SolverOptions:
 
     method: str = "auto"
     contact: str = "bilateral"
-    tolerance: float = 1e-9
+    tolerance: float = 1e-8
     max_iterations: int | None = None
     contact_tolerance: float = 1e-9
     contact_iterations: int = 100

@@ -17,10 +17,6 @@ SOLVED = [
         case,
         method,
         id=f"{case.key} [{method}]",
-        # Strict: mending the fault makes the mark fail, and the entry in stability.py goes.
-        marks=[pytest.mark.xfail(reason=dict(case.faults)[method])]
-        if method in dict(case.faults)
-        else [],
     )
     for case in CASES
     for method in case.methods

@@ -383,6 +383,20 @@ impl Tissue {
         }
     }
 
+    /// Largest λ/μ of any row, 2ν/(1−2ν) where it is isotropic: how nearly incompressible the tissue is.
+    pub fn largest_lame_ratio(&self) -> f64 {
+        let ratio = |t: usize| match self.of_tet(t) {
+            TetMaterial::Isotropic(l) => l.lambda_ / l.mu,
+            TetMaterial::Spencer(c, _) => {
+                c.lambda_ / c.mu_across.min(c.mu_across + c.mu_difference)
+            }
+            TetMaterial::General(c) => {
+                (c[0][1] + c[0][2] + c[1][2]) / (c[3][3] + c[4][4] + c[5][5])
+            }
+        };
+        (0..self.n_rows()).map(ratio).fold(0.0, f64::max)
+    }
+
     /// Constants of tet `t`.
     pub fn of_tet(&self, t: usize) -> TetMaterial<'_> {
         fn row<T>(rows: &[T], t: usize) -> &T {

@@ -82,6 +82,7 @@ impl StaticSolver {
             &positions,
             sliding.as_ref(),
             held,
+            tensors.tissue().largest_lame_ratio(),
             &options,
             &mut clock,
             interrupted,
