@@ -13,8 +13,8 @@ use meshes::{
 use mtm_core::boundary::{Boundary, Gap, Motion, Segment};
 use mtm_core::material::{FibreElastic, FibreLaw, Tissue};
 use mtm_core::mesh::TetMesh;
+use mtm_core::method::{Method, StaticOptions};
 use mtm_core::motion::SurfaceMotion;
-use mtm_core::statics::{Method, StaticOptions};
 use mtm_core::surface::Surface;
 use mtm_core::tensors::MassTensors;
 use mtm_core::winding::{WindingTree, winding_number_exact};

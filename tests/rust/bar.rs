@@ -12,7 +12,7 @@ use meshes::{
 use mtm_core::boundary::Motion;
 use mtm_core::material::{FibreElastic, Tissue};
 use mtm_core::mesh::TetMesh;
-use mtm_core::statics::Method;
+use mtm_core::method::Method;
 use nalgebra::Matrix3;
 
 const MODULI: FibreElastic = FibreElastic { young_along: 0.5, young_across: 0.79, poisson: 0.43 };

@@ -12,8 +12,8 @@ use meshes::{
 use mtm_core::boundary::{Gap, Motion};
 use mtm_core::material::{FibreElastic, Tissue};
 use mtm_core::mesh::TetMesh;
+use mtm_core::method::Method;
 use mtm_core::motion::SurfaceMotion;
-use mtm_core::statics::Method;
 
 /// Weights of a corner and of the others at the four points of the rule that is exact for quadratics
 /// (Keast 1986).

@@ -14,7 +14,7 @@ use mtm_core::material::{
     Elastic, FibreElastic, FibreLaw, Lame, Spencer, TetMaterial, Tissue, Voigt,
 };
 use mtm_core::mesh::TetMesh;
-use mtm_core::statics::Method;
+use mtm_core::method::Method;
 use mtm_core::tensors::{MassTensors, tet_tensor};
 use nalgebra::{DMatrix, Matrix3, Matrix6, SMatrix, SymmetricEigen};
 

@@ -179,7 +179,7 @@ impl StaticSolver {
         }
         let forces = self.tensors.matrix().multiply(&u);
         let residual = self.residual(&forces, loads, contact.as_ref(), &b);
-        if !residual.is_finite() {
+        if !(residual.is_finite() && effort.error_bound.is_finite()) {
             return Err(MtmError::NotPositiveDefinite {
                 node: 0,
                 detail: "the solution is not finite; the plan or the moduli overflow f64".into(),

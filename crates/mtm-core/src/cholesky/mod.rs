@@ -223,6 +223,9 @@ impl Symbolic {
 
     /// A⁻¹ B for several right-hand sides, each given as rows of three, in place.
     pub fn solve_many(&self, factor: &Factor, columns: &mut [Vec<[f64; 3]>]) {
+        if self.order.is_empty() {
+            return;
+        }
         let mut x: Vec<f64> = columns.iter().flat_map(|b| self.permuted(b)).collect();
         let k = columns.len();
         self.forward(factor, &mut x, k);

@@ -1,0 +1,764 @@
+//! Every kind of wrong input, and every numerical failure, gives its own error with index and value.
+#![allow(clippy::unwrap_used, clippy::panic)]
+
+mod meshes;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use meshes::{
+    BoxShape, GO_ON, boundary, isotropic, joined, plan, plane, rigid, sliding, solve, solver,
+    stays, surface, tensors, with_method,
+};
+use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, Segment};
+use mtm_core::contact::ContactOptions;
+use mtm_core::error::{ErrorKind, MtmError, Result};
+use mtm_core::material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
+use mtm_core::mesh::TetMesh;
+use mtm_core::method::{Method, StaticOptions};
+use mtm_core::motion::{RigidMotion, SurfaceMotion};
+use mtm_core::statics::StaticSolver;
+use mtm_core::surface::Surface;
+use mtm_core::tensors::MassTensors;
+use mtm_core::winding::{WindingOptions, WindingTree};
+
+const BAD: [f64; 3] = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY];
+
+/// The error of `outcome`, checked: its family, whether the input is at fault, every `part` in its text.
+fn refused<T>(outcome: Result<T>, kind: ErrorKind, input: bool, parts: &[&str]) -> MtmError {
+    let Err(error) = outcome else { panic!("accepted; expected an error with {parts:?}") };
+    let text = error.to_string();
+    for part in parts {
+        assert!(text.contains(part), "no {part:?} in: {text}");
+    }
+    assert_eq!(error.kind(), kind, "{text}");
+    assert_eq!(error.is_input(), input, "{text}");
+    error
+}
+
+/// The variant of an error and its text.
+macro_rules! assert_refused {
+    ($outcome:expr, $variant:pat, $kind:ident, $($part:expr),* $(,)?) => {
+        let error = refused($outcome, ErrorKind::$kind, true, &[$($part),*]);
+        assert!(matches!(error, $variant), "{error:?}");
+    };
+}
+
+/// A numerical outcome: the input is not at fault.
+macro_rules! assert_failed {
+    ($outcome:expr, $variant:pat, $kind:ident, $($part:expr),* $(,)?) => {
+        let error = refused($outcome, ErrorKind::$kind, false, &[$($part),*]);
+        assert!(matches!(error, $variant), "{error:?}");
+    };
+}
+
+fn tet() -> Vec<[f64; 3]> {
+    vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+}
+
+fn cube() -> (BoxShape, Arc<MassTensors>) {
+    let shape = BoxShape::cube(3);
+    let tensors = tensors(&shape.mesh(), &isotropic(0.01, 0.4));
+    (shape, tensors)
+}
+
+#[test]
+fn empty_arrays_are_named() {
+    use MtmError::Empty;
+    assert_refused!(TetMesh::new(vec![], vec![[0; 4]]), Empty { .. }, Mesh, "nodes is empty");
+    assert_refused!(TetMesh::new(tet(), vec![]), Empty { .. }, Mesh, "tets is empty");
+    assert_refused!(Surface::new(vec![], vec![[0; 3]]), Empty { .. }, Mesh, "surface vertices");
+    assert_refused!(Surface::new(tet(), vec![]), Empty { .. }, Mesh, "surface triangles");
+    assert_refused!(Tissue::isotropic(&[]), Empty { .. }, Material, "tissue constants");
+    assert_refused!(Tissue::from_stiffness(vec![]), Empty { .. }, Material, "tissue constants");
+    let m = FibreElastic { young_along: 1.0, young_across: 1.0, poisson: 0.3 };
+    let law = FibreLaw::Spencer;
+    assert_refused!(
+        Tissue::transversely_isotropic(&[m], &[], law),
+        Empty { .. },
+        Material,
+        "fibre is empty"
+    );
+    let preset = Preset::from_name("kim2010").unwrap();
+    let none = Tissue::mixture(&[], &[[1.0, 0.0, 0.0]], preset, Mixing::Moduli);
+    assert_refused!(none, Empty { .. }, Material, "tissue constants");
+}
+
+#[test]
+fn values_that_are_not_finite_are_named_with_their_row() {
+    use MtmError::{NotFinite, OutOfRange};
+    for bad in BAD {
+        let shown = format!("{bad}");
+        let mut nodes = tet();
+        nodes[2][1] = bad;
+        assert_refused!(
+            TetMesh::new(nodes.clone(), vec![[0, 1, 2, 3]]),
+            NotFinite { .. },
+            Mesh,
+            "nodes[2]",
+            &shown
+        );
+        assert_refused!(
+            Surface::new(nodes, vec![[0, 1, 2]]),
+            NotFinite { .. },
+            Mesh,
+            "surface vertices[2]",
+            &shown
+        );
+        let good = Elastic { young: 1.0, poisson: 0.3 };
+        for (rows, what) in [
+            ([good, Elastic { young: bad, ..good }], "young[1]"),
+            ([good, Elastic { poisson: bad, ..good }], "poisson[1]"),
+        ] {
+            assert_refused!(Tissue::isotropic(&rows), OutOfRange { .. }, Material, what, &shown);
+        }
+        let m = FibreElastic { young_along: 1.0, young_across: 2.0, poisson: 0.3 };
+        let fibres = [[1.0, 0.0, 0.0], [0.0, bad, 0.0]];
+        assert_refused!(
+            Tissue::transversely_isotropic(&[m], &fibres, FibreLaw::Spencer),
+            NotFinite { .. },
+            Material,
+            "fibre[1]",
+            &shown
+        );
+        let mut c = meshes::any_stiffness(1);
+        (c[1][4], c[4][1]) = (bad, bad);
+        let rows = vec![meshes::any_stiffness(2), c];
+        assert_refused!(
+            Tissue::from_stiffness(rows),
+            NotFinite { .. },
+            Material,
+            "stiffness[1]",
+            &shown
+        );
+        let preset = Preset::from_name("kim2010").unwrap();
+        let outcome = Tissue::mixture(&[0.5, bad], &[[1.0, 0.0, 0.0]], preset, Mixing::Stiffness);
+        assert_refused!(outcome, OutOfRange { .. }, Material, "fraction[1]", &shown);
+
+        let (shape, tensors) = cube();
+        let mut u = vec![[0.0; 3]; 64];
+        u[5][2] = bad;
+        assert_refused!(
+            tensors.internal_force(&u),
+            NotFinite { .. },
+            Mesh,
+            "displacements[5]",
+            &shown
+        );
+        let bounds = boundary(shape.side(0, false), vec![joined("jaw", shape.side(0, true))]);
+        let solver = solver(&tensors, &bounds, StaticOptions::default()).unwrap();
+        let still = plan([("jaw", stays())]);
+        assert_refused!(
+            solver.solve(&still, Some(&u), GO_ON),
+            NotFinite { .. },
+            Boundary,
+            "loads[5]",
+            &shown
+        );
+        let mut rows = vec![[0.0; 3]; 16];
+        rows[3][0] = bad;
+        assert_refused!(
+            solver.solve(&plan([("jaw", Motion::Nodes(rows))]), None, GO_ON),
+            NotFinite { .. },
+            Boundary,
+            "plan[\"jaw\"][3]",
+            &shown
+        );
+        let mut matrix = *RigidMotion::identity().matrix();
+        matrix[1][3] = bad;
+        assert_refused!(
+            RigidMotion::new("jaw", &matrix),
+            MtmError::Plan { .. },
+            Boundary,
+            "\"jaw\"",
+            "[1][3]",
+            &shown
+        );
+        let sheet = surface(plane(2, 1.0, 0.0));
+        let mut moved = sheet.vertices().to_vec();
+        moved[4][2] = bad;
+        assert_refused!(
+            SurfaceMotion::new((*sheet).clone(), moved),
+            NotFinite { .. },
+            Boundary,
+            "moved vertices[4]",
+            &shown
+        );
+    }
+}
+
+#[test]
+fn arrays_of_wrong_length_say_both_lengths() {
+    use MtmError::Length;
+    let (shape, tensors) = cube();
+    let u = vec![[0.0; 3]; 63];
+    let text = ["displacements", "63", "64"];
+    assert_refused!(tensors.internal_force(&u), Length { .. }, Mesh, text[0], text[1], text[2]);
+    assert_refused!(tensors.strain(&u), Length { .. }, Mesh, "63", "64");
+    let bounds = boundary(shape.side(0, false), vec![]);
+    let solver = solver(&tensors, &bounds, StaticOptions::default()).unwrap();
+    assert_refused!(
+        solver.solve(&plan([]), Some(&u), GO_ON),
+        Length { .. },
+        Boundary,
+        "loads has 63",
+        "64"
+    );
+    let rows = [Elastic { young: 1.0, poisson: 0.3 }; 5];
+    let tissue = Arc::new(Tissue::isotropic(&rows).unwrap());
+    assert_refused!(
+        MassTensors::new(shape.mesh(), tissue),
+        Length { .. },
+        Material,
+        "tissue has 5",
+        "162"
+    );
+    let m = [FibreElastic { young_along: 1.0, young_across: 2.0, poisson: 0.3 }; 3];
+    assert_refused!(
+        Tissue::transversely_isotropic(&m, &[[1.0, 0.0, 0.0]; 2], FibreLaw::Spencer),
+        Length { .. },
+        Material,
+        "fibre has 2",
+        "3"
+    );
+    let sheet = surface(plane(2, 1.0, 0.0));
+    assert_refused!(
+        SurfaceMotion::new((*sheet).clone(), vec![[0.0; 3]; 8]),
+        Length { .. },
+        Boundary,
+        "moved vertices has 8",
+        "9"
+    );
+}
+
+#[test]
+fn indices_past_the_end_are_named_with_row_and_count() {
+    use MtmError::IndexOutOfRange;
+    let tets = vec![[0, 1, 2, 3], [0, 1, 2, 4]];
+    assert_refused!(
+        TetMesh::new(tet(), tets),
+        IndexOutOfRange { .. },
+        Mesh,
+        "tets[1]",
+        "node 4",
+        "there are 4",
+        "numbered from 1"
+    );
+    // What −1 becomes in an unsigned index.
+    assert_refused!(
+        TetMesh::new(tet(), vec![[0, 1, 2, u32::MAX]]),
+        IndexOutOfRange { .. },
+        Mesh,
+        "4294967295"
+    );
+    assert_refused!(
+        Surface::new(tet(), vec![[0, 1, 2], [0, 1, 4]]),
+        IndexOutOfRange { .. },
+        Mesh,
+        "surface triangles[1]",
+        "vertex 4"
+    );
+    let (shape, tensors) = cube();
+    let sheet = surface(plane(2, 9.0, 0.0));
+    for (fixed, segments, what) in [
+        (vec![0, 64], vec![], "fixed[1]"),
+        (vec![], vec![joined("jaw", vec![0, 1, 99])], "joined[\"jaw\"][2]"),
+        (
+            shape.side(0, false),
+            vec![sliding("jaw", vec![60, 64], &sheet, Gap::Rest)],
+            "sliding[\"jaw\"][1]",
+        ),
+    ] {
+        let bounds = boundary(fixed, segments);
+        assert_refused!(
+            solver(&tensors, &bounds, StaticOptions::default()),
+            IndexOutOfRange { .. },
+            Boundary,
+            what,
+            "there are 64"
+        );
+    }
+    let bounds = boundary(shape.side(0, false), vec![]);
+    let solver = solver(&tensors, &bounds, StaticOptions::default()).unwrap();
+    assert_refused!(
+        solver.plan_operator(Some(vec![3, 64]), None, GO_ON),
+        IndexOutOfRange { .. },
+        Boundary,
+        "nodes[1]",
+        "64"
+    );
+}
+
+#[test]
+fn broken_tets_are_named() {
+    use MtmError::{DegenerateTet, DuplicateNode, DuplicateTet, InvertedTet, UnusedNode};
+    assert_refused!(
+        TetMesh::new(tet(), vec![[0, 1, 2, 3], [0, 3, 2, 3]]),
+        DuplicateNode { tet: 1, node: 3, .. },
+        Mesh,
+        "tet 1 names node 3 twice"
+    );
+    let mut nodes = tet();
+    nodes.push([1.0, 1.0, 1.0]);
+    let good = [0, 1, 2, 3];
+    assert_refused!(
+        TetMesh::new(nodes.clone(), vec![good, [1, 2, 4, 3]]),
+        InvertedTet { tet: 1, count: 1, .. },
+        Mesh,
+        "tet 1 is inverted",
+        "-3.33",
+        "[1, 2, 4, 3]"
+    );
+    nodes[4] = [0.5, 0.5, 1e-14];
+    assert_refused!(
+        TetMesh::new(nodes.clone(), vec![good, [0, 1, 2, 4]]),
+        DegenerateTet { tet: 1, .. },
+        Mesh,
+        "tet 1 is degenerate",
+        "longest edge"
+    );
+    nodes[4] = [-1.0; 3];
+    assert_refused!(
+        TetMesh::new(nodes.clone(), vec![good]),
+        UnusedNode { node: 4, count: 1 },
+        Mesh,
+        "node 4 belongs to no tet"
+    );
+    let twice = vec![good, [0, 2, 1, 4], [1, 2, 0, 3]];
+    assert_refused!(
+        TetMesh::new(nodes, twice),
+        DuplicateTet { first: 0, second: 2, .. },
+        Mesh,
+        "tets 0 and 2",
+        "[0, 1, 2, 3]"
+    );
+    // So large or small that products overflow or vanish: no panic, and no wrong "good".
+    for size in [1e-160, 1e160] {
+        let nodes = tet().iter().map(|x| x.map(|v| size * v)).collect();
+        assert!(TetMesh::new(nodes, vec![good]).is_err(), "{size:e}");
+    }
+}
+
+#[test]
+fn broken_triangles_are_named() {
+    use MtmError::{DegenerateTriangle, OutOfRange};
+    let mut vertices = tet();
+    vertices.push([0.5, 0.5, 0.0]);
+    for triangle in [[1, 1, 2], [1, 4, 2]] {
+        assert_refused!(
+            Surface::new(vertices.clone(), vec![[0, 1, 2], triangle]),
+            DegenerateTriangle { triangle: 1, .. },
+            Mesh,
+            "triangle 1 of surface",
+            "area"
+        );
+    }
+    for angle in [-0.1, 4.0, f64::NAN] {
+        assert_refused!(
+            Surface::with_crease_angle(vertices.clone(), vec![[0, 1, 2]], angle),
+            OutOfRange { .. },
+            Mesh,
+            "crease angle",
+            &format!("{angle}")
+        );
+    }
+    let sheet = Surface::new(vertices, vec![[0, 1, 2]]).unwrap();
+    for beta in [0.5, f64::NAN] {
+        assert_refused!(
+            WindingTree::with_options(&sheet, &WindingOptions { beta }),
+            OutOfRange { .. },
+            Mesh,
+            "beta",
+            &format!("{beta}")
+        );
+    }
+}
+
+#[test]
+fn inadmissible_materials_are_named_with_tet_and_value() {
+    use MtmError::{
+        AsymmetricStiffness, FibreNotUnit, IndefiniteMaterial, OutOfRange, UnknownName,
+    };
+    let good = Elastic { young: 1.0, poisson: 0.3 };
+    for (bad, what, value) in [
+        (Elastic { young: 0.0, ..good }, "young[1]", "0"),
+        (Elastic { young: -2.5, ..good }, "young[1]", "-2.5"),
+        (Elastic { poisson: 0.5, ..good }, "poisson[1]", "0.5"),
+        (Elastic { poisson: -1.0, ..good }, "poisson[1]", "-1"),
+        (Elastic { poisson: 0.7, ..good }, "poisson[1]", "0.7"),
+    ] {
+        assert_refused!(
+            Tissue::isotropic(&[good, bad]),
+            OutOfRange { .. },
+            Material,
+            what,
+            value,
+            "allowed"
+        );
+    }
+    // The paper's Table 1 with Picinbono's law: smallest eigenvalue −0.026 MPa (DESIGN 3.2).
+    let m = FibreElastic { young_along: 0.5, young_across: 0.79, poisson: 0.43 };
+    let error = refused(
+        Tissue::transversely_isotropic(&[m], &[[1.0, 0.0, 0.0]], FibreLaw::Picinbono),
+        ErrorKind::Material,
+        true,
+        &["tet 0", "indefinite", "young_along 0.5", "young_across 0.79", "picinbono"],
+    );
+    let IndefiniteMaterial { eigenvalue, .. } = error else { panic!("{error}") };
+    assert!((eigenvalue + 0.026).abs() < 0.001, "{eigenvalue}");
+    assert!(Tissue::transversely_isotropic(&[m], &[[1.0, 0.0, 0.0]], FibreLaw::Spencer).is_ok());
+
+    let mut c = meshes::any_stiffness(1);
+    c[3][3] = -1.0;
+    assert_refused!(
+        Tissue::from_stiffness(vec![meshes::any_stiffness(2), c]),
+        IndefiniteMaterial { tet: 1, .. },
+        Material,
+        "tet 1",
+        "smallest eigenvalue -"
+    );
+    let mut c = meshes::any_stiffness(1);
+    c[0][4] += 0.1;
+    assert_refused!(
+        Tissue::from_stiffness(vec![c]),
+        AsymmetricStiffness { tet: 0, row: 0, column: 4, .. },
+        Material,
+        "C[0][4]",
+        "C[4][0]"
+    );
+    for fibre in [[0.0; 3], [0.7, 0.7, 0.0], [2.0, 0.0, 0.0]] {
+        assert_refused!(
+            Tissue::transversely_isotropic(&[m], &[fibre], FibreLaw::Spencer),
+            FibreNotUnit { tet: 0, .. },
+            Material,
+            "fibre[0] has length"
+        );
+    }
+    let preset = Preset::from_name("kim2010").unwrap();
+    for p in [-0.1, 1.1] {
+        let outcome = Tissue::mixture(&[0.3, p], &[[1.0, 0.0, 0.0]], preset, Mixing::Moduli);
+        assert_refused!(outcome, OutOfRange { .. }, Material, "fraction[1]", &format!("{p}"));
+    }
+    assert_refused!(FibreLaw::from_name("hooke"), UnknownName { .. }, Material, "hooke", "spencer");
+    assert_refused!(Mixing::from_name("x"), UnknownName { .. }, Material, "\"x\"", "moduli");
+    assert_refused!(Preset::from_name("kim"), UnknownName { .. }, Material, "kim2010-swapped");
+    assert_refused!(Method::from_name("lu"), UnknownName { .. }, Solver, "\"lu\"", "cholesky");
+}
+
+#[test]
+fn node_of_two_kinds_is_named_with_both() {
+    use MtmError::NodeOfTwoKinds;
+    let sheet = surface(plane(2, 9.0, 0.0));
+    let slide = || sliding("lip", vec![7, 9], &sheet, Gap::Rest);
+    let refuse = |fixed, segments| Boundary::new(fixed, segments, Conflicts::Refuse);
+    assert_refused!(
+        refuse(vec![1, 7], vec![joined("jaw", vec![3, 7])]),
+        NodeOfTwoKinds { node: 7, .. },
+        Boundary,
+        "node 7",
+        "fixed",
+        "joined to \"jaw\""
+    );
+    assert_refused!(
+        refuse(vec![9], vec![slide()]),
+        NodeOfTwoKinds { node: 9, .. },
+        Boundary,
+        "fixed",
+        "sliding on \"lip\""
+    );
+    assert_refused!(
+        refuse(vec![], vec![slide(), joined("jaw", vec![9])]),
+        NodeOfTwoKinds { node: 9, .. },
+        Boundary,
+        "joined to \"jaw\"",
+        "sliding on \"lip\""
+    );
+    let both = vec![joined("a", vec![1, 2]), joined("b", vec![2, 3])];
+    assert_refused!(
+        Boundary::new(vec![], both, Conflicts::Resolve),
+        NodeOfTwoKinds { node: 2, .. },
+        Boundary,
+        "\"a\"",
+        "\"b\""
+    );
+    // Resolved: fixed over joined over sliding, counted.
+    let bounds = boundary(vec![1], vec![joined("jaw", vec![1, 7]), slide()]);
+    assert_eq!(bounds.conflicts(), 2);
+    assert_eq!(bounds.segments()[0].joined, [7]);
+    assert_eq!(bounds.segments()[1].sliding, [9]);
+}
+
+#[test]
+fn segments_that_cannot_serve_are_named() {
+    let sheet = surface(plane(2, 9.0, 0.0));
+    let bare = |name: &str| joined(name, vec![]);
+    let without = Segment { sliding: vec![1, 2], ..bare("lip") };
+    let with_gap = |gap| sliding("lip", vec![1, 2], &sheet, gap);
+    for (segments, parts) in [
+        (vec![bare("jaw")], ["\"jaw\"", "neither joined nor sliding"]),
+        (vec![joined("jaw", vec![1]), joined("jaw", vec![2])], ["\"jaw\"", "named twice"]),
+        (vec![without], ["2 sliding nodes", "no contact surface"]),
+        (vec![with_gap(Gap::Uniform(f64::NAN))], ["\"lip\"", "gap of NaN"]),
+        (vec![with_gap(Gap::PerNode(vec![0.1]))], ["1 gaps", "2 sliding"]),
+        (vec![with_gap(Gap::PerNode(vec![0.1, f64::INFINITY]))], ["gap[1]", "inf"]),
+    ] {
+        let outcome = Boundary::new(vec![], segments, Conflicts::Resolve);
+        assert_refused!(outcome, MtmError::Segment { .. }, Boundary, parts[0], parts[1]);
+    }
+}
+
+#[test]
+fn plans_that_do_not_fit_are_named() {
+    let (shape, tensors) = cube();
+    let floor = surface(plane(3, 9.0, 0.0));
+    let bounds = boundary(
+        shape.side(2, true),
+        vec![
+            joined("jaw", shape.nodes_where(|p| p[0] == 0 && p[2] == 1)),
+            sliding("lip", shape.side(2, false), &floor, Gap::Rest),
+        ],
+    );
+    let solver = solver(&tensors, &bounds, StaticOptions::default()).unwrap();
+    let four = || Motion::Nodes(vec![[0.0; 3]; 4]);
+    for (plan, parts) in [
+        (plan([("jaw", stays())]), ["\"lip\"", "missing"]),
+        (meshes::plan([]), ["\"jaw\"", "missing"]),
+        (
+            meshes::plan([("jaw", stays()), ("lip", stays()), ("chin", stays())]),
+            ["\"chin\"", "no such segment"],
+        ),
+        (
+            meshes::plan([("jaw", stays()), ("lip", stays()), ("jaw", stays())]),
+            ["\"jaw\"", "named twice"],
+        ),
+        (
+            meshes::plan([("jaw", Motion::Nodes(vec![[0.0; 3]; 3])), ("lip", stays())]),
+            ["3 displacements", "4 joined"],
+        ),
+        (
+            meshes::plan([("jaw", four()), ("lip", Motion::Nodes(vec![]))]),
+            ["\"lip\"", "contact surface moves"],
+        ),
+    ] {
+        assert_refused!(
+            solver.solve(&plan, None, GO_ON),
+            MtmError::Plan { .. },
+            Boundary,
+            parts[0],
+            parts[1]
+        );
+    }
+    let operator = solver.plan_operator(None, None, GO_ON).unwrap();
+    for (plan, part) in [
+        (plan([("jaw", stays())]), "missing"),
+        (meshes::plan([("jaw", four()), ("lip", stays())]), "rigid 4×4"),
+        (meshes::plan([("jaw", stays()), ("lip", stays()), ("x", stays())]), "no such segment"),
+    ] {
+        assert_refused!(operator.apply(&plan), MtmError::Plan { .. }, Boundary, part);
+    }
+    // The same node twice in the list of joined nodes, moved two ways.
+    let twice = boundary(shape.side(2, true), vec![joined("jaw", vec![0, 1, 0])]);
+    let rows = vec![[0.1, 0.0, 0.0], [0.0; 3], [0.2, 0.0, 0.0]];
+    let motion = meshes::plan([("jaw", Motion::Nodes(rows))]);
+    assert_refused!(
+        solve(&tensors, &twice, StaticOptions::default(), &motion, None),
+        MtmError::Plan { .. },
+        Boundary,
+        "row 2 moves node 0"
+    );
+}
+
+#[test]
+fn matrices_that_are_not_rigid_are_refused_with_the_reason() {
+    let turn = rigid([0.0, 0.0, 1.0], 30.0, [0.0; 3], [1.0, 2.0, 3.0]);
+    let changed = |change: &dyn Fn(&mut [[f64; 4]; 4])| {
+        let mut matrix = *turn.matrix();
+        change(&mut matrix);
+        matrix
+    };
+    for (matrix, parts) in [
+        (changed(&|m| m[0][0] *= 1.01), ["not rigid", "R^T R"]),
+        (changed(&|m| m[0][1] += 1e-3), ["not rigid", "allowed"]),
+        (changed(&|m| m[2] = m[2].map(|v| -v)), ["reflection", "determinant -1"]),
+        (changed(&|m| m[3][0] = 1.0), ["bottom row", "transpose"]),
+        (changed(&|m| m[3][3] = 0.0), ["bottom row", "0 0 0 1"]),
+        ([[0.0, 0.0, 0.0, 0.0], [0.0; 4], [0.0; 4], [0.0, 0.0, 0.0, 1.0]], ["not rigid", "1.0"]),
+        (changed(&|m| m[0][0] = 1e200), ["not rigid", "4x4"]),
+    ] {
+        let outcome = RigidMotion::new("jaw", &matrix);
+        assert_refused!(outcome, MtmError::Plan { .. }, Boundary, "\"jaw\"", parts[0], parts[1]);
+    }
+    // Seven written digits are enough.
+    assert!(RigidMotion::new("jaw", &changed(&|m| m[0][0] += 1e-7)).is_ok());
+}
+
+#[test]
+fn bodies_that_are_not_held_say_which_modes_are_free() {
+    use MtmError::Unconstrained;
+    let (shape, tensors) = cube();
+    let floor = surface(plane(3, 9.0, 0.0));
+    let options = StaticOptions::default();
+    for (fixed, segments, part) in [
+        (vec![], vec![], "all six rigid modes"),
+        (vec![0], vec![], "rotation about"),
+        // Lattice neighbours along z: a hinge.
+        (vec![0, 1], vec![], "rotation about z through (0.0000, 0.0000"),
+        (
+            vec![],
+            vec![sliding("lip", shape.side(2, false), &floor, Gap::Rest)],
+            "translation along",
+        ),
+    ] {
+        let bounds = boundary(fixed, segments);
+        assert_refused!(
+            solver(&tensors, &bounds, options),
+            Unconstrained { .. },
+            Boundary,
+            "the body",
+            part,
+            "64 nodes"
+        );
+    }
+    // A second body beside the first, held by nothing.
+    let (mut nodes, mut tets) = shape.tets();
+    nodes.extend(tet().iter().map(|x| [x[0] + 50.0, x[1], x[2]]));
+    tets.push([64, 65, 66, 67]);
+    let mesh = meshes::checked((nodes, tets));
+    let tensors = meshes::tensors(&mesh, &isotropic(0.01, 0.4));
+    assert_refused!(
+        solver(&tensors, &boundary(shape.side(0, false), vec![]), options),
+        Unconstrained { .. },
+        Boundary,
+        "a part of the body",
+        "4 nodes",
+        "node 64"
+    );
+}
+
+#[test]
+fn options_out_of_range_are_named() {
+    use MtmError::OutOfRange;
+    let (shape, tensors) = cube();
+    let bounds = boundary(shape.side(0, false), vec![]);
+    let default = StaticOptions::default();
+    let contact = |contact| StaticOptions { contact, ..default };
+    let usual = ContactOptions::default();
+    for (options, what) in [
+        (StaticOptions { tolerance: 0.0, ..default }, "tolerance"),
+        (StaticOptions { tolerance: f64::NAN, ..default }, "tolerance"),
+        (StaticOptions { tolerance: 1.0, ..default }, "tolerance"),
+        (StaticOptions { max_iterations: Some(0), ..default }, "max_iterations"),
+        (contact(ContactOptions { tolerance: -1.0, ..usual }), "contact_tolerance"),
+        (contact(ContactOptions { max_iterations: 0, ..usual }), "contact_iterations"),
+        (contact(ContactOptions { border_reach: f64::NAN, ..usual }), "border_reach"),
+        (contact(ContactOptions { border_reach: -1.0, ..usual }), "border_reach"),
+    ] {
+        assert_refused!(solver(&tensors, &bounds, options), OutOfRange { .. }, Solver, what);
+    }
+}
+
+/// Numerical outcomes: the input is well formed, the answer cannot be had.
+#[test]
+fn numerical_failures_are_told_from_mistakes() {
+    let (shape, tensors) = cube();
+    let bounds = boundary(shape.side(0, false), vec![joined("jaw", shape.side(0, true))]);
+    let motion = plan([("jaw", Motion::Rigid(rigid([1.0, 0.0, 0.0], 9.0, [0.0; 3], [1.0; 3])))]);
+    for (method, name) in [(Method::Pcg, "pcg"), (Method::Relaxation, "relaxation")] {
+        let options = StaticOptions { max_iterations: Some(3), ..with_method(method) };
+        assert_failed!(
+            solve(&tensors, &bounds, options, &motion, None),
+            MtmError::NotConverged { .. },
+            Solver,
+            name,
+            "3 iterations",
+            "mm was asked for"
+        );
+    }
+    let options = StaticOptions { memory_limit: Some(1000), ..with_method(Method::Cholesky) };
+    assert_failed!(
+        solver(&tensors, &bounds, options),
+        MtmError::OutOfMemory { .. },
+        Solver,
+        "Cholesky factor",
+        "pcg"
+    );
+    // `auto` takes conjugate gradients instead.
+    let options = StaticOptions { memory_limit: Some(1000), ..with_method(Method::Auto) };
+    assert_eq!(solver(&tensors, &bounds, options).unwrap().method(), Method::Pcg);
+
+    // Stiff tets afloat in soft ones, 1e12 times softer: what holds them is lost in rounding.
+    let shape = BoxShape::cube(6);
+    let mesh = shape.mesh();
+    let rows: Vec<Elastic> = mesh
+        .tets()
+        .iter()
+        .map(|tet| {
+            let afloat = tet
+                .iter()
+                .all(|&v| mesh.nodes()[v as usize].iter().all(|x| (1.5..4.5).contains(x)));
+            Elastic { young: if afloat { 3e9 } else { 0.003 }, poisson: 0.45 }
+        })
+        .collect();
+    let tensors = meshes::tensors(&mesh, &Arc::new(Tissue::isotropic(&rows).unwrap()));
+    let bounds = boundary(shape.side(0, false), vec![]);
+    assert_failed!(
+        solver(&tensors, &bounds, with_method(Method::Cholesky)),
+        MtmError::NotPositiveDefinite { .. },
+        Solver,
+        "not positive definite to working precision at node"
+    );
+}
+
+/// An overflow on the way is an error: no NaN or infinity is handed out.
+#[test]
+fn overflow_is_an_error() {
+    let (shape, tensors) = cube();
+    let bounds = boundary(shape.side(0, false), vec![]);
+    for load in [1e160, 1e300, f64::MAX] {
+        let loads = vec![[load, 0.0, 0.0]; 64];
+        for method in [Method::Cholesky, Method::Pcg, Method::Relaxation] {
+            match solve(&tensors, &bounds, with_method(method), &plan([]), Some(&loads)) {
+                Err(error) => assert_eq!(error.kind(), ErrorKind::Solver, "{error}"),
+                Ok(found) => {
+                    let numbers = found.displacements.iter().chain(&found.forces).flatten();
+                    assert!(
+                        numbers.chain([&found.residual, &found.error_bound]).all(|v| v.is_finite())
+                    );
+                }
+            }
+        }
+    }
+}
+
+/// Whoever asks for a stop gets one, at set-up and at any time of a solve.
+#[test]
+fn caller_can_stop_every_method() {
+    let shape = BoxShape::cube(5);
+    let mesh = shape.mesh();
+    let tensors = tensors(&mesh, &isotropic(0.01, 0.4));
+    let floor = surface(plane(4, 20.0, 0.2));
+    let segments = vec![
+        joined("lid", shape.side(2, true)),
+        sliding("floor", shape.side(2, false), &floor, Gap::Rest),
+    ];
+    let bounds = boundary(vec![], segments);
+    let tilt = rigid([1.0, 0.0, 0.0], 4.0, [2.0; 3], [0.0; 3]);
+    let motion = plan([("lid", stays()), ("floor", Motion::Rigid(tilt))]);
+    for method in [Method::Cholesky, Method::Pcg, Method::Relaxation] {
+        let options = with_method(method);
+        let outcome = StaticSolver::new(tensors.clone(), bounds.clone(), options, &|| true);
+        assert_failed!(outcome, MtmError::Interrupted, Interrupted, "interrupted");
+        let solver = solver(&tensors, &bounds, options).unwrap();
+        for after in [0, 1, 2] {
+            let calls = AtomicUsize::new(0);
+            let stop = || calls.fetch_add(1, Ordering::Relaxed) >= after;
+            let outcome = solver.solve(&motion, None, &stop);
+            if outcome.is_ok() {
+                assert!(after > 0, "{method:?} never asked");
+                continue;
+            }
+            assert_failed!(outcome, MtmError::Interrupted, Interrupted, "interrupted");
+        }
+        assert!(solver.solve(&motion, None, GO_ON).is_ok(), "{method:?}: solvable after a stop");
+    }
+}
