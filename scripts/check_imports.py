@@ -17,6 +17,7 @@ CORE: Mapping[str, frozenset[str]] = {
     for name, allowed in {
         "error": "",
         "mesh": "",
+        "memory": "",
         "blocks": "",
         "ordering": "blocks",
         "triangle": "",
@@ -34,9 +35,13 @@ CORE: Mapping[str, frozenset[str]] = {
         "restraint": "mesh",
         "contact": "boundary mesh motion surface",
         "constraints": "blocks mesh",
-        "cholesky": "blocks ordering cholesky/dense cholesky/structure",
-        "cholesky/dense": "cholesky",
-        "cholesky/structure": "blocks cholesky ordering",
+        "cholesky/workspace": "",
+        "cholesky/structure": "blocks ordering cholesky/workspace",
+        "cholesky/numeric": "blocks cholesky/structure",
+        "cholesky/dense": "cholesky/workspace",
+        "cholesky": (
+            "blocks ordering cholesky/dense cholesky/numeric cholesky/structure cholesky/workspace"
+        ),
         "row_sums": "blocks",
         "error_bound": "",
         "krylov": "blocks error_bound row_sums",
@@ -80,6 +85,7 @@ CRATES: Mapping[str, str] = {
     "parry3d_f64": "mtm-core/src/surface.rs",
     "faer": "mtm-core/src/cholesky/",
     "metis_sys": "mtm-core/src/ordering.rs",
+    "libc": "mtm-core/src/memory.rs",
     "pyo3": "mtm-py/",
     "numpy": "mtm-py/",
 }

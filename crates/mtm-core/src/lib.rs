@@ -59,6 +59,7 @@ pub mod error;
 mod error_bound;
 pub mod krylov;
 pub mod material;
+pub mod memory;
 pub mod mesh;
 pub mod method;
 pub mod motion;

@@ -7,6 +7,9 @@ mod materials;
 mod model;
 mod running;
 
+#[global_allocator]
+static MEMORY: mtm_core::memory::HugePages = mtm_core::memory::HugePages;
+
 /// The compiled core of cmfsim.
 #[pyo3::pymodule]
 mod _core {

@@ -10,7 +10,7 @@ use faer::linalg::triangular_solve::{
 use faer::{Accum, Mat, MatMut, MatRef, Par};
 use rayon::prelude::*;
 
-use super::parallelism;
+use super::workspace::parallelism;
 
 /// The end of the factor and its inverse, for contact: everything that sliding nodes do to one another.
 pub struct TailFactor {

@@ -2,16 +2,17 @@
 //! The only folder that names faer.
 
 mod dense;
+mod numeric;
 mod structure;
+mod workspace;
 
-use faer::dyn_stack::{MemBuffer, MemStack, StackReq};
-use faer::linalg::cholesky::llt;
+use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::sparse::linalg::cholesky::supernodal;
-use faer::sparse::{SparseColMatRef, SymbolicSparseColMatRef};
 use faer::{Conj, Mat, MatMut, Par};
 
 pub use dense::{DenseSymmetric, TailFactor};
-use structure::{lower_scalars, minimum_degree, supernodal_structure};
+use structure::{minimum_degree, supernodal_structure};
+use workspace::{out_of_memory, parallelism};
 
 use crate::blocks::BlockMatrix;
 use crate::error::{MtmError, Result};
@@ -19,11 +20,6 @@ use crate::ordering::{NodeGraph, elimination_tree, nested_dissection, postorder}
 
 /// Relative error of a known solution above which the system counts as singular to working precision.
 const TRIAL_ERROR: f64 = 1e-5;
-/// Unknowns from which the numeric factorisation uses threads.
-const PARALLEL_FACTOR_UNKNOWNS: usize = 300_000;
-/// Below this many unknowns threads cost more than they bring in dense work and in several columns at once.
-const PARALLEL_UNKNOWNS: usize = 3000;
-
 /// Which rows are eliminated last, so that their Schur complement is the end of the factor.
 pub type Tail<'a> = &'a [u32];
 
@@ -34,6 +30,7 @@ pub struct Symbolic {
     /// Number of rows kept last.
     n_tail: usize,
     structure: supernodal::SymbolicSupernodalCholesky<usize>,
+    tree: numeric::Tree,
 }
 
 /// L of P A Pᵀ = L Lᵀ.
@@ -48,31 +45,6 @@ impl Factor {
     /// estimate of the digits that the condition of the system leaves.
     pub fn trial_error(&self) -> f64 {
         self.trial_error
-    }
-}
-
-/// Parallelism of the numeric factorisation. Only the few largest supernodes gain from threads, and all
-/// others pay for them: two threads took as long as one at 150 000 unknowns on an idle machine, and twice
-/// as long on a busy one.
-fn factor_parallelism(unknowns: usize) -> Par {
-    if unknowns < PARALLEL_FACTOR_UNKNOWNS { Par::Seq } else { Par::rayon(0) }
-}
-
-fn parallelism(unknowns: usize) -> Par {
-    if unknowns < PARALLEL_UNKNOWNS { Par::Seq } else { Par::rayon(0) }
-}
-
-fn buffer(need: StackReq) -> Result<MemBuffer> {
-    MemBuffer::try_new(need)
-        .map_err(|_| out_of_memory("workspace of the factorisation", need.size_bytes()))
-}
-
-fn out_of_memory(what: &'static str, bytes: usize) -> MtmError {
-    MtmError::OutOfMemory {
-        what,
-        needed_mb: bytes >> 20,
-        limit_mb: None,
-        advice: "use method=\"pcg\", which keeps no factor",
     }
 }
 
@@ -108,7 +80,8 @@ impl Symbolic {
         order[..n_inner].copy_from_slice(&inner);
 
         let structure = supernodal_structure(matrix, &order)?;
-        Ok(Self { order, n_tail: tail.len(), structure })
+        let tree = numeric::Tree::new(&structure, 3 * n_inner);
+        Ok(Self { order, n_tail: tail.len(), structure, tree })
     }
 
     /// Bytes that a factor takes.
@@ -121,9 +94,6 @@ impl Symbolic {
     /// # Errors
     /// `NotPositiveDefinite` where a pivot is not positive or a known solution is not recovered.
     pub fn factor(&self, matrix: &BlockMatrix) -> Result<Factor> {
-        let scalars = lower_scalars(matrix, &self.order);
-        let n = 3 * self.order.len();
-        let par = factor_parallelism(n);
         let bytes = self.factor_bytes();
         // Asked for first, so that too little memory is an error and not an abort; then taken zeroed
         // from the system, which touches each page once.
@@ -131,38 +101,15 @@ impl Symbolic {
             .try_reserve_exact(self.structure.len_val())
             .map_err(|_| out_of_memory("the Cholesky factor", bytes))?;
         let mut values = vec![0.0; self.structure.len_val()];
-        let need = supernodal::factorize_supernodal_numeric_llt_scratch::<usize, f64>(
-            &self.structure,
-            par,
-            Default::default(),
-        );
-        let mut memory = buffer(need)?;
-        let pattern = SymbolicSparseColMatRef::new_unsorted_checked(
-            n,
-            n,
-            &scalars.start,
-            None,
-            &scalars.rows,
-        );
-        let outcome = supernodal::factorize_supernodal_numeric_llt(
-            &mut values,
-            SparseColMatRef::new(pattern, &scalars.values),
-            Default::default(),
-            &self.structure,
-            par,
-            MemStack::new(&mut memory),
-            Default::default(),
-        );
-        if let Err(llt::factor::LltError::NonPositivePivot { index }) = outcome {
-            return Err(MtmError::NotPositiveDefinite {
-                node: self.order[index.min(n - 1) / 3] as usize,
+        numeric::factor(&self.structure, &self.tree, matrix, &self.order, &mut values).map_err(
+            |index| MtmError::NotPositiveDefinite {
+                node: self.order[index / 3] as usize,
                 detail:
                     "a pivot of the factorisation is not positive; a part of the body may be a \
                          mechanism, or the material contrast too large for f64"
                         .into(),
-            });
-        }
-        drop(scalars);
+            },
+        )?;
         self.tried(matrix, Factor { values, trial_error: 0.0 })
     }
 

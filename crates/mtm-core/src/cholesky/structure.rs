@@ -1,13 +1,11 @@
-//! Elimination order without METIS, the supernodes of the factor, and the permuted matrix in scalars.
+//! Elimination order without METIS, and the supernodes of the factor.
 
 use faer::dyn_stack::{MemStack, StackReq};
 use faer::sparse::SymbolicSparseColMatRef;
 use faer::sparse::linalg::cholesky::{simplicial, supernodal};
 use faer::sparse::linalg::{SymbolicSupernodalParams, amd};
-use rayon::prelude::*;
 
-use super::buffer;
-use super::out_of_memory;
+use super::workspace::{buffer, out_of_memory};
 use crate::blocks::BlockMatrix;
 use crate::error::Result;
 use crate::ordering::NodeGraph;
@@ -60,7 +58,8 @@ pub fn supernodal_structure(
     .map_err(|_| out_of_memory("the structure of the factor", 8 * rows.len()))
 }
 
-fn positions(order: &[u32]) -> Vec<u32> {
+/// Position of each row in the order.
+pub fn positions(order: &[u32]) -> Vec<u32> {
     let mut position = vec![0_u32; order.len()];
     for (p, &j) in order.iter().enumerate() {
         position[j as usize] = p as u32;
@@ -85,64 +84,4 @@ fn upper_pattern(matrix: &BlockMatrix, order: &[u32]) -> (Vec<usize>, Vec<usize>
         }
     }
     (start, rows)
-}
-
-/// Lower triangle of P A Pᵀ in scalar columns.
-pub struct Scalars {
-    /// First entry of each column; one more than columns.
-    pub start: Vec<usize>,
-    /// Row of each entry.
-    pub rows: Vec<usize>,
-    /// Value of each entry.
-    pub values: Vec<f64>,
-}
-
-/// Lower triangle of the permuted matrix in scalar columns, filled in parallel.
-pub fn lower_scalars(matrix: &BlockMatrix, order: &[u32]) -> Scalars {
-    let (n, position) = (order.len(), positions(order));
-    let mut start = Vec::with_capacity(3 * n + 1);
-    start.push(0_usize);
-    for (p, &j) in order.iter().enumerate() {
-        let below =
-            matrix.row(j as usize).0.iter().filter(|&&k| position[k as usize] as usize > p).count();
-        for axis in 0..3 {
-            start.push(start[start.len() - 1] + 3 * below + 3 - axis);
-        }
-    }
-    let total = start[3 * n];
-    let (mut rows, mut values) = (vec![0_usize; total], vec![0.0; total]);
-    const NODES_PER_TASK: usize = 512;
-    let (mut tasks, mut rest_rows, mut rest_values) = (Vec::new(), &mut rows[..], &mut values[..]);
-    for first in (0..n).step_by(NODES_PER_TASK) {
-        let last = n.min(first + NODES_PER_TASK);
-        let length = start[3 * last] - start[3 * first];
-        let (r, tail_r) = rest_rows.split_at_mut(length);
-        let (v, tail_v) = rest_values.split_at_mut(length);
-        (rest_rows, rest_values) = (tail_r, tail_v);
-        tasks.push((first, last, r, v));
-    }
-    tasks.into_par_iter().for_each(|(first, last, rows, values)| {
-        let mut at = 0;
-        for p in first..last {
-            let (columns, blocks) = matrix.row(order[p] as usize);
-            let diagonal = matrix.diagonal_block(order[p] as usize);
-            for axis in 0..3 {
-                for a in axis..3 {
-                    (rows[at], values[at]) = (3 * p + a, diagonal[3 * a + axis]);
-                    at += 1;
-                }
-                for (&k, block) in columns.iter().zip(blocks) {
-                    let q = position[k as usize] as usize;
-                    if q > p {
-                        // Entry (q, p) of the matrix is the transpose of the stored block (p, q).
-                        for a in 0..3 {
-                            (rows[at], values[at]) = (3 * q + a, block[3 * axis + a]);
-                            at += 1;
-                        }
-                    }
-                }
-            }
-        }
-    });
-    Scalars { start, rows, values }
 }

@@ -1,0 +1,30 @@
+//! Workspace and threads that the factorisations ask for.
+
+use faer::Par;
+use faer::dyn_stack::{MemBuffer, StackReq};
+
+use crate::error::{MtmError, Result};
+
+/// Below this many unknowns threads cost more than they bring in dense work and in several columns at once.
+const PARALLEL_UNKNOWNS: usize = 3000;
+
+/// Threads for dense work and for several columns at once, where they pay.
+pub fn parallelism(unknowns: usize) -> Par {
+    if unknowns < PARALLEL_UNKNOWNS { Par::Seq } else { Par::rayon(0) }
+}
+
+/// Workspace of the given need.
+pub fn buffer(need: StackReq) -> Result<MemBuffer> {
+    MemBuffer::try_new(need)
+        .map_err(|_| out_of_memory("workspace of the factorisation", need.size_bytes()))
+}
+
+/// That the system does not give `bytes` for `what`.
+pub fn out_of_memory(what: &'static str, bytes: usize) -> MtmError {
+    MtmError::OutOfMemory {
+        what,
+        needed_mb: bytes >> 20,
+        limit_mb: None,
+        advice: "use method=\"pcg\", which keeps no factor",
+    }
+}
