@@ -12,7 +12,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 const HUGE_PAGE: usize = 2 << 20;
 /// Buffers from this size on get pages of their own, bytes.
 #[cfg(target_os = "linux")]
-const LARGE: usize = 4 << 20;
+const LARGE: usize = HUGE_PAGE;
 
 /// The system's allocator, with huge pages behind large buffers on Linux.
 ///

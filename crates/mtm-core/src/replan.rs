@@ -15,10 +15,10 @@ use crate::system::Frozen;
 
 /// Unit fields per segment.
 pub const COLUMNS: usize = 12;
-/// Nodes from which an operator's rows exceed a core's own cache, so that a second core helps.
-const NODES_FOR_THREADS: usize = 8192;
+/// Nodes from which a second core brings more than its wake-up costs.
+const NODES_FOR_THREADS: usize = 32_768;
 /// Nodes a thread takes at once.
-const NODES_PER_TASK: usize = 2048;
+const NODES_PER_TASK: usize = 8192;
 
 /// Linear map from rigid plans to the displacements of chosen nodes.
 #[derive(Debug, Clone)]
