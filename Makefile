@@ -22,7 +22,7 @@ PYTHON_DIRS := python tests/python scripts examples benches
 CORE_FEATURES := --features mtm-core/metis
 
 .DEFAULT_GOAL := help
-.PHONY: help build test test-rust test-python lint format bench demo clean
+.PHONY: help build test test-rust test-python lint format bench peers demo clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sort | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 16
@@ -63,6 +63,9 @@ format: $(BUILD_STAMP) ## rewrite the sources in the project's format
 
 bench: $(BUILD_STAMP) ## run the benches (minutes; close other programs first)
 	cargo bench --workspace $(CARGO_FLAGS) $(CORE_FEATURES)
+
+peers: $(BUILD_STAMP) ## compare with the peers that are installed (benches/peers/README.md)
+	"$(PY)" benches/peers/run.py --markdown peers.md --out peers.json
 
 demo: $(BUILD_STAMP) ## solve the first example
 	"$(PY)" examples/first_solve.py

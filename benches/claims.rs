@@ -6,6 +6,9 @@
 //! `MTM_BENCH_REPEATS` (3) is how often whole runs repeat. Times are the median, with the smallest and
 //! largest.
 
+#[global_allocator]
+static MEMORY: mtm_core::memory::HugePages = mtm_core::memory::HugePages;
+
 #[path = "scene.rs"]
 mod scene;
 #[path = "shell.rs"]

@@ -4,6 +4,9 @@
 
 #![allow(missing_docs)] // criterion's macros make public items without any
 
+#[global_allocator]
+static MEMORY: mtm_core::memory::HugePages = mtm_core::memory::HugePages;
+
 #[path = "scene.rs"]
 mod scene;
 #[path = "shell.rs"]
