@@ -33,6 +33,7 @@ from extended import (
     rigid_displacement,
     solve,
 )
+from meshes import box, oriented, spherical_shell
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -176,91 +177,11 @@ class Row:
 # Meshes.
 
 
-def oriented(nodes: Floats, tets: NDArray[np.integer[Any]]) -> Indices:
-    """The tets with two nodes swapped where their volume is negative."""
-    out = np.array(tets, dtype=np.uint32)
-    negative = signed_volumes(nodes, out) < 0.0
-    out[negative] = out[negative][:, [0, 2, 1, 3]]
-    return out
-
-
 def signed_volumes(nodes: Floats, tets: NDArray[np.integer[Any]]) -> Floats:
     """det(b − a, c − a, d − a) / 6."""
     a, b, c, d = (nodes[tets[:, i]] for i in range(4))
     volumes: Floats = np.einsum("ij,ij->i", b - a, np.cross(c - a, d - a)) / 6.0
     return volumes
-
-
-def box(
-    cells: tuple[int, int, int],
-    size: tuple[float, float, float],
-    *,
-    jitter: float = 0.0,
-    keep_layers: bool = False,
-    seed: int = 0,
-) -> tuple[Floats, Indices]:
-    """A box from the origin, each cell cut into Kuhn's six tets.
-
-    `jitter` shifts inner nodes at random, in cells; with `keep_layers` never along x.
-    """
-    axes = [np.arange(n + 1, dtype=np.float64) for n in cells]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    inner = np.all((grid > 0) & (grid < np.array(cells)), axis=1, keepdims=True)
-    shift: Floats = np.random.default_rng(seed).uniform(-jitter, jitter, grid.shape)
-    if keep_layers:
-        shift[:, 0] = 0.0
-    nodes = (grid + np.where(inner, shift, 0.0)) * (np.array(size) / np.array(cells))
-    i, j, k = (a.ravel() for a in np.meshgrid(*(np.arange(n) for n in cells), indexing="ij"))
-    step = ((cells[1] + 1) * (cells[2] + 1), cells[2] + 1, 1)
-    corner = i * step[0] + j * step[1] + k * step[2]
-    tets = []
-    for order in itertools.permutations(range(3)):
-        path = np.cumsum([0, *(step[axis] for axis in order)])
-        tets.append(corner[:, None] + path[None, :])
-    return nodes, oriented(nodes, np.concatenate(tets))
-
-
-def icosphere(level: int) -> tuple[Floats, NDArray[np.int64]]:
-    """A unit sphere of 20·4^level triangles, by halving the edges of an icosahedron."""
-    g = (1.0 + 5.0**0.5) / 2.0
-    corners = [(0.0, s, t * g) for s in (-1, 1) for t in (-1, 1)]
-    vertices = np.array([np.roll(c, r) for c in corners for r in range(3)])
-    near = np.isclose(np.linalg.norm(vertices[:, None] - vertices[None], axis=2), 2.0)
-    triangles = np.array(
-        [t for t in itertools.combinations(range(12), 3) if near[np.ix_(t, t)].sum() == 6]
-    )
-    for _ in range(level):
-        a, b, c = triangles.T
-        edges = np.sort(np.concatenate([[a, b], [b, c], [c, a]], axis=1).T, axis=1)
-        unique, back = np.unique(edges, axis=0, return_inverse=True)
-        ab, bc, ca = back.reshape(3, -1) + len(vertices)
-        vertices = np.concatenate([vertices, vertices[unique].sum(axis=1)])
-        triangles = np.concatenate(
-            [np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-        )
-        vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
-    vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
-    return vertices, triangles
-
-
-def spherical_shell(
-    level: int, layers: int, inner: float, outer: float
-) -> tuple[Floats, Indices, Indices, Indices]:
-    """Nodes and tets between two spheres, with the nodes of the inner and of the outer one."""
-    sphere, triangles = icosphere(level)
-    n = len(sphere)
-    nodes = (np.linspace(inner, outer, layers + 1)[:, None, None] * sphere[None]).reshape(-1, 3)
-    a, b, c = np.sort(triangles, axis=1).T
-    tets = []
-    for layer in range(layers):
-        low, high = layer * n, (layer + 1) * n
-        tets += [
-            np.stack([a + low, b + low, c + low, c + high], axis=1),
-            np.stack([a + low, b + low, b + high, c + high], axis=1),
-            np.stack([a + low, a + high, b + high, c + high], axis=1),
-        ]
-    ids = np.arange(n, dtype=np.uint32)
-    return nodes, oriented(nodes, np.concatenate(tets)), ids, ids + np.uint32(layers * n)
 
 
 def smallest_dihedrals(nodes: Floats, tets: NDArray[np.integer[Any]]) -> Floats:

@@ -14,7 +14,8 @@ import skfem
 import cmfsim
 import meshes
 
-HERE = Path(__file__).parent
+# Where a process of its own finds this module and the meshes.
+PATHS = [str(Path(__file__).parent), str(Path(meshes.__file__).parent)]
 
 
 def reference_matrix(nodes, tets, tensors):
@@ -239,7 +240,7 @@ def thread_digest():
 
 def test_one_and_two_threads_give_the_same_bits():
     """Sums have a fixed order: RAYON_NUM_THREADS changes no bit of any result."""
-    script = f"import sys; sys.path.insert(0, {str(HERE)!r}); import test_agreement as t; "
+    script = f"import sys; sys.path[:0] = {PATHS!r}; import test_agreement as t; "
     script += "print(t.thread_digest())"
     digests = {
         subprocess.run(

@@ -111,7 +111,7 @@ def test_patch_of_any_tets_reproduces_uniform_strain(build, method):
     )
     gradient = np.array([[0.02, -0.01, 0.03], [0.005, -0.04, 0.0], [0.01, 0.02, 0.015]])
     exact = nodes @ gradient.T
-    outer = meshes.outer_nodes(nodes, tets)
+    outer = meshes.outer_nodes(tets)
     boundary = cmfsim.Boundary(joined={"skin": outer})
     solver = cmfsim.StaticSolver(tensors, boundary, method=method)
     result = solver.solve({"skin": exact[outer]})
@@ -273,7 +273,7 @@ def test_manufactured_waves_converge_with_order_two(tensor):
     for cells in (4, 8, 16):
         nodes, tets = meshes.box((cells,) * 3, (10.0, 10.0, 10.0))
         tensors = cmfsim.MassTensors(cmfsim.TetMesh(nodes, tets), tissue)
-        outer = meshes.outer_nodes(nodes, tets)
+        outer = meshes.outer_nodes(tets)
         boundary = cmfsim.Boundary(joined={"skin": outer})
         result = cmfsim.StaticSolver(tensors, boundary).solve(
             {"skin": exact(nodes)[outer]}, loads=meshes.body_loads(nodes, tets, body_force)
