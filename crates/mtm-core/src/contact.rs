@@ -475,7 +475,7 @@ impl Held {
 
     /// Lets go of nodes that are pulled and holds those that penetrate; whether any changed.
     ///
-    /// Primal-dual active set (Hintermüller, Ito & Kunisch 2003); where a set comes back, only the
+    /// Primal-dual active set (Hintermüller, Ito & Kunisch 2002); where a set comes back, only the
     /// worst node changes at a time, which cannot cycle while closest points stay put.
     fn update(&mut self, forces: &[f64], gaps: &[f64], gap_limit: f64) -> bool {
         if !self.unilateral {
