@@ -224,6 +224,8 @@ class SegmentData:
     def __post_init__(self) -> None:
         joined = _indices("joined", self.joined)
         sliding = _indices("sliding", self.sliding)
+        if self.contact is not None:
+            _instance("contact", self.contact, SurfaceData)
         object.__setattr__(self, "joined", joined)
         object.__setattr__(self, "sliding", sliding)
         if isinstance(self.gap, str):
@@ -346,6 +348,10 @@ class Scene:
         nodes = _rows("nodes", self.nodes, 3)
         tets = _index_rows("tets", self.tets, 4, len(nodes), "nodes")
         fixed = _indices("fixed", self.fixed, len(nodes))
+        _instance("tissue", self.tissue, TissueData)
+        _instance("segments", self.segments, Mapping)
+        _instance("plan", self.plan, Mapping)
+        _instance("options", self.options, SolverOptions)
         for name, array in self.tissue.arrays().items():
             if len(array) not in {1, len(tets)}:
                 raise CaseInputError(
@@ -353,6 +359,7 @@ class Scene:
                 )
         for name, segment in self.segments.items():
             _text("segment name", name)
+            _instance(f"segment {name!r}", segment, SegmentData)
             for kind in ("joined", "sliding"):
                 _indices(f"segment {name!r} {kind}", getattr(segment, kind), len(nodes))
         loads = None if self.loads is None else _rows("loads", self.loads, 3)
@@ -599,6 +606,13 @@ def _text(name: str, value: object) -> str:
     if not isinstance(value, str) or not value:
         raise CaseInputError(f"{name} is {value!r}: a non-empty text is needed")
     return value
+
+
+def _instance(name: str, value: object, kind: type) -> None:
+    """Refuses a value of another type, naming both."""
+    if not isinstance(value, kind):
+        found = type(value).__name__
+        raise CaseInputError(f"{name} is of type {found}: a {kind.__name__} is needed")
 
 
 def _one_of(name: str, value: object, known: tuple[str, ...]) -> None:

@@ -570,3 +570,28 @@ def test_scene_values_are_frozen():
         s.nodes[0] = 0.0
     with pytest.raises(TypeError):
         s.plan["x"] = np.eye(4)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("tissue", {"young": 1.0}, "tissue is of type dict"),
+        ("segments", {"bone": [0, 1]}, "segment 'bone' is of type list"),
+        ("options", "cholesky", "options is of type str"),
+    ],
+)
+def test_a_scene_of_other_types_names_the_field(field, value, words):
+    """A part of a scene of another type is a CaseError that names the field and both types."""
+    parts = {
+        "nodes": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        "tets": [[0, 1, 2, 3]],
+        "tissue": cmfsim.TissueData("isotropic", young=0.003, poisson=0.46),
+    }
+    with pytest.raises(cmfsim.CaseError, match=words):
+        cmfsim.Scene(**{**parts, field: value})
+
+
+def test_a_contact_of_another_type_is_named():
+    """Vertices and triangles belong into a SurfaceData."""
+    with pytest.raises(cmfsim.CaseError, match="contact is of type tuple"):
+        cmfsim.SegmentData(sliding=[0], contact=([[0, 0, 0]], [[0, 0, 0]]))
