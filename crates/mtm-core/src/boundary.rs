@@ -240,34 +240,17 @@ impl Boundary {
     /// A segment that the plan lacks or names twice, a name that is no segment, displacements of the
     /// wrong number or not finite, displacements for a segment with sliding nodes.
     pub fn motions<'a>(&self, plan: &'a Plan) -> Result<Vec<&'a Motion>> {
-        let known = || {
-            let names: Vec<String> =
-                self.segments.iter().map(|s| format!("\"{}\"", s.name)).collect();
-            names.join(", ")
-        };
         let fail = |segment: &str, problem: String| MtmError::Plan {
             segment: segment.to_owned(),
             problem,
         };
-        for (i, (name, _)) in plan.iter().enumerate() {
-            if !self.segments.iter().any(|s| s.name == *name) {
-                return Err(fail(name, format!("no such segment; the boundary has {}", known())));
-            }
-            if plan[..i].iter().any(|(other, _)| other == name) {
-                return Err(fail(name, "it is named twice".into()));
-            }
-        }
+        let names: Vec<&str> = self.segments.iter().map(|s| s.name.as_str()).collect();
+        let motions = matched(plan, &names)?;
         self.segments
             .iter()
             .zip(&self.given)
-            .map(|(segment, given)| {
-                let Some((_, motion)) = plan.iter().find(|(name, _)| *name == segment.name) else {
-                    return Err(fail(
-                        &segment.name,
-                        "it is missing; a plan names every segment (the identity matrix: it stays)"
-                            .into(),
-                    ));
-                };
+            .zip(motions)
+            .map(|((segment, given), motion)| {
                 if let Motion::Nodes(rows) = motion {
                     if rows.len() != given.len() {
                         let problem = format!(
@@ -334,6 +317,37 @@ impl Boundary {
             }
         })
     }
+}
+
+/// The motion of each of `segments` in `plan`, in their order.
+///
+/// # Errors
+/// A segment that the plan lacks or names twice, a name that is no segment.
+pub(crate) fn matched<'a>(plan: &'a Plan, segments: &[&str]) -> Result<Vec<&'a Motion>> {
+    let fail =
+        |segment: &str, problem: String| MtmError::Plan { segment: segment.to_owned(), problem };
+    for (i, (name, _)) in plan.iter().enumerate() {
+        if !segments.contains(&name.as_str()) {
+            let known: Vec<String> = segments.iter().map(|s| format!("\"{s}\"")).collect();
+            return Err(fail(
+                name,
+                format!("no such segment; the boundary has {}", known.join(", ")),
+            ));
+        }
+        if plan[..i].iter().any(|(other, _)| other == name) {
+            return Err(fail(name, "it is named twice".into()));
+        }
+    }
+    segments
+        .iter()
+        .map(|&segment| match plan.iter().find(|(name, _)| name == segment) {
+            Some((_, motion)) => Ok(motion),
+            None => Err(fail(
+                segment,
+                "it is missing; a plan names every segment (the identity matrix: it stays)".into(),
+            )),
+        })
+        .collect()
 }
 
 /// `nodes` without repetitions, first occurrences kept in order.

@@ -116,8 +116,6 @@ pub struct ContactState {
     pub gaps: Vec<f64>,
     /// Whether the node is held to the surface.
     pub active: Vec<bool>,
-    /// n·u of each held node, as the last solve prescribed it, mm.
-    pub offsets: Vec<f64>,
     /// Outer iterations done.
     pub iterations: usize,
 }
@@ -262,7 +260,6 @@ impl Sliding {
                 forces,
                 gaps,
                 active: held.active.clone(),
-                offsets,
                 iterations: iteration,
             };
             if settled {

@@ -6,7 +6,7 @@
 
 use rayon::prelude::*;
 
-use crate::boundary::{Motion, NodeKind, Plan};
+use crate::boundary::{Motion, NodeKind, Plan, matched};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::mesh::{dot, sub};
 use crate::method::Interrupt;
@@ -205,25 +205,11 @@ impl PlanOperator {
             });
         }
         rigid_plan(plan)?;
-        let fail = |segment: &str, problem: &str| {
-            Err(MtmError::Plan { segment: segment.to_owned(), problem: problem.to_owned() })
-        };
-        for (i, (name, _)) in plan.iter().enumerate() {
-            if !self.segments.contains(name) {
-                return fail(name, "no such segment");
-            }
-            if plan[..i].iter().any(|(other, _)| other == name) {
-                return fail(name, "it is named twice");
-            }
-        }
-        let mut numbers = Vec::with_capacity(self.segments.len());
-        for (name, &centre) in self.segments.iter().zip(&self.centres) {
-            let Some(rigid) = find(plan, name) else {
-                return fail(
-                    name,
-                    "it is missing; a plan names every segment (the identity matrix: it stays)",
-                );
-            };
+        let names: Vec<&str> = self.segments.iter().map(String::as_str).collect();
+        let mut numbers = Vec::with_capacity(names.len());
+        for (motion, &centre) in matched(plan, &names)?.into_iter().zip(&self.centres) {
+            // Every other motion was refused above.
+            let Motion::Rigid(rigid) = motion else { continue };
             // (R − I)(x − c) + s with s the displacement of the centre.
             let mut own = [0.0; COLUMNS];
             for r in 0..3 {

@@ -140,11 +140,6 @@ pub struct DenseSymmetric {
 }
 
 impl DenseSymmetric {
-    /// The matrix of order `size` with the given columns (only the lower triangle is read).
-    pub fn new(size: usize, values: Vec<f64>) -> Self {
-        Self { size, values }
-    }
-
     /// A⁻¹ b by Cholesky; the row of the first pivot that is not positive on failure.
     pub fn solve(mut self, b: &mut [f64]) -> std::result::Result<(), usize> {
         let n = self.size;

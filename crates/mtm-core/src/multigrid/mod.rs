@@ -185,19 +185,6 @@ impl Multigrid {
         rows
     }
 
-    /// Entries of the matrices of all levels, relative to the finest.
-    pub fn operator_complexity(&self) -> f64 {
-        let fine = (9 * self.finest.matrix.columns.len()) as f64;
-        let mut sum = fine;
-        for level in &self.coarse {
-            sum += (MODES * MODES * level.matrix.columns.len()) as f64;
-        }
-        if let Some(c) = &self.coarsest {
-            sum += (c.size * c.size) as f64;
-        }
-        sum / fine
-    }
-
     /// Bytes held by the hierarchy.
     pub fn memory_bytes(&self) -> usize {
         self.scaling.len() * 72
