@@ -20,15 +20,7 @@ from cmfsim._core import (
     Tissue,
     __version__,
 )
-from cmfsim.case import (
-    MovedSurface,
-    Scene,
-    SceneResult,
-    SegmentData,
-    SolverOptions,
-    SurfaceData,
-    TissueData,
-)
+from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.errors import (
     BoundaryError,
     CaseError,
@@ -43,17 +35,30 @@ from cmfsim.errors import (
 )
 from cmfsim.io import read_plan, read_result, read_scene, write_result, write_scene
 from cmfsim.planning import RigidMotion, decompose_motion, rigid_motion
+from cmfsim.scene import (
+    MovedSurface,
+    Scene,
+    SceneResult,
+    SegmentData,
+    SolverOptions,
+    SurfaceData,
+    TissueData,
+)
 from cmfsim.simulation import scene_plan, scene_solver, solve_scene
 
 __all__ = [
     "LAWS",
     "METHODS",
     "PRESETS",
+    "Anatomy",
+    "BoneSegment",
     "Boundary",
     "BoundaryError",
     "CaseError",
     "CmfsimError",
     "ContactError",
+    "Finding",
+    "ImageData",
     "ImageError",
     "LandmarkError",
     "MassTensors",
@@ -61,6 +66,7 @@ __all__ = [
     "MeshError",
     "MeshQuality",
     "MovedSurface",
+    "NodeKinds",
     "PlanOperator",
     "RegistrationError",
     "RigidMotion",

@@ -1,620 +1,263 @@
-"""The plain values that stages hand to each other: frozen, checked where they are made, no files.
+"""The values of a patient case that stages hand to each other: frozen, checked, no files.
 
-A `Scene` is everything that one solve needs. Checks here are of shape, range and name, with the
-index and value at fault; what geometry and physics forbid (inverted tets, indefinite materials,
-bodies that are not held) the core finds when the scene is solved.
+An image and everything made from it lies on one axis-aligned grid in LPS. Anatomy is kept as *level
+images*: positive inside, negative outside, zero on the surface between voxels, so that a surface is
+known better than its voxels and cutting a bone by a plane is a minimum of two numbers.
 """
 
-import hashlib
-import json
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cmfsim.checks import Floats, as_rows, as_text, check_instance, check_one_of, frozen
 from cmfsim.errors import CaseInputError
+from cmfsim.scene import SurfaceData
 
-__all__ = [
-    "MovedSurface",
-    "Scene",
-    "SceneResult",
-    "SegmentData",
-    "SolverOptions",
-    "SurfaceData",
-    "TissueData",
-]
+__all__ = ["SEVERITIES", "Anatomy", "BoneSegment", "Finding", "ImageData", "NodeKinds"]
 
-Floats = NDArray[np.float64]
-Indices = NDArray[np.uint32]
-
-# Arrays that each kind of tissue needs, with the number of axes after the first.
-TISSUE_ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = MappingProxyType(
-    {
-        "isotropic": {"young": (), "poisson": ()},
-        "transversely_isotropic": {
-            "young_along": (),
-            "young_across": (),
-            "poisson": (),
-            "fibre": (3,),
-        },
-        "stiffness": {"stiffness": (6, 6)},
-        "preset": {"fraction": (), "fibre": (3,)},
-    }
-)
-# Arrays of the above that may be left out.
-TISSUE_OPTIONAL = frozenset({("preset", "fibre")})
-
-METHODS = ("auto", "cholesky", "pcg", "relaxation")
-CONTACTS = ("bilateral", "unilateral")
-CONFLICTS = ("error", "resolve")
+SEVERITIES = ("error", "warning", "note")
 
 
 @dataclass(frozen=True, eq=False)
-class TissueData:
-    """What the tets are made of, as the arrays that `cmfsim.Tissue` takes.
-
-    Every array holds one value per tet, or a single one for all tets.
+class ImageData:
+    """A scalar image on an axis-aligned grid: values[i, j, k] lies at origin + (i, j, k)·spacing.
 
     Attributes
     ----------
-    kind : str
-        "isotropic" (`young`, `poisson`), "transversely_isotropic" (`young_along`, `young_across`,
-        `poisson`, `fibre`, `law`), "stiffness" (`stiffness`) or "preset" (`preset`, `fraction`,
-        `fibre`, `mixing`).
-    young, young_along, young_across : (m,) or (1,) float64, MPa
-    poisson, fraction : (m,) or (1,) float64
-    fibre : (m, 3) or (1, 3) float64
-        Unit vectors.
-    stiffness : (m, 6, 6) or (1, 6, 6) float64, MPa
-        Voigt order xx, yy, zz, yz, xz, xy with engineering shears, global axes.
-    law, preset, mixing : str
-        Names that `cmfsim.Tissue` knows.
+    values : (nx, ny, nz) array of real numbers
+        Axes along +L, +P, +S. Kept as given, without a copy; treated as read-only.
+    spacing : (3,) float64, mm
+    origin : (3,) float64, mm
+        Centre of voxel (0, 0, 0), LPS.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) Unknown kind, an array missing, not wanted, misshapen or not finite.
+        (also `ValueError`) Not three axes, an empty axis, spacing not positive, NaN or infinity in
+        spacing or origin.
 
     Examples
     --------
-    >>> import cmfsim
-    >>> fat = cmfsim.TissueData("isotropic", young=0.003, poisson=0.46)
-    >>> fat.young.shape
-    (1,)
+    >>> import cmfsim, numpy as np
+    >>> image = cmfsim.ImageData(np.zeros((4, 5, 6)), spacing=(1, 1, 2), origin=(0, 0, 10))
+    >>> image.highest.tolist()
+    [3.0, 4.0, 20.0]
     """
 
-    kind: str
-    young: ArrayLike | None = None
-    poisson: ArrayLike | None = None
-    young_along: ArrayLike | None = None
-    young_across: ArrayLike | None = None
-    fibre: ArrayLike | None = None
-    stiffness: ArrayLike | None = None
-    fraction: ArrayLike | None = None
-    law: str = "spencer"
-    preset: str = "kim2010"
-    mixing: str = "moduli"
+    values: NDArray[Any]
+    spacing: ArrayLike
+    origin: ArrayLike = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        _one_of("tissue kind", self.kind, tuple(TISSUE_ARRAYS))
-        wanted = TISSUE_ARRAYS[self.kind]
-        for name in sorted({n for arrays in TISSUE_ARRAYS.values() for n in arrays}):
-            value = getattr(self, name)
-            if name not in wanted:
-                if value is not None:
-                    raise CaseInputError(f"tissue of kind {self.kind!r} takes no {name!r}")
-            elif value is not None:
-                array = _floats(f"tissue {name}", value)
-                tail = wanted[name]
-                if array.shape == tail:
-                    array = array[np.newaxis]
-                if array.shape[1:] != tail or array.ndim != 1 + len(tail):
-                    shape = ", ".join(str(n) for n in ("m", *tail))
-                    raise CaseInputError(
-                        f"tissue {name} has shape {array.shape}: ({shape}) is needed"
-                    )
-                object.__setattr__(self, name, _frozen(array))
-            elif (self.kind, name) not in TISSUE_OPTIONAL:
-                raise CaseInputError(f"tissue of kind {self.kind!r} lacks {name!r}")
-        for name in ("law", "preset", "mixing"):
-            _text(f"tissue {name}", getattr(self, name))
+        values = np.asarray(self.values)
+        if values.ndim != 3 or 0 in values.shape:
+            raise CaseInputError(f"image has shape {values.shape}: three axes, none empty, needed")
+        if values.dtype.kind not in "fiub":
+            raise CaseInputError(f"image has dtype {values.dtype}: real numbers are needed")
+        spacing = as_rows("image spacing", np.reshape(self.spacing, (1, -1)), 3)[0]
+        if (spacing <= 0.0).any():
+            raise CaseInputError(f"image spacing is {spacing.tolist()} mm: must be above 0")
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "spacing", spacing)
+        object.__setattr__(
+            self, "origin", as_rows("image origin", np.reshape(self.origin, (1, -1)), 3)[0]
+        )
 
-    def arrays(self) -> dict[str, Floats]:
-        """The arrays of this kind of tissue, by name."""
-        return {
-            name: np.asarray(getattr(self, name), dtype=np.float64)
-            for name in TISSUE_ARRAYS[self.kind]
-            if getattr(self, name) is not None
-        }
+    @property
+    def lowest(self) -> Floats:
+        """Centre of the first voxel, (3,) mm."""
+        origin: Floats = np.asarray(self.origin, dtype=np.float64)
+        return origin
 
+    @property
+    def highest(self) -> Floats:
+        """Centre of the last voxel, (3,) mm."""
+        return self.lowest + (np.array(self.values.shape) - 1) * np.asarray(self.spacing)
 
-@dataclass(frozen=True, eq=False)
-class SurfaceData:
-    """A triangle surface.
+    def with_values(self, values: NDArray[Any]) -> "ImageData":
+        """Other values on the same grid."""
+        if np.shape(values) != self.values.shape:
+            raise CaseInputError(f"values have shape {np.shape(values)}, not {self.values.shape}")
+        return ImageData(values, self.spacing, self.origin)
 
-    Attributes
-    ----------
-    vertices : (v, 3) float64, mm
-    triangles : (t, 3) uint32
-        Outward normals by the right-hand rule.
-    crease_angle : float, degrees
-        Edges sharper than this keep the normals of their triangles apart.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).vertices.shape
-    (3, 3)
-    """
-
-    vertices: ArrayLike
-    triangles: ArrayLike
-    crease_angle: float = 60.0
-
-    def __post_init__(self) -> None:
-        vertices = _rows("surface vertices", self.vertices, 3)
-        triangles = _index_rows("surface triangles", self.triangles, 3, len(vertices), "vertices")
-        object.__setattr__(self, "vertices", vertices)
-        object.__setattr__(self, "triangles", triangles)
-        object.__setattr__(self, "crease_angle", _number("crease_angle", self.crease_angle))
-
-
-@dataclass(frozen=True, eq=False)
-class MovedSurface:
-    """A motion of a segment given by a surface before and after.
-
-    Attributes
-    ----------
-    surface : SurfaceData
-    moved_vertices : (v, 3) float64, mm
-        Where each vertex of `surface` goes.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> bone = cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    >>> cmfsim.MovedSurface(bone, bone.vertices + [0, 0, 2.0]).moved_vertices[0].tolist()
-    [0.0, 0.0, 2.0]
-    """
-
-    surface: SurfaceData
-    moved_vertices: ArrayLike
-
-    def __post_init__(self) -> None:
-        moved = _rows("moved_vertices", self.moved_vertices, 3)
-        count = len(np.asarray(self.surface.vertices))
-        if len(moved) != count:
-            raise CaseInputError(
-                f"moved_vertices has {len(moved)} rows, but the surface has {count} vertices"
+    def axes(self) -> tuple[Floats, Floats, Floats]:
+        """The coordinates of the voxel centres along each axis, mm, shaped to broadcast."""
+        x, y, z = (
+            o + s * np.arange(n)
+            for o, s, n in zip(
+                self.lowest, np.asarray(self.spacing), self.values.shape, strict=True
             )
-        object.__setattr__(self, "moved_vertices", moved)
+        )
+        return x[:, None, None], y[None, :, None], z[None, None, :]
 
+    def sample(self, points: ArrayLike) -> Floats:
+        """The values at points, trilinear; beyond the border those of the nearest border point.
 
-@dataclass(frozen=True, eq=False)
-class SegmentData:
-    """A bone segment: the nodes that it carries and the surface that others slide on.
+        Parameters
+        ----------
+        points : (n, 3) float64, mm
 
-    Attributes
-    ----------
-    joined : (j,) uint32
-        Nodes that move with the segment.
-    sliding : (s,) uint32
-        Nodes that slide on `contact`.
-    contact : SurfaceData or None
-        Contact surface (teeth, mucosa) at rest; it moves with the segment.
-    gap : (s,) float64, mm, or float, or "rest"
-        Distance that each sliding node keeps from the surface, along its normal; "rest" keeps the
-        distance of the undeformed tissue.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> cmfsim.SegmentData(joined=[0, 4, 7]).joined.tolist()
-    [0, 4, 7]
-    """
-
-    joined: ArrayLike = ()
-    sliding: ArrayLike = ()
-    contact: SurfaceData | None = None
-    gap: ArrayLike | str = 0.0
-
-    def __post_init__(self) -> None:
-        joined = _indices("joined", self.joined)
-        sliding = _indices("sliding", self.sliding)
-        if self.contact is not None:
-            _instance("contact", self.contact, SurfaceData)
-        object.__setattr__(self, "joined", joined)
-        object.__setattr__(self, "sliding", sliding)
-        if isinstance(self.gap, str):
-            _one_of("gap", self.gap, ("rest",))
-            return
-        gap = _floats("gap", self.gap)
-        if gap.shape not in {(), (len(sliding),)}:
-            raise CaseInputError(
-                f"gap has shape {gap.shape}: one number or {len(sliding)} (one per sliding node)"
+        Returns
+        -------
+        (n,) float64
+        """
+        shape = np.array(self.values.shape)
+        place = (as_rows("points", points, 3) - self.lowest) / np.asarray(self.spacing)
+        place = np.clip(place, 0.0, shape - 1.0)
+        low = np.minimum(place.astype(np.intp), np.maximum(shape - 2, 0))
+        part = place - low
+        high = np.minimum(low + 1, shape - 1)
+        total = np.zeros(len(place))
+        for corner in range(8):
+            ends = [(corner >> axis) & 1 for axis in range(3)]
+            index = tuple((high if end else low)[:, axis] for axis, end in enumerate(ends))
+            weight = np.prod(
+                [part[:, a] if end else 1.0 - part[:, a] for a, end in enumerate(ends)], axis=0
             )
-        object.__setattr__(self, "gap", _frozen(gap))
+            total += weight * self.values[index]
+        return total
 
 
 @dataclass(frozen=True)
-class SolverOptions:
-    """How a scene is solved; the defaults are those of `cmfsim.StaticSolver`.
+class Finding:
+    """Something that a person should know before trusting a case.
 
     Attributes
     ----------
-    method : str
-        "auto", "cholesky", "pcg" or "relaxation".
-    contact : str
-        "bilateral" or "unilateral".
-    tolerance : float
-        Relative error bound of the iterative methods.
-    max_iterations : int or None
-    contact_tolerance : float, mm
-    contact_iterations : int
-    memory_limit : float or None, MB
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> cmfsim.SolverOptions(method="cholesky").contact
-    'bilateral'
+    severity : str
+        "error" (the work cannot go on), "warning" (the result may be wrong), "note".
+    code : str
+        Short stable name, such as "ct-spacing-coarse".
+    what : str
+        The fact, with its figure.
+    where : str
+        File, table, place in mm.
+    why : str
+        What it does to the result.
+    mend : str
+        What to do.
     """
 
-    method: str = "auto"
-    contact: str = "bilateral"
-    tolerance: float = 1e-8
-    max_iterations: int | None = None
-    contact_tolerance: float = 1e-9
-    contact_iterations: int = 100
-    memory_limit: float | None = None
+    severity: str
+    code: str
+    what: str
+    where: str = ""
+    why: str = ""
+    mend: str = ""
 
     def __post_init__(self) -> None:
-        _one_of("method", self.method, METHODS)
-        _one_of("contact", self.contact, CONTACTS)
-        for name in ("tolerance", "contact_tolerance"):
-            _positive(name, getattr(self, name))
-        if self.memory_limit is not None:
-            _positive("memory_limit", self.memory_limit)
-        for name in ("max_iterations", "contact_iterations"):
-            value = getattr(self, name)
-            if value is None and name == "max_iterations":
-                continue
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise CaseInputError(f"{name} is {value!r}: a whole number from 1 on is needed")
-
-    def as_dict(self) -> dict[str, Any]:
-        """The options by name, as `StaticSolver` and the scene file take them."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
+        check_one_of("severity", self.severity, SEVERITIES)
+        as_text("finding code", self.code)
+        as_text("finding", self.what)
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
-    """Everything that one solve needs: mesh, tissue, node kinds, plan and options.
+class Anatomy:
+    """A head as level images on one grid: positive inside, zero on the surface.
 
     Attributes
     ----------
-    nodes : (n, 3) float64, mm
-    tets : (m, 4) uint32
-        Positively oriented.
-    tissue : TissueData
-    segments : mapping of str to SegmentData
-        Order is kept.
-    plan : mapping of str to (4, 4) float64, (j, 3) float64 or MovedSurface
-        One entry for every segment: a rigid motion (mm), the displacements of its joined nodes
-        (mm), or a surface before and after.
-    fixed : (f,) uint32
-        Nodes that do not move.
-    loads : (n, 3) float64, N, or None
-        Forces on the nodes.
-    options : SolverOptions
-    conflicts : str
-        "error", or "resolve": fixed wins over joined, joined over sliding.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Misshapen or non-finite arrays, indices out of range, a plan that lacks
-        a segment or names another one.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> scene = cmfsim.Scene(
-    ...     nodes=[[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    ...     tets=[[0, 1, 2, 3]],
-    ...     tissue=cmfsim.TissueData("isotropic", young=1.0, poisson=0.3),
-    ...     fixed=[0, 1, 2],
-    ...     segments={"tip": cmfsim.SegmentData(joined=[3])},
-    ...     plan={"tip": cmfsim.rigid_motion(translation=(0, 0, 0.1))},
-    ... )
-    >>> scene.n_nodes, scene.n_tets
-    (4, 1)
+    skin : ImageData
+        Inside the outer skin, bones and hollows included; float32. Its size is clipped, so it is a
+        distance nowhere but near zero, and there only up to a factor.
+    bones : mapping of str to ImageData
+        Each bone with the hollows that it encloses (cranial cavity, sinuses, marrow): "cranium" and
+        "mandible", or "skull" where they were not parted.
+    air : ImageData or None
+        Hollows inside the skin that no bone encloses: airway, nasal and oral cavity.
+    teeth : ImageData or None
+        Teeth and what lies with them, where they could be told from bone.
+    findings : tuple of Finding
+    surfaces : mapping of str to SurfaceData
+        The surfaces that levels were made from ("skin" and bones), where surfaces were given.
     """
 
-    nodes: ArrayLike
-    tets: ArrayLike
-    tissue: TissueData
-    segments: Mapping[str, SegmentData] = field(default_factory=dict)
-    plan: Mapping[str, ArrayLike | MovedSurface] = field(default_factory=dict)
-    fixed: ArrayLike = ()
-    loads: ArrayLike | None = None
-    options: SolverOptions = field(default_factory=SolverOptions)
-    conflicts: str = "error"
+    skin: ImageData
+    bones: Mapping[str, ImageData]
+    air: ImageData | None = None
+    teeth: ImageData | None = None
+    findings: tuple[Finding, ...] = ()
+    surfaces: Mapping[str, SurfaceData] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        nodes = _rows("nodes", self.nodes, 3)
-        tets = _index_rows("tets", self.tets, 4, len(nodes), "nodes")
-        fixed = _indices("fixed", self.fixed, len(nodes))
-        _instance("tissue", self.tissue, TissueData)
-        _instance("segments", self.segments, Mapping)
-        _instance("plan", self.plan, Mapping)
-        _instance("options", self.options, SolverOptions)
-        for name, array in self.tissue.arrays().items():
-            if len(array) not in {1, len(tets)}:
-                raise CaseInputError(
-                    f"tissue {name} has {len(array)} rows: 1 or {len(tets)} (one per tet) needed"
-                )
-        for name, segment in self.segments.items():
-            _text("segment name", name)
-            _instance(f"segment {name!r}", segment, SegmentData)
-            for kind in ("joined", "sliding"):
-                _indices(f"segment {name!r} {kind}", getattr(segment, kind), len(nodes))
-        loads = None if self.loads is None else _rows("loads", self.loads, 3)
-        if loads is not None and len(loads) != len(nodes):
-            raise CaseInputError(f"loads has {len(loads)} rows for {len(nodes)} nodes")
-        _one_of("conflicts", self.conflicts, CONFLICTS)
-        object.__setattr__(self, "nodes", nodes)
-        object.__setattr__(self, "tets", tets)
-        object.__setattr__(self, "fixed", fixed)
-        object.__setattr__(self, "loads", loads)
-        object.__setattr__(self, "segments", MappingProxyType(dict(self.segments)))
-        object.__setattr__(self, "plan", MappingProxyType(self._checked_plan()))
-
-    def _checked_plan(self) -> dict[str, Floats | MovedSurface]:
-        for name in self.plan:
-            if name not in self.segments:
-                known = ", ".join(repr(s) for s in self.segments) or "none"
-                raise CaseInputError(f"plan names segment {name!r}; segments are: {known}")
-        checked: dict[str, Floats | MovedSurface] = {}
-        for name, segment in self.segments.items():
-            if name not in self.plan:
-                raise CaseInputError(
-                    f"plan lacks segment {name!r}: give the identity matrix if it stays"
-                )
-            motion = self.plan[name]
-            if isinstance(motion, MovedSurface):
-                checked[name] = motion
-                continue
-            array = _floats(f"plan of segment {name!r}", motion)
-            joined = len(np.asarray(segment.joined))
-            if array.shape not in {(4, 4), (joined, 3)}:
-                raise CaseInputError(
-                    f"plan of segment {name!r} has shape {array.shape}: a (4, 4) matrix or "
-                    f"({joined}, 3) displacements of its joined nodes are needed"
-                )
-            checked[name] = _frozen(array)
-        return checked
-
-    @property
-    def n_nodes(self) -> int:
-        """Number of nodes."""
-        return len(np.asarray(self.nodes))
-
-    @property
-    def n_tets(self) -> int:
-        """Number of tets."""
-        return len(np.asarray(self.tets))
-
-    def header(self) -> dict[str, Any]:
-        """Names, kinds and options of the scene: what of it is not an array, ready for JSON."""
-        segments = []
-        for name, segment in self.segments.items():
-            entry: dict[str, Any] = {"name": name}
-            if segment.contact is not None:
-                entry["crease_angle"] = segment.contact.crease_angle
-            if isinstance(segment.gap, str):
-                entry["gap"] = segment.gap
-            motion = self.plan[name]
-            if isinstance(motion, MovedSurface):
-                entry["motion"] = "surface"
-                entry["motion_crease_angle"] = motion.surface.crease_angle
-            else:
-                entry["motion"] = "array"
-            segments.append(entry)
-        tissue = {"kind": self.tissue.kind}
-        if self.tissue.kind == "transversely_isotropic":
-            tissue["law"] = self.tissue.law
-        elif self.tissue.kind == "preset":
-            tissue |= {"preset": self.tissue.preset, "mixing": self.tissue.mixing}
-        return {
-            "tissue": tissue,
-            "segments": segments,
-            "conflicts": self.conflicts,
-            "solver": self.options.as_dict(),
-        }
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Every array of the scene by the name it has in a scene file."""
-        return dict(self._arrays())
-
-    def _arrays(self) -> Iterator[tuple[str, NDArray[Any]]]:
-        yield "nodes", np.asarray(self.nodes)
-        yield "tets", np.asarray(self.tets)
-        for name, array in self.tissue.arrays().items():
-            yield f"tissue.{name}", array
-        yield "fixed", np.asarray(self.fixed)
-        if self.loads is not None:
-            yield "loads", np.asarray(self.loads)
-        # Segments are numbered: their names are free text and stay out of the archive's directory.
-        for number, (name, segment) in enumerate(self.segments.items()):
-            key = f"segment.{number}"
-            yield f"{key}.joined", np.asarray(segment.joined)
-            yield f"{key}.sliding", np.asarray(segment.sliding)
-            if segment.contact is not None:
-                yield f"{key}.contact.vertices", np.asarray(segment.contact.vertices)
-                yield f"{key}.contact.triangles", np.asarray(segment.contact.triangles)
-            if not isinstance(segment.gap, str):
-                yield f"{key}.gap", np.asarray(segment.gap)
-            motion = self.plan[name]
-            if isinstance(motion, MovedSurface):
-                yield f"{key}.motion.vertices", np.asarray(motion.surface.vertices)
-                yield f"{key}.motion.triangles", np.asarray(motion.surface.triangles)
-                yield f"{key}.motion.moved_vertices", np.asarray(motion.moved_vertices)
-            else:
-                yield f"{key}.motion", np.asarray(motion)
-
-    def sha256(self) -> str:
-        """The SHA-256 of the scene's content, the same from whichever file it was read."""
-        digest = hashlib.sha256(json.dumps(self.header(), sort_keys=True).encode())
-        for name, array in self._arrays():
-            digest.update(f"\n{name} {array.dtype.str} {array.shape}\n".encode())
-            digest.update(np.ascontiguousarray(array).tobytes())
-        return digest.hexdigest()
+        check_instance("skin", self.skin, ImageData)
+        others = {f"bone {name!r}": level for name, level in self.bones.items()}
+        others |= {n: v for n, v in (("air", self.air), ("teeth", self.teeth)) if v is not None}
+        for name, level in others.items():
+            check_instance(name, level, ImageData)
+            same = (
+                level.values.shape == self.skin.values.shape
+                and np.array_equal(level.lowest, self.skin.lowest)
+                and np.array_equal(np.asarray(level.spacing), np.asarray(self.skin.spacing))
+            )
+            if not same:
+                raise CaseInputError(f"{name} lies on another grid than the skin")
+        object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))
+        object.__setattr__(self, "surfaces", MappingProxyType(dict(self.surfaces)))
 
 
 @dataclass(frozen=True, eq=False)
-class SceneResult:
-    """The answer to a scene, with what is needed to draw it and to trace it back.
+class BoneSegment:
+    """A piece of bone that moves as one, or that stays.
 
     Attributes
     ----------
-    nodes : (n, 3) float64, mm
-        At rest; deformed = nodes + displacements.
-    tets : (m, 4) uint32
-    skin_triangles : (t, 3) uint32
-        Boundary of the mesh, outward, as node indices.
-    displacements : (n, 3) float64, mm
-    forces : (n, 3) float64, N
-        K u.
-    residual_history : (k,) float64
-    contact_nodes : (s,) uint32
-    contact_points, contact_normals : (s, 3) float64, mm
-        On the moved contact surface.
-    contact_forces : (s,) float64, N
-    contact_gaps : (s,) float64, mm
-    summary : dict
-        Method, residual, error bound, iterations, largest contact gap, timings, versions and the
-        SHA-256 of the scene's content.
+    name : str
+        "cranium", "maxilla", "mandible_body", "ramus_left", "chin", …
+    level : ImageData
+        Positive inside; on the grid of the anatomy.
+    surface : SurfaceData
+        Its surface, outward normals; the contact surface of nodes that slide on it.
     """
 
-    nodes: Floats
-    tets: Indices
-    skin_triangles: Indices
-    displacements: Floats
-    forces: Floats
-    residual_history: Floats
-    contact_nodes: Indices
-    contact_points: Floats
-    contact_normals: Floats
-    contact_forces: Floats
-    contact_gaps: Floats
-    summary: Mapping[str, Any]
+    name: str
+    level: ImageData
+    surface: SurfaceData
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Every array of the result by its name."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "summary"}
+    def __post_init__(self) -> None:
+        as_text("segment name", self.name)
+        check_instance(f"level of segment {self.name!r}", self.level, ImageData)
+        check_instance(f"surface of segment {self.name!r}", self.surface, SurfaceData)
 
 
-def _frozen(array: NDArray[Any]) -> NDArray[Any]:
-    """A read-only array in C order that shares nothing with the caller's."""
-    copy = np.array(array, order="C")
-    copy.setflags(write=False)
-    return copy
+@dataclass(frozen=True, eq=False)
+class NodeKinds:
+    """What each node of a mesh does (paper 2.5, Figure 4).
 
+    Attributes
+    ----------
+    kind : (n,) uint8
+        0 free, 1 fixed, 2 joined, 3 sliding: the order of `NODE_KINDS` in scene files.
+    segment : (n,) int16
+        Index into `segments` of joined and sliding nodes, −1 elsewhere.
+    segments : tuple of str
+    """
 
-def _floats(name: str, value: ArrayLike) -> Floats:
-    try:
-        array = np.asarray(value)
-        if array.dtype.kind not in "fiu":
-            raise CaseInputError(f"{name} has dtype {array.dtype}: real numbers are needed")
-        array = array.astype(np.float64)
-    except (TypeError, ValueError) as error:
-        if isinstance(error, CaseInputError):
-            raise
-        raise CaseInputError(f"{name} is not an array of numbers: {error}") from error
-    bad = np.argwhere(~np.isfinite(array))
-    if len(bad):
-        index = ", ".join(str(i) for i in bad[0])
-        raise CaseInputError(
-            f"{name}[{index}] is {array[tuple(bad[0])]}: every value must be finite"
-        )
-    return array
+    kind: NDArray[np.uint8]
+    segment: NDArray[np.int16]
+    segments: tuple[str, ...]
 
+    def __post_init__(self) -> None:
+        kind = np.asarray(self.kind, dtype=np.uint8)
+        segment = np.asarray(self.segment, dtype=np.int16)
+        if kind.ndim != 1 or segment.shape != kind.shape:
+            raise CaseInputError(f"kind has shape {kind.shape}, segment {segment.shape}: (n,) both")
+        bad = np.flatnonzero((kind > 3) | ((kind >= 2) & (segment < 0)))
+        if len(bad) or (segment >= len(self.segments)).any():
+            raise CaseInputError("kind is 0 to 3, and joined and sliding nodes need a segment")
+        object.__setattr__(self, "kind", frozen(kind))
+        object.__setattr__(self, "segment", frozen(segment))
 
-def _rows(name: str, value: ArrayLike, width: int) -> Floats:
-    array = _floats(name, value)
-    if array.ndim != 2 or array.shape[1] != width:
-        raise CaseInputError(f"{name} has shape {array.shape}: (rows, {width}) is needed")
-    return _frozen(array)
-
-
-def _whole_numbers(name: str, value: ArrayLike, count: int | None, of: str) -> Indices:
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise CaseInputError(f"{name} is not an array of indices: {error}") from error
-    if array.size == 0:
-        return np.zeros(array.shape, dtype=np.uint32)
-    if array.dtype.kind not in "iu":
-        raise CaseInputError(f"{name} has dtype {array.dtype}: whole numbers are needed")
-    limit = 2**32 if count is None else count
-    bad = np.argwhere((array < 0) | (array >= limit))
-    if len(bad):
-        index = ", ".join(str(i) for i in bad[0])
-        allowed = f"0 to {limit - 1}" if limit else "none"
-        raise CaseInputError(
-            f"{name}[{index}] is {array[tuple(bad[0])]}, but there are {limit} {of} "
-            f"(allowed {allowed}); is the file numbered from 1?"
-        )
-    return array.astype(np.uint32)
-
-
-def _index_rows(name: str, value: ArrayLike, width: int, count: int, of: str) -> Indices:
-    array = _whole_numbers(name, value, count, of)
-    if array.ndim != 2 or array.shape[1] != width:
-        raise CaseInputError(f"{name} has shape {array.shape}: (rows, {width}) is needed")
-    return _frozen(array)
-
-
-def _indices(name: str, value: ArrayLike, count: int | None = None) -> Indices:
-    array = _whole_numbers(name, value, count, "nodes")
-    if array.ndim != 1:
-        raise CaseInputError(f"{name} has shape {array.shape}: a list of node indices is needed")
-    return _frozen(array)
-
-
-def _number(name: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        raise CaseInputError(f"{name} is {value!r}: a number is needed")
-    number = float(value)
-    if not np.isfinite(number):
-        raise CaseInputError(f"{name} is {number}: must be finite")
-    return number
-
-
-def _positive(name: str, value: object) -> float:
-    number = _number(name, value)
-    if number <= 0.0:
-        raise CaseInputError(f"{name} is {number:g}: must be above 0")
-    return number
-
-
-def _text(name: str, value: object) -> str:
-    if not isinstance(value, str) or not value:
-        raise CaseInputError(f"{name} is {value!r}: a non-empty text is needed")
-    return value
-
-
-def _instance(name: str, value: object, kind: type) -> None:
-    """Refuses a value of another type, naming both."""
-    if not isinstance(value, kind):
-        found = type(value).__name__
-        raise CaseInputError(f"{name} is of type {found}: a {kind.__name__} is needed")
-
-
-def _one_of(name: str, value: object, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise CaseInputError(f"{name} is {value!r}: use one of {', '.join(known)}")
+    def nodes(self, kind: str, segment: str | None = None) -> NDArray[np.uint32]:
+        """The indices of the nodes of a kind ("free", "fixed", "joined", "sliding")."""
+        names = ("free", "fixed", "joined", "sliding")
+        check_one_of("kind", kind, names)
+        chosen = self.kind == names.index(kind)
+        if segment is not None:
+            check_one_of("segment", segment, self.segments)
+            chosen &= self.segment == self.segments.index(segment)
+        return np.flatnonzero(chosen).astype(np.uint32)

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from cmfsim import __version__
-from cmfsim.case import CONTACTS, METHODS, Scene
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import read_plan, read_scene, result_suffixes, write_result
+from cmfsim.scene import CONTACTS, METHODS, Scene
 from cmfsim.simulation import solve_scene
 
 __all__ = ["main"]

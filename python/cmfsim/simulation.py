@@ -18,7 +18,7 @@ from cmfsim._core import (
     Tissue,
     __version__,
 )
-from cmfsim.case import MovedSurface, Scene, SceneResult, SurfaceData, TissueData
+from cmfsim.scene import MovedSurface, Scene, SceneResult, SurfaceData, TissueData
 
 __all__ = ["scene_plan", "scene_solver", "solve_scene"]
 

@@ -1,0 +1,136 @@
+"""Checks of what comes in: shape, range and name, with the index and value at fault."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim.errors import CaseInputError
+
+__all__ = [
+    "Floats",
+    "Indices",
+    "as_floats",
+    "as_index_rows",
+    "as_indices",
+    "as_number",
+    "as_positive",
+    "as_rows",
+    "as_text",
+    "check_instance",
+    "check_one_of",
+    "frozen",
+]
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.uint32]
+
+
+def frozen(array: NDArray[Any]) -> NDArray[Any]:
+    """A read-only array in C order that shares nothing with the caller's."""
+    copy = np.array(array, order="C")
+    copy.setflags(write=False)
+    return copy
+
+
+def as_floats(name: str, value: ArrayLike) -> Floats:
+    """The value as finite float64, or an error with the index at fault."""
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "fiu":
+            raise CaseInputError(f"{name} has dtype {array.dtype}: real numbers are needed")
+        array = array.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, CaseInputError):
+            raise
+        raise CaseInputError(f"{name} is not an array of numbers: {error}") from error
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        index = ", ".join(str(i) for i in bad[0])
+        raise CaseInputError(
+            f"{name}[{index}] is {array[tuple(bad[0])]}: every value must be finite"
+        )
+    return array
+
+
+def as_rows(name: str, value: ArrayLike, width: int) -> Floats:
+    """A read-only (rows, width) float64 copy."""
+    array = as_floats(name, value)
+    if array.ndim != 2 or array.shape[1] != width:
+        raise CaseInputError(f"{name} has shape {array.shape}: (rows, {width}) is needed")
+    return frozen(array)
+
+
+def _whole_numbers(name: str, value: ArrayLike, count: int | None, of: str) -> Indices:
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise CaseInputError(f"{name} is not an array of indices: {error}") from error
+    if array.size == 0:
+        return np.zeros(array.shape, dtype=np.uint32)
+    if array.dtype.kind not in "iu":
+        raise CaseInputError(f"{name} has dtype {array.dtype}: whole numbers are needed")
+    limit = 2**32 if count is None else count
+    bad = np.argwhere((array < 0) | (array >= limit))
+    if len(bad):
+        index = ", ".join(str(i) for i in bad[0])
+        allowed = f"0 to {limit - 1}" if limit else "none"
+        raise CaseInputError(
+            f"{name}[{index}] is {array[tuple(bad[0])]}, but there are {limit} {of} "
+            f"(allowed {allowed}); is the file numbered from 1?"
+        )
+    return array.astype(np.uint32)
+
+
+def as_index_rows(name: str, value: ArrayLike, width: int, count: int, of: str) -> Indices:
+    """A read-only (rows, width) uint32 copy of indices below `count`."""
+    array = _whole_numbers(name, value, count, of)
+    if array.ndim != 2 or array.shape[1] != width:
+        raise CaseInputError(f"{name} has shape {array.shape}: (rows, {width}) is needed")
+    return frozen(array)
+
+
+def as_indices(name: str, value: ArrayLike, count: int | None = None) -> Indices:
+    """A read-only (k,) uint32 copy of node indices, below `count` if given."""
+    array = _whole_numbers(name, value, count, "nodes")
+    if array.ndim != 1:
+        raise CaseInputError(f"{name} has shape {array.shape}: a list of node indices is needed")
+    return frozen(array)
+
+
+def as_number(name: str, value: object) -> float:
+    """A finite float."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise CaseInputError(f"{name} is {value!r}: a number is needed")
+    number = float(value)
+    if not np.isfinite(number):
+        raise CaseInputError(f"{name} is {number}: must be finite")
+    return number
+
+
+def as_positive(name: str, value: object) -> float:
+    """A finite float above zero."""
+    number = as_number(name, value)
+    if number <= 0.0:
+        raise CaseInputError(f"{name} is {number:g}: must be above 0")
+    return number
+
+
+def as_text(name: str, value: object) -> str:
+    """A text that is not empty."""
+    if not isinstance(value, str) or not value:
+        raise CaseInputError(f"{name} is {value!r}: a non-empty text is needed")
+    return value
+
+
+def check_instance(name: str, value: object, kind: type) -> None:
+    """Refuses a value of another type, naming both."""
+    if not isinstance(value, kind):
+        found = type(value).__name__
+        raise CaseInputError(f"{name} is of type {found}: a {kind.__name__} is needed")
+
+
+def check_one_of(name: str, value: object, known: tuple[str, ...]) -> None:
+    """Refuses a name that is not among the known ones."""
+    if value not in known:
+        raise CaseInputError(f"{name} is {value!r}: use one of {', '.join(known)}")

@@ -1,0 +1,137 @@
+"""What every reader and writer of the package does: names in errors, documents, safe replacement.
+
+Files come from strangers: paths may not lead out of a folder, sizes are checked before memory is
+taken. A file is written under a temporary name and renamed, so a run that fails leaves the old one
+whole.
+"""
+
+import contextlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from pathlib import Path, PurePosixPath
+from typing import Any, BinaryIO
+
+from cmfsim.errors import CaseInputError
+
+__all__ = [
+    "FORMAT_VERSION",
+    "beside",
+    "check_version",
+    "known_keys",
+    "named",
+    "read_document",
+    "refuse_constant",
+    "replacing",
+    "table_of",
+]
+
+# Text files (plans, scene descriptions) above this size are not what they say they are, bytes.
+MAX_TEXT = 16 * 2**20
+FORMAT_VERSION = 1
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A file under a temporary name in the same folder, renamed to `path` when all went well."""
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    temporary = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        # mkstemp makes files that only their owner reads; results follow the user's umask.
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Puts the file's name before the text of an error about its content."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        if error.filename is None:
+            raise
+        raise FileNotFoundError(f"{error.filename}: no such file") from error
+    except IsADirectoryError as error:
+        raise CaseInputError(f"{path.name}: is a folder, not a file") from error
+    except ValueError as error:
+        raise CaseInputError(f"{path.name}: {error}") from error
+
+
+def beside(folder: Path, where: str, name: object) -> Path:
+    """A path given by a text file, which may not lead out of that file's folder."""
+    if not isinstance(name, str) or not name:
+        raise CaseInputError(f"{where} names no file")
+    relative = PurePosixPath(name)
+    if relative.is_absolute() or ".." in relative.parts or "\\" in name or ":" in name:
+        raise CaseInputError(f"{where} is {name!r}: a file in the folder of the scene is needed")
+    return folder / relative
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """The tables of a `.toml` or `.json` file."""
+    if path.suffix not in {".toml", ".json"}:
+        raise CaseInputError(f"ends in {path.suffix!r}: .toml or .json is needed")
+    if path.stat().st_size > MAX_TEXT:
+        raise CaseInputError(f"is larger than {MAX_TEXT} bytes")
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+        if path.suffix == ".json":
+            document = json.loads(text, parse_constant=refuse_constant)
+        else:
+            document = _toml().loads(text)
+    except (ValueError, RecursionError) as error:
+        raise CaseInputError(f"cannot be read: {error}") from error
+    if not isinstance(document, dict):
+        raise CaseInputError("is not a table of names and values")
+    return document
+
+
+def _toml() -> Any:
+    for name in ("tomllib", "tomli"):
+        with contextlib.suppress(ModuleNotFoundError):
+            return import_module(name)
+    raise CaseInputError("Python 3.10 reads TOML with tomli: pip install tomli, or use .json")
+
+
+def refuse_constant(name: str) -> float:
+    """Refuses NaN and Infinity, which JSON has not."""
+    message = f"{name} is not a JSON number"
+    raise ValueError(message)
+
+
+def known_keys(where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> dict[str, Any]:
+    """The table, if it has no other keys."""
+    for name in table:
+        if name not in known:
+            raise CaseInputError(f"[{where}] has the unknown key {name!r}: use {', '.join(known)}")
+    return dict(table)
+
+
+def table_of(header: Mapping[str, Any], name: str, *, optional: bool = False) -> dict[str, Any]:
+    """A table of a document by its name; empty if optional and absent."""
+    if name not in header and optional:
+        return {}
+    table = header.get(name)
+    if not isinstance(table, dict):
+        raise CaseInputError(f"lacks the table {name!r}" if table is None else f"{name!r} no table")
+    return table
+
+
+def check_version(version: object) -> None:
+    """Refuses other versions of a format than this one."""
+    if isinstance(version, bool) or not isinstance(version, int):
+        raise CaseInputError(f"version is {version!r}: a whole number is needed")
+    if version != FORMAT_VERSION:
+        hint = "a newer cmfsim made it: update" if version > FORMAT_VERSION else "unknown version"
+        raise CaseInputError(f"version is {version}, this cmfsim reads {FORMAT_VERSION}; {hint}")

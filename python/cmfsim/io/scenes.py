@@ -1,0 +1,306 @@
+"""Scenes and plans: one `.npz`, or a text beside its mesh and surfaces (docs/formats.md)."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.errors import CaseInputError
+from cmfsim.io.archives import member_of, read_archive, write_archive
+from cmfsim.io.files import beside, check_version, known_keys, named, read_document, table_of
+from cmfsim.io.meshes import read_mesh, read_surface, read_tets, read_triangles
+from cmfsim.planning import rigid_motion
+from cmfsim.scene import (
+    TISSUE_ARRAYS,
+    MovedSurface,
+    Scene,
+    SegmentData,
+    SolverOptions,
+    SurfaceData,
+    TissueData,
+)
+
+__all__ = ["read_plan", "read_scene", "write_scene"]
+
+SCENE_FORMAT = "cmfsim-scene"
+# Kinds of node in the point data of a VTU scene.
+NODE_KINDS = ("free", "fixed", "joined", "sliding")
+# Texts of a tissue, beside its arrays.
+TISSUE_TEXTS = ("kind", "law", "preset", "mixing")
+
+
+def read_scene(path: str | os.PathLike[str]) -> Scene:
+    """The scene in a file: one `.npz`, or a `.toml` beside its mesh and surfaces.
+
+    Parameters
+    ----------
+    path : path
+        TOML scenes need the extra `mesh` (meshio).
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    FileNotFoundError
+        The file, or one that it names, does not exist.
+    CaseError
+        (also `ValueError`) Not a scene, another version, an entry missing, misshapen or not finite.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> scene = cmfsim.read_scene("scene.npz")  # doctest: +SKIP
+    """
+    path = Path(path)
+    if path.suffix == ".toml":
+        return _read_toml_scene(path)
+    with named(path):
+        return _scene_from_members(*read_archive(path, SCENE_FORMAT, "scene"))
+
+
+def write_scene(path: str | os.PathLike[str], scene: Scene) -> None:
+    """Writes a scene as one `.npz` that `read_scene` and `cmfsim solve` take.
+
+    The same scene gives the same bytes. An existing file is replaced in one step.
+
+    Parameters
+    ----------
+    path : path
+        Ends in `.npz`.
+    scene : Scene
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Another ending.
+    OSError
+        The folder cannot be written to.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.write_scene("scene.npz", scene)  # doctest: +SKIP
+    """
+    path = Path(path)
+    if path.suffix != ".npz":
+        raise CaseInputError(f"{path.name}: a scene is written as .npz, not {path.suffix!r}")
+    write_archive(path, SCENE_FORMAT, "scene", scene.header(), scene.arrays())
+
+
+def read_plan(path: str | os.PathLike[str], scene: Scene) -> dict[str, NDArray[Any] | MovedSurface]:
+    """The plan in a `.toml` or `.json` file, for the segments of a scene.
+
+    Parameters
+    ----------
+    path : path
+        One table per segment under `plan`: `translation`, `angle` (degrees), `axis`, `centre`; or
+        `matrix` (4 × 4); or `moved_surface` with `surface` (files beside this one).
+    scene : Scene
+        Its segments are those that the plan may name; those that it leaves out are an error.
+
+    Returns
+    -------
+    dict of str to (4, 4) float64, mm, or MovedSurface
+
+    Raises
+    ------
+    FileNotFoundError
+        The file does not exist.
+    CaseError
+        (also `ValueError`) Not a plan, an unknown segment or key, a segment missing.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> plan = cmfsim.read_plan("plan.toml", scene)  # doctest: +SKIP
+    """
+    path = Path(path)
+    with named(path):
+        document = read_document(path)
+        table = table_of(document, "plan")
+        for name in table:
+            if name not in scene.segments:
+                known = ", ".join(repr(s) for s in scene.segments) or "none"
+                raise CaseInputError(f"[plan] names segment {name!r}; segments are: {known}")
+        for name in scene.segments:
+            if name not in table:
+                raise CaseInputError(
+                    f"[plan] lacks segment {name!r}: give it translation = [0, 0, 0] if it stays"
+                )
+        return {name: _motion(name, table, path.parent) for name in scene.segments}
+
+
+def _scene_from_members(header: Mapping[str, Any], members: dict[str, NDArray[Any]]) -> Scene:
+    tissue = table_of(header, "tissue")
+    kind = _tissue_kind(tissue)
+    arrays = {n: members[f"tissue.{n}"] for n in TISSUE_ARRAYS[kind] if f"tissue.{n}" in members}
+    segments: dict[str, SegmentData] = {}
+    plan: dict[str, NDArray[Any] | MovedSurface] = {}
+    entries = header.get("segments")
+    if not isinstance(entries, list):
+        raise CaseInputError("'segments' is not a list")
+    for number, entry in enumerate(entries):
+        key = f"segment.{number}"
+        if not isinstance(entry, dict) or not isinstance(entry.get("name"), str):
+            raise CaseInputError(f"segments[{number}] has no name")
+        name = entry["name"]
+        if name in segments:
+            raise CaseInputError(f"segments[{number}] is {name!r} again")
+        contact = None
+        if f"{key}.contact.vertices" in members:
+            contact = SurfaceData(
+                members[f"{key}.contact.vertices"],
+                member_of(members, f"{key}.contact.triangles"),
+                entry.get("crease_angle", 60.0),
+            )
+        gap = entry["gap"] if "gap" in entry else member_of(members, f"{key}.gap")
+        segments[name] = SegmentData(
+            member_of(members, f"{key}.joined"), member_of(members, f"{key}.sliding"), contact, gap
+        )
+        if entry.get("motion") == "surface":
+            surface = SurfaceData(
+                member_of(members, f"{key}.motion.vertices"),
+                member_of(members, f"{key}.motion.triangles"),
+                entry.get("motion_crease_angle", 60.0),
+            )
+            plan[name] = MovedSurface(surface, member_of(members, f"{key}.motion.moved_vertices"))
+        else:
+            plan[name] = member_of(members, f"{key}.motion")
+    return Scene(
+        nodes=member_of(members, "nodes"),
+        tets=member_of(members, "tets"),
+        tissue=TissueData(**(known_keys("tissue", tissue, TISSUE_TEXTS) | arrays)),
+        segments=segments,
+        plan=plan,
+        fixed=member_of(members, "fixed"),
+        loads=members.get("loads"),
+        options=_options(header),
+        conflicts=header.get("conflicts", "error"),
+    )
+
+
+def _tissue_kind(table: Mapping[str, Any]) -> str:
+    kind = table.get("kind")
+    if not isinstance(kind, str) or kind not in TISSUE_ARRAYS:
+        raise CaseInputError(f"tissue kind is {kind!r}: use one of {', '.join(TISSUE_ARRAYS)}")
+    return kind
+
+
+def _options(header: Mapping[str, Any]) -> SolverOptions:
+    table = table_of(header, "solver", optional=True)
+    return SolverOptions(**known_keys("solver", table, tuple(SolverOptions().as_dict())))
+
+
+def _read_toml_scene(path: Path) -> Scene:
+    with named(path):
+        document = read_document(path)
+        if document.get("format") != SCENE_FORMAT:
+            raise CaseInputError(f"format is {document.get('format')!r}: {SCENE_FORMAT!r} needed")
+        check_version(document.get("version"))
+        keys = ("format", "version", "mesh", "conflicts", "tissue", "segments", "plan", "solver")
+        known_keys("scene", document, keys)
+        mesh_path = beside(path.parent, "mesh", document.get("mesh"))
+        mesh = read_mesh(mesh_path)
+        tets, tet_data = read_tets(mesh, mesh_path)
+        tables = table_of(document, "segments", optional=True)
+        kinds = _node_integers(mesh, "kind", len(mesh.points), mesh_path)
+        owners = _node_integers(mesh, "segment", len(mesh.points), mesh_path) if tables else kinds
+        segments = {
+            name: _segment(name, tables, kinds, owners == number, path.parent)
+            for number, name in enumerate(tables)
+        }
+        _check_kinds(kinds, owners, len(tables))
+        plans = table_of(document, "plan", optional=True)
+        plan = {name: _motion(name, plans, path.parent) for name in plans}
+        tissue = table_of(document, "tissue")
+        return Scene(
+            nodes=mesh.points,
+            tets=tets,
+            tissue=_tissue(tissue, tet_data),
+            segments=segments,
+            plan=plan,
+            fixed=np.flatnonzero(kinds == NODE_KINDS.index("fixed")),
+            loads=mesh.point_data.get("load"),
+            options=_options(document),
+            conflicts=document.get("conflicts", "error"),
+        )
+
+
+def _tissue(table: Mapping[str, Any], tet_data: Mapping[str, NDArray[Any]]) -> TissueData:
+    wanted = TISSUE_ARRAYS[_tissue_kind(table)]
+    given = known_keys("tissue", table, (*TISSUE_TEXTS, *wanted))
+    for name, tail in wanted.items():
+        if name in tet_data:
+            if name in given:
+                raise CaseInputError(f"tissue {name} stands in the file and in the mesh: drop one")
+            values = tet_data[name]
+            # VTK has tensors of 9 components at most, so 6 × 6 travel as 36.
+            given[name] = values.reshape(-1, 6, 6) if tail == (6, 6) else values
+    return TissueData(**given)
+
+
+def _segment(
+    name: str,
+    tables: Mapping[str, Any],
+    kinds: NDArray[np.int64],
+    mine: NDArray[np.bool_],
+    folder: Path,
+) -> SegmentData:
+    table = known_keys(
+        f"segments.{name}", table_of(tables, name), ("contact", "crease_angle", "gap")
+    )
+    contact = None
+    if "contact" in table:
+        surface_path = beside(folder, f"segments.{name}.contact", table["contact"])
+        contact = read_surface(surface_path, table.get("crease_angle", 60.0))
+    return SegmentData(
+        joined=np.flatnonzero((kinds == NODE_KINDS.index("joined")) & mine),
+        sliding=np.flatnonzero((kinds == NODE_KINDS.index("sliding")) & mine),
+        contact=contact,
+        gap=table.get("gap", 0.0),
+    )
+
+
+def _motion(name: str, plans: Mapping[str, Any], folder: Path) -> NDArray[Any] | MovedSurface:
+    where = f"plan.{name}"
+    table = table_of(plans, name)
+    if "matrix" in table:
+        return np.asarray(known_keys(where, table, ("matrix",))["matrix"])
+    if "moved_surface" in table:
+        files = known_keys(where, table, ("surface", "moved_surface"))
+        before, weld = read_triangles(beside(folder, f"{where}.surface", files.get("surface")))
+        after = beside(folder, f"{where}.moved_surface", files["moved_surface"])
+        moved = np.asarray(read_mesh(after).points)
+        if len(moved) != weld.n_read:
+            raise CaseInputError(
+                f"{after.name} has {len(moved)} vertices, {files.get('surface')} {weld.n_read}"
+            )
+        return MovedSurface(before, moved[weld.kept])
+    return rigid_motion(**known_keys(where, table, ("translation", "angle", "axis", "centre")))
+
+
+def _node_integers(mesh: Any, name: str, count: int, path: Path) -> NDArray[np.int64]:
+    if name not in mesh.point_data:
+        raise CaseInputError(f"{path.name}: lacks the point data {name!r}")
+    values = np.asarray(mesh.point_data[name]).reshape(-1)
+    if values.shape != (count,) or not np.isfinite(values).all() or (values % 1 != 0).any():
+        raise CaseInputError(f"{path.name}: point data {name!r} is not one whole number per node")
+    return values.astype(np.int64)
+
+
+def _check_kinds(kinds: NDArray[np.int64], owners: NDArray[np.int64], n_segments: int) -> None:
+    known = ", ".join(f"{i} {name}" for i, name in enumerate(NODE_KINDS))
+    bad = np.flatnonzero((kinds < 0) | (kinds >= len(NODE_KINDS)))
+    if len(bad):
+        raise CaseInputError(f"kind[{bad[0]}] is {kinds[bad[0]]}: use {known}")
+    bad = np.flatnonzero((kinds >= 2) & ((owners < 0) | (owners >= n_segments)))
+    if len(bad):
+        raise CaseInputError(
+            f"segment[{bad[0]}] is {owners[bad[0]]}, but there are {n_segments} segments "
+            "(numbered from 0 in the order of [segments])"
+        )
