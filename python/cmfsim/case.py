@@ -8,7 +8,7 @@ known better than its voxels and cutting a bone by a plane is a minimum of two n
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,13 +70,13 @@ class ImageData:
     @property
     def lowest(self) -> Floats:
         """Centre of the first voxel, (3,) mm."""
-        origin: Floats = np.asarray(self.origin, dtype=np.float64)
-        return origin
+        return cast("Floats", self.origin)
 
     @property
     def highest(self) -> Floats:
         """Centre of the last voxel, (3,) mm."""
-        return self.lowest + (np.array(self.values.shape) - 1) * np.asarray(self.spacing)
+        steps = np.array(self.values.shape) - 1
+        return cast("Floats", self.lowest + steps * np.asarray(self.spacing))
 
     def with_values(self, values: NDArray[Any]) -> "ImageData":
         """Other values on the same grid."""
