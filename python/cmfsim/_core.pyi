@@ -29,6 +29,10 @@ __all__ = [
     "TetMesh",
     "Tissue",
     "__version__",
+    "distance_image",
+    "part_mesh",
+    "signed_distance_image",
+    "stuff_image",
 ]
 
 _Floats: TypeAlias = NDArray[np.float64]
@@ -259,3 +263,25 @@ class PlanOperator:
     @property
     def matrix(self) -> _Floats: ...
     def __call__(self, plan: _Plan) -> _Floats: ...
+
+def stuff_image(
+    values: ArrayLike,
+    spacing: tuple[float, float, float],
+    edge_length: float,
+    origin: tuple[float, float, float],
+    *,
+    refinements: int,
+    least_body: float,
+) -> tuple[TetMesh, dict[str, float]]: ...
+def distance_image(
+    targets: ArrayLike, spacing: tuple[float, float, float]
+) -> NDArray[np.float32]: ...
+def signed_distance_image(
+    surface: Surface,
+    shape: tuple[int, int, int],
+    spacing: tuple[float, float, float],
+    origin: tuple[float, float, float],
+    *,
+    band: float,
+) -> NDArray[np.float32]: ...
+def part_mesh(mesh: TetMesh, surface: Surface) -> tuple[TetMesh, int]: ...

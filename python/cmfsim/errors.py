@@ -28,6 +28,7 @@ __all__ = [
     "LandmarkError",
     "MaterialError",
     "MeshError",
+    "MeshInputError",
     "RegistrationError",
     "SolverError",
 ]
@@ -39,3 +40,7 @@ class BoundaryInputError(BoundaryError, ValueError):
 
 class CaseInputError(CaseError, ValueError):
     """A scene or case, in memory or on disk, that cannot be meant."""
+
+
+class MeshInputError(MeshError, ValueError):
+    """Labels, levels or surfaces that cannot be meshed."""

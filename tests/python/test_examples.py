@@ -17,7 +17,16 @@ MODULES = sorted(
     m.name for m in pkgutil.walk_packages(cmfsim.__path__, "cmfsim.") if m.name != "cmfsim._core"
 )
 # Values that only stages make: their attributes are described, an example would say nothing.
-MADE_BY_STAGES = {"Anatomy", "BoneSegment", "Finding", "NodeKinds", "RigidMotion", "SceneResult"}
+MADE_BY_STAGES = {
+    "Anatomy",
+    "BoneSegment",
+    "Finding",
+    "MeshReport",
+    "NodeKinds",
+    "RigidMotion",
+    "SceneResult",
+    "TissueMesh",
+}
 
 
 @pytest.fixture

@@ -114,6 +114,70 @@ pub fn values(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<f64>> {
     }
 }
 
+/// An image of three axes, k fastest.
+pub enum Image {
+    /// Whether each voxel is tissue.
+    Labels([usize; 3], Vec<bool>),
+    /// Level of each voxel.
+    Level([usize; 3], Vec<f32>),
+}
+
+/// An image: labels if its values are bool or whole numbers, a level if they are real.
+pub fn image(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Image> {
+    let (array, shape, kind) = three_axes(value, name)?;
+    if "biu".contains(&kind) {
+        return Ok(Image::Labels(shape, non_zero(&array, name)?));
+    }
+    let array = converted(&array, name, "f", "float32", "labels or real numbers")?;
+    let array: PyReadonlyArrayDyn<'_, f32> = array.extract()?;
+    let values = array.as_slice().map_err(|e| name.fail(format!("is not contiguous: {e}")))?;
+    Ok(Image::Level(shape, values.to_vec()))
+}
+
+/// Whether each voxel of an image of bool or whole numbers is not zero.
+pub fn labels(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<([usize; 3], Vec<bool>)> {
+    let (array, shape, kind) = three_axes(value, name)?;
+    if !"biu".contains(&kind) {
+        return Err(name.fail("has real numbers where bool or whole numbers are needed".into()));
+    }
+    Ok((shape, non_zero(&array, name)?))
+}
+
+fn three_axes<'py>(
+    value: &Bound<'py, PyAny>,
+    name: Named<'_>,
+) -> PyResult<(Bound<'py, PyAny>, [usize; 3], String)> {
+    let array = value
+        .py()
+        .import("numpy")?
+        .call_method1("asarray", (value,))
+        .map_err(|e| name.fail(format!("cannot be read as an array: {e}")))?;
+    let shape: Vec<usize> = array.getattr("shape")?.extract()?;
+    let shape = shape.try_into().map_err(|found: Vec<usize>| {
+        name.fail(format!("has shape {} where (nx, ny, nz) is needed", shape_text(&found)))
+    })?;
+    let kind = array.getattr("dtype")?.getattr("kind")?.extract()?;
+    Ok((array, shape, kind))
+}
+
+fn non_zero(array: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<bool>> {
+    let numpy = array.py().import("numpy")?;
+    let inside = numpy.call_method1("not_equal", (array, 0))?;
+    let inside = numpy.call_method1("ascontiguousarray", (inside,))?;
+    let inside: PyReadonlyArrayDyn<'_, bool> = inside.extract()?;
+    let values = inside.as_slice().map_err(|e| name.fail(format!("is not contiguous: {e}")))?;
+    Ok(values.to_vec())
+}
+
+/// An image of three axes for Python, k fastest.
+pub fn volume(
+    py: Python<'_>,
+    shape: [usize; 3],
+    values: Vec<f32>,
+) -> PyResult<Bound<'_, PyArray3<f32>>> {
+    values.into_pyarray(py).reshape(shape)
+}
+
 /// A 4×4 matrix, or nothing where the shape is another.
 pub fn matrix4(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Option<[[f64; 4]; 4]>> {
     let array = converted(value, name, "fiu", "float64", "real numbers")?;

@@ -6,6 +6,7 @@ mod geometry;
 mod materials;
 mod model;
 mod running;
+mod stuffing;
 
 #[global_allocator]
 static MEMORY: mtm_core::memory::HugePages = mtm_core::memory::HugePages;
@@ -21,6 +22,9 @@ mod _core {
     use crate::materials::{PyMassTensors, PyTissue};
     #[pymodule_export]
     use crate::model::{PyBoundary, PyPlanOperator, PySolution, PyStaticSolver};
+
+    #[pymodule_export]
+    use crate::stuffing::{distance_image, part_mesh, signed_distance_image, stuff_image};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

@@ -1,0 +1,256 @@
+//! Level images: a scalar on a regular grid, positive in the tissue, zero on its surface.
+
+use rayon::prelude::*;
+
+use crate::error::{ErrorKind, MtmError, Result};
+
+/// Value far outside the grid, and of a clipped level far outside the tissue.
+const OUTSIDE: f32 = -1.0;
+/// Smallest size of a level made from labels at a voxel centre. Smoothing rounds the steps between
+/// voxels, but it must not take a voxel its label: sheets and gaps one voxel thick stay.
+const LABEL_FLOOR: f32 = 0.1;
+
+/// Regular grid of voxels; value [i, j, k] lies at origin + (i, j, k) · spacing, k runs fastest.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Grid {
+    /// Voxels along each axis.
+    pub shape: [usize; 3],
+    /// Distance of voxel centres along each axis, mm.
+    pub spacing: [f64; 3],
+    /// Centre of the first voxel, mm.
+    pub origin: [f64; 3],
+}
+
+/// Scalar on a grid, positive inside, interpolated trilinearly; outside the grid it is negative.
+#[derive(Debug, Clone)]
+pub struct LevelImage {
+    grid: Grid,
+    values: Vec<f32>,
+}
+
+impl Grid {
+    /// The grid, checked.
+    ///
+    /// # Errors
+    /// An empty axis, spacing that is not positive, values that are not finite.
+    pub fn new(shape: [usize; 3], spacing: [f64; 3], origin: [f64; 3]) -> Result<Self> {
+        let kind = ErrorKind::Mesh;
+        if shape.contains(&0) {
+            return Err(MtmError::Empty { what: "image", kind });
+        }
+        for axis in 0..3 {
+            if !(spacing[axis] > 0.0 && spacing[axis].is_finite()) {
+                return Err(MtmError::OutOfRange {
+                    what: "spacing".into(),
+                    index: axis,
+                    value: spacing[axis],
+                    allowed: "above 0 mm and finite",
+                    kind,
+                });
+            }
+            if !origin[axis].is_finite() {
+                let (what, value) = ("origin".into(), origin[axis]);
+                return Err(MtmError::NotFinite { what, index: axis, value, kind });
+            }
+        }
+        Ok(Self { shape, spacing, origin })
+    }
+
+    /// Number of voxels.
+    pub fn len(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// Whether there is no voxel; a checked grid has some.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Centre of the last voxel, mm.
+    pub fn highest(&self) -> [f64; 3] {
+        [0, 1, 2].map(|a| self.origin[a] + (self.shape[a] - 1) as f64 * self.spacing[a])
+    }
+
+    /// Centre of voxel `index` of the flat array, mm.
+    pub fn centre(&self, index: usize) -> [f64; 3] {
+        let [_, ny, nz] = self.shape;
+        let voxel = [index / (ny * nz), index / nz % ny, index % nz];
+        [0, 1, 2].map(|a| self.origin[a] + voxel[a] as f64 * self.spacing[a])
+    }
+}
+
+impl LevelImage {
+    /// The level image of `values` on `grid`.
+    ///
+    /// # Errors
+    /// Another number of values than voxels, NaN or infinity.
+    pub fn new(grid: Grid, values: Vec<f32>) -> Result<Self> {
+        let kind = ErrorKind::Mesh;
+        if values.len() != grid.len() {
+            return Err(MtmError::Length {
+                what: "level image".into(),
+                found: values.len(),
+                expected: grid.len(),
+                why: "one per voxel",
+                kind,
+            });
+        }
+        if let Some(index) = values.par_iter().position_first(|v| !v.is_finite()) {
+            let value = f64::from(values[index]);
+            return Err(MtmError::NotFinite { what: "level image".into(), index, value, kind });
+        }
+        Ok(Self { grid, values })
+    }
+
+    /// The level image of labels: non-zero is tissue.
+    ///
+    /// Steps between voxels are smoothed by the binomial filter (1 2 1)/4 along each axis, which keeps
+    /// flat faces half-way between voxels; every voxel centre keeps its side.
+    ///
+    /// # Errors
+    /// Another number of labels than voxels.
+    pub fn from_labels(grid: Grid, inside: &[bool]) -> Result<Self> {
+        if inside.len() != grid.len() {
+            return Err(MtmError::Length {
+                what: "labels".into(),
+                found: inside.len(),
+                expected: grid.len(),
+                why: "one per voxel",
+                kind: ErrorKind::Mesh,
+            });
+        }
+        let [nx, ny, nz] = grid.shape;
+        let plane = ny * nz;
+        // Along j and k plane by plane, then along i from the three planes round each.
+        let mut smooth = vec![0.0_f32; grid.len()];
+        smooth.par_chunks_mut(plane).zip(inside.par_chunks(plane)).for_each(|(out, labels)| {
+            let mut rows = vec![0.0_f32; plane];
+            for (row, labels) in rows.chunks_mut(nz).zip(labels.chunks(nz)) {
+                let at = |k: usize| if labels[k] { 1.0 } else { OUTSIDE };
+                for k in 0..nz {
+                    let low = if k > 0 { at(k - 1) } else { OUTSIDE };
+                    let high = if k + 1 < nz { at(k + 1) } else { OUTSIDE };
+                    row[k] = 0.25 * (low + high) + 0.5 * at(k);
+                }
+            }
+            for j in 0..ny {
+                for k in 0..nz {
+                    let low = if j > 0 { rows[(j - 1) * nz + k] } else { OUTSIDE };
+                    let high = if j + 1 < ny { rows[(j + 1) * nz + k] } else { OUTSIDE };
+                    out[j * nz + k] = 0.25 * (low + high) + 0.5 * rows[j * nz + k];
+                }
+            }
+        });
+        let mut values = vec![0.0_f32; grid.len()];
+        values.par_chunks_mut(plane).enumerate().for_each(|(i, out)| {
+            for (p, value) in out.iter_mut().enumerate() {
+                let at = |i: usize| smooth[i * plane + p];
+                let low = if i > 0 { at(i - 1) } else { OUTSIDE };
+                let high = if i + 1 < nx { at(i + 1) } else { OUTSIDE };
+                let level = 0.25 * (low + high) + 0.5 * at(i);
+                *value = if inside[i * plane + p] {
+                    level.max(LABEL_FLOOR)
+                } else {
+                    level.min(-LABEL_FLOOR)
+                };
+            }
+        });
+        Ok(Self { grid, values })
+    }
+
+    /// The grid.
+    pub fn grid(&self) -> &Grid {
+        &self.grid
+    }
+
+    /// Value of each voxel, k fastest.
+    pub fn values(&self) -> &[f32] {
+        &self.values
+    }
+
+    /// Value of each voxel, k fastest, given away.
+    pub fn into_values(self) -> Vec<f32> {
+        self.values
+    }
+
+    /// The trilinear value at a point (mm).
+    ///
+    /// Tissue ends where its image ends: a voxel beyond the border is as far outside as the border voxel is
+    /// inside, so that the surface runs half a voxel beyond the last centre, on the face of the voxel.
+    pub fn value(&self, point: [f64; 3]) -> f64 {
+        let mut low = [0_isize; 3];
+        let mut part = [0.0_f64; 3];
+        for axis in 0..3 {
+            let place = (point[axis] - self.grid.origin[axis]) / self.grid.spacing[axis];
+            let floor = place.floor();
+            if floor < -1.0 || floor >= self.grid.shape[axis] as f64 {
+                return f64::from(OUTSIDE);
+            }
+            low[axis] = floor as isize;
+            part[axis] = place - floor;
+        }
+        let [nx, ny, nz] = self.grid.shape.map(|n| n as isize);
+        let at = |i: isize, j: isize, k: isize| {
+            let [p, q, r] = [i.clamp(0, nx - 1), j.clamp(0, ny - 1), k.clamp(0, nz - 1)];
+            let value = f64::from(self.values[((p * ny + q) * nz + r) as usize]);
+            if [p, q, r] == [i, j, k] { value } else { -value.abs() }
+        };
+        let [i, j, k] = low;
+        let along_k =
+            |i: isize, j: isize| at(i, j, k) * (1.0 - part[2]) + at(i, j, k + 1) * part[2];
+        let along_j = |i: isize| along_k(i, j) * (1.0 - part[1]) + along_k(i, j + 1) * part[1];
+        along_j(i) * (1.0 - part[0]) + along_j(i + 1) * part[0]
+    }
+
+    /// Gradient of the level at a point by central differences over a tenth of a voxel, 1/mm.
+    pub fn gradient(&self, point: [f64; 3]) -> [f64; 3] {
+        [0, 1, 2].map(|axis| {
+            let step = 0.1 * self.grid.spacing[axis];
+            let mut ends = [point; 2];
+            ends[0][axis] -= step;
+            ends[1][axis] += step;
+            (self.value(ends[1]) - self.value(ends[0])) / (2.0 * step)
+        })
+    }
+
+    /// Volume inside, mm³: voxels at their value's share, linear across the surface.
+    ///
+    /// A voxel whose neighbours all have its sign counts whole; the others by eight sub-samples.
+    pub fn volume(&self) -> f64 {
+        let [_, ny, nz] = self.grid.shape;
+        let voxel = self.grid.spacing.iter().product::<f64>();
+        let eighths: u64 = (0..self.values.len())
+            .into_par_iter()
+            .map(|index| {
+                let (i, j, k) = (index / (ny * nz), index / nz % ny, index % nz);
+                if self.is_surrounded(i, j, k) {
+                    return if self.values[index] > 0.0 { 8 } else { 0 };
+                }
+                let centre = self.grid.centre(index);
+                (0..8_u64)
+                    .filter(|corner| {
+                        let point = [0, 1, 2].map(|a| {
+                            let side = if corner >> a & 1 == 1 { 0.25 } else { -0.25 };
+                            centre[a] + side * self.grid.spacing[a]
+                        });
+                        self.value(point) > 0.0
+                    })
+                    .count() as u64
+            })
+            .sum();
+        eighths as f64 / 8.0 * voxel
+    }
+
+    fn is_surrounded(&self, i: usize, j: usize, k: usize) -> bool {
+        let [nx, ny, nz] = self.grid.shape;
+        if i == 0 || j == 0 || k == 0 || i + 1 == nx || j + 1 == ny || k + 1 == nz {
+            return false;
+        }
+        let here = self.values[(i * ny + j) * nz + k] > 0.0;
+        (i - 1..=i + 1).all(|i| {
+            (j - 1..=j + 1).all(|j| {
+                (k - 1..=k + 1).all(|k| (self.values[(i * ny + j) * nz + k] > 0.0) == here)
+            })
+        })
+    }
+}

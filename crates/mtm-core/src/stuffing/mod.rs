@@ -1,0 +1,291 @@
+//! Isosurface stuffing: tets of good shape inside a level image (Labelle & Shewchuk 2007).
+//!
+//! A body-centred cubic lattice covers the image, finer where the tissue or a gap in it is thin. The zero
+//! set of the level cuts it; vertices near the cut move onto it, so that no sliver is left. Where cubes of
+//! two sizes meet on the surface the bound on the angles is lost, and `improve` wins it back.
+
+pub mod cut;
+pub mod distance;
+pub mod improve;
+pub mod lattice;
+pub mod level;
+pub mod parts;
+
+use rayon::prelude::*;
+
+use crate::error::{ErrorKind, MtmError, Result};
+use crate::mesh::{TetMesh, add, cross, norm, scaled, sub};
+
+use cut::cut;
+use distance::{squared_distance, thin_parts};
+use improve::improve;
+use lattice::{Lattice, Octree};
+use level::LevelImage;
+use parts::{Dropped, keep_bodies};
+
+/// Deepest refinement: edges an eighth of the edge length.
+pub const MAX_REFINEMENTS: u32 = 3;
+/// Most coarse cubes of a lattice; above, the edge length is a mistake of units.
+const MAX_CUBES: f64 = 1e8;
+/// No point is farther from the lattice than √5/4 of its edge, so that a sheet thicker than twice that is
+/// found everywhere; a little more against unlucky places.
+const THIN_RADIUS: f64 = 0.6;
+/// Edges and corners up to 90° are no sheets: a ball in them leaves √2 − 1 of its radius.
+const THIN_SLACK: f64 = 0.5;
+/// Shortest edge that refinement makes, in the mean size of a voxel.
+const LEAST_EDGE_IN_VOXELS: f64 = 0.7;
+/// Steps along a normal that look for the surface, and halvings that then find it.
+const ERROR_STEPS: usize = 20;
+const ERROR_HALVINGS: usize = 12;
+
+/// How a level image is filled with tets.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StuffingOptions {
+    /// Longest edge of the lattice, mm: the edge of its cubes.
+    pub edge_length: f64,
+    /// How often the edge may be halved where the tissue or a gap is thin; 0 keeps one size.
+    pub refinements: u32,
+    /// Volume below which a body apart from the largest is a speck and is dropped, mm³.
+    pub least_body: f64,
+}
+
+impl Default for StuffingOptions {
+    fn default() -> Self {
+        Self { edge_length: 3.0, refinements: 1, least_body: 0.0 }
+    }
+}
+
+/// A mesh with what its making left out and how near it came to its level.
+#[derive(Debug, Clone)]
+pub struct Stuffed {
+    /// The mesh.
+    pub mesh: TetMesh,
+    /// Bodies that were too small to keep.
+    pub dropped: Dropped,
+    /// Poor tets at the surface that were dropped.
+    pub dropped_tets: usize,
+    /// Volume inside the level image, mm³.
+    pub level_volume: f64,
+    /// Mean distance of the boundary triangles' centroids from the zero set, mm.
+    pub boundary_error_mean: f64,
+    /// Largest of these distances, mm; at most the edge length, where the zero set is out of reach.
+    pub boundary_error_max: f64,
+}
+
+/// The mesh of `level`, with dihedral angles of at least 10°.
+///
+/// # Errors
+/// Options out of range, no tissue in the image, or none that the lattice catches, an edge length so small
+/// that the lattice has no end.
+pub fn stuff(level: &LevelImage, options: &StuffingOptions) -> Result<Stuffed> {
+    check(options)?;
+    let cover = Cover::new(level, options)?;
+    let lattice = Lattice::new(&cover.tree(level, options));
+    let mut stuffed = cut(&lattice, level, cover.origin, cover.unit);
+    drop(lattice);
+    if stuffed.tets.is_empty() {
+        return Err(MtmError::OutOfRange {
+            what: "edge_length".into(),
+            index: 0,
+            value: options.edge_length,
+            allowed: "below about the thickness of the tissue, or more refinements: no tet fits",
+            kind: ErrorKind::Mesh,
+        });
+    }
+    let dropped_tets = improve(&mut stuffed, level);
+    let dropped = keep_bodies(&mut stuffed, options.least_body);
+    let mesh = TetMesh::new(stuffed.nodes, stuffed.tets)?;
+    let (boundary_error_mean, boundary_error_max) =
+        boundary_error(&mesh, level, options.edge_length);
+    Ok(Stuffed {
+        mesh,
+        dropped,
+        dropped_tets,
+        level_volume: level.volume(),
+        boundary_error_mean,
+        boundary_error_max,
+    })
+}
+
+/// Mean and largest distance of the centroids of boundary triangles from the zero set along their normals.
+fn boundary_error(mesh: &TetMesh, level: &LevelImage, reach: f64) -> (f64, f64) {
+    let errors: Vec<f64> = mesh
+        .boundary_triangles()
+        .par_iter()
+        .map(|triangle| {
+            let [a, b, c] = triangle.map(|v| mesh.nodes()[v as usize]);
+            let normal = cross(sub(b, a), sub(c, a));
+            let centroid = scaled(add(add(a, b), c), 1.0 / 3.0);
+            // Outwards where the centroid lies inside, inwards where it lies outside.
+            let inside = level.value(centroid) > 0.0;
+            let sense = if inside { 1.0 } else { -1.0 } / norm(normal);
+            let at = |d: f64| level.value(add(centroid, scaled(normal, d * sense))) > 0.0;
+            let step = reach / ERROR_STEPS as f64;
+            let beyond = (1..=ERROR_STEPS).map(|s| s as f64 * step).find(|&d| at(d) != inside);
+            let Some(mut high) = beyond else { return reach };
+            let mut low = high - step;
+            for _ in 0..ERROR_HALVINGS {
+                let middle = 0.5 * (low + high);
+                if at(middle) == inside { low = middle } else { high = middle }
+            }
+            0.5 * (low + high)
+        })
+        .collect();
+    let sum: f64 = errors.iter().sum();
+    (sum / errors.len() as f64, errors.iter().copied().fold(0.0, f64::max))
+}
+
+fn check(options: &StuffingOptions) -> Result<()> {
+    let kind = ErrorKind::Mesh;
+    if !(options.edge_length > 0.0 && options.edge_length.is_finite()) {
+        return Err(MtmError::OutOfRange {
+            what: "edge_length".into(),
+            index: 0,
+            value: options.edge_length,
+            allowed: "above 0 mm and finite",
+            kind,
+        });
+    }
+    if options.refinements > MAX_REFINEMENTS {
+        return Err(MtmError::OutOfRange {
+            what: "refinements".into(),
+            index: 0,
+            value: f64::from(options.refinements),
+            allowed: "0 to 3",
+            kind,
+        });
+    }
+    if options.least_body.is_nan() || options.least_body < 0.0 {
+        return Err(MtmError::OutOfRange {
+            what: "least_body".into(),
+            index: 0,
+            value: options.least_body,
+            allowed: "0 mm³ or more",
+            kind,
+        });
+    }
+    Ok(())
+}
+
+/// Coarse cubes over the inside of an image.
+struct Cover {
+    origin: [f64; 3],
+    counts: [usize; 3],
+    edge: f64,
+    unit: f64,
+}
+
+impl Cover {
+    fn new(level: &LevelImage, options: &StuffingOptions) -> Result<Self> {
+        let grid = level.grid();
+        let (low, high) = inside_bounds(level)
+            .ok_or(MtmError::Empty { what: "tissue of the image", kind: ErrorKind::Mesh })?;
+        let edge = options.edge_length;
+        // The surface lies up to one voxel beyond the last voxel inside; one cube more on every side.
+        let margin = grid.spacing.map(|s| s + edge);
+        let origin = [0, 1, 2].map(|a| low[a] - margin[a]);
+        let counts = [0, 1, 2].map(|a| ((high[a] + margin[a] - origin[a]) / edge).ceil().max(1.0));
+        if counts.iter().product::<f64>() > MAX_CUBES {
+            return Err(MtmError::OutOfRange {
+                what: "edge_length".into(),
+                index: 0,
+                value: edge,
+                allowed: "large enough for at most 1e8 cubes over the tissue; are both in mm?",
+                kind: ErrorKind::Mesh,
+            });
+        }
+        let unit = edge / f64::from(2_u32 << options.refinements);
+        Ok(Self { origin, counts: counts.map(|c| c as usize), edge, unit })
+    }
+
+    /// The octree over the cubes near tissue, refined where tissue or a gap in it is thin.
+    fn tree(&self, level: &LevelImage, options: &StuffingOptions) -> Octree {
+        let active = self.active(level);
+        let mut tree = Octree::new(self.counts, options.refinements, &active);
+        if options.refinements == 0 {
+            return tree;
+        }
+        let grid = level.grid();
+        let values = level.values();
+        let to_outside = squared_distance(grid, |index| values[index] <= 0.0);
+        let to_inside = squared_distance(grid, |index| values[index] > 0.0);
+        let voxel = grid.spacing.iter().product::<f64>().cbrt();
+        for refinement in 0..options.refinements {
+            let edge = self.edge / f64::from(1_u32 << refinement);
+            // What is finer than the image is its noise.
+            if 0.5 * edge < LEAST_EDGE_IN_VOXELS * voxel {
+                break;
+            }
+            let size = tree.coarse_size() >> (refinement + 1);
+            for squared in [&to_outside, &to_inside] {
+                let thin = thin_parts(grid, squared, THIN_RADIUS * edge, THIN_SLACK);
+                for index in (0..grid.len()).filter(|&index| thin[index]) {
+                    self.refine_round(&mut tree, grid.centre(index), 0.5 * edge, size);
+                }
+            }
+        }
+        tree.balance();
+        tree
+    }
+
+    /// Refines the cubes at a point and at the corners of a box round it.
+    fn refine_round(&self, tree: &mut Octree, point: [f64; 3], reach: f64, size: i32) {
+        for corner in 0..8 {
+            let place = [0, 1, 2].map(|a| {
+                let side = if corner >> a & 1 == 1 { reach } else { -reach };
+                ((point[a] + side - self.origin[a]) / self.unit).floor() as i32
+            });
+            tree.refine(place, size);
+        }
+    }
+
+    /// Whether each cube, or one beside it, holds a voxel inside or next to one.
+    fn active(&self, level: &LevelImage) -> Vec<bool> {
+        let grid = level.grid();
+        let [nx, ny, nz] = self.counts;
+        let occupied: Vec<bool> = (0..nx * ny * nz)
+            .into_par_iter()
+            .map(|c| {
+                let cube = [c / (ny * nz), c / nz % ny, c % nz];
+                // Voxels from one before the cube to one after it, the cubes beside it included.
+                let span = |a: usize| {
+                    let low = self.origin[a] + (cube[a] as f64 - 1.0) * self.edge;
+                    let high = low + 3.0 * self.edge;
+                    let voxel = |x: f64| (x - grid.origin[a]) / grid.spacing[a];
+                    let first = (voxel(low).floor() - 1.0).max(0.0);
+                    let last = (voxel(high).ceil() + 1.0).min(grid.shape[a] as f64 - 1.0);
+                    (first as usize)..((last.max(-1.0) + 1.0) as usize)
+                };
+                let [i, j, k] = [span(0), span(1), span(2)];
+                i.clone().any(|i| {
+                    j.clone().any(|j| {
+                        let row = (i * grid.shape[1] + j) * grid.shape[2];
+                        level.values()[row + k.start.min(k.end)..row + k.end]
+                            .iter()
+                            .any(|&v| v > 0.0)
+                    })
+                })
+            })
+            .collect();
+        occupied
+    }
+}
+
+/// Smallest box round the voxel centres inside.
+fn inside_bounds(level: &LevelImage) -> Option<([f64; 3], [f64; 3])> {
+    let grid = level.grid();
+    let [_, ny, nz] = grid.shape;
+    let voxels = level
+        .values()
+        .par_iter()
+        .enumerate()
+        .filter(|(_, v)| **v > 0.0)
+        .map(|(index, _)| [index / (ny * nz), index / nz % ny, index % nz])
+        .map(|voxel| (voxel, voxel))
+        .reduce_with(|(a, b), (c, d)| {
+            ([0, 1, 2].map(|x| a[x].min(c[x])), [0, 1, 2].map(|x| b[x].max(d[x])))
+        })?;
+    let place =
+        |voxel: [usize; 3]| [0, 1, 2].map(|a| grid.origin[a] + voxel[a] as f64 * grid.spacing[a]);
+    Some((place(voxels.0), place(voxels.1)))
+}

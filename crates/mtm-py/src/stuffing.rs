@@ -1,0 +1,102 @@
+//! Meshes of labels and level images, and level images of surfaces, for Python.
+
+use std::sync::Arc;
+
+use mtm_core::error::ErrorKind;
+use mtm_core::parting::part;
+use mtm_core::signed_distance::signed_distance;
+use mtm_core::stuffing::distance::squared_distance;
+use mtm_core::stuffing::level::{Grid, LevelImage};
+use mtm_core::stuffing::{Stuffed, StuffingOptions, stuff};
+use numpy::PyArray3;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::arrays::{self, Named};
+use crate::errors::Failure;
+use crate::geometry::{PySurface, PyTetMesh};
+use crate::running::interruptible;
+
+const MESH: ErrorKind = ErrorKind::Mesh;
+
+/// Mesh of the tissue in a label image or inside a level image, and a dict of what its making says.
+///
+/// `values`: (nx, ny, nz); bool or whole numbers are labels (non-zero is tissue), real numbers a level
+/// (positive inside). `spacing`, `origin`: (3,) mm. The dict has `dropped_parts`, `dropped_volume` (mm³),
+/// `dropped_tets`, `level_volume` (mm³), `boundary_error_mean` and `boundary_error_max` (mm).
+#[pyfunction]
+#[pyo3(signature = (values, spacing, edge_length, origin, *, refinements, least_body))]
+pub fn stuff_image<'py>(
+    py: Python<'py>,
+    values: &Bound<'py, PyAny>,
+    spacing: [f64; 3],
+    edge_length: f64,
+    origin: [f64; 3],
+    refinements: u32,
+    least_body: f64,
+) -> PyResult<(PyTetMesh, Bound<'py, PyDict>)> {
+    let image = arrays::image(values, Named("image", MESH))?;
+    let options = StuffingOptions { edge_length, refinements, least_body };
+    let made: Stuffed = interruptible(py, move |_| {
+        let level = match image {
+            arrays::Image::Labels(shape, inside) => {
+                LevelImage::from_labels(Grid::new(shape, spacing, origin)?, &inside)?
+            }
+            arrays::Image::Level(shape, values) => {
+                LevelImage::new(Grid::new(shape, spacing, origin)?, values)?
+            }
+        };
+        stuff(&level, &options)
+    })?;
+    let report = PyDict::new(py);
+    report.set_item("dropped_parts", made.dropped.parts)?;
+    report.set_item("dropped_volume", made.dropped.volume)?;
+    report.set_item("dropped_tets", made.dropped_tets)?;
+    report.set_item("level_volume", made.level_volume)?;
+    report.set_item("boundary_error_mean", made.boundary_error_mean)?;
+    report.set_item("boundary_error_max", made.boundary_error_max)?;
+    Ok((PyTetMesh::wrap(Arc::new(made.mesh)), report))
+}
+
+/// Distance of every voxel centre to the nearest non-zero one, (nx, ny, nz) float32, mm; infinite without any.
+#[pyfunction]
+pub fn distance_image<'py>(
+    py: Python<'py>,
+    targets: &Bound<'py, PyAny>,
+    spacing: [f64; 3],
+) -> PyResult<Bound<'py, PyArray3<f32>>> {
+    let name = Named("targets", MESH);
+    let (shape, inside) = arrays::labels(targets, name)?;
+    let grid = Grid::new(shape, spacing, [0.0; 3]).map_err(Failure)?;
+    let squared = interruptible(py, move |_| Ok(squared_distance(&grid, |index| inside[index])))?;
+    arrays::volume(py, shape, squared.into_iter().map(f32::sqrt).collect())
+}
+
+/// Signed distance to a surface on a grid, (nx, ny, nz) float32, mm: positive inside, clipped at ±band.
+#[pyfunction]
+#[pyo3(signature = (surface, shape, spacing, origin, *, band))]
+pub fn signed_distance_image<'py>(
+    py: Python<'py>,
+    surface: &Bound<'py, PySurface>,
+    shape: [usize; 3],
+    spacing: [f64; 3],
+    origin: [f64; 3],
+    band: f64,
+) -> PyResult<Bound<'py, PyArray3<f32>>> {
+    let grid = Grid::new(shape, spacing, origin).map_err(Failure)?;
+    let surface = surface.get().core.clone();
+    let level = interruptible(py, move |_| signed_distance(&surface, grid, band))?;
+    arrays::volume(py, shape, level.into_values())
+}
+
+/// The mesh parted along an open surface, and the number of nodes doubled; (n,) tuple of mesh and count.
+#[pyfunction]
+pub fn part_mesh(
+    py: Python<'_>,
+    mesh: &Bound<'_, PyTetMesh>,
+    surface: &Bound<'_, PySurface>,
+) -> PyResult<(PyTetMesh, usize)> {
+    let (mesh, surface) = (mesh.get().core.clone(), surface.get().core.clone());
+    let parted = interruptible(py, move |_| part(&mesh, &surface))?;
+    Ok((PyTetMesh::wrap(Arc::new(parted.mesh)), parted.doubled))
+}

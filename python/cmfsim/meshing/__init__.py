@@ -1,0 +1,28 @@
+"""From labels, levels or surfaces to tets, with a report of their quality."""
+
+from cmfsim.meshing.levels import anatomy_from_surfaces, signed_level
+from cmfsim.meshing.quality import MeshReport, mesh_report
+from cmfsim.meshing.stuffing import (
+    MeshOptions,
+    TissueMesh,
+    mesh_from_labels,
+    mesh_from_level,
+    part_mesh,
+)
+from cmfsim.meshing.tetwild import mesh_with_tetwild
+from cmfsim.meshing.tissue import TissueRegion, tissue_level
+
+__all__ = [
+    "MeshOptions",
+    "MeshReport",
+    "TissueMesh",
+    "TissueRegion",
+    "anatomy_from_surfaces",
+    "mesh_from_labels",
+    "mesh_from_level",
+    "mesh_report",
+    "mesh_with_tetwild",
+    "part_mesh",
+    "signed_level",
+    "tissue_level",
+]

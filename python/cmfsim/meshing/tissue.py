@@ -1,0 +1,172 @@
+"""Which part of a head is soft tissue to be meshed: outside the bones, in front of a plane."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim import _core
+from cmfsim.case import Anatomy, Finding, ImageData
+from cmfsim.checks import as_number, as_positive, as_rows
+from cmfsim.errors import MeshInputError
+
+__all__ = ["TissueRegion", "tissue_level"]
+
+Levels = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# A level is clipped two voxels from its surface, like those of given surfaces.
+BAND_IN_VOXELS = 2.0
+# Radius of the foramina and fissures through which the cranial cavity meets the face, mm: the
+# superior orbital fissure is 6 mm wide at most, the optic canal 5 mm.
+FORAMEN_RADIUS = 3.0
+# Hollows smaller than this are gaps between surfaces, not worth a word, mm³.
+NOTEWORTHY_HOLLOW = 500.0
+
+
+@dataclass(frozen=True, eq=False)
+class TissueRegion:
+    """The part of the head that is meshed.
+
+    Attributes
+    ----------
+    point, normal : (3,) float64, mm
+        A point of the posterior plane, and its normal, out of the region.
+    lower, upper : float or None, mm
+        Heights (S axis) that bound the region.
+    foramen_radius : float, mm
+        Hollows behind openings up to this radius are no tissue.
+    """
+
+    point: ArrayLike
+    normal: ArrayLike = (0.0, 1.0, 0.0)
+    lower: float | None = None
+    upper: float | None = None
+    foramen_radius: float = FORAMEN_RADIUS
+
+    def __post_init__(self) -> None:
+        for name in ("point", "normal"):
+            row = as_rows(name, np.reshape(getattr(self, name), (1, -1)), 3)[0]
+            object.__setattr__(self, name, row)
+        length = float(np.linalg.norm(np.asarray(self.normal)))
+        if length == 0.0:
+            raise MeshInputError("normal of the posterior plane is (0, 0, 0): give its direction")
+        object.__setattr__(self, "normal", np.asarray(self.normal) / length)
+        for name in ("lower", "upper"):
+            if getattr(self, name) is not None:
+                as_number(name, getattr(self, name))
+        as_positive("foramen_radius", self.foramen_radius)
+
+
+def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tuple[Finding, ...]]:
+    """The level image of the soft tissue in front of the posterior plane, and what was left out.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+    region : TissueRegion
+
+    Returns
+    -------
+    level : ImageData
+        float32, positive in the tissue: inside the skin, outside every bone and hollow, in the
+        region. What lies behind bone, as in the cranial cavity, is not tissue.
+    findings : tuple of Finding
+
+    Raises
+    ------
+    MeshError
+        (also `ValueError`) Nothing of the head lies in the region.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> region = cmfsim.TissueRegion(point=(0, -120, 0))
+    >>> level, findings = cmfsim.tissue_level(anatomy, region)  # doctest: +SKIP
+    """
+    grid = anatomy.skin
+    level: Levels = np.array(grid.values, dtype=np.float32)
+    bone: Levels = np.full(level.shape, -1.0, dtype=np.float32)
+    for other in anatomy.bones.values():
+        np.maximum(bone, other.values, out=bone)
+    np.minimum(level, -bone, out=level)
+    if anatomy.air is not None:
+        np.minimum(level, -anatomy.air.values, out=level)
+    for distance in _inward_distances(grid, region):
+        np.minimum(level, distance, out=level)
+    if not (level > 0.0).any():
+        raise MeshInputError(
+            "no soft tissue lies in front of the posterior plane: check its point and normal, "
+            "and that skin and bones are of one patient"
+        )
+    findings = tuple(_without_hollows(level, bone, grid, region))
+    return grid.with_values(level), findings
+
+
+def _inward_distances(grid: ImageData, region: TissueRegion) -> Iterator[Levels]:
+    """Distance into the region from each of its planes, in the scale of a level."""
+    band = BAND_IN_VOXELS * float(np.asarray(grid.spacing).max())
+    x, y, z = grid.axes()
+    point, normal = np.asarray(region.point), np.asarray(region.normal)
+    behind = (x - point[0]) * normal[0] + (y - point[1]) * normal[1] + (z - point[2]) * normal[2]
+    yield np.clip(-behind / band, -1.0, 1.0).astype(np.float32)
+    if region.lower is not None:
+        yield np.clip((z - region.lower) / band, -1.0, 1.0).astype(np.float32)
+    if region.upper is not None:
+        yield np.clip((region.upper - z) / band, -1.0, 1.0).astype(np.float32)
+
+
+def _without_hollows(
+    level: Levels, bone: Levels, grid: ImageData, region: TissueRegion
+) -> Iterator[Finding]:
+    """Takes from `level` what only openings narrower than a foramen join to the outer tissue."""
+    ndimage = _ndimage()
+    sx, sy, sz = (float(s) for s in np.asarray(grid.spacing))
+    spacing = (sx, sy, sz)
+    tissue: Mask = level > 0.0
+    # Where a ball of the foramen's radius fits between bones, and what such balls reach.
+    near_bone = _core.distance_image(bone > 0.0, spacing)
+    roomy = near_bone > region.foramen_radius
+    closed: Mask = _core.distance_image(roomy, spacing) > region.foramen_radius
+    # Outer tissue touches the skin where no bone stands between; thin tissue over bone is not
+    # roomy, so that the way along the skin stays open whatever its thickness.
+    shallow = np.asarray(grid.values) < 1.0
+    open_tissue = tissue & (~closed | shallow)
+    labels, count = ndimage.label(open_tissue)
+    if count == 0:
+        return
+    touches = np.zeros(count + 1, dtype=bool)
+    touches[np.unique(labels[open_tissue & shallow])] = True
+    touches[0] = False
+    hollow: Mask = open_tissue & ~touches[labels]
+    if not hollow.any():
+        return
+    # The openings themselves go to the nearer side.
+    to_hollow = _core.distance_image(hollow, spacing)
+    to_outer = _core.distance_image(open_tissue & ~hollow, spacing)
+    hollow |= tissue & ~open_tissue & (to_hollow < to_outer)
+    np.minimum(level, np.where(hollow, np.float32(-1.0), level), out=level)
+    volume = float(np.count_nonzero(hollow)) * sx * sy * sz
+    if volume < NOTEWORTHY_HOLLOW:
+        return
+    place = np.asarray(grid.lowest) + np.argwhere(hollow).mean(axis=0) * np.asarray(grid.spacing)
+    yield Finding(
+        "note",
+        "hollow-left-out",
+        f"{volume / 1000.0:.1f} cm³ behind bone were left out of the tissue",
+        f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
+        "the cranial cavity and closed sinuses do not deform with the face",
+        "none is needed; lower foramen_radius if tissue of the face is missing",
+    )
+
+
+def _ndimage() -> Any:
+    try:
+        return import_module("scipy.ndimage")
+    except ModuleNotFoundError as error:
+        raise MeshInputError(
+            "tissue is told from hollows with scipy: pip install 'cmfsim[imaging]'"
+        ) from error
