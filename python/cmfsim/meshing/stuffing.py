@@ -30,6 +30,12 @@ class MeshOptions:
         How often the edge may be halved where tissue, or a gap in it, is thinner than an edge.
     least_body : float, mm³
         Bodies apart from the largest below this volume are specks and left out.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.MeshOptions(edge_length=2.5).refinements
+    1
     """
 
     edge_length: float = 3.0
@@ -106,8 +112,8 @@ def mesh_from_labels(
     --------
     >>> import cmfsim, numpy as np
     >>> mesh = cmfsim.mesh_from_labels(np.ones((12, 10, 8)) > 0, spacing=1.0, edge_length=3.0)
-    >>> round(float(mesh.volumes.sum()) / (12 * 10 * 8), 2)
-    0.98
+    >>> float(mesh.volumes.sum()) > 0.9 * 12 * 10 * 8  # the edges of the box are rounded
+    True
     >>> bool(mesh.quality().min_dihedral.min() >= 10.0)
     True
     """

@@ -39,6 +39,12 @@ class TissueRegion:
         Heights (S axis) that bound the region.
     foramen_radius : float, mm
         Hollows behind openings up to this radius are no tissue.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.TissueRegion(point=(0, -120, 0)).normal.tolist()
+    [0.0, 1.0, 0.0]
     """
 
     point: ArrayLike
