@@ -25,6 +25,7 @@ __all__ = [
     "CmfsimError",
     "ContactError",
     "ImageError",
+    "ImageInputError",
     "LandmarkError",
     "MaterialError",
     "MeshError",
@@ -39,3 +40,7 @@ class BoundaryInputError(BoundaryError, ValueError):
 
 class CaseInputError(CaseError, ValueError):
     """A scene or case, in memory or on disk, that cannot be meant."""
+
+
+class ImageInputError(ImageError, ValueError):
+    """An image that cannot be meant: not three axes, no CT, damaged, no head in it."""
