@@ -36,6 +36,12 @@ BEHIND = 32.0
 # An ear is no larger than this: what is, and lies beside the head, is a holder; mm³ and mm.
 LARGEST_EAR = 25_000.0
 FARTHEST_EAR = 45.0
+# What stands out behind the head by more than these is a rest, not the nape; mm³ and mm.
+REST = 6_000.0
+REST_REACH = 12.0
+# A couch is wider than this, and its middle farther behind the head's, mm.
+COUCH_WIDTH = 60.0
+COUCH_BEHIND = 40.0
 # Part of the slices in which something fixed to the scanner shows.
 IN_ALL_SLICES = 0.9
 # Nostrils, ear canals and open lips narrower than twice this are closed, mm.
@@ -113,32 +119,21 @@ def _rest_removed(volume: float) -> Finding:
 
 def _without_couch(tissue: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, Mask]:
     """What is left without that which shows alike in all slices behind the head; and that."""
-    nothing = np.zeros_like(tissue)
-    always = tissue.mean(axis=2) > IN_ALL_SLICES
+    part = tissue.mean(axis=2)
+    always = part > IN_ALL_SLICES
+    # The head changes from slice to slice: what shows in some slices tells where it is.
+    some = (part > 0.2) & ~always
     labels, count = ndimage().label(always)
-    if count < 2:
-        return tissue, nothing
-    thickness = ndimage().distance_transform_edt(
-        np.pad(always, 1, mode="edge"), sampling=spacing[:2]
-    )[1:-1, 1:-1]
-    numbers = np.arange(1, count + 1)
-    thickest = ndimage().maximum(thickness, labels, numbers)
-    places = ndimage().center_of_mass(always, labels, numbers)
-    widths = [
-        (box[0].stop - box[0].start) * spacing[0] for box in ndimage().find_objects(labels)
-    ]
-    # Neck and head show in all slices too: they are the foremost thing that is thick.
-    thick = [i for i in range(count) if thickest[i] > CORE_RADIUS]
-    if not thick:
-        return tissue, nothing
-    neck = min(thick, key=lambda i: places[i][1])
-    behind = [
-        i for i in range(count) if i != neck and places[i][1] > places[neck][1] and widths[i] > 60.0
-    ]
-    if not behind:
-        return tissue, nothing
-    couch = np.isin(labels, [i + 1 for i in behind])
-    couch = ndimage().binary_dilation(couch) & ~(labels == neck + 1)
+    if not count or not some.any():
+        return tissue, np.zeros_like(tissue)
+    middle = np.nonzero(some)[1].mean()
+    couch = np.zeros_like(always)
+    for i, box in enumerate(ndimage().find_objects(labels)):
+        piece = labels == i + 1
+        width = (box[0].stop - box[0].start) * spacing[0]
+        behind = (np.nonzero(piece)[1].mean() - middle) * spacing[1]
+        if behind > COUCH_BEHIND and width > COUCH_WIDTH:
+            couch |= piece
     # All that lies behind the couch's top belongs to it.
     from_top = np.maximum.accumulate(couch, axis=1)
     gone = tissue & from_top[:, :, None]
@@ -156,29 +151,46 @@ def _without_rests(tissue: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, Ma
     head = labels == np.argmax(sizes_of(labels, count))
     column = np.flatnonzero(head.any(axis=(0, 1)))
     low = max(column[0], column[-1] - int(HEAD_HEIGHT / spacing[2]))
-    upper = head[:, :, low : column[-1] + 1]
-    weights = upper.sum(axis=(0, 2))
+    weights = head[:, :, low : column[-1] + 1].sum(axis=(0, 2))
     middle = float(np.average(np.arange(len(weights)), weights=weights))
     y = (np.arange(tissue.shape[1]) - middle) * spacing[1]
     around = depth(head, spacing)
-    step = float(spacing.max())
-    # Nothing stands out behind: the opened head, a voxel wider, is the head there.
-    allowed = (around > -step) | (y < BEHIND)[None, :, None]
-    kept = reached(tissue & allowed, head)
-    rest = kept & ~(around > -step)
-    labels, count = label(rest)
-    boxes = ndimage().find_objects(labels.T)
-    sizes = sizes_of(labels, count) * float(np.prod(spacing))
-    drop = np.zeros(count + 1, dtype=bool)
-    reaches = -ndimage().minimum(around.T, labels.T, np.arange(1, count + 1)) if count else []
-    for i in range(count):
-        begin, end = boxes[i][1].start, boxes[i][1].stop
-        in_front = y[begin] < -BEHIND and y[end - 1] < 0.0
-        behind = y[end - 1] > BEHIND - 1.5 * step
-        large = sizes[i + 1] > LARGEST_EAR or reaches[i] > FARTHEST_EAR
-        drop[i + 1] = not in_front and large and (behind or reaches[i] > FARTHEST_EAR)
-    kept &= ~drop[labels]
+    # The opened head, a voxel wider, is the head; ears, nose and chin stand out from it.
+    near = around > -float(spacing.max())
+    behind = (y > BEHIND)[None, :, None]
+    rest = tissue & ~near & behind
+    out = _standing_out(rest, around, spacing, REST, REST_REACH)
+    # At the bottom border the nape widens into the back, and is no rest.
+    nape = reached(rest, _bottom(rest))
+    nape &= ~_standing_out(nape, around, spacing, np.inf, FARTHEST_EAR)
+    kept = tissue & ~(out & ~nape)
+    kept = reached(kept, head)
+    beside = kept & ~near & (y > -BEHIND)[None, :, None]
+    kept &= ~_standing_out(beside, around, spacing, LARGEST_EAR, FARTHEST_EAR)
+    kept = reached(kept, head)
     return kept, tissue & ~kept
+
+
+def _bottom(mask: Mask) -> Mask:
+    """The voxels of the lowest layer."""
+    layer = np.zeros_like(mask)
+    layer[:, :, 0] = mask[:, :, 0]
+    return layer
+
+
+def _standing_out(
+    rest: Mask, around: Volume, spacing: NDArray[np.float64], volume: float, reach: float
+) -> Mask:
+    """The pieces above a volume (mm³) or farther out than a reach (mm)."""
+    labels, count = label(rest)
+    if not count:
+        return rest
+    large = sizes_of(labels, count) * float(np.prod(spacing)) > volume
+    farthest = -ndimage().minimum(around.T, labels.T, np.arange(1, count + 1))
+    large[1:] |= np.asarray(farthest) > reach
+    large[0] = False
+    gone: Mask = large[labels]
+    return gone
 
 
 def _with_hollows(solid: Mask, work: Working) -> tuple[Mask, Mask]:
