@@ -62,9 +62,9 @@ BEFORE_RAMUS = 5.0
 # The middle of the condyle from the supraglenoid landmark: towards the midline, back, up, mm;
 # within 2 mm in the four joints of two skulls in which it was measured.
 CONDYLE = (15.0, 0.5, -12.0)
-# Length over which bone, as seen by the flood, grows deep, mm.
+# Depth in bone that counts as much as FLOOD_HU, mm.
 FLOOD_DEPTH = 3.0
-# HU that counts as much as that depth: a joint space is dark before it is open.
+# A joint space is dark before it is open, HU.
 FLOOD_HU = 700.0
 # Mandibles have volumes (with marrow, mm³) and widths (mm) in these ranges, children's included.
 VOLUMES = (8_000.0, 250_000.0)
@@ -106,7 +106,7 @@ def part_jaws(work: Working, bone: Bone, landmarks: Mapping[str, Floats] | None)
     seeds = _seeds(work, bone, landmarks, box)
     if not ((seeds == 1).any() and (seeds == 2).any()):
         return Jaws(None, None, None, (_not_parted("the landmarks lie far from bone"),))
-    deep = np.clip(depth(domain, work.spacing) / np.float32(FLOOD_DEPTH), 0.0, 1.0)
+    deep = depth(domain, work.spacing) / np.float32(FLOOD_DEPTH)
     dense = np.clip(smoothed(bone.hu[box], 0.7, work.spacing) / np.float32(FLOOD_HU), 0.0, 2.0)
     basins = _watershed(-(deep + dense), seeds, domain)
     mandible = np.zeros(bone.mask.shape, dtype=bool, order="F")
