@@ -8,17 +8,16 @@ from numpy.typing import NDArray
 from cmfsim.case import Finding
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.levels import level_of
+from cmfsim.imaging.metal import Metal, without_spikes
 from cmfsim.imaging.morphology import (
     Mask,
     Volume,
     closed,
     depth,
     label,
-    ndimage,
-    opened,
     resampled_to,
     sizes_of,
-    smoothed,
+    watershed,
 )
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import Skin
@@ -26,6 +25,11 @@ from cmfsim.imaging.working import Working, coarse_of
 
 __all__ = ["Bone", "find_bone"]
 
+# Teeth are denser than compact bone, HU; smaller groups of such voxels are none, mm³.
+ENAMEL = 1400.0
+LEAST_TEETH = 200.0
+# Enamel lies within this of the occlusal plane at the incisors, mm.
+OCCLUSAL_REACH = 30.0
 # Full range of the bone's level, HU: soft tissue is near −1 then.
 BONE_SCALE = 250.0
 # The cavity of the skull is what a ball of this radius fits into, once the way through the great
@@ -62,7 +66,7 @@ class Bone:
     findings: tuple[Finding, ...]
 
 
-def find_bone(work: Working, hu: Volume, skin: Skin, options: SegmentOptions) -> Bone:
+def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) -> Bone:
     """The bone of a head.
 
     Errors
@@ -72,7 +76,9 @@ def find_bone(work: Working, hu: Volume, skin: Skin, options: SegmentOptions) ->
     """
     threshold = options.bone_threshold
     under = depth(skin.mask, work.spacing)
-    solid = (hu > threshold) & (under > options.least_skin)
+    hu = metal.hu
+    solid = without_spikes(hu > threshold, metal, work.spacing, bone=True)
+    solid &= under > options.least_skin
     solid, findings = _without_islands(solid, work, options)
     cavity = _cranial_cavity(solid, skin, work)
     mask = _enclosed(hu, solid, cavity, under, work, options)
@@ -134,21 +140,14 @@ def _cranial_cavity(solid: Mask, skin: Skin, work: Working) -> Mask | None:
     brain = int(np.argmax(sizes))
     if not sizes[brain] or not len(outer):
         return None
-    watershed = _watershed()
     seeds = np.where(labels == brain, 1, np.where(labels > 0, 2, 0))
     # Rooms part where the way between them is narrowest.
-    basins = watershed((-room).T, seeds.T, mask=~sealed.T).T
+    basins = watershed(-room, seeds, ~sealed)
     cavity = (basins == 1)[1:-1, 1:-1, 1:-1]
     if np.count_nonzero(cavity) * float(np.prod(steps)) < LEAST_CAVITY:
         return None
     fine = resampled_to(cavity.astype(np.float32), steps, shift, solid.shape, work.spacing)
     return fine > 0.5
-
-
-def _watershed():  # type: ignore[no-untyped-def]
-    from importlib import import_module  # noqa: PLC0415
-
-    return import_module("skimage.segmentation").watershed
 
 
 def _enclosed(
@@ -181,3 +180,15 @@ def _enclosed(
     mask = solid | hollows | added
     mask &= under > options.least_skin
     return mask
+
+
+def teeth_level(bone: Bone, work: Working, occlusal_height: float | None) -> Volume | None:
+    """The level of what is as dense as enamel near the tooth rows; None if that is little."""
+    if occlusal_height is None:
+        return None
+    z = work.origin[2] + work.spacing[2] * np.arange(work.hu.shape[2])
+    near = np.abs(z - occlusal_height) < OCCLUSAL_REACH
+    mask = bone.mask & (bone.hu > ENAMEL) & near[None, None, :]
+    if np.count_nonzero(mask) * float(np.prod(work.spacing)) < LEAST_TEETH:
+        return None
+    return level_of(bone.hu, ENAMEL, BONE_SCALE, mask)

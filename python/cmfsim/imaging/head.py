@@ -8,13 +8,15 @@ from numpy.typing import ArrayLike
 
 from cmfsim.checks import Floats, as_rows
 from cmfsim.case import Anatomy, Finding, ImageData
-from cmfsim.imaging.bone import bone_level, find_bone
-from cmfsim.imaging.intensity import noise_of, weak_bone
+from cmfsim.imaging.air import air_level
+from cmfsim.imaging.bone import bone_level, find_bone, teeth_level
+from cmfsim.imaging.intensity import weak_bone
 from cmfsim.imaging.jaw import part_jaws
-from cmfsim.imaging.morphology import smoothed
+from cmfsim.imaging.metal import find_metal
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import find_skin
-from cmfsim.imaging.working import working_grid
+from cmfsim.imaging.view import view_findings
+from cmfsim.imaging.working import without_noise, working_grid
 
 __all__ = ["segment_head"]
 
@@ -28,7 +30,36 @@ def segment_head(
     landmarks: Mapping[str, ArrayLike] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Anatomy:
-    """Skin, bones, air and teeth of a head CT."""
+    """Skin, bones, air and teeth of a head CT, as level images on one grid, with findings.
+
+    Parameters
+    ----------
+    image : ImageData
+        A CT in LPS; in HU, or in a scale that its histogram gives away (a finding says so).
+    options : SegmentOptions, optional
+    landmarks : mapping of str to (3,) float64, mm, optional
+        Of the skull, LPS: they tell the mandible from the rest. Without them its shape does.
+    progress : callable, optional
+        Called with the name of each stage: "grid", "metal", "skin", "bone", "jaw", "air".
+
+    Returns
+    -------
+    Anatomy
+        With bones "cranium" (with the cervical spine) and "mandible", or "skull".
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) Too small, not finite, no CT, no head, no bone.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> image = cmfsim.read_image("ct.nii.gz")  # doctest: +SKIP
+    >>> anatomy = cmfsim.segment_head(image)  # doctest: +SKIP
+    >>> sorted(anatomy.bones)  # doctest: +SKIP
+    ['cranium', 'mandible']
+    """
     options = SegmentOptions() if options is None else options
 
     def say(stage: str) -> None:
@@ -40,14 +71,23 @@ def segment_head(
     say("grid")
     work, findings = working_grid(image, options)
     all_findings: list[Finding] = list(findings)
+    work = without_noise(work)
+    say("metal")
+    metal = find_metal(work, options)
     say("skin")
-    skin = find_skin(work, options)
-    all_findings += skin.findings
+    skin = find_skin(work, metal, options)
     say("bone")
-    bone = find_bone(work, work.hu, skin, options)
-    all_findings += bone.findings
+    bone = find_bone(work, metal, skin, options)
+    all_findings += [
+        *weak_bone(work.hu[skin.mask], options.bone_threshold),
+        *metal.findings,
+        *skin.findings,
+        *bone.findings,
+        *view_findings(work, skin, bone),
+    ]
     level = bone_level(bone, options)
     bones = {"skull": work.image(level)}
+    teeth = None
     if options.part_jaws:
         say("jaw")
         jaws = part_jaws(work, bone, points)
@@ -57,7 +97,12 @@ def segment_head(
                 "cranium": work.image(np.minimum(level, -jaws.side)),
                 "mandible": work.image(np.minimum(level, jaws.side)),
             }
-    return Anatomy(work.image(skin.level), bones, findings=tuple(all_findings))
+        dense = teeth_level(bone, work, jaws.occlusal_height)
+        teeth = None if dense is None else work.image(dense)
+    say("air")
+    hollow = air_level(work, skin, bone, options)
+    air = None if hollow is None else work.image(hollow)
+    return Anatomy(work.image(skin.level), bones, air, teeth, tuple(all_findings))
 
 
 def _checked(landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:

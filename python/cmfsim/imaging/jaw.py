@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from cmfsim.case import Finding
 from cmfsim.checks import Floats
 from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.guess import guessed_landmarks
-from cmfsim.imaging.morphology import Mask, Volume, depth, reached, smoothed
+from cmfsim.imaging.morphology import Mask, Volume, depth, reached, smoothed, watershed
 from cmfsim.imaging.working import Working
 
 __all__ = ["Jaws", "part_jaws"]
@@ -108,7 +107,7 @@ def part_jaws(work: Working, bone: Bone, landmarks: Mapping[str, Floats] | None)
         return Jaws(None, None, None, (_not_parted("the landmarks lie far from bone"),))
     deep = depth(domain, work.spacing) / np.float32(FLOOD_DEPTH)
     dense = np.clip(smoothed(bone.hu[box], 0.7, work.spacing) / np.float32(FLOOD_HU), 0.0, 2.0)
-    basins = _watershed(-(deep + dense), seeds, domain)
+    basins = watershed(-(deep + dense), seeds, domain)
     mandible = np.zeros(bone.mask.shape, dtype=bool, order="F")
     mandible[box] = basins == 1
     # Scraps that the flood cut off elsewhere are not the mandible.
@@ -283,9 +282,3 @@ def _balls(
             continue
         ball = np.linalg.norm(offsets - offsets[nearest], axis=1) < SEED_RADIUS
         seeds[part][tuple(index[ball].T)] = value
-
-
-def _watershed(height: Volume, seeds: NDArray[np.int32], domain: Mask) -> NDArray[np.int32]:
-    flood = import_module("skimage.segmentation").watershed
-    basins: NDArray[np.int32] = flood(height.T, seeds.T, mask=domain.T).T
-    return basins

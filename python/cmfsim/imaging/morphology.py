@@ -30,6 +30,7 @@ __all__ = [
     "simpleitk",
     "sizes_of",
     "smoothed",
+    "watershed",
 ]
 
 Mask = NDArray[np.bool_]
@@ -53,6 +54,13 @@ def _package(name: str) -> Any:
         raise ImageError(
             f"CTs are segmented with {name}, which is missing: pip install 'cmfsim[imaging]'"
         ) from error
+
+
+def watershed(height: Volume, seeds: NDArray[Any], mask: Mask) -> NDArray[Any]:
+    """The seed whose flood reaches each voxel of the mask first, rising over the height."""
+    flood = _package("skimage.segmentation").watershed
+    basins: NDArray[Any] = flood(height.T, seeds.T, mask=mask.T).T
+    return basins
 
 
 def as_itk(array: NDArray[Any], spacing: NDArray[np.float64]) -> Any:

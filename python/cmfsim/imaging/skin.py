@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from cmfsim.case import Finding
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.levels import level_of
+from cmfsim.imaging.metal import Metal, without_spikes
 from cmfsim.imaging.morphology import (
     Mask,
     Volume,
@@ -33,6 +34,11 @@ SKIN_SCALE = 400.0
 CORE_RADIUS = 20.0
 # Behind this distance from the middle of the head nothing stands out from it, mm: ears end there.
 BEHIND = 32.0
+# Layers less than these below the vertex hold no ears, and no muscle of the neck, mm.
+ABOVE_EARS = 85.0
+ABOVE_NAPE = 115.0
+# Scalp with hair pressed on it, mm.
+THICKEST_SCALP = 15.0
 # An ear is no larger than this: what is, and lies beside the head, is a holder; mm³ and mm.
 LARGEST_EAR = 25_000.0
 FARTHEST_EAR = 45.0
@@ -75,7 +81,7 @@ class Skin:
     findings: tuple[Finding, ...]
 
 
-def find_skin(work: Working, options: SegmentOptions) -> Skin:
+def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
     """The skin of the head on the working grid.
 
     Errors
@@ -86,17 +92,18 @@ def find_skin(work: Working, options: SegmentOptions) -> Skin:
     coarse, steps, shift = coarse_of(work.hu, work.spacing)
     tissue: Mask = coarse > options.skin_threshold
     free, removed = _without_couch(tissue, steps)
-    head, more = _without_rests(free, steps)
+    bone = largest(free & (coarse > options.bone_threshold))
+    head, more = _without_rests(free, bone, steps)
     # Off the coarse grid the head is known to a voxel: the threshold places its surface.
     margin = 1.2 * float(steps.max())
     near = resampled_to(depth(head, steps), steps, shift, work.hu.shape, work.spacing)
     near += np.float32(margin)
-    above = work.hu > options.skin_threshold
+    above = without_spikes(metal.hu > options.skin_threshold, metal, work.spacing)
     solid = largest(above & (near > 0.0))
     if not solid.any():
         raise ImageInputError("the image holds no head above the skin's threshold")
     mask, hollow = _with_hollows(solid, work)
-    level = level_of(work.hu, options.skin_threshold, SKIN_SCALE, mask)
+    level = level_of(metal.hu, options.skin_threshold, SKIN_SCALE, mask)
     # Where a rest was cut off in contact, the surface is that of the distance.
     np.minimum(level, near, out=level, where=~hollow)
     findings = []
@@ -140,35 +147,68 @@ def _without_couch(tissue: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, Ma
     return tissue & ~gone, gone
 
 
-def _without_rests(tissue: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, Mask]:
+def _without_rests(
+    tissue: Mask, bone: Mask, spacing: NDArray[np.float64]
+) -> tuple[Mask, Mask]:
     """The head without pillow and head-holder, and these."""
-    inside = depth(tissue, spacing)
-    radius = min(CORE_RADIUS, 0.6 * float(inside.max()))
-    core = opened(tissue, radius, spacing)
-    labels, count = label(core)
-    if not count:
-        raise ImageInputError("the image holds nothing as thick as a head")
-    head = labels == np.argmax(sizes_of(labels, count))
+    head = _core(tissue, spacing)
     column = np.flatnonzero(head.any(axis=(0, 1)))
     low = max(column[0], column[-1] - int(HEAD_HEIGHT / spacing[2]))
     weights = head[:, :, low : column[-1] + 1].sum(axis=(0, 2))
     middle = float(np.average(np.arange(len(weights)), weights=weights))
     y = (np.arange(tissue.shape[1]) - middle) * spacing[1]
+    free = tissue & ~_beyond_scalp(tissue, bone, y, spacing)
+    head = _core(free, spacing)
     around = depth(head, spacing)
     # The opened head, a voxel wider, is the head; ears, nose and chin stand out from it.
     near = around > -float(spacing.max())
     behind = (y > BEHIND)[None, :, None]
-    rest = tissue & ~near & behind
+    rest = free & ~near & behind
     out = _standing_out(rest, around, spacing, REST, REST_REACH)
     # At the bottom border the nape widens into the back, and is no rest.
     nape = reached(rest, _bottom(rest))
     nape &= ~_standing_out(nape, around, spacing, np.inf, FARTHEST_EAR)
-    kept = tissue & ~(out & ~nape)
+    kept = free & ~(out & ~nape)
     kept = reached(kept, head)
     beside = kept & ~near & (y > -BEHIND)[None, :, None]
     kept &= ~_standing_out(beside, around, spacing, LARGEST_EAR, FARTHEST_EAR)
     kept = reached(kept, head)
     return kept, tissue & ~kept
+
+
+def _core(tissue: Mask, spacing: NDArray[np.float64]) -> Mask:
+    """The thick part of head and neck."""
+    radius = min(CORE_RADIUS, 0.6 * float(depth(tissue, spacing).max()))
+    core = opened(tissue, radius, spacing)
+    if not core.any():
+        raise ImageInputError("the image holds nothing as thick as a head")
+    return largest(core)
+
+
+def _beyond_scalp(
+    tissue: Mask, bone: Mask, y: NDArray[np.float64], spacing: NDArray[np.float64]
+) -> Mask:
+    """What lies behind or beside the skull's vault, farther from it than the scalp is thick."""
+    nothing = np.zeros_like(tissue)
+    layers = np.flatnonzero(bone.any(axis=(0, 1)))
+    if not len(layers) or bone[:, :, -1].any():
+        # Without the vertex nobody knows which layer lies above the ears.
+        return nothing
+    down = (layers[-1] - np.arange(bone.shape[2])) * spacing[2]
+    beside = (down < ABOVE_EARS)[None, None, :] & (y > 0.0)[None, :, None]
+    behind = (down < ABOVE_NAPE)[None, None, :] & (y > BEHIND)[None, :, None]
+    # The vault with what it encloses: the skull is a ring in each layer there.
+    vault = ndimage().binary_closing(bone, iterations=2) | bone
+    for k in np.flatnonzero(down < ABOVE_NAPE):
+        vault[:, :, k] = ndimage().binary_fill_holes(vault[:, :, k])
+    away = -depth(np.asfortranarray(vault), spacing)
+    skin = tissue & ~ndimage().binary_erosion(tissue) & (down < ABOVE_EARS)[None, None, :]
+    thickness = away[skin & (away > 0.0)]
+    if not thickness.size:
+        return nothing
+    scalp = min(float(np.percentile(thickness, 60.0)) + float(spacing.max()), THICKEST_SCALP)
+    gone: Mask = (beside | behind) & (away > scalp)
+    return tissue & gone
 
 
 def _bottom(mask: Mask) -> Mask:

@@ -1,0 +1,126 @@
+"""Metal of fillings, crowns and plates, and its streaks taken out of a CT."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.case import Finding
+from cmfsim.imaging.morphology import (
+    Mask,
+    Volume,
+    as_array,
+    as_itk,
+    depth,
+    label,
+    opened,
+    simpleitk,
+    sizes_of,
+)
+from cmfsim.imaging.options import SegmentOptions
+from cmfsim.imaging.working import Working
+
+__all__ = ["Metal", "find_metal", "without_spikes"]
+
+# Metal of less than this is a point of noise or dense enamel, mm³.
+LEAST_METAL = 15.0
+# Streaks lie in the slices of the metal, and this far above and below, mm.
+STREAK_REACH = 3.0
+# Streaks are narrow: across them the median over this half width, mm, is what was there.
+STREAK_WIDTH = 2.0
+# Bone within this of metal is not judged by its width, mm: roots and alveolar walls are thin.
+NEAR_METAL = 3.0
+# What stands out farther than the second from what a ball of the first can sweep, is a spike, mm.
+SPIKE_RADIUS = 3.0
+SPIKE_REACH = 4.0
+BONE_SPIKE_RADIUS = 1.4
+BONE_SPIKE_REACH = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Metal:
+    """Metal in an image.
+
+    Attributes
+    ----------
+    mask : (nx, ny, nz) bool or None
+    layers : slice
+        The slices with streaks.
+    hu : (nx, ny, nz) float32
+        The image with the median across streaks in those slices; itself where there is no metal.
+    findings : tuple of Finding
+    """
+
+    mask: Mask | None
+    layers: slice
+    hu: Volume
+    findings: tuple[Finding, ...]
+
+
+def find_metal(work: Working, options: SegmentOptions) -> Metal:
+    """The metal of a head, and the image without its streaks."""
+    bright = work.hu > options.metal_threshold
+    volume = float(np.prod(work.spacing))
+    nothing = Metal(None, slice(0, 0), work.hu, ())
+    if np.count_nonzero(bright) * volume < LEAST_METAL:
+        return nothing
+    labels, count = label(bright, corners=True)
+    large = sizes_of(labels, count) * volume >= LEAST_METAL
+    if not large.any():
+        return nothing
+    mask: Mask = large[labels]
+    layers = np.flatnonzero(mask.any(axis=(0, 1)))
+    more = int(np.ceil(STREAK_REACH / work.spacing[2]))
+    zone = slice(max(int(layers[0]) - more, 0), min(int(layers[-1]) + more + 1, mask.shape[2]))
+    hu = work.hu.copy(order="F")
+    part = hu[:, :, zone]
+    hu[:, :, zone] = np.where(mask[:, :, zone], part, _median(part, work.spacing))
+    low, high = (work.origin[2] + work.spacing[2] * layers[i] for i in (0, -1))
+    finding = Finding(
+        "warning",
+        "metal",
+        f"{int(np.count_nonzero(large))} pieces of metal, "
+        f"{np.count_nonzero(mask) * volume / 1000.0:.1f} cm³, between z = {low:.0f} and "
+        f"{high:.0f} mm",
+        where="image",
+        why="streaks hide skin and bone at that height; they were smoothed and spikes removed",
+        mend="check lips, cheeks and tooth rows by eye",
+    )
+    return Metal(mask, zone, hu, (finding,))
+
+
+def _median(part: Volume, spacing: NDArray[np.float64]) -> Volume:
+    across = [max(1, round(STREAK_WIDTH / s)) for s in spacing[:2]]
+    image = simpleitk().Median(as_itk(np.asfortranarray(part), spacing), [*across, 0])
+    median: Volume = as_array(image)
+    return median
+
+
+def without_spikes(
+    mask: Mask,
+    metal: Metal,
+    spacing: NDArray[np.float64],
+    *,
+    bone: bool = False,
+) -> Mask:
+    """The mask without thin pieces that stand far out from it in the slices of the metal."""
+    if metal.mask is None:
+        return mask
+    radius, reach = (
+        (BONE_SPIKE_RADIUS, BONE_SPIKE_REACH) if bone else (SPIKE_RADIUS, SPIKE_REACH)
+    )
+    part = np.asfortranarray(mask[:, :, metal.layers])
+    thick = opened(part, radius, spacing)
+    if not thick.any():
+        return mask
+    around = depth(thick, spacing)
+    rest = part & (around < -0.5 * float(spacing.max()))
+    if bone:
+        near = depth(np.asfortranarray(metal.mask[:, :, metal.layers]), spacing)
+        rest &= near < -NEAR_METAL
+    labels, count = label(rest, corners=True)
+    farthest = np.zeros(count + 1)
+    np.maximum.at(farthest, labels[rest], -around[rest])
+    cleaned = mask.copy(order="F")
+    cleaned[:, :, metal.layers] &= ~((farthest > reach)[labels] & rest)
+    return cleaned
