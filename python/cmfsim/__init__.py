@@ -33,7 +33,16 @@ from cmfsim.errors import (
     RegistrationError,
     SolverError,
 )
-from cmfsim.io import read_plan, read_result, read_scene, write_result, write_scene
+from cmfsim.imaging import SegmentOptions, segment_head
+from cmfsim.io import (
+    read_image,
+    read_plan,
+    read_result,
+    read_scene,
+    write_image,
+    write_result,
+    write_scene,
+)
 from cmfsim.planning import RigidMotion, decompose_motion, rigid_motion
 from cmfsim.scene import (
     MovedSurface,
@@ -73,6 +82,7 @@ __all__ = [
     "Scene",
     "SceneResult",
     "SegmentData",
+    "SegmentOptions",
     "Solution",
     "SolverError",
     "SolverOptions",
@@ -85,13 +95,16 @@ __all__ = [
     "TissueData",
     "__version__",
     "decompose_motion",
+    "read_image",
     "read_plan",
     "read_result",
     "read_scene",
     "rigid_motion",
     "scene_plan",
     "scene_solver",
+    "segment_head",
     "solve_scene",
+    "write_image",
     "write_result",
     "write_scene",
 ]

@@ -1,9 +1,10 @@
 """A CT made harder: what other scanners, patients and exports do to an image."""
 
 import numpy as np
-from cmfsim import ImageData
 from scipy import ndimage
 from skimage.transform import iradon, radon
+
+from cmfsim import ImageData
 
 # Parts of the phantom's tooth rows, LPS mm: upper and lower, left and right, and one in front.
 FILLINGS = (

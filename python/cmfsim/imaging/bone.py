@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cmfsim.case import Finding
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.levels import level_of
-from cmfsim.imaging.metal import Metal, without_spikes
+from cmfsim.imaging.metal import Metal, without_streaks
 from cmfsim.imaging.morphology import (
     Mask,
     Volume,
@@ -77,7 +76,7 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     threshold = options.bone_threshold
     under = depth(skin.mask, work.spacing)
     hu = metal.hu
-    solid = without_spikes(hu > threshold, metal, work.spacing, bone=True)
+    solid = without_streaks(hu > threshold, metal, work.spacing, bone=True)
     solid &= under > options.least_skin
     solid, findings = _without_islands(solid, work, options)
     cavity = _cranial_cavity(solid, skin, work)

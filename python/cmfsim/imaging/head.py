@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_rows
 from cmfsim.case import Anatomy, Finding, ImageData
+from cmfsim.checks import Floats, as_rows
 from cmfsim.imaging.air import air_level
 from cmfsim.imaging.bone import bone_level, find_bone, teeth_level
 from cmfsim.imaging.intensity import weak_bone

@@ -109,9 +109,7 @@ def _peaks(sample: NDArray[np.float64], low: float, high: float) -> tuple[float,
     best = above[np.argmax(smooth[above])]
     # Fat has the larger peak in some heads; muscle and brain lie a tenth of the way above it.
     reach = centres[best] + 0.2 * (centres[best] - centres[air])
-    near = above[
-        (above > best) & (centres[above] <= reach) & (smooth[above] > 0.4 * smooth[best])
-    ]
+    near = above[(above > best) & (centres[above] <= reach) & (smooth[above] > 0.4 * smooth[best])]
     return float(centres[air]), float(centres[near[-1] if len(near) else best])
 
 

@@ -27,8 +27,7 @@ def level_of(values: Volume, threshold: float, scale: float, mask: Mask) -> Volu
     scipy = ndimage()
     box = scipy.find_objects(forced.T.view(np.uint8))[0][::-1]
     box = tuple(
-        slice(max(b.start - 4, 0), min(b.stop + 4, n))
-        for b, n in zip(box, mask.shape, strict=True)
+        slice(max(b.start - 4, 0), min(b.stop + 4, n)) for b, n in zip(box, mask.shape, strict=True)
     )
     inside, changed, part = mask[box], forced[box], level[box]
     rim = scipy.binary_dilation(inside) & scipy.binary_dilation(~inside)

@@ -11,6 +11,7 @@ from cmfsim.imaging.morphology import (
     Volume,
     as_array,
     as_itk,
+    closed,
     depth,
     label,
     opened,
@@ -20,21 +21,22 @@ from cmfsim.imaging.morphology import (
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.working import Working
 
-__all__ = ["Metal", "find_metal", "without_spikes"]
+__all__ = ["Metal", "find_metal", "without_streaks"]
 
 # Metal of less than this is a point of noise or dense enamel, mm³.
 LEAST_METAL = 15.0
+# Farther from metal than this, streaks are weaker than bone, and thin bone (the vault) is kept, mm.
+FAR_FROM_METAL = 35.0
 # Streaks lie in the slices of the metal, and this far above and below, mm.
 STREAK_REACH = 3.0
 # Streaks are narrow: across them the median over this half width, mm, is what was there.
 STREAK_WIDTH = 2.0
 # Bone within this of metal is not judged by its width, mm: roots and alveolar walls are thin.
 NEAR_METAL = 3.0
-# What stands out farther than the second from what a ball of the first can sweep, is a spike, mm.
-SPIKE_RADIUS = 3.0
-SPIKE_REACH = 4.0
-BONE_SPIKE_RADIUS = 1.4
-BONE_SPIKE_REACH = 3.0
+# What stands out farther than the second from what a ball of the first can sweep, is a spike; gaps
+# up to twice the third are dark streaks; mm.
+SKIN_WIDTHS = (3.0, 4.0, 3.0)
+BONE_WIDTHS = (1.4, 3.0, 1.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,31 +98,33 @@ def _median(part: Volume, spacing: NDArray[np.float64]) -> Volume:
     return median
 
 
-def without_spikes(
+def without_streaks(
     mask: Mask,
     metal: Metal,
     spacing: NDArray[np.float64],
     *,
     bone: bool = False,
 ) -> Mask:
-    """The mask without thin pieces that stand far out from it in the slices of the metal."""
+    """The mask without thin pieces that stand far out from it in the slices of the metal.
+
+    Notches that dark streaks cut into it there are closed.
+    """
     if metal.mask is None:
         return mask
-    radius, reach = (
-        (BONE_SPIKE_RADIUS, BONE_SPIKE_REACH) if bone else (SPIKE_RADIUS, SPIKE_REACH)
-    )
-    part = np.asfortranarray(mask[:, :, metal.layers])
+    cleaned = mask.copy(order="F")
+    radius, reach, notch = BONE_WIDTHS if bone else SKIN_WIDTHS
+    part = closed(np.asfortranarray(mask[:, :, metal.layers]), notch, spacing)
+    cleaned[:, :, metal.layers] = part
     thick = opened(part, radius, spacing)
     if not thick.any():
-        return mask
+        return cleaned
     around = depth(thick, spacing)
     rest = part & (around < -0.5 * float(spacing.max()))
     if bone:
         near = depth(np.asfortranarray(metal.mask[:, :, metal.layers]), spacing)
-        rest &= near < -NEAR_METAL
+        rest &= (near < -NEAR_METAL) & (near > -FAR_FROM_METAL)
     labels, count = label(rest, corners=True)
     farthest = np.zeros(count + 1)
     np.maximum.at(farthest, labels[rest], -around[rest])
-    cleaned = mask.copy(order="F")
     cleaned[:, :, metal.layers] &= ~((farthest > reach)[labels] & rest)
     return cleaned

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from cmfsim.case import Finding
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.levels import level_of
-from cmfsim.imaging.metal import Metal, without_spikes
+from cmfsim.imaging.metal import Metal, without_streaks
 from cmfsim.imaging.morphology import (
     Mask,
     Volume,
@@ -39,6 +39,8 @@ ABOVE_EARS = 85.0
 ABOVE_NAPE = 115.0
 # Scalp with hair pressed on it, mm.
 THICKEST_SCALP = 15.0
+# Dark streaks as wide as twice this do not part the head, mm.
+STREAK_GAP = 5.0
 # An ear is no larger than this: what is, and lies beside the head, is a holder; mm³ and mm.
 LARGEST_EAR = 25_000.0
 FARTHEST_EAR = 45.0
@@ -89,8 +91,11 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
     ImageError
         (also `ValueError`) Nothing as large as a head.
     """
-    coarse, steps, shift = coarse_of(work.hu, work.spacing)
-    tissue: Mask = coarse > options.skin_threshold
+    coarse, steps, shift = coarse_of(metal.hu, work.spacing)
+    tissue = np.asfortranarray(coarse > options.skin_threshold)
+    if metal.mask is not None:
+        # Dark streaks would cut the head in two.
+        tissue = _filled(closed(tissue, STREAK_GAP, steps))
     free, removed = _without_couch(tissue, steps)
     bone = largest(free & (coarse > options.bone_threshold))
     head, more = _without_rests(free, bone, steps)
@@ -98,7 +103,7 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
     margin = 1.2 * float(steps.max())
     near = resampled_to(depth(head, steps), steps, shift, work.hu.shape, work.spacing)
     near += np.float32(margin)
-    above = without_spikes(metal.hu > options.skin_threshold, metal, work.spacing)
+    above = without_streaks(metal.hu > options.skin_threshold, metal, work.spacing)
     solid = largest(above & (near > 0.0))
     if not solid.any():
         raise ImageInputError("the image holds no head above the skin's threshold")
@@ -125,7 +130,7 @@ def _rest_removed(volume: float) -> Finding:
 
 
 def _without_couch(tissue: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, Mask]:
-    """What is left without that which shows alike in all slices behind the head; and that."""
+    """What is left without that which shows alike in all slices; and that."""
     part = tissue.mean(axis=2)
     always = part > IN_ALL_SLICES
     # The head changes from slice to slice: what shows in some slices tells where it is.
@@ -134,22 +139,23 @@ def _without_couch(tissue: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, Ma
     if not count or not some.any():
         return tissue, np.zeros_like(tissue)
     middle = np.nonzero(some)[1].mean()
-    couch = np.zeros_like(always)
+    couch, in_front = np.zeros_like(always), np.zeros_like(always)
     for i, box in enumerate(ndimage().find_objects(labels)):
         piece = labels == i + 1
         width = (box[0].stop - box[0].start) * spacing[0]
         behind = (np.nonzero(piece)[1].mean() - middle) * spacing[1]
         if behind > COUCH_BEHIND and width > COUCH_WIDTH:
             couch |= piece
-    # All that lies behind the couch's top belongs to it.
-    from_top = np.maximum.accumulate(couch, axis=1)
-    gone = tissue & from_top[:, :, None]
+        elif -behind > COUCH_BEHIND and width > COUCH_WIDTH:
+            in_front |= piece
+    # All that lies behind the couch's top belongs to it; patients who lie prone have it in front.
+    beyond = np.maximum.accumulate(couch, axis=1)
+    beyond |= np.maximum.accumulate(in_front[:, ::-1], axis=1)[:, ::-1]
+    gone = tissue & beyond[:, :, None]
     return tissue & ~gone, gone
 
 
-def _without_rests(
-    tissue: Mask, bone: Mask, spacing: NDArray[np.float64]
-) -> tuple[Mask, Mask]:
+def _without_rests(tissue: Mask, bone: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, Mask]:
     """The head without pillow and head-holder, and these."""
     head = _core(tissue, spacing)
     column = np.flatnonzero(head.any(axis=(0, 1)))

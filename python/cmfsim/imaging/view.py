@@ -4,21 +4,20 @@ import numpy as np
 
 from cmfsim.case import Finding
 from cmfsim.imaging.bone import Bone
+from cmfsim.imaging.morphology import depth
 from cmfsim.imaging.skin import Skin
-from cmfsim.imaging.working import Working
+from cmfsim.imaging.working import COARSE, Working
 
 __all__ = ["view_findings"]
 
 # Skin or bone that meets a border of the image over less than this is not cut off, mm².
 CUT_SKIN = 150.0
 CUT_BONE = 60.0
-# The face lies in front of the brain's middle and below it by more than this, mm.
-LEAST_OFFSET = 8.0
-# Bone of the face: within this in height below the cavity's lowest tenth, mm.
-FACE_HEIGHT = 120.0
-# From the lowest bone of the front to the skull's lowest cavity there are at least this many mm
-# where the chin is in the image.
-LEAST_FACE = 60.0
+# Face, jaws and spine lie farther than this from the brain's cavity, the vault does not, mm.
+VAULT = 15.0
+# The middle of face, jaws and spine lies some 40 mm in front of the brain's and 80 mm below it: it
+# may not lie behind it or above it by more than this, mm.
+LEAST_OFFSET = 5.0
 
 
 def view_findings(work: Working, skin: Skin, bone: Bone) -> tuple[Finding, ...]:
@@ -34,40 +33,20 @@ def _direction(work: Working, bone: Bone) -> tuple[Finding, ...]:
     """
     if bone.cavity is None:
         return ()
-    brain, extent = _middle(work, bone.cavity)
-    # Bone of the vault surrounds the brain evenly; the face and the jaws are what lies beyond it.
-    x, y, z = (
-        o + s * np.arange(n)
-        for o, s, n in zip(work.origin, work.spacing, bone.solid.shape, strict=True)
-    )
-    del x
-    up = np.abs(z - brain[2])
-    counts = bone.solid.sum(axis=0).astype(np.float64)
-    beyond = up[None, :] > 0.8 * extent[2]
-    above = counts[:, z > brain[2]][:, (up > 1.1 * extent[2])[z > brain[2]]].sum()
-    below = counts[:, z < brain[2]][:, (up > 1.1 * extent[2])[z < brain[2]]].sum()
+    steps = tuple(max(1, int(COARSE / h)) for h in work.spacing)
+    blocks = tuple(slice(None, None, n) for n in steps)
+    spacing = work.spacing * np.array(steps)
+    cavity = np.asfortranarray(bone.cavity[blocks])
+    beyond = bone.solid[blocks] & (depth(cavity, spacing) < -VAULT)
+    if not beyond.any():
+        return ()
+    away = (np.argwhere(beyond).mean(axis=0) - np.argwhere(cavity).mean(axis=0)) * spacing
     findings = []
-    if above > 2.0 * below:
+    if away[2] > LEAST_OFFSET:
         findings.append(_turned("upside-down", "the head stands on its vertex"))
-    # Spine and face both lie beyond the cavity, the face farther from its middle and with more bone.
-    away = y[:, None] - brain[1]
-    beyond = beyond & (np.abs(away) > 0.35 * extent[1])
-    front = float((counts * beyond * np.clip(-away, 0.0, None)).sum())
-    back = float((counts * beyond * np.clip(away, 0.0, None)).sum())
-    if back > 1.3 * front:
+    if away[1] > LEAST_OFFSET:
         findings.append(_turned("facing-back", "the face looks to the back (+y, posterior)"))
     return tuple(findings)
-
-
-def _middle(work: Working, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]
-    """Middle and half extent of a mask, mm."""
-    low, high = [], []
-    for axis in range(3):
-        others = tuple(a for a in range(3) if a != axis)
-        found = np.flatnonzero(mask.any(axis=others))
-        low.append(work.origin[axis] + work.spacing[axis] * found[0])
-        high.append(work.origin[axis] + work.spacing[axis] * found[-1])
-    return 0.5 * (np.array(low) + np.array(high)), 0.5 * (np.array(high) - np.array(low))
 
 
 def _turned(code: str, what: str) -> Finding:
@@ -99,7 +78,7 @@ def _cut_off(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
             )
     top = float(np.count_nonzero(bone.solid[:, :, -1]) * x * y)
     if work.border[1, 2] and top > CUT_BONE:
-        findings.append(_top(work, bone, top))
+        findings.append(_top(bone, top))
     chin = _chin_area(work, bone, skin)
     if work.border[0, 2] and chin > CUT_BONE:
         findings.append(
@@ -108,7 +87,7 @@ def _cut_off(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
     return findings
 
 
-def _top(work: Working, bone: Bone, area: float) -> Finding:
+def _top(bone: Bone, area: float) -> Finding:
     """The forehead is missing if the border cuts the skull below its widest layer."""
     per_layer = bone.mask.sum(axis=(0, 1))
     what = f"bone of the skull meets the border over {area:.0f} mm²"

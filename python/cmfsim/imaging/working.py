@@ -70,9 +70,7 @@ class Working:
         return ImageData(np.ascontiguousarray(values), self.spacing, self.origin)
 
 
-def working_grid(
-    image: ImageData, options: SegmentOptions
-) -> tuple[Working, tuple[Finding, ...]]:
+def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tuple[Finding, ...]]:
     """The head's part of an image in HU, and what was found on the image.
 
     Errors

@@ -1,7 +1,10 @@
 """Images in the formats that SimpleITK reads: NRRD, NIfTI, MetaImage and folders of DICOM."""
 
+import gzip
 import os
+import struct
 import tempfile
+import zlib
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -26,6 +29,8 @@ UNEVEN = 0.02
 MOST_VOXELS = 2_100_000_000
 # Outside a rotated image there is air, HU; images without negative values get their least.
 OUTSIDE = -1024.0
+# The longer of both NIfTI headers, bytes.
+NIFTI_HEADER = 544
 _MODALITY = "0008|0060"
 _POSITION = "0020|0032"
 _ORIENTATION = "0020|0037"
@@ -145,9 +150,7 @@ def _simpleitk() -> Any:
     try:
         return import_module("SimpleITK")
     except ModuleNotFoundError as error:
-        raise ImageError(
-            "images are read with SimpleITK: pip install 'cmfsim[imaging]'"
-        ) from error
+        raise ImageError("images are read with SimpleITK: pip install 'cmfsim[imaging]'") from error
 
 
 def _last_line(error: Exception) -> str:
@@ -168,10 +171,11 @@ def _read_file(itk: Any, path: Path) -> tuple[Any, str, list[Finding]]:
             f"{path.name}: is no image that can be read ({_last_line(error)}); NRRD, NIfTI, "
             "MetaImage or DICOM is needed"
         ) from error
-    size = [int(n) for n in reader.GetSize()]
-    _check_shape(path, size, int(reader.GetNumberOfComponents()))
     modality = _tag(reader, _MODALITY)
     _check_modality(path, modality)
+    _check_shape(path, [int(n) for n in reader.GetSize()], int(reader.GetNumberOfComponents()))
+    if path.name.lower().endswith((".nii", ".nii.gz")):
+        _check_nifti_length(path)
     try:
         image = reader.Execute()
     except RuntimeError as error:
@@ -181,6 +185,51 @@ def _read_file(itk: Any, path: Path) -> tuple[Any, str, list[Finding]]:
     if image.GetDimension() == 4:
         image = image[:, :, :, 0]
     return image, modality, []
+
+
+def _check_nifti_length(path: Path) -> None:
+    """Refuses a NIfTI file with fewer bytes than its header says: ITK reads zeros for the rest."""
+    opener: Any = gzip.open if _packed(path) else open
+    try:
+        with opener(path, "rb") as file:
+            header = file.read(NIFTI_HEADER)
+            needed = _nifti_length(header)
+            found = len(header)
+            while block := file.read(2**22):
+                found += len(block)
+    except (EOFError, OSError, struct.error, zlib.error) as error:
+        raise ImageInputError(
+            f"{path.name}: is cut short or damaged ({error}); copy it again"
+        ) from error
+    if found < needed:
+        raise ImageInputError(
+            f"{path.name}: is cut short: {found} of {needed} bytes; copy it again"
+        )
+
+
+def _packed(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(2) == b"\x1f\x8b"
+
+
+def _nifti_length(header: bytes) -> int:
+    """The bytes of a file by its header, of NIfTI-1 (348 bytes) or NIfTI-2 (540)."""
+    order = next((o for o in "<>" if struct.unpack(f"{o}i", header[:4])[0] in {348, 540}), None)
+    if order is None:
+        message = "no NIfTI header"
+        raise OSError(message)
+    if struct.unpack(f"{order}i", header[:4])[0] == 348:
+        shape = struct.unpack(f"{order}8h", header[40:56])
+        bits = struct.unpack(f"{order}h", header[72:74])[0]
+        start = struct.unpack(f"{order}f", header[108:112])[0]
+    else:
+        shape = struct.unpack(f"{order}8q", header[16:80])
+        bits = struct.unpack(f"{order}h", header[14:16])[0]
+        start = struct.unpack(f"{order}q", header[168:176])[0]
+    voxels = 1
+    for n in shape[1 : shape[0] + 1]:
+        voxels *= int(n)
+    return int(start) + voxels * bits // 8
 
 
 def _check_shape(path: Path, size: list[int], components: int) -> None:
@@ -327,9 +376,7 @@ def _numbers(text: str, count: int) -> NDArray[np.float64] | None:
     return values if values.shape == (count,) and np.isfinite(values).all() else None
 
 
-def _in_lps(
-    itk: Any, image: Any, modality: str, findings: list[Finding], path: Path
-) -> ImageFile:
+def _in_lps(itk: Any, image: Any, modality: str, findings: list[Finding], path: Path) -> ImageFile:
     spacing = np.array(image.GetSpacing())
     direction = np.array(image.GetDirection()).reshape(3, 3)
     if not (np.isfinite(spacing).all() and (spacing > 0.0).all()):
