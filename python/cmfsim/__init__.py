@@ -33,7 +33,16 @@ from cmfsim.errors import (
     RegistrationError,
     SolverError,
 )
-from cmfsim.io import read_plan, read_result, read_scene, write_result, write_scene
+from cmfsim.imaging import SegmentOptions, segment_head
+from cmfsim.io import (
+    read_image,
+    read_plan,
+    read_result,
+    read_scene,
+    write_image,
+    write_result,
+    write_scene,
+)
 from cmfsim.meshing import (
     MeshOptions,
     MeshReport,
@@ -89,6 +98,7 @@ __all__ = [
     "Scene",
     "SceneResult",
     "SegmentData",
+    "SegmentOptions",
     "Solution",
     "SolverError",
     "SolverOptions",
@@ -109,15 +119,18 @@ __all__ = [
     "mesh_report",
     "mesh_with_tetwild",
     "part_mesh",
+    "read_image",
     "read_plan",
     "read_result",
     "read_scene",
     "rigid_motion",
     "scene_plan",
     "scene_solver",
+    "segment_head",
     "signed_level",
     "solve_scene",
     "tissue_level",
+    "write_image",
     "write_result",
     "write_scene",
 ]

@@ -25,6 +25,7 @@ __all__ = [
     "CmfsimError",
     "ContactError",
     "ImageError",
+    "ImageInputError",
     "LandmarkError",
     "MaterialError",
     "MeshError",
@@ -44,3 +45,7 @@ class CaseInputError(CaseError, ValueError):
 
 class MeshInputError(MeshError, ValueError):
     """Labels, levels or surfaces that cannot be meshed."""
+
+
+class ImageInputError(ImageError, ValueError):
+    """An image that cannot be meant: not three axes, no CT, damaged, no head in it."""
