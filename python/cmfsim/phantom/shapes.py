@@ -1,0 +1,496 @@
+"""Building blocks of anatomy: levels that are positive inside, and how they melt together.
+
+A level is close to the signed distance in mm near its surface. Coordinates come as three arrays
+that broadcast, so that a grid is evaluated from its axes and what depends on one axis alone is
+computed once per line. A shape that lies far from the asked box is left out: levels are exact where
+they are above −REACH and merely below −REACH elsewhere, which no surface notices.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim.checks import Floats
+
+__all__ = [
+    "REACH",
+    "Blend",
+    "Box",
+    "Egg",
+    "Engraving",
+    "FlatTube",
+    "Level",
+    "Loft",
+    "Plane",
+    "Shape",
+    "Step",
+    "Table",
+    "Tube",
+    "box_of",
+    "smooth_curve",
+    "smooth_max",
+    "smooth_step",
+    "turn_about",
+]
+
+Level = NDArray[np.floating]
+
+# Below minus this many mm a level need not be right, only negative. Twice the widest melt of two
+# shapes, so that leaving a shape out never moves a surface.
+REACH = 16.0
+# Smallest length that is divided by, mm.
+TINY = 1e-6
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box, mm."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def meets(self, other: "Box", margin: float) -> bool:
+        """Whether the boxes come closer than the margin along every axis."""
+        return all(
+            a - margin <= d and c <= b + margin
+            for a, b, c, d in zip(self.low, self.high, other.low, other.high, strict=True)
+        )
+
+    def grown(self, margin: float) -> "Box":
+        """The box with a margin on every side."""
+        x, y, z = self.low
+        u, v, w = self.high
+        return Box(
+            (x - margin, y - margin, z - margin), (u + margin, v + margin, w + margin)
+        )
+
+
+EVERYWHERE = Box((-np.inf, -np.inf, -np.inf), (np.inf, np.inf, np.inf))
+
+
+class Shape(Protocol):
+    """Something with an inside."""
+
+    @property
+    def box(self) -> Box:
+        """Where the level can be above 0."""
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """The level at points, positive inside, mm."""
+
+
+def box_of(x: Level, y: Level, z: Level) -> Box:
+    """The box that the asked points fill."""
+    return Box(
+        (float(x.min()), float(y.min()), float(z.min())),
+        (float(x.max()), float(y.max()), float(z.max())),
+    )
+
+
+def smooth_max(a: Level, b: Level, melt: float) -> Level:
+    """The larger level, rounded where they differ by less than `melt` mm; never the smaller.
+
+    The quadratic polynomial h² melt/4 with h = 1 − |a − b|/melt is C¹ and of local support.
+    """
+    highest: Level = np.maximum(a, b)
+    if melt <= 0.0:
+        return highest
+    h = np.maximum(1.0 - np.abs(a - b) / melt, 0.0)
+    return highest + h * h * (0.25 * melt)
+
+
+def smooth_step(value: Level | float, start: float, end: float) -> Level:
+    """0 up to `start`, 1 from `end` on, C¹ between; `end` may lie below `start`."""
+    t = np.clip((np.asarray(value) - start) / (end - start), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def smooth_curve(points: ArrayLike, steps: int = 4, *, closed: bool = False) -> Floats:
+    """Points on the Catmull–Rom curve through rows of numbers, `steps` per interval.
+
+    Parameters
+    ----------
+    points : (n, k) float64
+        Places, and what belongs to them (radii), in any unit.
+    steps : int
+    closed : bool
+        Whether the curve returns to its first point, which then is not repeated.
+
+    Returns
+    -------
+    ((n − 1) steps + 1, k) float64, closed curves (n steps + 1, k)
+    """
+    rows = np.asarray(points, dtype=np.float64)
+    if closed:
+        padded = np.vstack([rows[-1:], rows, rows[:2]])
+    else:
+        ends = 2.0 * rows[0] - rows[1], 2.0 * rows[-1] - rows[-2]
+        padded = np.vstack([ends[0], rows, ends[1]])
+    before, start, end, after = padded[:-3], padded[1:-2], padded[2:-1], padded[3:]
+    t = (np.arange(steps) / steps)[:, None, None]
+    curve = 0.5 * (
+        2.0 * start
+        + t * (end - before)
+        + t**2 * (2.0 * before - 5.0 * start + 4.0 * end - after)
+        + t**3 * (3.0 * (start - end) + after - before)
+    )
+    return np.vstack([curve.transpose(1, 0, 2).reshape(-1, rows.shape[1]), end[-1:]])
+
+
+def turn_about(axis: str, degrees: float) -> Floats:
+    """Rows are the axes of something turned about a coordinate axis by the right-hand rule."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    rows = {
+        "x": [[1, 0, 0], [0, c, s], [0, -s, c]],
+        "y": [[c, 0, -s], [0, 1, 0], [s, 0, c]],
+        "z": [[c, s, 0], [-s, c, 0], [0, 0, 1]],
+    }
+    return np.array(rows[axis], dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Egg:
+    """A superellipsoid whose radii differ between the lower and the upper side of each axis.
+
+    Attributes
+    ----------
+    centre : (3,) mm
+    low, high : (3,) mm
+        Radii towards smaller and larger coordinates; `high` as `low` where left out.
+    power : float
+        2 is an ellipsoid, more is boxier.
+    turn : (3, 3) or None
+        Rows are the egg's own axes.
+    """
+
+    centre: Sequence[float]
+    low: Sequence[float]
+    high: Sequence[float] | None = None
+    power: float = 2.0
+    turn: Floats | None = None
+
+    @property
+    def box(self) -> Box:
+        """Where the level can be above 0."""
+        c = np.asarray(self.centre)
+        high = self.low if self.high is None else self.high
+        if self.turn is not None:
+            reach = float(max(*self.low, *high)) * (1.8 if self.power > 2.0 else 1.0)
+            lows, highs = c - reach, c + reach
+        else:
+            lows, highs = c - np.asarray(self.low), c + np.asarray(high)
+        return Box(tuple(lows.tolist()), tuple(highs.tolist()))
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """Value over gradient length of the homogeneous form: (1 − g)/|∇g|."""
+        parts = [x - self.centre[0], y - self.centre[1], z - self.centre[2]]
+        if self.turn is not None:
+            u, v, w = parts
+            parts = [row[0] * u + row[1] * v + row[2] * w for row in self.turn.tolist()]
+        high = self.low if self.high is None else self.high
+        n = self.power
+        total: Level = np.zeros(1, dtype=x.dtype)
+        slope: Level = np.zeros(1, dtype=x.dtype)
+        for part, low, up in zip(parts, self.low, high, strict=True):
+            radius = low if low == up else np.where(part < 0.0, low, up).astype(x.dtype)
+            q = np.abs(part) / radius
+            power = q * q if n == 2.0 else q**n
+            total = total + power
+            slope = slope + (power / np.maximum(q, TINY) / radius) ** 2
+        g = np.sqrt(total) if n == 2.0 else total ** (1.0 / n)
+        # ∇g = g^(1−n) (q^(n−1)/r); near the centre the level stays below the smallest radius.
+        slope_length = np.sqrt(slope) * np.maximum(g, TINY) ** (1.0 - n)
+        smallest = float(min(*self.low, *high))
+        return np.where(
+            g < 0.25, (1.0 - g) * smallest, (1.0 - g) / np.maximum(slope_length, TINY)
+        ).astype(x.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class Tube:
+    """A round tube of changing radius along a polyline.
+
+    Attributes
+    ----------
+    points : (n, 4)
+        Place and radius, mm.
+    """
+
+    points: Floats
+
+    @property
+    def box(self) -> Box:
+        """Where the level can be above 0."""
+        place, radius = self.points[:, :3], self.points[:, 3:]
+        return Box(
+            tuple((place - radius).min(axis=0).tolist()),
+            tuple((place + radius).max(axis=0).tolist()),
+        )
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """Radius less distance, of the best segment."""
+        best: Level | None = None
+        rows = self.points.tolist()
+        for (ax, ay, az, ar), (bx, by, bz, br) in zip(rows[:-1], rows[1:], strict=True):
+            ux, uy, uz = bx - ax, by - ay, bz - az
+            size = max(ux * ux + uy * uy + uz * uz, TINY)
+            px, py, pz = x - ax, y - ay, z - az
+            t = np.clip((px * ux + py * uy + pz * uz) / size, 0.0, 1.0)
+            d = np.sqrt((px - t * ux) ** 2 + (py - t * uy) ** 2 + (pz - t * uz) ** 2)
+            value = ar + t * (br - ar) - d
+            best = value if best is None else np.maximum(best, value)
+        assert best is not None
+        return best
+
+
+@dataclass(frozen=True, eq=False)
+class FlatTube:
+    """A tube of elliptic section along a polyline: a strap.
+
+    Attributes
+    ----------
+    points : (n, 3) mm
+    normals : (n, 3)
+        Unit vectors along which the strap is thin.
+    thick, wide : (n,) mm
+        Half axes of the section, along the normal and across it.
+    """
+
+    points: Floats
+    normals: Floats
+    thick: Floats
+    wide: Floats
+
+    @property
+    def box(self) -> Box:
+        """Where the level can be above 0."""
+        reach = np.maximum(self.thick, self.wide)[:, None]
+        return Box(
+            tuple((self.points - reach).min(axis=0).tolist()),
+            tuple((self.points + reach).max(axis=0).tolist()),
+        )
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """The level of the ellipse in the section through the closest point of the polyline."""
+        best: list[Level] = []
+        for i in range(len(self.points) - 1):
+            ax, ay, az = self.points[i].tolist()
+            ux, uy, uz = (self.points[i + 1] - self.points[i]).tolist()
+            size = max(ux * ux + uy * uy + uz * uz, TINY)
+            px, py, pz = x - ax, y - ay, z - az
+            t = np.clip((px * ux + py * uy + pz * uz) / size, 0.0, 1.0)
+            qx, qy, qz = px - t * ux, py - t * uy, pz - t * uz
+            d2 = qx * qx + qy * qy + qz * qz
+            n, dn = self.normals[i].tolist(), (self.normals[i + 1] - self.normals[i]).tolist()
+            off = qx * (n[0] + t * dn[0]) + qy * (n[1] + t * dn[1]) + qz * (n[2] + t * dn[2])
+            thick = self.thick[i] + t * (self.thick[i + 1] - self.thick[i])
+            wide = self.wide[i] + t * (self.wide[i + 1] - self.wide[i])
+            u2 = off * off
+            v2 = np.maximum(d2 - u2, 0.0)
+            # iq's bound of the distance to an ellipse: k₀(1 − k₀)/k₁.
+            k0 = np.sqrt(u2 / thick**2 + v2 / wide**2)
+            k1 = np.sqrt(u2 / thick**4 + v2 / wide**4)
+            value = np.where(k0 < 0.05, thick, k0 * (1.0 - k0) / np.maximum(k1, TINY))
+            best = [value] if not best else [np.maximum(best[0], value)]
+        return best[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """The half-space on the side that the normal looks away from.
+
+    Attributes
+    ----------
+    point : (3,) mm
+    normal : (3,)
+        Unit vector, outward.
+    """
+
+    point: Sequence[float]
+    normal: Sequence[float]
+
+    @property
+    def box(self) -> Box:
+        """Everywhere: a half-space has no end."""
+        return EVERYWHERE
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """The distance behind the plane."""
+        p, n = self.point, self.normal
+        return (p[0] - x) * n[0] + (p[1] - y) * n[1] + (p[2] - z) * n[2]
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A smooth function of one coordinate through rounded table values.
+
+    Attributes
+    ----------
+    places, values : (n,)
+        Ascending places, mm.
+    rounding : float, mm
+        Standard deviation of the Gaussian that rounds the corners.
+    """
+
+    places: Sequence[float]
+    values: Sequence[float]
+    rounding: float = 5.0
+
+    def __post_init__(self) -> None:
+        step = 0.5
+        margin = 4.0 * self.rounding
+        fine = np.arange(self.places[0] - margin, self.places[-1] + margin + step, step)
+        width = np.arange(-margin, margin + step, step)
+        kernel = np.exp(-0.5 * (width / self.rounding) ** 2)
+        raw = np.interp(fine, self.places, self.values)
+        reach = len(width) // 2
+        padded = np.pad(raw, reach, mode="edge")
+        smooth = np.convolve(padded, kernel / kernel.sum(), mode="valid")[: len(fine)]
+        object.__setattr__(self, "_fine", fine)
+        object.__setattr__(self, "_smooth", smooth)
+        object.__setattr__(self, "_slope", np.gradient(smooth, step))
+
+    def at(self, z: Level) -> Level:
+        """The value at places."""
+        fine, smooth = self.__dict__["_fine"], self.__dict__["_smooth"]
+        return np.interp(z, fine, smooth).astype(z.dtype)
+
+    def slope(self, z: Level) -> Level:
+        """The derivative at places, per mm."""
+        fine, slope = self.__dict__["_fine"], self.__dict__["_slope"]
+        return np.interp(z, fine, slope).astype(z.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class Loft:
+    """A body whose horizontal sections are superellipses that change with height.
+
+    Attributes
+    ----------
+    middle : float, mm
+        y of the widest place of every section.
+    front, back, width, power : Table
+        Of z: y of the foremost and hindmost point, half width, and the exponent of the section.
+    box : Box
+    """
+
+    middle: float
+    front: Table
+    back: Table
+    width: Table
+    power: Table
+    box: Box
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """Value over gradient length of the homogeneous form of the section."""
+        n, w = self.power.at(z), self.width.at(z)
+        forward = y < self.middle
+        f = np.where(forward, self.middle - self.front.at(z), self.back.at(z) - self.middle)
+        df = np.where(forward, -self.front.slope(z), self.back.slope(z))
+        qx = np.maximum(np.abs(x) / w, TINY)
+        qy = np.maximum(np.abs(y - self.middle) / f, TINY)
+        px, py = qx**n, qy**n
+        g = np.maximum(px + py, TINY) ** (1.0 / n)
+        gx, gy = px / qx / w, py / qy / f
+        gz = px * self.width.slope(z) / w + py * df / f
+        slope = np.sqrt(gx * gx + gy * gy + gz * gz) * np.maximum(g, 0.05) ** (1.0 - n)
+        return ((1.0 - g) / np.maximum(slope, 1.0 / 150.0)).astype(x.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class Engraving:
+    """A groove or ridge along a curve drawn on the face as seen from in front.
+
+    Attributes
+    ----------
+    curve : (n, 2) mm
+        x and z.
+    width : float, mm
+        Half width, where the groove ends with no corner.
+    depth : (n,) mm
+        How far the surface moves in; negative moves out.
+    behind : float, mm
+        y beyond which nothing is engraved.
+    """
+
+    curve: Floats
+    width: float
+    depth: Floats
+    behind: float = -40.0
+
+    @property
+    def box(self) -> Box:
+        """Where something is engraved."""
+        (x, z), (u, w) = self.curve.min(axis=0) - self.width, self.curve.max(axis=0) + self.width
+        return Box((x, -200.0, z), (u, self.behind, w))
+
+    def shift(self, x: Level, y: Level, z: Level) -> Level:
+        """How far the level sinks."""
+        near: Level | None = None
+        depth: Level | None = None
+        for i in range(len(self.curve) - 1):
+            (ax, az), (bx, bz) = self.curve[i].tolist(), self.curve[i + 1].tolist()
+            ux, uz = bx - ax, bz - az
+            px, pz = x - ax, z - az
+            t = np.clip((px * ux + pz * uz) / max(ux * ux + uz * uz, TINY), 0.0, 1.0)
+            d2 = (px - t * ux) ** 2 + (pz - t * uz) ** 2
+            value = self.depth[i] + t * (self.depth[i + 1] - self.depth[i])
+            if near is None or depth is None:
+                near, depth = d2, value
+            else:
+                depth = np.where(d2 < near, value, depth)
+                near = np.minimum(near, d2)
+        assert near is not None and depth is not None
+        bump = np.maximum(1.0 - near / self.width**2, 0.0) ** 2
+        fade = smooth_step(y, self.behind, self.behind - 10.0)
+        return (depth * bump * fade).astype(x.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What one shape does to the shapes before it.
+
+    Attributes
+    ----------
+    how : str
+        "join" adds the shape, "cut" takes it away, "meet" keeps what lies in both.
+    shape : Shape
+    melt : float, mm
+        Width of the rounding.
+    """
+
+    how: str
+    shape: Shape
+    melt: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Blend:
+    """Shapes joined, cut and engraved one after another."""
+
+    steps: tuple[Step | Engraving, ...]
+    box: Box
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """The level after the last step."""
+        asked = box_of(x, y, z)
+        shape = np.broadcast_shapes(x.shape, y.shape, z.shape)
+        value: Level = np.full(shape, -100.0, dtype=x.dtype)
+        for step in self.steps:
+            if isinstance(step, Engraving):
+                if step.box.meets(asked, 0.0):
+                    value = value - step.shift(x, y, z)
+                continue
+            if step.how != "meet" and not step.shape.box.meets(asked, max(REACH, 2.0 * step.melt)):
+                continue
+            other = step.shape.level(x, y, z)
+            if step.how == "join":
+                value = smooth_max(value, other, step.melt)
+            elif step.how == "cut":
+                value = -smooth_max(-value, other, step.melt)
+            else:
+                value = -smooth_max(-value, -other, step.melt)
+        return value.astype(x.dtype)
