@@ -12,6 +12,7 @@ from cmfsim.case import Anatomy, ImageData
 from cmfsim.checks import Floats, as_positive, as_rows, check_one_of
 from cmfsim.phantom.grid import Field, level_grid, level_surface
 from cmfsim.phantom.head import HEAD_BOX, skin_shape
+from cmfsim.phantom.muscles import Muscle, make_muscles
 from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.phantom.shapes import Box, Level, Shape, smooth_max
 from cmfsim.phantom.skull import airway_shape, brain_shape, cranium_shape, mandible_shape, teeth_shape
@@ -63,10 +64,16 @@ class PhantomHead:
         if name == "teeth":
             parts = [self.shapes[n].level(x, y, z) for n in ("upper_teeth", "lower_teeth")]
             return np.maximum(*parts)
+        if name == "bone":
+            return np.maximum.reduce([self.shapes[n].level(x, y, z) for n in BONES])
         if name == "skin":
-            bone = np.maximum.reduce([self.shapes[n].level(x, y, z) for n in BONES])
+            bone = self.drawn_level("bone", x, y, z)
             return self._covered(self.shapes["drawn_skin"].level(x, y, z), bone)
         return self.shapes[name].level(x, y, z)
+
+    @cached_property
+    def muscles(self) -> Mapping[str, Muscle]:
+        return make_muscles(self)
 
     @staticmethod
     def _covered(skin: Level, bone: Level) -> Level:

@@ -92,7 +92,7 @@ def cranium_shape(p: HeadParameters) -> Blend:
         Step("cut", Egg((32, -74, 18.5), (18.5, 20, 16.5), power=2.3, turn=turn_about("z", 14)), 3.0),
         Step("cut", _tube([[32, -76, 18.5, 15.5], [24, -54, 19, 11], [17, -38, 20, 3]], 10), 3.0),
         # Arch: from the cheekbone free of the temple to the ear.
-        Step("join", _tube([[49, -62, -3, 6.0], [58, -54, -1, 4.4], [63.5, -42, 1, 3.6], [64.3, -30, 2, 3.5], [62, -18, 3.5, 4.2], [57, -8, 5, 6.0]]), 4.0),
+        Step("join", _tube([[49, -62, -3, 6.0], [56.5, -54, -1, 4.4], [61.8, -42, 1, 3.6], [63.2, -30, 2, 3.5], [61.5, -18, 3.5, 4.2], [57, -8, 5, 6.0]]), 4.0),
         # Alveolar process and palate.
         Step("join", _arch(UPPER_ARCH, -23.0, 6.2, 11.0), 5.0),
         Step("join", Egg((0, -62, -19), (24, 26, 4)), 5.0),
