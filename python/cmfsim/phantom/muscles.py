@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.checks import Floats, as_rows, frozen
-from cmfsim.phantom.courses import COURSES, Course
+from cmfsim.phantom.courses import COURSES, Course, Row
 from cmfsim.phantom.grid import Field, gradient_at, to_surface
-from cmfsim.phantom.shapes import Box, FlatTube, Level, smooth_curve, smooth_max
+from cmfsim.phantom.shapes import REACH, Box, FlatTube, Level, smooth_curve, smooth_max
 from cmfsim.phantom.warp import FaceWarp, JawWarp
 
 __all__ = ["Muscle", "Tissue", "make_muscles"]
@@ -22,6 +22,8 @@ BELOW_SKIN = 0.6
 MELT = 1.5
 # Points per interval of a course.
 STEPS = 5
+# Rows per interval of a course that is put below the skin row by row.
+DENSE_STEPS = 3
 # Step along a fibre for its direction after the warp, mm.
 NUDGE = 1e-3
 
@@ -33,8 +35,8 @@ class Tissue(Protocol):
     def warp(self) -> FaceWarp:
         """From the person's space to the symmetric head."""
 
-    def drawn_level(self, name: str, x: Level, y: Level, z: Level) -> Level:
-        """The level of a part in the symmetric head."""
+    def skin_and_bone(self, x: Level, y: Level, z: Level) -> tuple[Level, Level]:
+        """The levels of the skin, and of all bones and teeth, in the symmetric head."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +102,10 @@ class Muscle:
 
     def drawn_level(self, x: Level, y: Level, z: Level) -> Level:
         """The level in the symmetric head: below the skin and outside the bones."""
-        skin = self.tissue.drawn_level("skin", x, y, z)
-        bone = self.tissue.drawn_level("bone", x, y, z)
-        return self.clipped(self.strap_level(x, y, z), skin, bone)
+        strap = self.strap_level(x, y, z)
+        if strap.max() < -REACH:
+            return strap
+        return self.clipped(strap, *self.tissue.skin_and_bone(x, y, z))
 
     @staticmethod
     def clipped(strap: Level, skin: Level, bone: Level) -> Level:
@@ -174,8 +177,9 @@ def _closest_direction(line: Floats, points: Floats) -> tuple[Floats, Floats]:
 
 def make_muscles(tissue: Tissue) -> Mapping[str, Muscle]:
     """All muscles of a person by name, on both sides."""
-    rows = [row for course in COURSES.values() for line in course.lines for row in line]
-    table = np.array(rows, dtype=np.float64)
+    lines = [_dense(line, course) for course in COURSES.values() for line in course.lines]
+    lengths = [len(line) for line in lines]
+    table = np.vstack(lines)
     soft = JawWarp(tissue.warp.parameters, soft=True)
     table[:, :3] = soft.forward(table[:, :3])
     table[:, :3] = _placed(tissue, table[:, :3], table[:, 3])
@@ -183,15 +187,23 @@ def make_muscles(tissue: Tissue) -> Mapping[str, Muscle]:
     start = 0
     for name, course in COURSES.items():
         tubes = []
-        for line in course.lines:
-            part = table[start : start + len(line)]
-            start += len(line)
-            tubes.append(_strap(tissue, part, course))
+        for _ in course.lines:
+            tubes.append(_strap(tissue, table[start : start + lengths[0]], course))
+            start += lengths.pop(0)
         for side in ("L", "R") if course.paired else ("both",):
             muscle = f"{name}_{side}" if course.paired else name
             lines = tuple(_line(tissue, tube, side, course) for tube in tubes)
             muscles[muscle] = Muscle(muscle, side, course.kind, lines, tuple(tubes), tissue)
     return MappingProxyType(muscles)
+
+
+def _dense(line: tuple[Row, ...], course: Course) -> Floats:
+    """More rows, where all lie superficially: a sheet must follow the skin between them."""
+    rows = np.array(line, dtype=np.float64)
+    if course.kind != "sheet" and not (rows[:, 3] > 1.0).all():
+        return rows
+    dense = smooth_curve(rows, DENSE_STEPS, closed=course.closed)
+    return dense[:-1] if course.closed else dense
 
 
 def _line(tissue: Tissue, tube: FlatTube, side: str, course: Course) -> Floats:
@@ -220,7 +232,7 @@ def _strap(tissue: Tissue, rows: Floats, course: Course) -> FlatTube:
 
 
 def _skin(tissue: Tissue) -> Field:
-    return lambda x, y, z: tissue.drawn_level("skin", x, y, z)
+    return lambda x, y, z: tissue.skin_and_bone(x, y, z)[0]
 
 
 def _placed(tissue: Tissue, points: Floats, place: Floats) -> Floats:
@@ -232,12 +244,11 @@ def _placed(tissue: Tissue, points: Floats, place: Floats) -> Floats:
     def level(share: Floats, depth: Floats) -> Callable[[Level, Level, Level], Level]:
         # (1 − f) skin + f bone vanishes at the fraction f of the way, as bone is minus its distance.
         def value(x: Level, y: Level, z: Level) -> Level:
-            skin = tissue.drawn_level("skin", x, y, z)
-            bone = tissue.drawn_level("bone", x, y, z)
+            skin, bone = tissue.skin_and_bone(x, y, z)
             return (1.0 - share) * skin + share * bone - depth
 
         return value
 
     placed = points.copy()
-    placed[moves] = to_surface(level(share[moves], depth[moves]), points[moves], rounds=12)
+    placed[moves] = to_surface(level(share[moves], depth[moves]), points[moves])
     return placed

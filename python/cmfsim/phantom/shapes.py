@@ -8,6 +8,7 @@ they are above −REACH and merely below −REACH elsewhere, which no surface no
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -29,7 +30,6 @@ __all__ = [
     "Step",
     "Table",
     "Tube",
-    "box_of",
     "smooth_curve",
     "smooth_max",
     "smooth_step",
@@ -41,6 +41,8 @@ Level = NDArray[np.floating]
 # Below minus this many mm a level need not be right, only negative. Twice the widest melt of two
 # shapes, so that leaving a shape out never moves a surface.
 REACH = 16.0
+# The level where no shape is near, mm.
+FAR = -100.0
 # Smallest length that is divided by, mm.
 TINY = 1e-6
 
@@ -51,13 +53,6 @@ class Box:
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
-
-    def meets(self, other: "Box", margin: float) -> bool:
-        """Whether the boxes come closer than the margin along every axis."""
-        return all(
-            a - margin <= d and c <= b + margin
-            for a, b, c, d in zip(self.low, self.high, other.low, other.high, strict=True)
-        )
 
     def grown(self, margin: float) -> "Box":
         """The box with a margin on every side."""
@@ -80,14 +75,6 @@ class Shape(Protocol):
 
     def level(self, x: Level, y: Level, z: Level) -> Level:
         """The level at points, positive inside, mm."""
-
-
-def box_of(x: Level, y: Level, z: Level) -> Box:
-    """The box that the asked points fill."""
-    return Box(
-        (float(x.min()), float(y.min()), float(z.min())),
-        (float(x.max()), float(y.max()), float(z.max())),
-    )
 
 
 def smooth_max(a: Level, b: Level, melt: float) -> Level:
@@ -151,6 +138,13 @@ def turn_about(axis: str, degrees: float) -> Floats:
     return np.array(rows[axis], dtype=np.float64)
 
 
+def _root(total: Level, n: Level | float) -> Level:
+    """total^(1/n) for totals above 0; log and exp are faster than the power of float32."""
+    if isinstance(n, float) and n == 2.0:
+        return np.sqrt(total)
+    return np.exp(np.log(np.maximum(total, TINY)) / n)
+
+
 @dataclass(frozen=True, eq=False)
 class Egg:
     """A superellipsoid whose radii differ between the lower and the upper side of each axis.
@@ -200,13 +194,42 @@ class Egg:
             power = q * q if n == 2.0 else q**n
             total = total + power
             slope = slope + (power / np.maximum(q, TINY) / radius) ** 2
-        g = np.sqrt(total) if n == 2.0 else total ** (1.0 / n)
+        g = _root(total, n)
         # ∇g = g^(1−n) (q^(n−1)/r); near the centre the level stays below the smallest radius.
-        slope_length = np.sqrt(slope) * np.maximum(g, TINY) ** (1.0 - n)
+        slope_length = np.sqrt(slope) * g / np.maximum(total, TINY)
         smallest = float(min(*self.low, *high))
         return np.where(
             g < 0.25, (1.0 - g) * smallest, (1.0 - g) / np.maximum(slope_length, TINY)
         ).astype(x.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class Reaches:
+    """Boxes of many things, to find those that come near an asked box.
+
+    Attributes
+    ----------
+    low, high : (n, 3) mm
+        Grown by how far each thing matters.
+    """
+
+    low: Floats
+    high: Floats
+
+    @classmethod
+    def of_line(cls, points: Floats, radius: Floats) -> "Reaches":
+        """The boxes of the segments of a tube."""
+        low, high = points - radius[:, None], points + radius[:, None]
+        return cls(
+            np.minimum(low[:-1], low[1:]) - REACH, np.maximum(high[:-1], high[1:]) + REACH
+        )
+
+    def near(self, x: Level, y: Level, z: Level) -> list[int]:
+        """The things that matter where the points lie."""
+        low = np.array([x.min(), y.min(), z.min()])
+        high = np.array([x.max(), y.max(), z.max()])
+        meets = (self.low <= high) & (self.high >= low)
+        return np.flatnonzero(meets.all(axis=1)).tolist()
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +244,11 @@ class Tube:
 
     points: Floats
 
+    @cached_property
+    def segments(self) -> Reaches:
+        """Where each segment matters."""
+        return Reaches.of_line(self.points[:, :3], self.points[:, 3])
+
     @property
     def box(self) -> Box:
         """Where the level can be above 0."""
@@ -232,17 +260,16 @@ class Tube:
 
     def level(self, x: Level, y: Level, z: Level) -> Level:
         """Radius less distance, of the best segment."""
-        best: Level | None = None
+        best = np.full(np.broadcast_shapes(x.shape, y.shape, z.shape), -REACH, dtype=x.dtype)
         rows = self.points.tolist()
-        for (ax, ay, az, ar), (bx, by, bz, br) in zip(rows[:-1], rows[1:], strict=True):
+        for i in self.segments.near(x, y, z):
+            (ax, ay, az, ar), (bx, by, bz, br) = rows[i], rows[i + 1]
             ux, uy, uz = bx - ax, by - ay, bz - az
             size = max(ux * ux + uy * uy + uz * uz, TINY)
             px, py, pz = x - ax, y - ay, z - az
             t = np.clip((px * ux + py * uy + pz * uz) / size, 0.0, 1.0)
             d = np.sqrt((px - t * ux) ** 2 + (py - t * uy) ** 2 + (pz - t * uz) ** 2)
-            value = ar + t * (br - ar) - d
-            best = value if best is None else np.maximum(best, value)
-        assert best is not None
+            best = np.maximum(best, ar + t * (br - ar) - d)
         return best
 
 
@@ -264,6 +291,11 @@ class FlatTube:
     thick: Floats
     wide: Floats
 
+    @cached_property
+    def segments(self) -> Reaches:
+        """Where each segment matters."""
+        return Reaches.of_line(self.points, np.maximum(self.thick, self.wide))
+
     @property
     def box(self) -> Box:
         """Where the level can be above 0."""
@@ -275,8 +307,8 @@ class FlatTube:
 
     def level(self, x: Level, y: Level, z: Level) -> Level:
         """The level of the ellipse in the section through the closest point of the polyline."""
-        best: list[Level] = []
-        for i in range(len(self.points) - 1):
+        best = np.full(np.broadcast_shapes(x.shape, y.shape, z.shape), -REACH, dtype=x.dtype)
+        for i in self.segments.near(x, y, z):
             ax, ay, az = self.points[i].tolist()
             ux, uy, uz = (self.points[i + 1] - self.points[i]).tolist()
             size = max(ux * ux + uy * uy + uz * uz, TINY)
@@ -294,8 +326,8 @@ class FlatTube:
             k0 = np.sqrt(u2 / thick**2 + v2 / wide**2)
             k1 = np.sqrt(u2 / thick**4 + v2 / wide**4)
             value = np.where(k0 < 0.05, thick, k0 * (1.0 - k0) / np.maximum(k1, TINY))
-            best = [value] if not best else [np.maximum(best[0], value)]
-        return best[0]
+            best = np.maximum(best, value)
+        return best.astype(x.dtype)
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,10 +425,11 @@ class Loft:
         qx = np.maximum(np.abs(x) / w, TINY)
         qy = np.maximum(np.abs(y - self.middle) / f, TINY)
         px, py = qx**n, qy**n
-        g = np.maximum(px + py, TINY) ** (1.0 / n)
+        total = np.maximum(px + py, TINY)
+        g = _root(total, n)
         gx, gy = px / qx / w, py / qy / f
         gz = px * self.width.slope(z) / w + py * df / f
-        slope = np.sqrt(gx * gx + gy * gy + gz * gz) * np.maximum(g, 0.05) ** (1.0 - n)
+        slope = np.sqrt(gx * gx + gy * gy + gz * gz) * g / total
         return ((1.0 - g) / np.maximum(slope, 1.0 / 150.0)).astype(x.dtype)
 
 
@@ -474,17 +507,29 @@ class Blend:
     steps: tuple[Step | Engraving, ...]
     box: Box
 
-    def level(self, x: Level, y: Level, z: Level) -> Level:
-        """The level after the last step."""
-        asked = box_of(x, y, z)
-        shape = np.broadcast_shapes(x.shape, y.shape, z.shape)
-        value: Level = np.full(shape, -100.0, dtype=x.dtype)
+    @cached_property
+    def _reaches(self) -> Reaches:
+        """Where each step matters: within the larger of REACH and twice its melt of its box."""
+        low, high = [], []
         for step in self.steps:
             if isinstance(step, Engraving):
-                if step.box.meets(asked, 0.0):
-                    value = value - step.shift(x, y, z)
-                continue
-            if step.how != "meet" and not step.shape.box.meets(asked, max(REACH, 2.0 * step.melt)):
+                box, margin = step.box, 0.0
+            elif step.how == "meet":
+                box, margin = EVERYWHERE, 0.0
+            else:
+                box, margin = step.shape.box, max(REACH, 2.0 * step.melt)
+            low.append(np.asarray(box.low) - margin)
+            high.append(np.asarray(box.high) + margin)
+        return Reaches(np.array(low), np.array(high))
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """The level after the last step."""
+        shape = np.broadcast_shapes(x.shape, y.shape, z.shape)
+        value: Level = np.full(shape, FAR, dtype=x.dtype)
+        for i in self._reaches.near(x, y, z):
+            step = self.steps[i]
+            if isinstance(step, Engraving):
+                value = value - step.shift(x, y, z)
                 continue
             other = step.shape.level(x, y, z)
             if step.how == "join":
@@ -493,4 +538,4 @@ class Blend:
                 value = -smooth_max(-value, other, step.melt)
             else:
                 value = -smooth_max(-value, -other, step.melt)
-        return value.astype(x.dtype)
+        return value.astype(x.dtype, copy=False)

@@ -7,6 +7,7 @@ encloses count as bone, as `Anatomy.bones` wants it; `brain_shape` and the like 
 
 import numpy as np
 
+from cmfsim.checks import Floats
 from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.phantom.shapes import (
     Blend,
@@ -25,6 +26,7 @@ __all__ = [
     "brain_shape",
     "cranium_shape",
     "mandible_shape",
+    "metal_pieces",
     "teeth_shape",
 ]
 
@@ -58,9 +60,11 @@ def _plate(rows: list[list[float]], normal: tuple[float, float, float], steps: i
     return FlatTube(curve[:, :3], np.tile(unit, (len(curve), 1)), curve[:, 3], curve[:, 4])
 
 
-def cranium_shape(p: HeadParameters) -> Blend:
-    """The cranium without teeth: vault, face and base in one."""
-    del p  # people differ by the warp of the whole head, and by mandible and skin
+def cranium_shape() -> Blend:
+    """The cranium without teeth: vault, face and base in one.
+
+    It is the same for all: people differ by the map of the whole head, by mandible and skin.
+    """
     nose = Blend(
         (
             # Pear-shaped opening, wider below, and the nasal cavity behind it.
@@ -129,20 +133,20 @@ def mandible_shape(p: HeadParameters) -> Blend:
     body = _body()
     steps = (
         Step("join", body),
-        Step("join", _arch(LOWER_ARCH, -62.0, 5.0, 9.5), 5.0),
+        Step("join", _arch(LOWER_ARCH, -58.5, 4.2, 6.0), 5.0),
         # Chin: mental eminence and tubercles, hollow above.
-        Step("join", Egg((0, -82.5 + chin, -73.5), (10, 6.6, 8.0)), 6.0),
+        Step("join", Egg((0, -83.6 + chin, -74.5), (11, 6.6, 8.0)), 6.0),
         Step("join", Egg((12, -79.5 + chin, -76), (9, 6, 6)), 6.0),
         # Ramus, angle, coronoid and condyle.
         Step(
             "join",
             _plate(
-                [[45.5, -29, -52, 4.0, 15], [46.5, -27, -40, 3.6, 15.5], [47.5, -25, -28, 3.4, 16], [48, -24, -20, 3.2, 15]],
+                [[45.5, -31, -50, 4.0, 14], [46.5, -27, -40, 3.6, 15.5], [47.5, -25, -28, 3.4, 16], [48, -24, -20, 3.2, 15]],
                 (1, 0, 0.08),
             ),
             5.0,
         ),
-        Step("join", Egg((44.8, -26, -49), (4.6, 14, 13)), 8.0),
+        Step("join", Egg((44.8, -29, -48), (4.6, 13, 12)), 8.0),
         Step("join", _plate([[47.5, -36, -22, 3.0, 7], [47.5, -36.5, -8, 2.4, 5], [47, -35.5, 0, 1.8, 3]], (1, 0, 0)), 4.0),
         Step("join", _tube([[48, -17, -26, 4.0], [49, -14.5, -14, 4.0], [50, -13, -7, 4.5]]), 4.0),
         Step("join", Egg(CONDYLE, (9.0, 4.6, 4.4), turn=turn_about("z", -14)), 3.0),
@@ -194,6 +198,12 @@ def teeth_shape(*, upper: bool) -> Blend:
         low = np.minimum(low, np.asarray(tooth.box.low))
         high = np.maximum(high, np.asarray(tooth.box.high))
     return Blend(tuple(steps), Box(tuple(low.tolist()), tuple(high.tolist())))
+
+
+def metal_pieces() -> Floats:
+    """Centre and half size of four crowns, (4, 4) mm: first upper molars, first upper premolars."""
+    half = [[24.5, -70.5, -39.0, 2.8], [27.5, -57.5, -39.0, 3.6]]
+    return np.array(half + [[-x, y, z, size] for x, y, z, size in half])
 
 
 def brain_shape() -> Egg:
