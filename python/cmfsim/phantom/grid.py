@@ -104,9 +104,7 @@ def to_surface(
     return place
 
 
-def level_surface(
-    field: Field, low: Floats, high: Floats, spacing: float
-) -> SurfaceData:
+def level_surface(field: Field, low: Floats, high: Floats, spacing: float) -> SurfaceData:
     """The closed zero surface of a level within a box, normals outward.
 
     Raises

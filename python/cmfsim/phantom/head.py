@@ -77,7 +77,7 @@ def _head(p: HeadParameters) -> list[Step | Engraving]:
         (
             Step("join", face),
             Step("meet", jaw, 15.0),
-            Step("meet", Plane((0, 0, 62), (0, 0, 1)), 20.0),
+            Step("meet", Plane((0, 0, 62), (0, 0, 1)), 16.0),
         ),
         face.box,
     )
@@ -94,7 +94,7 @@ def _head(p: HeadParameters) -> list[Step | Engraving]:
     return [
         Step("join", vault),
         Step("join", lower_face, 10.0),
-        Step("join", neck, 22.0),
+        Step("join", neck, 16.0),
         # Cheekbones, cheeks, the muzzle that the lips lie on, and the chin.
         Step("join", Egg((42, -58, -4), (22 + 0.4 * fat, 24, 17)), 12.0),
         Step("join", Egg((36, -62, -30), (16 + fat, 18 + 0.5 * fat, 20)), 14.0),
@@ -104,7 +104,19 @@ def _head(p: HeadParameters) -> list[Step | Engraving]:
         Step("join", Egg((0, -81 + chin, -75), (24, 18, 15), power=2.2), 14.0),
         Step("join", Egg((42, -25, -55), (13 + fat, 18, 14)), 14.0),
         # Brow ridge and glabella.
-        Step("join", _tube([[0, -89, 43, 8], [14, -88, 41, 8.5], [30, -83, 42, 8], [46, -71, 37, 7], [56, -56, 26, 4]]), 9.0),
+        Step(
+            "join",
+            _tube(
+                [
+                    [0, -89, 43, 8],
+                    [14, -88, 41, 8.5],
+                    [30, -83, 42, 8],
+                    [46, -71, 37, 7],
+                    [56, -56, 26, 4],
+                ]
+            ),
+            9.0,
+        ),
     ]
 
 
@@ -153,7 +165,9 @@ def _nose(p: HeadParameters) -> list[Step | Engraving]:
         # Wings.
         Step(
             "join",
-            Egg((12.2, -102.0 + 0.6 * out, -12.0 + down), (5.2, 8.5, 7.2), turn=turn_about("z", 14)),
+            Egg(
+                (12.2, -102.0 + 0.6 * out, -12.0 + down), (5.2, 8.5, 7.2), turn=turn_about("z", 14)
+            ),
             3.5,
         ),
         # Column.
@@ -166,7 +180,13 @@ def _nose(p: HeadParameters) -> list[Step | Engraving]:
         ),
         # Fold behind the wing.
         _engrave(
-            [[9, -2 + down, 0.1], [13.5, -3 + down, 0.8], [17.4, -8 + down, 1.2], [18.2, -14 + down, 1.2], [15, -20 + down, 0.6]],
+            [
+                [9, -2 + down, 0.1],
+                [13.5, -3 + down, 0.8],
+                [17.4, -8 + down, 1.2],
+                [18.2, -14 + down, 1.2],
+                [15, -20 + down, 0.6],
+            ],
             3.0,
             -85.0,
         ),

@@ -134,9 +134,7 @@ class PhantomHead:
         bone = self._level(self._shapes, "bone", x, y, z)
         return _covered(self._shapes["drawn_skin"].level(x, y, z), bone), bone
 
-    def _level(
-        self, shapes: Mapping[str, Shape], name: str, x: Level, y: Level, z: Level
-    ) -> Level:
+    def _level(self, shapes: Mapping[str, Shape], name: str, x: Level, y: Level, z: Level) -> Level:
         if name == "skin":
             bone = self._level(shapes, "bone", x, y, z)
             return _covered(shapes["drawn_skin"].level(x, y, z), bone)
@@ -256,7 +254,10 @@ class PhantomHead:
         half = np.ceil(max(-low[0], high[0]) / step[0])
         axes = (
             step[0] * np.arange(-half, half + 1.0),
-            *(low[a] + step[a] * np.arange(np.ceil((high[a] - low[a]) / step[a]) + 1.0) for a in (1, 2)),
+            *(
+                low[a] + step[a] * np.arange(np.ceil((high[a] - low[a]) / step[a]) + 1.0)
+                for a in (1, 2)
+            ),
         )
         size = int(np.prod([len(axis) for axis in axes]))
         if size > MOST_VOXELS:
@@ -327,7 +328,10 @@ class PhantomHead:
         )
 
     def _muscle_grid(
-        self, axes: tuple[Floats, Floats, Floats], skin: NDArray[np.float32], bone: NDArray[np.float32]
+        self,
+        axes: tuple[Floats, Floats, Floats],
+        skin: NDArray[np.float32],
+        bone: NDArray[np.float32],
     ) -> NDArray[np.float32]:
         """The level of all muscles together on a grid, each evaluated in its own box."""
         scale, warp = self.parameters.scale, self.warp

@@ -250,5 +250,6 @@ def _placed(tissue: Tissue, points: Floats, place: Floats) -> Floats:
         return value
 
     placed = points.copy()
-    placed[moves] = to_surface(level(share[moves], depth[moves]), points[moves])
+    field = level(share[moves], depth[moves])
+    placed[moves] = to_surface(field, points[moves], fresh=6, rounds=16, longest=4.0)
     return placed

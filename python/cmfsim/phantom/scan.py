@@ -37,7 +37,9 @@ COUCH_RADIUS = 220.0
 STREAKS, STREAK_HU, STREAK_REACH = 14, 900.0, 35.0
 
 
-def mixed(image: NDArray[np.float32], value: float, level: NDArray[np.float32], width: float) -> None:
+def mixed(
+    image: NDArray[np.float32], value: float, level: NDArray[np.float32], width: float
+) -> None:
     """Paints a tissue into an image: each voxel by the share of it that lies inside.
 
     `width` is the size of a voxel in mm: a surface through the middle of one fills half.
@@ -66,9 +68,7 @@ def add_couch(image: NDArray[np.float32], axes: tuple[Floats, Floats, Floats], b
     thick = np.broadcast_to(depth, image.shape)
     air = image < 0.5 * HOUNSFIELD["air"]
     image[inside & air & (thick < COUCH_SHELL + COUCH_FOAM)] = HOUNSFIELD["couch_foam"]
-    shell = (thick < COUCH_SHELL) | (
-        (thick > COUCH_FOAM) & (thick < COUCH_FOAM + COUCH_SHELL)
-    )
+    shell = (thick < COUCH_SHELL) | ((thick > COUCH_FOAM) & (thick < COUCH_FOAM + COUCH_SHELL))
     image[inside & air & shell] = HOUNSFIELD["couch_shell"]
 
 

@@ -2,8 +2,9 @@
 
 A level is close to the signed distance in mm near its surface. Coordinates come as three arrays
 that broadcast, so that a grid is evaluated from its axes and what depends on one axis alone is
-computed once per line. A shape that lies far from the asked box is left out: levels are exact where
-they are above −REACH and merely below −REACH elsewhere, which no surface notices.
+computed once per line. Shapes further than REACH from the asked box are left out: they cannot move
+what is nearer to a surface than REACH less the widest melt, so levels above −4 mm do not depend on
+which points are asked together.
 """
 
 from collections.abc import Sequence
@@ -38,9 +39,8 @@ __all__ = [
 
 Level = NDArray[np.floating]
 
-# Below minus this many mm a level need not be right, only negative. Twice the widest melt of two
-# shapes, so that leaving a shape out never moves a surface.
-REACH = 16.0
+# Shapes further away than this are left out, mm; melts are 16 mm wide at most.
+REACH = 20.0
 # The level where no shape is near, mm.
 FAR = -100.0
 # Smallest length that is divided by, mm.
@@ -58,9 +58,7 @@ class Box:
         """The box with a margin on every side."""
         x, y, z = self.low
         u, v, w = self.high
-        return Box(
-            (x - margin, y - margin, z - margin), (u + margin, v + margin, w + margin)
-        )
+        return Box((x - margin, y - margin, z - margin), (u + margin, v + margin, w + margin))
 
 
 EVERYWHERE = Box((-np.inf, -np.inf, -np.inf), (np.inf, np.inf, np.inf))
@@ -220,9 +218,7 @@ class Reaches:
     def of_line(cls, points: Floats, radius: Floats) -> "Reaches":
         """The boxes of the segments of a tube."""
         low, high = points - radius[:, None], points + radius[:, None]
-        return cls(
-            np.minimum(low[:-1], low[1:]) - REACH, np.maximum(high[:-1], high[1:]) + REACH
-        )
+        return cls(np.minimum(low[:-1], low[1:]) - REACH, np.maximum(high[:-1], high[1:]) + REACH)
 
     def near(self, x: Level, y: Level, z: Level) -> list[int]:
         """The things that matter where the points lie."""
@@ -260,7 +256,7 @@ class Tube:
 
     def level(self, x: Level, y: Level, z: Level) -> Level:
         """Radius less distance, of the best segment."""
-        best = np.full(np.broadcast_shapes(x.shape, y.shape, z.shape), -REACH, dtype=x.dtype)
+        best = np.full(np.broadcast_shapes(x.shape, y.shape, z.shape), FAR, dtype=x.dtype)
         rows = self.points.tolist()
         for i in self.segments.near(x, y, z):
             (ax, ay, az, ar), (bx, by, bz, br) = rows[i], rows[i + 1]
@@ -307,7 +303,7 @@ class FlatTube:
 
     def level(self, x: Level, y: Level, z: Level) -> Level:
         """The level of the ellipse in the section through the closest point of the polyline."""
-        best = np.full(np.broadcast_shapes(x.shape, y.shape, z.shape), -REACH, dtype=x.dtype)
+        best = np.full(np.broadcast_shapes(x.shape, y.shape, z.shape), FAR, dtype=x.dtype)
         for i in self.segments.near(x, y, z):
             ax, ay, az = self.points[i].tolist()
             ux, uy, uz = (self.points[i + 1] - self.points[i]).tolist()
@@ -509,7 +505,7 @@ class Blend:
 
     @cached_property
     def _reaches(self) -> Reaches:
-        """Where each step matters: within the larger of REACH and twice its melt of its box."""
+        """Where each step matters: within REACH of its box."""
         low, high = [], []
         for step in self.steps:
             if isinstance(step, Engraving):
@@ -517,7 +513,7 @@ class Blend:
             elif step.how == "meet":
                 box, margin = EVERYWHERE, 0.0
             else:
-                box, margin = step.shape.box, max(REACH, 2.0 * step.melt)
+                box, margin = step.shape.box, REACH
             low.append(np.asarray(box.low) - margin)
             high.append(np.asarray(box.high) + margin)
         return Reaches(np.array(low), np.array(high))

@@ -33,8 +33,22 @@ __all__ = [
 # Centre of the left condyle, mm: the mandible opens about the axis through both.
 CONDYLE = (50.0, -13.0, -5.0)
 # Middle line of the alveolar arch of either jaw as seen from above: x, y in mm.
-UPPER_ARCH = ((0.0, -90.0), (9.0, -88.0), (18.0, -81.0), (24.0, -70.0), (27.5, -57.0), (28.5, -45.0))
-LOWER_ARCH = ((0.0, -87.5), (8.0, -85.5), (16.5, -79.0), (23.0, -68.5), (27.0, -56.0), (29.0, -43.0))
+UPPER_ARCH = (
+    (0.0, -90.0),
+    (9.0, -88.0),
+    (18.0, -81.0),
+    (24.0, -70.0),
+    (27.5, -57.0),
+    (28.5, -45.0),
+)
+LOWER_ARCH = (
+    (0.0, -87.5),
+    (8.0, -85.5),
+    (16.5, -79.0),
+    (23.0, -68.5),
+    (27.0, -56.0),
+    (29.0, -43.0),
+)
 # Widths along the arch of incisors, canine, premolars and molars without the third, mm.
 UPPER_WIDTHS = (8.6, 6.6, 7.6, 7.0, 6.8, 10.0, 9.4)
 LOWER_WIDTHS = (5.4, 6.0, 6.9, 7.1, 7.1, 10.9, 10.4)
@@ -70,7 +84,11 @@ def cranium_shape() -> Blend:
             # Pear-shaped opening, wider below, and the nasal cavity behind it.
             Step("join", Egg((4.6, -90, -11), (8.2, 16, 8.8))),
             Step("join", Egg((0, -94, 0), (6.5, 16, 10.5)), 4.0),
-            Step("join", Tube(np.array([[3.5, -88, -8, 7.5], [4, -60, -8, 9.0], [5, -36, -8, 8.0]])), 5.0),
+            Step(
+                "join",
+                Tube(np.array([[3.5, -88, -8, 7.5], [4, -60, -8, 9.0], [5, -36, -8, 8.0]])),
+                5.0,
+            ),
         ),
         Box((0, -115, -25), (18, -26, 10)),
     )
@@ -82,21 +100,64 @@ def cranium_shape() -> Blend:
         Step("join", Egg((52, 8, -12), (9, 11, 17)), 9.0),
         Step("join", Egg((46, -4, 8), (18, 22, 10)), 8.0),
         # Brow: glabella and the upper rim of the orbit.
-        Step("join", _tube([[0, -85, 43, 7], [14, -84, 42, 7.5], [30, -80, 41, 7], [45, -69, 35, 6], [51, -62, 26, 5.5]]), 8.0),
+        Step(
+            "join",
+            _tube(
+                [
+                    [0, -85, 43, 7],
+                    [14, -84, 42, 7.5],
+                    [30, -80, 41, 7],
+                    [45, -69, 35, 6],
+                    [51, -62, 26, 5.5],
+                ]
+            ),
+            8.0,
+        ),
         # Temples are hollow behind the rim.
         Step("cut", Egg((67, -43, 18), (14, 21, 25)), 8.0),
         # Midface: body of the maxilla, cheekbone, floor of the orbit.
         Step("join", Egg((0, -58, -4), (33, 31, 22), power=2.6), 8.0),
         Step("join", Egg((18, -62, -14), (17, 21, 18), power=2.3), 8.0),
         Step("join", Egg((46, -62, -4), (12, 10, 11), turn=turn_about("z", 35)), 9.0),
-        Step("join", _tube([[40, -69, -1, 6], [30, -75, 0, 5], [20, -80, 5, 5], [14, -84, 16, 5], [11, -84, 30, 6]]), 6.0),
-        Step("join", _tube([[48, -66, 0, 6], [52, -63, 10, 5], [51.5, -63, 20, 5], [51, -62, 28, 5.5]]), 4.0),
+        Step(
+            "join",
+            _tube(
+                [
+                    [40, -69, -1, 6],
+                    [30, -75, 0, 5],
+                    [20, -80, 5, 5],
+                    [14, -84, 16, 5],
+                    [11, -84, 30, 6],
+                ]
+            ),
+            6.0,
+        ),
+        Step(
+            "join",
+            _tube([[48, -66, 0, 6], [52, -63, 10, 5], [51.5, -63, 20, 5], [51, -62, 28, 5.5]]),
+            4.0,
+        ),
         Step("join", _tube([[47, -62, -14, 4.5], [36, -62, -24, 5], [29, -60, -30, 5]]), 6.0),
         # Orbits: open cones towards the optic canal.
-        Step("cut", Egg((32, -74, 18.5), (18.5, 20, 16.5), power=2.3, turn=turn_about("z", 14)), 3.0),
+        Step(
+            "cut", Egg((32, -74, 18.5), (18.5, 20, 16.5), power=2.3, turn=turn_about("z", 14)), 3.0
+        ),
         Step("cut", _tube([[32, -76, 18.5, 15.5], [24, -54, 19, 11], [17, -38, 20, 3]], 10), 3.0),
         # Arch: from the cheekbone free of the temple to the ear.
-        Step("join", _tube([[49, -62, -3, 6.0], [56.5, -54, -1, 4.4], [61.8, -42, 1, 3.6], [63.2, -30, 2, 3.5], [61.5, -18, 3.5, 4.2], [57, -8, 5, 6.0]]), 4.0),
+        Step(
+            "join",
+            _tube(
+                [
+                    [49, -62, -3, 6.0],
+                    [56.5, -54, -1, 4.4],
+                    [61.8, -42, 1, 3.6],
+                    [63.2, -30, 2, 3.5],
+                    [61.5, -18, 3.5, 4.2],
+                    [57, -8, 5, 6.0],
+                ]
+            ),
+            4.0,
+        ),
         # Alveolar process and palate.
         Step("join", _arch(UPPER_ARCH, -23.0, 6.2, 11.0), 5.0),
         Step("join", Egg((0, -62, -19), (24, 26, 4)), 5.0),
@@ -105,11 +166,31 @@ def cranium_shape() -> Blend:
         # Canine fossa.
         Step("cut", Egg((25, -88, -16), (9, 9, 9)), 8.0),
         # Nasal bones, then the opening under them.
-        Step("join", _tube([[0, -82, 34, 6.5], [0, -86, 24, 5.0], [0, -92, 14, 4.5], [0, -96, 9, 3.6]]), 6.0),
-        Step("join", _tube([[4, -82, 32, 5.5], [6, -86, 18, 5], [7.5, -89, 8, 4.6], [13.5, -85, -3, 4.6], [15, -82, -12, 5]]), 5.0),
+        Step(
+            "join",
+            _tube([[0, -82, 34, 6.5], [0, -86, 24, 5.0], [0, -92, 14, 4.5], [0, -96, 9, 3.6]]),
+            6.0,
+        ),
+        Step(
+            "join",
+            _tube(
+                [
+                    [4, -82, 32, 5.5],
+                    [6, -86, 18, 5],
+                    [7.5, -89, 8, 4.6],
+                    [13.5, -85, -3, 4.6],
+                    [15, -82, -12, 5],
+                ]
+            ),
+            5.0,
+        ),
         Step("cut", nose, 2.5),
         # Septum and the spine in front of it.
-        Step("join", _plate([[0, -84, -6, 1.2, 9], [0, -60, -6, 1.2, 11], [0, -42, -6, 1.2, 9]], (1, 0, 0)), 1.0),
+        Step(
+            "join",
+            _plate([[0, -84, -6, 1.2, 9], [0, -60, -6, 1.2, 11], [0, -42, -6, 1.2, 9]], (1, 0, 0)),
+            1.0,
+        ),
         Step("join", _tube([[0, -88, -21, 3.0], [0, -93.5, -19.5, 1.6]]), 3.0),
         # Joint sockets, with room for the disc about the condyle.
         Step("cut", Egg(CONDYLE, (12.0, 7.6, 7.0)), 1.5),
@@ -136,18 +217,30 @@ def mandible_shape(p: HeadParameters) -> Blend:
         Step("join", _arch(LOWER_ARCH, -58.5, 4.2, 6.0), 5.0),
         # Chin: mental eminence and tubercles, hollow above.
         Step("join", Egg((0, -83.6 + chin, -74.5), (11, 6.6, 8.0)), 6.0),
-        Step("join", Egg((12, -79.5 + chin, -76), (9, 6, 6)), 6.0),
+        Step("join", Egg((10, -80 + chin, -76), (8, 6, 6)), 8.0),
         # Ramus, angle, coronoid and condyle.
         Step(
             "join",
             _plate(
-                [[45.5, -31, -50, 4.0, 14], [46.5, -27, -40, 3.6, 15.5], [47.5, -25, -28, 3.4, 16], [48, -24, -20, 3.2, 15]],
+                [
+                    [45.5, -31, -50, 4.0, 14],
+                    [46.5, -27, -40, 3.6, 15.5],
+                    [47.5, -25, -28, 3.4, 16],
+                    [48, -24, -20, 3.2, 15],
+                ],
                 (1, 0, 0.08),
             ),
             5.0,
         ),
-        Step("join", Egg((44.8, -29, -48), (4.6, 13, 12)), 8.0),
-        Step("join", _plate([[47.5, -36, -22, 3.0, 7], [47.5, -36.5, -8, 2.4, 5], [47, -35.5, 0, 1.8, 3]], (1, 0, 0)), 4.0),
+        Step("join", Egg((44.8, -29, -48), (4.8, 13, 12)), 10.0),
+        Step(
+            "join",
+            _plate(
+                [[47.5, -36, -22, 3.0, 7], [47.5, -36.5, -8, 2.4, 5], [47, -35.5, 0, 1.8, 3]],
+                (1, 0, 0),
+            ),
+            4.0,
+        ),
         Step("join", _tube([[48, -17, -26, 4.0], [49, -14.5, -14, 4.0], [50, -13, -7, 4.5]]), 4.0),
         Step("join", Egg(CONDYLE, (9.0, 4.6, 4.4), turn=turn_about("z", -14)), 3.0),
         # Notch between the two.
@@ -215,7 +308,14 @@ def airway_shape() -> Blend:
     """Air of the nasal cavity and the throat: the only hollows that no bone encloses."""
     steps = (
         Step("join", Tube(np.array([[4.6, -84, -8, 2.4], [5, -60, -7, 4.6], [5, -38, -8, 5.5]]))),
-        Step("join", Tube(np.array([[4, -34, -8, 6.0], [3, -27, -20, 7.0], [3, -22, -60, 7.0], [0, -18, -150, 8.0]])), 4.0),
+        Step(
+            "join",
+            Tube(
+                np.array(
+                    [[4, -34, -8, 6.0], [3, -27, -20, 7.0], [3, -22, -60, 7.0], [0, -18, -150, 8.0]]
+                )
+            ),
+            4.0,
+        ),
     )
     return Blend(steps, Box((0, -92, -160), (16, -8, 4)))
-

@@ -141,5 +141,3 @@ class JawWarped:
         if self.warp.idle:
             return self.shape.level(x, y, z)
         return self.shape.level(*self.warp.inverse(x, y, z))
-
-
