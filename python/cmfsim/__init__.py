@@ -34,6 +34,7 @@ from cmfsim.errors import (
     SolverError,
 )
 from cmfsim.io import read_plan, read_result, read_scene, write_result, write_scene
+from cmfsim.phantom import HeadParameters, Muscle, PhantomHead, make_head
 from cmfsim.planning import RigidMotion, decompose_motion, rigid_motion
 from cmfsim.scene import (
     MovedSurface,
@@ -58,6 +59,7 @@ __all__ = [
     "CmfsimError",
     "ContactError",
     "Finding",
+    "HeadParameters",
     "ImageData",
     "ImageError",
     "LandmarkError",
@@ -66,7 +68,9 @@ __all__ = [
     "MeshError",
     "MeshQuality",
     "MovedSurface",
+    "Muscle",
     "NodeKinds",
+    "PhantomHead",
     "PlanOperator",
     "RegistrationError",
     "RigidMotion",
@@ -85,6 +89,7 @@ __all__ = [
     "TissueData",
     "__version__",
     "decompose_motion",
+    "make_head",
     "read_plan",
     "read_result",
     "read_scene",

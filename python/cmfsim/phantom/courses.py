@@ -16,11 +16,11 @@ Row = tuple[float, float, float, float, float, float]
 
 
 class Course(NamedTuple):
-    """How one muscle runs: its kind, whether it crosses the midline as one, its fibre lines."""
+    """How one muscle runs: kind, fibre lines, whether there are two, whether the lines close."""
 
     kind: str
-    paired: bool
     lines: tuple[tuple[Row, ...], ...]
+    paired: bool = True
     closed: bool = False
 
 
@@ -49,7 +49,6 @@ COURSES = MappingProxyType(
     {
         "masseter": Course(
             "strap",
-            True,
             (
                 (
                     (52, -61, -7, 1, 3.0, 6),
@@ -70,7 +69,6 @@ COURSES = MappingProxyType(
         ),
         "temporalis": Course(
             "fan",
-            True,
             (
                 (
                     (52, -54, 60, 0.9, 1.6, 11),
@@ -106,7 +104,6 @@ COURSES = MappingProxyType(
         ),
         "medial_pterygoid": Course(
             "strap",
-            True,
             (
                 ((21, -40, -8, 0, 3.0, 6), (32, -34, -32, 0, 4.0, 7), (41.5, -29, -54, 0, 2.5, 7)),
                 ((23, -35, -8, 0, 3.0, 6), (34, -28, -30, 0, 4.0, 7), (42, -22, -48, 0, 2.5, 7)),
@@ -114,7 +111,6 @@ COURSES = MappingProxyType(
         ),
         "buccinator": Course(
             "sheet",
-            True,
             (
                 (
                     (32, -50, -29, 0.95, 1.0, 4),
@@ -138,7 +134,6 @@ COURSES = MappingProxyType(
         ),
         "orbicularis_oris": Course(
             "ring",
-            False,
             (
                 (
                     (0, -103, -32.5, 0.45, 1.5, 3.6),
@@ -159,10 +154,10 @@ COURSES = MappingProxyType(
                     (0, -99, -51, 0.38, 1.5, 3.2),
                 ),
             ),
+            paired=False,
         ),
         "orbicularis_oculi": Course(
             "ring",
-            True,
             (
                 _ring(32, 18, 14.5, 8.5, 2.0, 0.8, 3.0),
                 _ring(32.5, 18, 19, 14, 2.4, 0.9, 3.2),
@@ -172,7 +167,6 @@ COURSES = MappingProxyType(
         ),
         "zygomaticus_major": Course(
             "strap",
-            True,
             (
                 (
                     (50, -66, -8, 1, 1.6, 3.4),
@@ -183,7 +177,6 @@ COURSES = MappingProxyType(
         ),
         "zygomaticus_minor": Course(
             "strap",
-            True,
             (
                 (
                     (42, -72, -5, 1, 1.2, 2.4),
@@ -194,7 +187,6 @@ COURSES = MappingProxyType(
         ),
         "levator_labii_superioris": Course(
             "strap",
-            True,
             (
                 (
                     (29, -77, 0, 1, 1.2, 5.0),
@@ -205,7 +197,6 @@ COURSES = MappingProxyType(
         ),
         "levator_labii_alaeque_nasi": Course(
             "strap",
-            True,
             (
                 (
                     (9.5, -87, 16, 1, 1.0, 2.0),
@@ -217,7 +208,6 @@ COURSES = MappingProxyType(
         ),
         "levator_anguli_oris": Course(
             "strap",
-            True,
             (
                 (
                     (25, -77, -13, 1, 1.3, 4.2),
@@ -228,7 +218,6 @@ COURSES = MappingProxyType(
         ),
         "depressor_anguli_oris": Course(
             "fan",
-            True,
             (
                 (
                     (23, -76, -75, 0.9, 1.2, 4.0),
@@ -244,7 +233,6 @@ COURSES = MappingProxyType(
         ),
         "depressor_labii_inferioris": Course(
             "strap",
-            True,
             (
                 (
                     (19, -80, -75, 0.95, 1.2, 4.4),
@@ -255,7 +243,6 @@ COURSES = MappingProxyType(
         ),
         "mentalis": Course(
             "strap",
-            True,
             (
                 (
                     (5, -87, -62, 1, 2.4, 3.2),
@@ -266,7 +253,6 @@ COURSES = MappingProxyType(
         ),
         "risorius": Course(
             "strap",
-            True,
             (
                 (
                     (53, -54, -41, 0.3, 0.9, 4.6),
@@ -277,7 +263,6 @@ COURSES = MappingProxyType(
         ),
         "platysma": Course(
             "sheet",
-            True,
             (
                 (
                     (12, -28, -116, 3, 1.0, 12),
@@ -315,7 +300,6 @@ COURSES = MappingProxyType(
         ),
         "frontalis": Course(
             "sheet",
-            True,
             (
                 (
                     (8, -82, 92, 0.5, 1.2, 10),
@@ -341,7 +325,6 @@ COURSES = MappingProxyType(
         ),
         "procerus": Course(
             "strap",
-            False,
             (
                 (
                     (0, -101, 12, 0.6, 0.9, 3.6),
@@ -349,10 +332,10 @@ COURSES = MappingProxyType(
                     (0, -97, 47, 0.4, 1.0, 4.6),
                 ),
             ),
+            paired=False,
         ),
         "nasalis": Course(
             "strap",
-            True,
             (
                 (
                     (15, -86, -17, 0.95, 1.0, 2.6),
@@ -364,7 +347,6 @@ COURSES = MappingProxyType(
         ),
         "corrugator": Course(
             "strap",
-            True,
             (
                 (
                     (6, -94, 41, 0.95, 1.2, 2.2),

@@ -1,4 +1,4 @@
-"""Levels on grids and as triangles: bricks of voxels, marching cubes, and the way to the surface."""
+"""Levels on grids and as triangles: bricks of voxels, marching cubes, the way to the surface."""
 
 from collections.abc import Callable, Sequence
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
-from cmfsim.phantom.shapes import Level
+from cmfsim.phantom.curves import Level
 from cmfsim.scene import SurfaceData
 
 __all__ = ["Field", "gradient_at", "level_grid", "level_surface", "to_surface"]
@@ -65,7 +65,7 @@ def level_grid(field: Field, axes: Sequence[Floats], clip: float) -> NDArray[np.
     return values
 
 
-def gradient_at(field: Field, points: Floats, level: Floats | None = None) -> Floats:
+def gradient_at(field: Field, points: Floats, level: Level | None = None) -> Floats:
     """The gradient of the level at points, (n, 3), by forward differences.
 
     `level` is the level at the points, where it is known.
@@ -135,7 +135,7 @@ def level_surface(field: Field, low: Floats, high: Floats, spacing: float) -> Su
         raise CaseInputError(
             f"spacing is {spacing:g} mm: no grid point lies inside the part; use a smaller spacing"
         )
-    corners, triangles, _, _ = marching_cubes(
+    corners, triangles, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
         values, 0.0, spacing=(spacing,) * 3, gradient_direction="ascent"
     )
     start = np.array([axis[0] for axis in axes])

@@ -6,7 +6,7 @@ the other side is its mirror image), y backwards, z up; the Frankfort plane is z
 
 import numpy as np
 
-from cmfsim.checks import Floats
+from cmfsim.phantom.curves import Table, smooth_curve, turn_about
 from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.phantom.shapes import (
     Blend,
@@ -17,10 +17,7 @@ from cmfsim.phantom.shapes import (
     Loft,
     Plane,
     Step,
-    Table,
     Tube,
-    smooth_curve,
-    turn_about,
 )
 
 __all__ = ["skin_shape"]

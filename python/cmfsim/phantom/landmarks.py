@@ -7,9 +7,9 @@ from typing import Protocol
 import numpy as np
 
 from cmfsim.checks import Floats, frozen
+from cmfsim.phantom.curves import Level
 from cmfsim.phantom.grid import Field, to_surface
 from cmfsim.phantom.parameters import HeadParameters
-from cmfsim.phantom.shapes import Level
 from cmfsim.phantom.warp import FaceWarp, JawWarp
 
 __all__ = ["find_skin_landmarks", "find_skull_landmarks"]
@@ -54,7 +54,7 @@ def _first_hit(field: Field, starts: Floats, direction: Floats, length: float) -
         middle = 0.5 * (low + high)
         deep = field(*(starts + middle[:, None] * direction).T) > 0.0
         high, low = np.where(deep, middle, high), np.where(deep, low, middle)
-    hit = starts + high[:, None] * direction
+    hit: Floats = starts + high[:, None] * direction
     hit[~found] = np.nan
     return hit
 

@@ -12,12 +12,13 @@ from cmfsim.case import Anatomy, ImageData
 from cmfsim.checks import Floats, as_number, as_positive, as_rows, check_instance, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import scan
+from cmfsim.phantom.curves import Level, smooth_max
 from cmfsim.phantom.grid import Field, level_grid, level_surface
 from cmfsim.phantom.head import HEAD_BOX, skin_shape
 from cmfsim.phantom.landmarks import find_skin_landmarks, find_skull_landmarks
 from cmfsim.phantom.muscles import Muscle, make_muscles
 from cmfsim.phantom.parameters import HeadParameters
-from cmfsim.phantom.shapes import Box, Level, Shape, smooth_max
+from cmfsim.phantom.shapes import Shape
 from cmfsim.phantom.skull import (
     airway_shape,
     brain_shape,
@@ -404,7 +405,7 @@ class PhantomHead:
         width = float(np.cbrt(np.prod(step)))
         image = np.full(level["skin"].shape, scan.HOUNSFIELD["air"], dtype=np.float32)
         muscle = self._muscle_grid(axes, level["skin"], level["bone"])
-        for tissue, inside in (
+        layers: tuple[tuple[str, Level], ...] = (
             ("skin", level["skin"]),
             ("fat", level["skin"] - SKIN_THICKNESS),
             ("muscle", level["skin"] - LEAN_DEPTH),
@@ -414,12 +415,13 @@ class PhantomHead:
             ("cancellous", np.maximum(level["cranium"], level["mandible"]) - CORTEX),
             ("brain", level["brain"]),
             ("tooth", np.maximum(level["upper_teeth"], level["lower_teeth"])),
-        ):
+        )
+        for tissue, inside in layers:
             scan.mixed(image, scan.HOUNSFIELD[tissue], inside, width)
         grid = (axes[0][:, None, None], axes[1][None, :, None], axes[2][None, None, :])
         if couch:
-            inside = (level["skin"] > 0.0).any(axis=(0, 2))
-            scan.add_couch(image, grid, float(axes[1][np.flatnonzero(inside)[-1]]))
+            rows = np.flatnonzero((level["skin"] > 0.0).any(axis=(0, 2)))
+            scan.add_couch(image, grid, float(axes[1][rows[-1]]))
         if metal:
             pieces = metal_pieces()
             pieces[:, :3] = self.warp.forward(pieces[:, :3])
@@ -445,7 +447,8 @@ def _covered(skin: Level, bone: Level) -> Level:
 
 def _airway(air: Level, skin: Level, bone: Level) -> Level:
     """The airway kept off bone and skin."""
-    return np.minimum(np.minimum(air, -bone - MUCOSA), skin - AIR_BELOW_SKIN)
+    level: Level = np.minimum(np.minimum(air, -bone - MUCOSA), skin - AIR_BELOW_SKIN)
+    return level
 
 
 def make_head(parameters: HeadParameters | None = None) -> PhantomHead:

@@ -1,4 +1,4 @@
-"""The muscles of one person: straps along their courses, with the true direction of their fibres."""
+"""The muscles of one person: straps along their courses, with the true fibre directions."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike
 
 from cmfsim.checks import Floats, as_rows, frozen
 from cmfsim.phantom.courses import COURSES, Course, Row
+from cmfsim.phantom.curves import Level, smooth_curve, smooth_max
 from cmfsim.phantom.grid import Field, gradient_at, to_surface
-from cmfsim.phantom.shapes import REACH, Box, FlatTube, Level, smooth_curve, smooth_max
+from cmfsim.phantom.shapes import REACH, Box, FlatTube
 from cmfsim.phantom.warp import FaceWarp, JawWarp
 
 __all__ = ["Muscle", "Tissue", "make_muscles"]
@@ -76,7 +77,7 @@ class Muscle:
         return np.array([line[-1] for line in self.course])
 
     def _fold(self, x: Level) -> Level:
-        """x on the drawn, left, side."""
+        """The place on the drawn, left, side."""
         if self.side == "both":
             return np.abs(x)
         return -x if self.side == "R" else x
@@ -110,7 +111,8 @@ class Muscle:
     @staticmethod
     def clipped(strap: Level, skin: Level, bone: Level) -> Level:
         """A strap's level, kept below the skin and outside the bones."""
-        return np.minimum(np.minimum(strap, skin - BELOW_SKIN), -bone)
+        level: Level = np.minimum(np.minimum(strap, skin - BELOW_SKIN), -bone)
+        return level
 
     def level(self, points: ArrayLike) -> Floats:
         """The level at points, (n,) mm: positive inside the muscle.
@@ -153,7 +155,7 @@ class Muscle:
         here = np.column_stack([x, y, z])
         ahead = self.tissue.warp.forward(here + NUDGE * total)
         moved = ahead - self.tissue.warp.forward(here - NUDGE * total)
-        return moved / np.linalg.norm(moved, axis=1)[:, None]
+        return np.asarray(moved / np.linalg.norm(moved, axis=1)[:, None])
 
 
 def _closest_direction(line: Floats, points: Floats) -> tuple[Floats, Floats]:
@@ -192,8 +194,8 @@ def make_muscles(tissue: Tissue) -> Mapping[str, Muscle]:
             start += lengths.pop(0)
         for side in ("L", "R") if course.paired else ("both",):
             muscle = f"{name}_{side}" if course.paired else name
-            lines = tuple(_line(tissue, tube, side, course) for tube in tubes)
-            muscles[muscle] = Muscle(muscle, side, course.kind, lines, tuple(tubes), tissue)
+            fibres = tuple(_line(tissue, tube, side, course) for tube in tubes)
+            muscles[muscle] = Muscle(muscle, side, course.kind, fibres, tuple(tubes), tissue)
     return MappingProxyType(muscles)
 
 
@@ -242,7 +244,7 @@ def _placed(tissue: Tissue, points: Floats, place: Floats) -> Floats:
     moves = place > 0.0
 
     def level(share: Floats, depth: Floats) -> Callable[[Level, Level, Level], Level]:
-        # (1 − f) skin + f bone vanishes at the fraction f of the way, as bone is minus its distance.
+        # (1 − f) skin + f bone vanishes at the fraction f of the way: bone is minus a distance.
         def value(x: Level, y: Level, z: Level) -> Level:
             skin, bone = tissue.skin_and_bone(x, y, z)
             return (1.0 - share) * skin + share * bone - depth

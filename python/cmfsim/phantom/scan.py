@@ -60,7 +60,6 @@ def add_couch(image: NDArray[np.float32], axes: tuple[Floats, Floats, Floats], b
     """Paints a hollow couch behind the head, whose rearmost point is at y = back."""
     x, y, _ = axes
     # A circular trough whose deepest line just clears the head.
-    depth = y + COUCH_RADIUS - np.sqrt(np.maximum(COUCH_RADIUS**2 - x**2, 0.0)) * 1.0
     depth = np.sqrt(x**2 + (y - back - COUCH_GAP + COUCH_RADIUS) ** 2) - COUCH_RADIUS
     beside = np.abs(x) < COUCH_HALF_WIDTH
     behind = y > back - 0.35 * COUCH_RADIUS

@@ -13,9 +13,9 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import Floats
+from cmfsim.phantom.curves import Level, Table, smooth_max, smooth_step
 
 __all__ = [
     "REACH",
@@ -24,23 +24,17 @@ __all__ = [
     "Egg",
     "Engraving",
     "FlatTube",
-    "Level",
     "Loft",
     "Plane",
     "Shape",
     "Step",
-    "Table",
     "Tube",
-    "smooth_curve",
-    "smooth_max",
-    "smooth_step",
-    "turn_about",
 ]
-
-Level = NDArray[np.floating]
 
 # Shapes further away than this are left out, mm; melts are 16 mm wide at most.
 REACH = 20.0
+# No section of a loft is larger than this, mm.
+LARGEST_RADIUS = 150.0
 # The level where no shape is near, mm.
 FAR = -100.0
 # Smallest length that is divided by, mm.
@@ -73,67 +67,6 @@ class Shape(Protocol):
 
     def level(self, x: Level, y: Level, z: Level) -> Level:
         """The level at points, positive inside, mm."""
-
-
-def smooth_max(a: Level, b: Level, melt: float) -> Level:
-    """The larger level, rounded where they differ by less than `melt` mm; never the smaller.
-
-    The quadratic polynomial h² melt/4 with h = 1 − |a − b|/melt is C¹ and of local support.
-    """
-    highest: Level = np.maximum(a, b)
-    if melt <= 0.0:
-        return highest
-    h = np.maximum(1.0 - np.abs(a - b) / melt, 0.0)
-    return highest + h * h * (0.25 * melt)
-
-
-def smooth_step(value: Level | float, start: float, end: float) -> Level:
-    """0 up to `start`, 1 from `end` on, C¹ between; `end` may lie below `start`."""
-    t = np.clip((np.asarray(value) - start) / (end - start), 0.0, 1.0)
-    return t * t * (3.0 - 2.0 * t)
-
-
-def smooth_curve(points: ArrayLike, steps: int = 4, *, closed: bool = False) -> Floats:
-    """Points on the Catmull–Rom curve through rows of numbers, `steps` per interval.
-
-    Parameters
-    ----------
-    points : (n, k) float64
-        Places, and what belongs to them (radii), in any unit.
-    steps : int
-    closed : bool
-        Whether the curve returns to its first point, which then is not repeated.
-
-    Returns
-    -------
-    ((n − 1) steps + 1, k) float64, closed curves (n steps + 1, k)
-    """
-    rows = np.asarray(points, dtype=np.float64)
-    if closed:
-        padded = np.vstack([rows[-1:], rows, rows[:2]])
-    else:
-        ends = 2.0 * rows[0] - rows[1], 2.0 * rows[-1] - rows[-2]
-        padded = np.vstack([ends[0], rows, ends[1]])
-    before, start, end, after = padded[:-3], padded[1:-2], padded[2:-1], padded[3:]
-    t = (np.arange(steps) / steps)[:, None, None]
-    curve = 0.5 * (
-        2.0 * start
-        + t * (end - before)
-        + t**2 * (2.0 * before - 5.0 * start + 4.0 * end - after)
-        + t**3 * (3.0 * (start - end) + after - before)
-    )
-    return np.vstack([curve.transpose(1, 0, 2).reshape(-1, rows.shape[1]), end[-1:]])
-
-
-def turn_about(axis: str, degrees: float) -> Floats:
-    """Rows are the axes of something turned about a coordinate axis by the right-hand rule."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    rows = {
-        "x": [[1, 0, 0], [0, c, s], [0, -s, c]],
-        "y": [[c, 0, -s], [0, 1, 0], [s, 0, c]],
-        "z": [[c, s, 0], [-s, c, 0], [0, 0, 1]],
-    }
-    return np.array(rows[axis], dtype=np.float64)
 
 
 def _root(total: Level, n: Level | float) -> Level:
@@ -348,48 +281,8 @@ class Plane:
     def level(self, x: Level, y: Level, z: Level) -> Level:
         """The distance behind the plane."""
         p, n = self.point, self.normal
-        return (p[0] - x) * n[0] + (p[1] - y) * n[1] + (p[2] - z) * n[2]
-
-
-@dataclass(frozen=True, eq=False)
-class Table:
-    """A smooth function of one coordinate through rounded table values.
-
-    Attributes
-    ----------
-    places, values : (n,)
-        Ascending places, mm.
-    rounding : float, mm
-        Standard deviation of the Gaussian that rounds the corners.
-    """
-
-    places: Sequence[float]
-    values: Sequence[float]
-    rounding: float = 5.0
-
-    def __post_init__(self) -> None:
-        step = 0.5
-        margin = 4.0 * self.rounding
-        fine = np.arange(self.places[0] - margin, self.places[-1] + margin + step, step)
-        width = np.arange(-margin, margin + step, step)
-        kernel = np.exp(-0.5 * (width / self.rounding) ** 2)
-        raw = np.interp(fine, self.places, self.values)
-        reach = len(width) // 2
-        padded = np.pad(raw, reach, mode="edge")
-        smooth = np.convolve(padded, kernel / kernel.sum(), mode="valid")[: len(fine)]
-        object.__setattr__(self, "_fine", fine)
-        object.__setattr__(self, "_smooth", smooth)
-        object.__setattr__(self, "_slope", np.gradient(smooth, step))
-
-    def at(self, z: Level) -> Level:
-        """The value at places."""
-        fine, smooth = self.__dict__["_fine"], self.__dict__["_smooth"]
-        return np.interp(z, fine, smooth).astype(z.dtype)
-
-    def slope(self, z: Level) -> Level:
-        """The derivative at places, per mm."""
-        fine, slope = self.__dict__["_fine"], self.__dict__["_slope"]
-        return np.interp(z, fine, slope).astype(z.dtype)
+        depth: Level = (p[0] - x) * n[0] + (p[1] - y) * n[1] + (p[2] - z) * n[2]
+        return depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -426,7 +319,9 @@ class Loft:
         gx, gy = px / qx / w, py / qy / f
         gz = px * self.width.slope(z) / w + py * df / f
         slope = np.sqrt(gx * gx + gy * gy + gz * gz) * g / total
-        return ((1.0 - g) / np.maximum(slope, 1.0 / 150.0)).astype(x.dtype)
+        # Deep inside, where the form is flat, the level stays below its largest radius.
+        level: Level = (1.0 - g) / np.maximum(slope, 1.0 / LARGEST_RADIUS)
+        return level.astype(x.dtype, copy=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -458,8 +353,8 @@ class Engraving:
 
     def shift(self, x: Level, y: Level, z: Level) -> Level:
         """How far the level sinks."""
-        near: Level | None = None
-        depth: Level | None = None
+        near: Level = np.full(np.broadcast_shapes(x.shape, z.shape), np.inf, dtype=x.dtype)
+        depth: Level = np.zeros_like(near)
         for i in range(len(self.curve) - 1):
             (ax, az), (bx, bz) = self.curve[i].tolist(), self.curve[i + 1].tolist()
             ux, uz = bx - ax, bz - az
@@ -467,15 +362,12 @@ class Engraving:
             t = np.clip((px * ux + pz * uz) / max(ux * ux + uz * uz, TINY), 0.0, 1.0)
             d2 = (px - t * ux) ** 2 + (pz - t * uz) ** 2
             value = self.depth[i] + t * (self.depth[i + 1] - self.depth[i])
-            if near is None or depth is None:
-                near, depth = d2, value
-            else:
-                depth = np.where(d2 < near, value, depth)
-                near = np.minimum(near, d2)
-        assert near is not None and depth is not None
+            depth = np.where(d2 < near, value, depth)
+            near = np.minimum(near, d2)
         bump = np.maximum(1.0 - near / self.width**2, 0.0) ** 2
         fade = smooth_step(y, self.behind, self.behind - 10.0)
-        return (depth * bump * fade).astype(x.dtype)
+        shift: Level = depth * bump * fade
+        return shift.astype(x.dtype, copy=False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,17 +8,9 @@ encloses count as bone, as `Anatomy.bones` wants it; `brain_shape` and the like 
 import numpy as np
 
 from cmfsim.checks import Floats
+from cmfsim.phantom.curves import smooth_curve, turn_about
 from cmfsim.phantom.parameters import HeadParameters
-from cmfsim.phantom.shapes import (
-    Blend,
-    Box,
-    Egg,
-    FlatTube,
-    Step,
-    Tube,
-    smooth_curve,
-    turn_about,
-)
+from cmfsim.phantom.shapes import Blend, Box, Egg, FlatTube, Step, Tube
 
 __all__ = [
     "CONDYLE",
@@ -143,6 +135,15 @@ def cranium_shape() -> Blend:
             "cut", Egg((32, -74, 18.5), (18.5, 20, 16.5), power=2.3, turn=turn_about("z", 14)), 3.0
         ),
         Step("cut", _tube([[32, -76, 18.5, 15.5], [24, -54, 19, 11], [17, -38, 20, 3]], 10), 3.0),
+        # Lateral wall of the orbit, between it and the temple.
+        Step(
+            "join",
+            _plate(
+                [[50.5, -63, 18, 1.6, 14], [43, -53, 18, 1.6, 13], [36, -45, 19, 1.6, 10]],
+                (0.82, 0.57, 0),
+            ),
+            3.0,
+        ),
         # Arch: from the cheekbone free of the temple to the ear.
         Step(
             "join",

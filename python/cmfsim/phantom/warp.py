@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmfsim.checks import Floats
+from cmfsim.phantom.curves import Level, smooth_step
 from cmfsim.phantom.parameters import HeadParameters
-from cmfsim.phantom.shapes import REACH, Box, Level, Shape, smooth_step
+from cmfsim.phantom.shapes import REACH, Box, Shape
 
 __all__ = ["FaceWarp", "JawWarp", "JawWarped"]
 
