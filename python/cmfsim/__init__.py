@@ -57,6 +57,7 @@ from cmfsim.meshing import (
     signed_level,
     tissue_level,
 )
+from cmfsim.phantom import HeadParameters, Muscle, PhantomHead, make_head
 from cmfsim.planning import RigidMotion, decompose_motion, rigid_motion
 from cmfsim.scene import (
     MovedSurface,
@@ -81,6 +82,7 @@ __all__ = [
     "CmfsimError",
     "ContactError",
     "Finding",
+    "HeadParameters",
     "ImageData",
     "ImageError",
     "LandmarkError",
@@ -91,7 +93,9 @@ __all__ = [
     "MeshQuality",
     "MeshReport",
     "MovedSurface",
+    "Muscle",
     "NodeKinds",
+    "PhantomHead",
     "PlanOperator",
     "RegistrationError",
     "RigidMotion",
@@ -114,6 +118,7 @@ __all__ = [
     "__version__",
     "anatomy_from_surfaces",
     "decompose_motion",
+    "make_head",
     "mesh_from_labels",
     "mesh_from_level",
     "mesh_report",

@@ -1,0 +1,21 @@
+"""The default scene: a head made by code alone, known exactly.
+
+`make_head` returns a `PhantomHead` with skin, skull, mandible, teeth, airway, muscles and landmarks
+as level functions, label images, CT-like images and closed surfaces; `HeadParameters` give other
+people.
+"""
+
+from cmfsim.phantom.model import BONES, LABELS, PARTS, PhantomHead, make_head
+from cmfsim.phantom.muscles import Muscle
+from cmfsim.phantom.parameters import PARAMETER_RANGES, HeadParameters
+
+__all__ = [
+    "BONES",
+    "LABELS",
+    "PARAMETER_RANGES",
+    "PARTS",
+    "HeadParameters",
+    "Muscle",
+    "PhantomHead",
+    "make_head",
+]
