@@ -48,6 +48,9 @@ _OPTIONS: Mapping[str, Mapping[str, tuple[float, float, float]]] = MappingProxyT
             "cant": (0.0, -30.0, 30.0),
             # Of the pterygomaxillary junction behind the second molars' landmarks.
             "posterior": (12.0, 2.0, 30.0),
+            # Of the buttress beside the second molars' landmarks; further out bone stays, so that
+            # the lower edge of the zygoma is not shaved.
+            "width": (12.0, 5.0, 40.0),
         },
         "le_fort_3": {
             # Of the nasofrontal cut above (positive) or below nasion.
@@ -296,16 +299,17 @@ def _le_fort_1(
     down = _turned(down, frame.left, options["cant"])
     planes = (
         CuttingPlane(back, down, "Le Fort I"),
-        _junction("le_fort_1", points, frame, options["posterior"]),
+        _junction(points, frame, options["posterior"]),
+        *(
+            CuttingPlane(points[f"supra_m2_{side}"] + options["width"] * out, -out, f"zygoma {side}")
+            for side, out in (("L", frame.left), ("R", -frame.left))
+        ),
     )
     return (Cut("maxilla", (planes,), _UPPER),), ()
 
 
-def _junction(
-    kind: str, points: Mapping[str, Floats], frame: _Frame, posterior: float
-) -> CuttingPlane:
+def _junction(points: Mapping[str, Floats], frame: _Frame, posterior: float) -> CuttingPlane:
     """The coronal plane at the pterygomaxillary junction; what lies before it moves."""
-    del kind
     place = _middle(points, "supra_m2") - posterior * frame.front
     return CuttingPlane(place, frame.front, "pterygomaxillary junction")
 
@@ -314,7 +318,7 @@ def _le_fort_3(
     points: Mapping[str, Floats], options: Mapping[str, float]
 ) -> tuple[tuple[Cut, ...], tuple[Finding, ...]]:
     frame = _upper_frame("le_fort_3", points)
-    junction = _junction("le_fort_3", points, frame, options["posterior"])
+    junction = _junction(points, frame, options["posterior"])
     top = points["nasion"] + options["height"] * frame.up
     bottom = np.asarray(junction.point) + options["junction"] * frame.up
     along = top - bottom
