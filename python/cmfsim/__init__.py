@@ -33,7 +33,25 @@ from cmfsim.errors import (
     RegistrationError,
     SolverError,
 )
-from cmfsim.io import read_plan, read_result, read_scene, write_result, write_scene
+from cmfsim.io import (
+    read_plan,
+    read_result,
+    read_scene,
+    read_transform,
+    write_result,
+    write_scene,
+    write_transform,
+)
+from cmfsim.osteotomy import (
+    CutBones,
+    CuttingPlane,
+    Procedure,
+    cut_bones,
+    free_cut,
+    place_procedure,
+    procedure_options,
+    segments_from_surfaces,
+)
 from cmfsim.planning import RigidMotion, decompose_motion, rigid_motion
 from cmfsim.scene import (
     MovedSurface,
@@ -56,6 +74,8 @@ __all__ = [
     "BoundaryError",
     "CaseError",
     "CmfsimError",
+    "CutBones",
+    "CuttingPlane",
     "ContactError",
     "Finding",
     "ImageData",
@@ -68,6 +88,7 @@ __all__ = [
     "MovedSurface",
     "NodeKinds",
     "PlanOperator",
+    "Procedure",
     "RegistrationError",
     "RigidMotion",
     "Scene",
@@ -84,14 +105,21 @@ __all__ = [
     "Tissue",
     "TissueData",
     "__version__",
+    "cut_bones",
     "decompose_motion",
+    "free_cut",
+    "place_procedure",
+    "procedure_options",
     "read_plan",
     "read_result",
     "read_scene",
+    "read_transform",
     "rigid_motion",
     "scene_plan",
     "scene_solver",
+    "segments_from_surfaces",
     "solve_scene",
     "write_result",
     "write_scene",
+    "write_transform",
 ]

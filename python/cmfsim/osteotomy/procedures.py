@@ -291,7 +291,9 @@ def _le_fort_1(
     tip = points["supradentale"] + (UPPER_CANINE_REACH + options["height"]) * frame.up
     back = molars + (UPPER_MOLAR_REACH + options["height"]) * frame.up
     ahead = tip - back
-    ahead = _unit("le_fort_1", "front and back of the plane", ahead - (ahead @ frame.left) * frame.left)
+    ahead = _unit(
+        "le_fort_1", "front and back of the plane", ahead - (ahead @ frame.left) * frame.left
+    )
     down = np.cross(frame.left, ahead)
     down = -down * np.sign(down @ frame.up)
     # Raising the front turns the downward normal forwards; raising the left turns it leftwards.
@@ -301,7 +303,9 @@ def _le_fort_1(
         CuttingPlane(back, down, "Le Fort I"),
         _junction(points, frame, options["posterior"]),
         *(
-            CuttingPlane(points[f"supra_m2_{side}"] + options["width"] * out, -out, f"zygoma {side}")
+            CuttingPlane(
+                points[f"supra_m2_{side}"] + options["width"] * out, -out, f"zygoma {side}"
+            )
             for side, out in (("L", frame.left), ("R", -frame.left))
         ),
     )
