@@ -1,6 +1,7 @@
 """Real heads as anatomies: closed surfaces turned into levels, and their landmarks."""
 
 import functools
+import itertools
 import json
 import os
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import cmfsim
+import meshes
 
 HEADS = ("atlas_head", "ct_phantom")
 # Levels are right to this many voxels from the surface, and clipped beyond.
@@ -93,3 +95,39 @@ def anatomy(head, spacing=2.0):
     return cmfsim.Anatomy(
         levels["skin"], {"cranium": levels["cranium"], "mandible": levels["mandible"]}
     )
+
+
+def tissue_mesh(head, edge=6.0, *, posterior=None, spacing=2.0):
+    """Soft tissue of a head as voxels cut into Kuhn's six tets: nodes and tets, not snapped.
+
+    What lies behind the coronal plane y = posterior is left out.
+    """
+    whole = anatomy(head, spacing)
+    low, high = whole.skin.lowest, whole.skin.highest
+    counts = np.floor((high - low) / edge).astype(int)
+    centres = low + edge * (0.5 + np.stack(np.indices(counts), axis=-1).reshape(-1, 3))
+    level = whole.skin.sample(centres)
+    for bone in whole.bones.values():
+        level = np.minimum(level, -bone.sample(centres))
+    if posterior is not None:
+        level = np.minimum(level, posterior - centres[:, 1])
+    cells = (level > 0.0).reshape(counts)
+    return voxel_tets(cells, low, edge)
+
+
+def voxel_tets(cells, origin, edge):
+    """The largest face-connected part of the cells that hold, each cut into Kuhn's six tets."""
+    ndimage = pytest.importorskip("scipy.ndimage")
+    labels, _ = ndimage.label(cells)
+    cells = labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
+    corner = np.argwhere(cells)
+    shape = np.array(cells.shape) + 1
+    tets = []
+    for order in itertools.permutations(range(3)):
+        path = [corner]
+        for axis in order:
+            path.append(path[-1] + np.eye(3, dtype=int)[axis])
+        tets.append(np.stack([np.ravel_multi_index(tuple(p.T), shape) for p in path], axis=1))
+    used, tets = np.unique(np.concatenate(tets), return_inverse=True)
+    nodes = np.stack(np.unravel_index(used, shape), axis=1) * edge + np.asarray(origin)
+    return nodes, meshes.oriented(nodes, tets.reshape(-1, 4))

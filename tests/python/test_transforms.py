@@ -32,7 +32,7 @@ def itk_transforms():
     angles, centre, shift = (0.1, -0.3, 0.7), (10.0, -20.0, 30.0), (1.5, -2.5, 3.5)
     euler = sitk.Euler3DTransform(centre, *angles, shift)
     zyx = sitk.Euler3DTransform(centre, *angles, shift)
-    zyx.SetComputeZYX(True)
+    zyx.SetComputeZYX(True)  # noqa: FBT003 - takes no keyword
     versor = sitk.VersorRigid3DTransform()
     versor.SetCenter(centre)
     versor.SetRotation((1.0, 2.0, -0.5), 0.4)
@@ -158,7 +158,7 @@ def test_binary_and_absent_files_and_wrong_frames_are_named(tmp_path):
     (tmp_path / "a.mat").write_bytes(b"\xff\xfe\x00binary")
     with pytest.raises(cmfsim.CaseError, match="is not text"):
         cmfsim.read_transform(tmp_path / "a.mat")
-    with pytest.raises(FileNotFoundError, match="b.tfm: no such file"):
+    with pytest.raises(FileNotFoundError, match=r"b\.tfm: no such file"):
         cmfsim.read_transform(tmp_path / "b.tfm")
     cmfsim.write_transform(tmp_path / "c.tfm", np.eye(4))
     with pytest.raises(cmfsim.CaseError, match="LPS always"):

@@ -131,7 +131,7 @@ def write_transform(
     if path.suffix.lower() == ".tfm":
         if frame != "LPS":
             raise CaseInputError(f"{path.name}: ITK transforms are LPS always: drop frame")
-        lines = (
+        lines: tuple[str, ...] = (
             f"{ITK_HEADER} V1.0",
             "#Transform 0",
             "Transform: AffineTransform_double_3_3",
@@ -199,12 +199,13 @@ def _itk(text: str) -> Floats:
     counts, rotation = ITK_KINDS[base]
     if "Parameters" not in found:
         raise CaseInputError("holds no line 'Parameters: ...'")
-    line, parameters = found["Parameters"]
+    parameters_line, parameters = found["Parameters"]
     if len(parameters) != counts:
         raise CaseInputError(
-            f"line {line}: Parameters holds {len(parameters)} numbers: {base} needs {counts}"
+            f"line {parameters_line}: Parameters holds {len(parameters)} numbers: "
+            f"{base} needs {counts}"
         )
-    fixed_line, fixed = found.get("FixedParameters", (line, np.zeros(0)))
+    fixed_line, fixed = found.get("FixedParameters", (parameters_line, np.zeros(0)))
     # Older files have no centre; Euler3DTransform has a fourth number, the order of its turns.
     allowed = (0, 3, 4) if base == "Euler3DTransform" else (0, 3)
     if len(fixed) not in allowed:
@@ -216,7 +217,7 @@ def _itk(text: str) -> Floats:
     try:
         turn = rotation(parameters, fixed)
     except CaseInputError as error:
-        raise CaseInputError(f"line {line}: {error}") from error
+        raise CaseInputError(f"line {parameters_line}: {error}") from error
     # x ↦ R (x − c) + c + t; a VersorTransform has no t.
     shift = parameters[-3:] if base != "VersorTransform" else np.zeros(3)
     matrix = np.eye(4)

@@ -1,7 +1,7 @@
 """Bones cut into segments: the levels of the pieces, and what became of crumbs."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, cast
 
@@ -43,7 +43,7 @@ class CutOptions:
     """
 
     crumb_volume: float = 500.0
-    surface: SurfaceOptions = SurfaceOptions()
+    surface: SurfaceOptions = field(default_factory=SurfaceOptions)
 
     def __post_init__(self) -> None:
         if as_number("crumb_volume", self.crumb_volume) < 0.0:
@@ -81,7 +81,7 @@ def cut_bones(
     procedures: Sequence[Procedure] | Mapping[str, Mapping[str, float]] = (),
     *,
     landmarks: Mapping[str, ArrayLike] | None = None,
-    options: CutOptions = CutOptions(),
+    options: CutOptions | None = None,
 ) -> CutBones:
     """The bone segments that osteotomies make of bones.
 
@@ -93,7 +93,7 @@ def cut_bones(
         Standard ones are made from above to below, then the others as they stand.
     landmarks : mapping of str to (3,) float64, mm, optional
         Skull landmarks, LPS; needed where procedures are given by name.
-    options : CutOptions
+    options : CutOptions, optional
 
     Returns
     -------
@@ -124,6 +124,7 @@ def cut_bones(
     >>> [s.name for s in cmfsim.cut_bones({"mandible": ball}, [cut]).segments]
     ['mandible_body', 'chin']
     """
+    options = options or CutOptions()
     if not bones:
         raise CaseInputError("there is no bone to cut")
     for name, level in bones.items():

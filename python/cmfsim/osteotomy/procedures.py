@@ -330,7 +330,7 @@ def _le_fort_3(
     down = np.cross(frame.left, along)
     # Into the face: forwards and down.
     down = down * np.sign(down @ (frame.front - frame.up))
-    groups = [(CuttingPlane(top, down, "nasofrontal"), junction)]
+    groups: list[tuple[CuttingPlane, ...]] = [(CuttingPlane(top, down, "nasofrontal"), junction)]
     for side, outward in (("L", frame.left), ("R", -frame.left)):
         upper, lower = points[f"supraorbital_{side}"], points[f"suborbital_{side}"]
         rim, arch = points[f"lateral_orbit_{side}"], points[f"zygomatic_arch_{side}"]

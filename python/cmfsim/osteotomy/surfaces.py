@@ -47,7 +47,7 @@ class SurfaceOptions:
 
 
 def surface_of_level(
-    name: str, level: ImageData, options: SurfaceOptions = SurfaceOptions()
+    name: str, level: ImageData, options: SurfaceOptions | None = None
 ) -> SurfaceData:
     """The zero surface of a level, closed also where the level reaches the image's border.
 
@@ -59,7 +59,7 @@ def surface_of_level(
         Of the bone, for messages.
     level : ImageData
         Positive inside.
-    options : SurfaceOptions
+    options : SurfaceOptions, optional
 
     Returns
     -------
@@ -72,6 +72,7 @@ def surface_of_level(
         (also `ValueError`) A level without an inside; scikit-image, or PyVista where the surface
         has to be decimated, is missing.
     """
+    options = options or SurfaceOptions()
     values = np.asarray(level.values, dtype=np.float32)
     index = np.argwhere(values > 0.0)
     if not len(index):
@@ -144,7 +145,7 @@ def _decimated(
         "with PyVista (or raise max_triangles)",
     )
     mesh = pv.PolyData.from_regular_faces(points, triangles)
-    # Quadric decimation stays within a tenth of a voxel, but now and then folds a sheet onto itself.
+    # Quadric decimation stays within a tenth of a voxel, but here and there it folds a sheet.
     less = mesh.decimate(1.0 - wanted / len(triangles))
     return _closed(
         np.asarray(less.points, dtype=np.float64), np.asarray(less.regular_faces, dtype=np.int64)
@@ -164,7 +165,8 @@ def _closed(points: Floats, triangles: NDArray[np.int64]) -> tuple[Floats, NDArr
     edges = _half_edges(triangles)
     n = len(points)
     lone = ~np.isin(edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0])
-    centres, fans = [], []
+    centres: list[Floats] = []
+    fans: list[tuple[int, int, int]] = []
     for loop in _loops(edges[lone][:, ::-1]):
         centre = n + len(centres)
         centres.append(points[loop].mean(axis=0))
