@@ -9,7 +9,7 @@ import struct
 import warnings
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
@@ -58,8 +58,6 @@ DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
     }
 )
 MARGIN = 1.04
-# Diameter of a node's dot, as a part of the edges of the mesh.
-DOT = 0.55
 TEXT_SIZE = 9
 LEGEND_ROW = 26  # pixels
 
@@ -154,8 +152,9 @@ def picture_node_kinds(
 ) -> None:
     """Writes a picture of the node kinds in the colours of Kim et al. (2010), Figure 4.
 
-    The boundary of the mesh from the front and from the left, then without its free part, so that
-    the interface with the bones shows: from the front, and from behind.
+    The boundary of the mesh, each node with its share of the triangles round it: the whole of it,
+    then without its free part, so that the interface with the bones shows, from the left, from the
+    front and from behind.
 
     Parameters
     ----------
@@ -175,54 +174,63 @@ def picture_node_kinds(
     --------
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_node_kinds(
-    ...     "kinds.png", mesh.nodes, mesh.surface().triangles, found.kinds
+    ...     "kinds.png", mesh.nodes, mesh.boundary_triangles(), found.kinds
     ... )  # doctest: +SKIP
     """
     points = as_rows("nodes", nodes, 3)
     triangles = as_index_rows("boundary triangles", boundary_triangles, 3, len(points), "nodes")
     if len(kinds.kind) != len(points):
         raise CaseInputError(f"kinds are of {len(kinds.kind)} nodes, but there are {len(points)}")
+    if not len(triangles):
+        raise CaseInputError("the mesh has no boundary triangles to draw")
     held = (kinds.kind[triangles] > 0).any(axis=1)
     corners = _bounds([points[np.unique(triangles)]])
+    # What closes the mesh behind would hide all else from there: the rearmost cut is left out.
+    edge = points[triangles[:, 0]] - points[triangles[:, 1]]
+    rear = corners[1, 1] - 0.5 * float(np.median(np.linalg.norm(edge, axis=1)))
+    closing = (points[triangles][:, :, 1] >= rear).all(axis=1)
     entries = [
         (f"{name} {len(kinds.nodes(name))}", KIND_COLOURS[name])
         for name in ("fixed", "joined", "sliding", "free")
     ]
-    edge = points[triangles[:, 0]] - points[triangles[:, 1]]
-    diameter = DOT * float(np.median(np.linalg.norm(edge, axis=1))) if len(edge) else 1.0
-    border = np.zeros(len(points), dtype=bool)
-    border[np.unique(triangles)] = True
 
     def paint(plotter: Any, view: _View) -> None:
-        shown = triangles[held] if view.bare else triangles
-        if len(shown):
-            plotter.add_mesh(
-                _polydata(points, shown),
-                color=KIND_COLOURS["free"],
-                show_edges=True,
-                edge_color="#b0b0b0",
-                line_width=0.5,
-                ambient=0.3,
-            )
+        shown = triangles
+        if view.bare:
+            shown = triangles[held & ~closing]
         for number, name in enumerate(KIND_NAMES):
-            chosen = points[border & (kinds.kind == number)]
-            if name != "free" and len(chosen):
-                # Lifted towards the camera, or the surface that they lie on would cut them in half.
-                chosen = chosen + diameter * _toward(view.direction)
-                plotter.add_points(
-                    chosen,
+            corner = _corners_of_kind(points, shown, kinds.kind == number)
+            if len(corner):
+                count = np.arange(3 * len(corner)).reshape(-1, 3)
+                plotter.add_mesh(
+                    _polydata(corner.reshape(-1, 3), count),
                     color=KIND_COLOURS[name],
-                    point_size=max(2.0, diameter / view.mm_per_pixel),
-                    render_points_as_spheres=True,
+                    ambient=0.25,
+                    specular=0.0,
                 )
 
     views = (
-        _View("front", "front"),
-        _View("left", "left"),
+        _View("left front", "whole boundary"),
+        _View("left", "left, without the free part", bare=True),
         _View("front", "front, without the free part", bare=True),
         _View("behind", "from behind, without the free part", bare=True),
     )
     _draw(path, views, corners, size, paint, entries)
+
+
+def _corners_of_kind(
+    points: Floats, triangles: NDArray[np.uint32], chosen: NDArray[np.bool_]
+) -> Floats:
+    """The thirds of triangles that belong to chosen nodes, each as two triangles, (2 k, 3, 3)."""
+    places = points[triangles]
+    middle = places.mean(axis=1)
+    parts = []
+    for corner in range(3):
+        mine = chosen[triangles[:, corner]]
+        a, b, c = (places[mine, (corner + k) % 3] for k in range(3))
+        centre, half_ab, half_ac = middle[mine], 0.5 * (a + b), 0.5 * (a + c)
+        parts += [np.stack([a, half_ab, centre], 1), np.stack([a, centre, half_ac], 1)]
+    return np.concatenate(parts)
 
 
 @dataclass(frozen=True)
@@ -232,7 +240,6 @@ class _View:
     direction: str
     caption: str
     bare: bool = False
-    mm_per_pixel: float = 1.0
 
 
 def _draw(
@@ -249,6 +256,8 @@ def _draw(
         raise CaseInputError(f"{path.name}: a picture is written as .png, not {path.suffix!r}")
     width, height = (int(as_positive("picture size", n)) for n in size)
     pv = _pyvista()
+    # One scale for all views.
+    half = max(_half_height(view, corners, width / len(views), height) for view in views)
     try:
         # PyVista and VTK warn of missing screens; whether the picture was made decides here.
         with warnings.catch_warnings():
@@ -261,8 +270,8 @@ def _draw(
                 for column, view in enumerate(views):
                     plotter.subplot(0, column)
                     plotter.set_background("white")
-                    scale = _place_camera(plotter, view, corners, width / len(views), height)
-                    paint(plotter, replace(view, mm_per_pixel=scale))
+                    _place_camera(plotter, view, corners, half)
+                    paint(plotter, view)
                     plotter.reset_camera_clipping_range()
                     plotter.add_text(
                         view.caption, position=(10, 10), font_size=TEXT_SIZE, color="black"
@@ -299,25 +308,29 @@ def _toward(direction: str) -> Floats:
     return unit
 
 
-def _place_camera(plotter: Any, view: _View, corners: Floats, width: float, height: float) -> float:
-    """Looks at the whole box in parallel projection; the size of a pixel in mm."""
+def _half_height(view: _View, corners: Floats, width: float, height: float) -> float:
+    """Half the height, in mm, that a view needs to show the whole box."""
     toward = _toward(view.direction)
-    middle = corners.mean(axis=0)
     across = np.cross(toward, (0.0, 0.0, 1.0))
     across = across / np.linalg.norm(across)
-    upward = np.cross(across, toward)
-    box = np.array([[corners[i >> a & 1, a] for a in range(3)] for i in range(8)]) - middle
-    half_width, half_height = np.abs(box @ across).max(), np.abs(box @ upward).max()
-    scale = MARGIN * float(max(half_height, half_width * height / width))
+    box = np.array([[corners[i >> a & 1, a] for a in range(3)] for i in range(8)])
+    box -= corners.mean(axis=0)
+    upright = np.abs(box @ np.cross(across, toward)).max()
+    return MARGIN * float(max(upright, np.abs(box @ across).max() * height / width))
+
+
+def _place_camera(plotter: Any, view: _View, corners: Floats, half_height: float) -> None:
+    """Looks at the middle of the box in parallel projection."""
+    middle = corners.mean(axis=0)
+    distance = 4.0 * float(np.linalg.norm(corners[1] - corners[0]))
     plotter.enable_parallel_projection()
     camera = plotter.camera
     camera.focal_point = tuple(middle)
-    camera.position = tuple(middle + 4.0 * np.linalg.norm(corners[1] - corners[0]) * toward)
+    camera.position = tuple(middle + distance * _toward(view.direction))
     camera.up = (0.0, 0.0, 1.0)
-    camera.parallel_scale = scale
+    camera.parallel_scale = half_height
     # A camera that was set by hand must not be put back when the first mesh comes.
     plotter.camera_set = True
-    return 2.0 * scale / height
 
 
 def _add_bone(plotter: Any, segment: BoneSegment, colour: str) -> None:

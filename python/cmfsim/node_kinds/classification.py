@@ -97,7 +97,7 @@ def classify_nodes(
     --------
     >>> import cmfsim
     >>> found = cmfsim.classify_nodes(
-    ...     mesh.nodes, mesh.surface().triangles, anatomy, segments, moved=["maxilla"]
+    ...     mesh.nodes, mesh.boundary_triangles(), anatomy, segments, moved=["maxilla"]
     ... )  # doctest: +SKIP
     >>> found.counts["joined on maxilla"]  # doctest: +SKIP
     1204
