@@ -309,7 +309,8 @@ def _join_crumbs(
             others, block
         )
         rim |= crumb
-        touching = ndimage.binary_dilation(crumb, block) & (rest[around] > 0.0)
+        # Two steps: a plane through voxel centres leaves a layer on neither side.
+        touching = ndimage.binary_dilation(crumb, block, CRUMB_RIM) & (rest[around] > 0.0)
         if not touching.any():
             continue
         if sizes[label] > limit:

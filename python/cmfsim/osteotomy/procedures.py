@@ -23,10 +23,10 @@ __all__ = ["PROCEDURES", "place_procedure", "procedure_options"]
 
 # How far roots reach beyond the bone landmark of their arch, mm, after Wheeler's mean root lengths
 # (Nelson, Dental Anatomy): upper canine 17 with its neck 1 above that of the incisors, upper second
-# molar 11 above the alveolar bone point, lower canine 16 with its neck 1 below.
+# molar 11 above the alveolar bone point, lower canine 16 with its neck 1 below and 1 for its lean.
 UPPER_CANINE_REACH = 18.0
 UPPER_MOLAR_REACH = 11.0
-LOWER_CANINE_REACH = 17.0
+LOWER_CANINE_REACH = 18.0
 # Crown of a lower central incisor, mm (Wheeler): infradentale lies this much under the bite.
 LOWER_INCISOR_CROWN = 9.0
 # A chin piece lower than this is hard to hold with a plate, mm; where the symphysis is short the
@@ -74,8 +74,8 @@ _OPTIONS: Mapping[str, Mapping[str, tuple[float, float, float]]] = MappingProxyT
         "genioplasty": {
             # Of the cut below the estimated root apices of the lower front teeth.
             "clearance": (5.0, -5.0, 20.0),
-            # Turns the cut about its front edge; positive lowers the back.
-            "tilt": (0.0, -30.0, 30.0),
+            # Turns the cut about its front edge; positive lowers the back. Roots lean backwards.
+            "tilt": (5.0, -30.0, 30.0),
             # How far back the chin may reach, behind (positive) the second molars' landmarks.
             "posterior": (0.0, -40.0, 20.0),
         },
@@ -164,8 +164,8 @@ def place_procedure(
     nasofrontal suture down to the pterygomaxillary junction, the lateral orbital walls below the
     frontozygomatic sutures, and the arches. BSSO: on each side the ramus behind an oblique plane
     that runs from the outer face behind the second molar to the inner face before the angle, and
-    above a level over the lingula. Genioplasty: a plane below the lower front roots, parallel to
-    the bite, ending below the second molars.
+    above a level over the lingula. Genioplasty: a plane below the lower front roots, falling
+    backwards from the bite, ending below the second molars.
 
     Parameters
     ----------
