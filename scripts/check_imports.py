@@ -112,14 +112,14 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "phantom": "case checks errors scene",
         "planning": "errors",
         "osteotomy": "case checks errors planning scene",
-        "node_kinds": "case checks errors scene",
+        "node_kinds": "case checks errors scene _core",
         "simulation": "scene errors _core",
         "evaluation": "case checks errors scene _core",
         "build": (
             "case checks errors imaging io meshing node_kinds osteotomy phantom planning scene"
         ),
         "study": "build case errors template simulation evaluation scene",
-        "pictures": "case errors scene",
+        "pictures": "case checks errors scene",
         "report": "case errors scene",
         "doctor": "case errors io scene _core",
         "cli": "cmfsim build case doctor errors io pictures report scene simulation study",

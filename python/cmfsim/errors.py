@@ -27,6 +27,7 @@ __all__ = [
     "ImageError",
     "ImageInputError",
     "LandmarkError",
+    "LandmarkInputError",
     "MaterialError",
     "MeshError",
     "MeshInputError",
@@ -49,3 +50,7 @@ class MeshInputError(MeshError, ValueError):
 
 class ImageInputError(ImageError, ValueError):
     """An image that cannot be meant: not three axes, no CT, damaged, no head in it."""
+
+
+class LandmarkInputError(LandmarkError, ValueError):
+    """A landmark that is missing or cannot be meant."""
