@@ -21,6 +21,7 @@ from cmfsim._core import (
     __version__,
 )
 from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
+from cmfsim.doctor import diagnose
 from cmfsim.errors import (
     BoundaryError,
     CaseError,
@@ -33,7 +34,18 @@ from cmfsim.errors import (
     RegistrationError,
     SolverError,
 )
-from cmfsim.io import read_plan, read_result, read_scene, write_result, write_scene
+from cmfsim.io import (
+    Case,
+    read_landmarks,
+    read_plan,
+    read_result,
+    read_scene,
+    read_surface,
+    write_landmarks,
+    write_result,
+    write_scene,
+    write_surface,
+)
 from cmfsim.planning import RigidMotion, decompose_motion, rigid_motion
 from cmfsim.scene import (
     MovedSurface,
@@ -45,6 +57,8 @@ from cmfsim.scene import (
     TissueData,
 )
 from cmfsim.simulation import scene_plan, scene_solver, solve_scene
+from cmfsim.surface_checks import SurfaceReport, check_surface
+from cmfsim.surface_repair import RepairOptions, repair_surface
 
 __all__ = [
     "LAWS",
@@ -54,6 +68,7 @@ __all__ = [
     "BoneSegment",
     "Boundary",
     "BoundaryError",
+    "Case",
     "CaseError",
     "CmfsimError",
     "ContactError",
@@ -69,6 +84,7 @@ __all__ = [
     "NodeKinds",
     "PlanOperator",
     "RegistrationError",
+    "RepairOptions",
     "RigidMotion",
     "Scene",
     "SceneResult",
@@ -80,18 +96,26 @@ __all__ = [
     "Surface",
     "SurfaceData",
     "SurfaceMotion",
+    "SurfaceReport",
     "TetMesh",
     "Tissue",
     "TissueData",
     "__version__",
+    "check_surface",
     "decompose_motion",
+    "diagnose",
+    "read_landmarks",
     "read_plan",
     "read_result",
     "read_scene",
+    "read_surface",
+    "repair_surface",
     "rigid_motion",
     "scene_plan",
     "scene_solver",
     "solve_scene",
+    "write_landmarks",
     "write_result",
     "write_scene",
+    "write_surface",
 ]

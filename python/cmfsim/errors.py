@@ -26,6 +26,7 @@ __all__ = [
     "ContactError",
     "ImageError",
     "LandmarkError",
+    "LandmarkInputError",
     "MaterialError",
     "MeshError",
     "RegistrationError",
@@ -39,3 +40,7 @@ class BoundaryInputError(BoundaryError, ValueError):
 
 class CaseInputError(CaseError, ValueError):
     """A scene or case, in memory or on disk, that cannot be meant."""
+
+
+class LandmarkInputError(LandmarkError, ValueError):
+    """Landmarks, in memory or on disk, that cannot be meant."""
