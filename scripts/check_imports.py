@@ -105,7 +105,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "checks": "errors",
         "scene": "checks errors",
         "case": "checks errors scene",
-        "io": "case checks errors planning scene",
+        "patient": "checks errors",
+        "io": "case checks errors patient planning scene",
         "imaging": "case checks errors scene",
         "meshing": "case checks errors scene _core",
         "template": "case checks errors scene _core",
@@ -116,16 +117,25 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "simulation": "scene errors _core",
         "evaluation": "case checks errors scene _core",
         "build": (
-            "case checks errors imaging io meshing node_kinds osteotomy phantom planning scene"
+            "case checks errors imaging io meshing node_kinds osteotomy patient phantom planning "
+            "scene surface_repair"
         ),
         "study": "build case errors template simulation evaluation scene",
         "pictures": "case checks errors scene",
         "report": "case errors scene",
-        "doctor": "case errors io scene _core",
-        "cli": "cmfsim build case doctor errors io pictures report scene simulation study",
+        "topology": "",
+        "crossings": "checks",
+        "capping": "checks",
+        "surface_checks": "checks crossings scene topology",
+        "surface_repair": "capping case checks errors scene surface_checks topology _core",
+        "doctor": (
+            "case checks errors io patient planning scene surface_checks surface_repair _core"
+        ),
+        "cli": ("cmfsim build case checks doctor errors io pictures report scene simulation study"),
         "__init__": (
             "_core build case doctor errors evaluation imaging io meshing node_kinds osteotomy "
-            "phantom planning scene simulation study template"
+            "patient phantom planning scene simulation study surface_checks surface_repair "
+            "template"
         ),
     }.items()
 }

@@ -21,6 +21,7 @@ from cmfsim._core import (
     __version__,
 )
 from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
+from cmfsim.doctor import diagnose
 from cmfsim.errors import (
     BoundaryError,
     CaseError,
@@ -35,14 +36,19 @@ from cmfsim.errors import (
 )
 from cmfsim.imaging import SegmentOptions, segment_head
 from cmfsim.io import (
+    Case,
     read_image,
+    read_landmarks,
     read_plan,
     read_result,
     read_scene,
+    read_surface,
     read_transform,
     write_image,
+    write_landmarks,
     write_result,
     write_scene,
+    write_surface,
     write_transform,
 )
 from cmfsim.meshing import (
@@ -89,6 +95,8 @@ from cmfsim.scene import (
     TissueData,
 )
 from cmfsim.simulation import scene_plan, scene_solver, solve_scene
+from cmfsim.surface_checks import SurfaceReport, check_surface
+from cmfsim.surface_repair import RepairOptions, repair_surface
 
 __all__ = [
     "LAWS",
@@ -98,6 +106,7 @@ __all__ = [
     "BoneSegment",
     "Boundary",
     "BoundaryError",
+    "Case",
     "CaseError",
     "ClassifiedNodes",
     "CmfsimError",
@@ -123,6 +132,7 @@ __all__ = [
     "PlanOperator",
     "Procedure",
     "RegistrationError",
+    "RepairOptions",
     "RigidMotion",
     "Scene",
     "SceneResult",
@@ -137,6 +147,7 @@ __all__ = [
     "Surface",
     "SurfaceData",
     "SurfaceMotion",
+    "SurfaceReport",
     "TetMesh",
     "Tissue",
     "TissueData",
@@ -144,9 +155,11 @@ __all__ = [
     "TissueRegion",
     "__version__",
     "anatomy_from_surfaces",
+    "check_surface",
     "classify_nodes",
     "cut_bones",
     "decompose_motion",
+    "diagnose",
     "free_cut",
     "make_head",
     "mesh_from_labels",
@@ -157,10 +170,13 @@ __all__ = [
     "place_procedure",
     "procedure_options",
     "read_image",
+    "read_landmarks",
     "read_plan",
     "read_result",
     "read_scene",
+    "read_surface",
     "read_transform",
+    "repair_surface",
     "rigid_motion",
     "scene_plan",
     "scene_solver",
@@ -171,7 +187,9 @@ __all__ = [
     "solve_scene",
     "tissue_level",
     "write_image",
+    "write_landmarks",
     "write_result",
     "write_scene",
+    "write_surface",
     "write_transform",
 ]

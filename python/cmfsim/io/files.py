@@ -26,6 +26,7 @@ __all__ = [
     "refuse_constant",
     "replacing",
     "table_of",
+    "toml_module",
 ]
 
 # Text files (plans, scene descriptions) above this size are not what they say they are, bytes.
@@ -89,7 +90,7 @@ def read_document(path: Path) -> dict[str, Any]:
         if path.suffix == ".json":
             document = json.loads(text, parse_constant=refuse_constant)
         else:
-            document = _toml().loads(text)
+            document = toml_module().loads(text)
     except (ValueError, RecursionError) as error:
         raise CaseInputError(f"cannot be read: {error}") from error
     if not isinstance(document, dict):
@@ -97,7 +98,8 @@ def read_document(path: Path) -> dict[str, Any]:
     return document
 
 
-def _toml() -> Any:
+def toml_module() -> Any:
+    """The reader of TOML: of the standard library, or tomli before Python 3.11."""
     for name in ("tomllib", "tomli"):
         with contextlib.suppress(ModuleNotFoundError):
             return import_module(name)

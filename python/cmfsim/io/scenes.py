@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.io.archives import member_of, read_archive, write_archive
 from cmfsim.io.files import beside, check_version, known_keys, named, read_document, table_of
-from cmfsim.io.meshes import read_mesh, read_surface, read_tets, read_triangles
+from cmfsim.io.meshes import read_mesh, read_tets
+from cmfsim.io.surfaces import read_surface, read_triangles
 from cmfsim.planning import rigid_motion
 from cmfsim.scene import (
     TISSUE_ARRAYS,

@@ -1,118 +1,27 @@
-"""The command line: `cmfsim solve SCENE -o OUT` and `cmfsim info SCENE`.
-
-Results and `--json` go to standard output, progress and errors to standard error.
-Exit codes: 0 done, 1 failed, 2 bad input.
-"""
+"""`cmfsim solve` and `cmfsim info`: scenes."""
 
 import argparse
 import dataclasses
 import json
 import logging
-import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cmfsim import __version__
-from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.cli.exit_codes import DONE
+from cmfsim.cli.terminal import escaped
+from cmfsim.errors import CaseInputError
 from cmfsim.io import read_plan, read_scene, result_suffixes, write_result
-from cmfsim.scene import CONTACTS, METHODS, Scene
+from cmfsim.scene import Scene
 from cmfsim.simulation import solve_scene
 
-__all__ = ["main"]
-
-DONE, FAILED, BAD_INPUT = 0, 1, 2
+__all__ = ["info", "solve"]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The exit code of one command: 0 done, 1 failed, 2 bad input.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Words after the program's name; those of the process if left out.
-
-    Returns
-    -------
-    int
-
-    Examples
-    --------
-    >>> from cmfsim.cli import main
-    >>> main(["solve", "no-such-scene.npz", "-o", "out.npz"])
-    2
-    """
-    parser = _parser()
-    options = parser.parse_args(arguments)
-    if options.command is None:
-        parser.print_help(sys.stderr)
-        return BAD_INPUT
-    handler = _ProgressHandler()
-    logger = logging.getLogger("cmfsim")
-    previous = logger.level
-    logger.addHandler(handler)
-    logger.setLevel(logging.WARNING if options.quiet else logging.INFO)
-    try:
-        return _run(options)
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(previous)
-
-
-def _run(options: argparse.Namespace) -> int:
-    try:
-        if options.command == "solve":
-            _solve(options)
-        else:
-            _info(options)
-    except (FileNotFoundError, ValueError) as error:
-        _say_error(error)
-        return BAD_INPUT
-    except (CmfsimError, OSError, MemoryError) as error:
-        _say_error(error)
-        return FAILED
-    except KeyboardInterrupt:
-        print("cmfsim: stopped; existing files are as they were", file=sys.stderr)
-        return FAILED
-    return DONE
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="cmfsim",
-        description="Soft tissue after cranio-maxillofacial surgery, by the mass-tensor model.",
-        epilog="Exit codes: 0 done, 1 failed, 2 bad input. Research software, no medical device.",
-    )
-    parser.add_argument("--version", action="version", version=f"cmfsim {__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("scene", metavar="SCENE", type=Path, help="scene.npz or scene.toml")
-    common.add_argument("--json", action="store_true", help="print a JSON object")
-    common.add_argument("-q", "--quiet", action="store_true", help="no progress lines")
-
-    solve = commands.add_parser("solve", parents=[common], help="solve a scene")
-    solve.add_argument(
-        "-o",
-        "--output",
-        metavar="OUT",
-        type=Path,
-        required=True,
-        help=f"result file, by its ending {' '.join(result_suffixes())}",
-    )
-    solve.add_argument("--method", choices=METHODS, help="instead of the scene's own")
-    solve.add_argument("--contact", choices=CONTACTS, help="instead of the scene's own")
-    solve.add_argument("--tolerance", type=float, help="relative error bound, iterative methods")
-    solve.add_argument(
-        "--plan", metavar="PLAN", type=Path, help="plan.toml or plan.json instead of the scene's"
-    )
-    commands.add_parser("info", parents=[common], help="say what a scene holds")
-    return parser
-
-
-def _solve(options: argparse.Namespace) -> None:
+def solve(options: argparse.Namespace) -> int:
+    """Solves a scene and writes its result."""
     _check_output(options.output, options.scene)
     scene = _with_overrides(_read(options.scene), options)
     started = time.perf_counter()
@@ -125,7 +34,7 @@ def _solve(options: argparse.Namespace) -> None:
     if options.json:
         extra = {"output": str(options.output), "seconds": seconds, "largest": float(size.max())}
         print(json.dumps({**summary, **extra}, allow_nan=False))
-        return
+        return DONE
     print(f"solved        {summary['n_tets']} tets, {summary['n_unknowns']} unknowns")
     print(f"method        {summary['method']}, {summary['iterations']} iterations")
     print(
@@ -138,6 +47,7 @@ def _solve(options: argparse.Namespace) -> None:
         )
     print(f"displacement  {size.max():.3f} mm at most, {size.mean():.3f} mm on average")
     print(f"time          {seconds:.3f} s")
+    return DONE
 
 
 def _check_output(output: Path, scene: Path) -> None:
@@ -172,7 +82,8 @@ def _read(path: Path) -> Scene:
     return read_scene(path)
 
 
-def _info(options: argparse.Namespace) -> None:
+def info(options: argparse.Namespace) -> int:
+    """Says what a scene holds."""
     scene = _read(options.scene)
     nodes = np.asarray(scene.nodes)
     if options.json:
@@ -196,7 +107,7 @@ def _info(options: argparse.Namespace) -> None:
                 allow_nan=False,
             )
         )
-        return
+        return DONE
     print(f"mesh      {scene.n_nodes} nodes, {scene.n_tets} tets")
     if len(nodes):
         low, high = nodes.min(axis=0), nodes.max(axis=0)
@@ -206,33 +117,13 @@ def _info(options: argparse.Namespace) -> None:
     print(f"fixed     {np.size(scene.fixed)} nodes")
     for name, segment in scene.segments.items():
         print(
-            f"segment   {_escaped(name)}: {np.size(segment.joined)} joined, "
+            f"segment   {escaped(name)}: {np.size(segment.joined)} joined, "
             f"{np.size(segment.sliding)} sliding"
         )
     print(f"solver    {scene.options.method}, {scene.options.contact} contact")
     print(f"sha256    {scene.sha256()}")
-
-
-class _ProgressHandler(logging.Handler):
-    """Log lines on the standard error of the moment."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        print(f"cmfsim: {_escaped(record.getMessage())}", file=sys.stderr, flush=True)
+    return DONE
 
 
 def _number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.2e}"
-
-
-def _say_error(error: BaseException) -> None:
-    text = str(error) or type(error).__name__
-    print(f"cmfsim: error: {_escaped(text)}", file=sys.stderr)
-
-
-def _escaped(text: str) -> str:
-    """A text that cannot steer the terminal: names in files come from strangers."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,71 @@
+"""`cmfsim doctor` and `cmfsim build`: patient cases."""
+
+import argparse
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import TextIO
+
+from cmfsim.case import SEVERITIES, Finding
+from cmfsim.checks import as_positive
+from cmfsim.cli.exit_codes import BAD_INPUT, DONE
+from cmfsim.cli.terminal import StageProgress, columns, escaped, in_colour
+from cmfsim.doctor import diagnose, findings_text
+from cmfsim.io import Case
+
+__all__ = ["build", "doctor"]
+
+
+def doctor(options: argparse.Namespace) -> int:
+    """Says what will go wrong with a case; bad input if anything is an error."""
+    case = Case.load(options.case)
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        progress.stage(f"checking {case.name}")
+        findings = diagnose(case)
+    if options.json:
+        counts = {f"{s}s": sum(f.severity == s for f in findings) for s in SEVERITIES}
+        entries = [dataclasses.asdict(finding) for finding in findings]
+        report = {"case": case.name, "file": str(case.file), **counts, "findings": entries}
+        print(json.dumps(report, allow_nan=False))
+    else:
+        _print_findings(findings, sys.stdout)
+    return BAD_INPUT if _has_errors(findings) else DONE
+
+
+def build(options: argparse.Namespace) -> int:
+    """Builds a case, unless the doctor finds an error in it."""
+    case = Case.load(options.case)
+    if options.edge_length is not None:
+        edge_length = as_positive("--edge-length", options.edge_length)
+        case = dataclasses.replace(
+            case, mesh=dataclasses.replace(case.mesh, edge_length=edge_length)
+        )
+    if options.output is not None:
+        case = dataclasses.replace(case, output=options.output)
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        if not options.no_doctor:
+            progress.stage("checking the case")
+            findings = diagnose(case)
+            if _has_errors(findings):
+                _print_findings(findings, sys.stderr)
+                return BAD_INPUT
+        built = import_module("cmfsim.build").build_case(case, progress=progress.stage)
+    if options.json:
+        print(json.dumps(dict(built.summary), allow_nan=False))
+    else:
+        for name, value in built.summary.items():
+            print(f"{escaped(str(name)):<20} {escaped(str(value))}")
+    return DONE
+
+
+def _has_errors(findings: Sequence[Finding]) -> bool:
+    return any(finding.severity == "error" for finding in findings)
+
+
+def _print_findings(findings: Sequence[Finding], stream: TextIO) -> None:
+    """On a terminal wrapped and coloured, in a pipe one line for each part."""
+    width = columns() if stream.isatty() else 0
+    text = findings_text(findings, colour=in_colour(stream), width=width, escape=escaped)
+    print(text, file=stream)

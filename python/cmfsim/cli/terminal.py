@@ -1,0 +1,107 @@
+"""What the command line says to a person: errors, log lines, the stage of the work."""
+
+import logging
+import os
+import shutil
+import sys
+import threading
+import time
+from types import TracebackType
+from typing import TextIO
+
+__all__ = ["ProgressHandler", "StageProgress", "columns", "escaped", "in_colour", "say_error"]
+
+# Back to the start of the line and erase it.
+CLEAR_LINE = "\r\x1b[K"
+# Time between two updates of the line that shows the stage, s.
+TICK = 0.2
+
+
+class ProgressHandler(logging.Handler):
+    """Log lines on the standard error of the moment."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Prints one line, over the line of the stage where there is one."""
+        clear = CLEAR_LINE if sys.stderr.isatty() else ""
+        print(f"{clear}cmfsim: {escaped(record.getMessage())}", file=sys.stderr, flush=True)
+
+
+class StageProgress:
+    """The stage of a long command: one line that counts seconds, or in a pipe a line per stage.
+
+    Use it as a context; `stage` names what begins. Its own thread counts, so that a stage that
+    takes a minute is seen to be alive.
+    """
+
+    def __init__(self, stream: TextIO, *, quiet: bool = False) -> None:
+        self._stream = stream
+        self._quiet = quiet
+        self._live = not quiet and stream.isatty()
+        self._stage = ""
+        self._begun = time.perf_counter()
+        self._stopped = threading.Event()
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._tick, daemon=True)
+
+    def __enter__(self) -> "StageProgress":
+        if self._live:
+            self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._stopped.set()
+        if self._live:
+            self._thread.join()
+            self._write(CLEAR_LINE)
+
+    def stage(self, name: str) -> None:
+        """Says that a stage begins, and what the one before took."""
+        with self._lock:
+            now = time.perf_counter()
+            self._stage, self._begun = name, now
+        if self._live:
+            self._show()
+        elif not self._quiet:
+            self._write(f"cmfsim: {escaped(name)}\n")
+
+    def _tick(self) -> None:
+        while not self._stopped.wait(TICK):
+            self._show()
+
+    def _show(self) -> None:
+        with self._lock:
+            name, seconds = self._stage, time.perf_counter() - self._begun
+        if name:
+            text = f"cmfsim: {escaped(name)} {seconds:.1f} s"
+            # A line that wraps could not be erased.
+            self._write(f"{CLEAR_LINE}{text[: columns() - 1]}")
+
+    def _write(self, text: str) -> None:
+        self._stream.write(text)
+        self._stream.flush()
+
+
+def say_error(error: BaseException) -> None:
+    """Prints an error as one line on standard error."""
+    text = str(error) or type(error).__name__
+    print(f"cmfsim: error: {escaped(text)}", file=sys.stderr)
+
+
+def escaped(text: str) -> str:
+    """A text that cannot steer the terminal: names in files come from strangers."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def in_colour(stream: TextIO) -> bool:
+    """Whether colours are shown and wanted (https://no-color.org)."""
+    return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
+def columns() -> int:
+    """The width of the terminal, in characters."""
+    return shutil.get_terminal_size().columns

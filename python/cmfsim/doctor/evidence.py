@@ -1,0 +1,235 @@
+"""Everything that a case names, as far as it can be read, and a finding for what cannot."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from cmfsim._core import PRESETS, Surface
+from cmfsim.case import Finding
+from cmfsim.checks import Floats
+from cmfsim.errors import CmfsimError
+from cmfsim.io import Case, read_landmark_file, read_surface
+from cmfsim.patient import CaseMotion, CaseSurfaces
+from cmfsim.scene import SurfaceData
+from cmfsim.surface_checks import SurfaceReport, check_surface
+from cmfsim.surface_repair import RepairOptions, repair_surface
+
+__all__ = ["Body", "Evidence", "gather"]
+
+# Points of a surface that distances are measured at; a few thousand describe a skull.
+MAX_SAMPLES = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A surface of the case, as read and as it would be mended.
+
+    Attributes
+    ----------
+    name : str
+        "skin", or the bone's.
+    where : str
+    surface : SurfaceData
+    """
+
+    name: str
+    where: str
+    surface: SurfaceData
+
+    @cached_property
+    def report(self) -> SurfaceReport:
+        """The state of the surface as read."""
+        return check_surface(self.surface)
+
+    @cached_property
+    def mended(self) -> SurfaceData:
+        """The surface closed and outward, as `build` would make it."""
+        return repair_surface(self.surface, self.name, RepairOptions())[0]
+
+    @cached_property
+    def index(self) -> Surface:
+        """Closest points and winding numbers of the mended surface."""
+        return Surface(self.mended.vertices, self.mended.triangles)
+
+    @cached_property
+    def samples(self) -> Floats:
+        """Vertices, evenly taken from the list where there are many."""
+        vertices = np.asarray(self.mended.vertices)
+        step = -(-len(vertices) // MAX_SAMPLES)
+        return vertices[::step]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What could be read of a case.
+
+    Attributes
+    ----------
+    case : Case
+    skin : Body or None
+    bones : mapping of str to Body
+    skull_landmarks, skin_landmarks : mapping of str to (3,) float64, mm
+        Empty where there are none, or none could be read.
+    motions : mapping of str to (4, 4) float64, mm
+        Of the segments whose plan is a matrix.
+    findings : tuple of Finding
+    """
+
+    case: Case
+    skin: Body | None = None
+    bones: Mapping[str, Body] = field(default_factory=dict)
+    skull_landmarks: Mapping[str, Floats] = field(default_factory=dict)
+    skin_landmarks: Mapping[str, Floats] = field(default_factory=dict)
+    motions: Mapping[str, Floats] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
+
+
+def gather(case: Case) -> Evidence:
+    """What can be read of a case, with a finding for each file that cannot."""
+    findings: list[Finding] = []
+    skin: Body | None = None
+    bones: dict[str, Body] = {}
+    if case.surfaces is not None:
+        files = {"skin": case.surfaces.skin}
+        files |= {f"bones.{name}": path for name, path in case.surfaces.bones.items()}
+        for key, path in files.items():
+            body = _body(case, case.surfaces, key, path, findings)
+            if body is None:
+                continue
+            if key == "skin":
+                skin = body
+            else:
+                bones[body.name] = body
+    if case.image is not None:
+        _check_file(case, "image.file", case.image.file, findings, folder=True)
+    skull = _landmarks(case, "landmarks.skull", case.landmarks.skull, findings)
+    skin_points = _landmarks(case, "landmarks.skin", case.landmarks.skin, findings)
+    if case.mesh.parting is not None:
+        _check_file(case, "mesh.parting.surface", case.mesh.parting, findings)
+    if case.mesh.file is not None:
+        _check_file(case, "mesh.file", case.mesh.file, findings)
+    motions: dict[str, Floats] = {}
+    for name, motion in case.plan.items():
+        _check_motion_files(case, name, motion, findings)
+        if motion.matrix is not None:
+            motions[name] = motion.matrix
+    if case.tissue.kind == "preset" and case.tissue.preset not in PRESETS:
+        findings.append(
+            Finding(
+                "error",
+                "tissue-preset",
+                f"preset is {case.tissue.preset!r}",
+                case.where("tissue.preset"),
+                "no tissue can be made from it",
+                f"use one of: {', '.join(PRESETS)}",
+            )
+        )
+    _check_output(case, findings)
+    return Evidence(case, skin, bones, skull, skin_points, motions, tuple(findings))
+
+
+def _body(
+    case: Case, given: CaseSurfaces, key: str, path: Path, findings: list[Finding]
+) -> Body | None:
+    where = f"{case.where(f'surfaces.{key}')} ({path.name})"
+    if not _check_file(case, f"surfaces.{key}", path, findings):
+        return None
+    try:
+        surface = read_surface(path, units=given.units, frame=given.frame)
+        body = Body(key.removeprefix("bones."), where, surface)
+        # Triangles that are all without area pass the reader and fail when the surface is mended.
+        _ = body.index
+    except CmfsimError as error:
+        findings.append(
+            Finding(
+                "error",
+                "surface-unreadable",
+                str(error),
+                where,
+                "nothing can be built from it",
+                "export it again from the program that made it, as STL, PLY, OBJ or VTP",
+            )
+        )
+        return None
+    return body
+
+
+def _landmarks(
+    case: Case, key: str, path: Path | None, findings: list[Finding]
+) -> Mapping[str, Floats]:
+    if path is None or not _check_file(case, key, path, findings):
+        return {}
+    try:
+        found = read_landmark_file(path, frame=case.landmarks.frame)
+    except CmfsimError as error:
+        findings.append(
+            Finding(
+                "error",
+                "landmarks-unreadable",
+                str(error),
+                case.where(key),
+                "cuts and muscles are placed from landmarks",
+                "correct the file, or save it again from 3D Slicer",
+            )
+        )
+        return {}
+    findings.extend(found.findings)
+    return found.points
+
+
+def _check_motion_files(case: Case, name: str, motion: CaseMotion, findings: list[Finding]) -> None:
+    for key in ("transform", "surface", "moved_surface"):
+        path = getattr(motion, key)
+        if path is not None:
+            _check_file(case, f"plan.{name}.{key}", path, findings)
+
+
+def _check_file(
+    case: Case, key: str, path: Path, findings: list[Finding], *, folder: bool = False
+) -> bool:
+    """Whether a file is there and can be read; a finding if not."""
+    what = ""
+    if not path.exists():
+        what = f"{path} does not exist"
+    elif path.is_dir() and not folder:
+        what = f"{path} is a folder, not a file"
+    elif not os.access(path, os.R_OK):
+        what = f"{path} may not be read"
+    elif path.is_file() and path.stat().st_size == 0:
+        what = f"{path} is empty"
+    if not what:
+        return True
+    findings.append(
+        Finding(
+            "error",
+            "file-missing",
+            what,
+            case.where(key),
+            "the case cannot be built without it",
+            f"correct the path; it is relative to {case.file.parent.resolve()}",
+        )
+    )
+    return False
+
+
+def _check_output(case: Case, findings: list[Finding]) -> None:
+    folder = case.output
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    if folder.is_dir() and os.access(folder, os.W_OK | os.X_OK):
+        return
+    what = "may not be written to" if folder.is_dir() else "is a file, not a folder"
+    findings.append(
+        Finding(
+            "error",
+            "output-not-writable",
+            f"{folder} {what}",
+            case.where("output.folder"),
+            "results could not be written after the work is done",
+            "name another folder, or change its permissions",
+        )
+    )

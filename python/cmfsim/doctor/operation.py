@@ -1,0 +1,165 @@
+"""Whether cuts and plan can be meant: names, landmarks, sizes of motions, bone through skin."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from cmfsim.case import Finding
+from cmfsim.checks import Floats
+from cmfsim.doctor.evidence import Body, Evidence
+from cmfsim.doctor.places import place_text
+from cmfsim.planning import decompose_motion
+
+__all__ = ["check_cuts", "check_plan"]
+
+# Motions of bone above which a plan is unusual, and above which it cannot be meant; mm and degrees.
+# The largest relocation in Table 2 of the paper is 12.6 mm; distraction reaches 30 mm.
+FAR, TOO_FAR = 20.0, 60.0
+TURNED, TOO_TURNED = 20.0, 60.0
+# Depth by which a moved bone may pass the skin at rest before it is said, mm: skin gives way.
+THROUGH_SKIN = 0.1
+# How far outside a bone its neighbourhood is asked for tissue, mm.
+BESIDE_BONE = 0.5
+
+
+def check_cuts(evidence: Evidence) -> Iterator[Finding]:
+    """Findings about the names of bones and segments, and the landmarks that cuts need."""
+    case = evidence.case
+    bones = set(case.surfaces.bones) if case.surfaces else {"cranium", "mandible", "skull"}
+    available = set(bones)
+    for number, cut in enumerate(case.osteotomies):
+        where = case.where(f"osteotomies.{number}")
+        if cut.bone is not None and cut.bone not in available:
+            yield Finding(
+                "error",
+                "cut-unknown-bone",
+                f"the cut is through bone {cut.bone!r}",
+                where,
+                "there is no such bone or segment at this point of the list",
+                f"use one of: {', '.join(sorted(available))}",
+            )
+        available |= set(cut.segments)
+    for name in case.plan:
+        if name not in available:
+            yield Finding(
+                "error",
+                "plan-unknown-segment",
+                f"the plan moves {name!r}",
+                case.where(f"plan.{name}"),
+                "no bone and no osteotomy of the case has this name",
+                f"use one of: {', '.join(sorted(available))}, or add the osteotomy that makes it",
+            )
+
+
+def check_plan(evidence: Evidence) -> Iterator[Finding]:
+    """Findings about what the plan does to each bone."""
+    for name, matrix in evidence.motions.items():
+        body = evidence.bones.get(name)
+        wrong = list(_check_size(evidence, name, matrix, body))
+        yield from wrong
+        # A bone that flies off passes the skin as well: one reason is enough.
+        if body is not None and not any(f.severity == "error" for f in wrong):
+            yield from _check_through_skin(evidence, name, matrix, body)
+            yield from _check_tissue(evidence, name, body)
+
+
+def _check_size(
+    evidence: Evidence, name: str, matrix: Floats, body: Body | None
+) -> Iterator[Finding]:
+    case = evidence.case
+    centre = case.plan[name].centre
+    points = body.samples if body is not None else None
+    if centre is None:
+        centre = np.zeros(3) if points is None else points.mean(axis=0)
+    motion = decompose_motion(matrix, centre)
+    moved = motion.translation[None] if points is None else _moved(matrix, points) - points
+    far = float(np.linalg.norm(moved, axis=1).max())
+    where = case.where(f"plan.{name}")
+    if far > FAR:
+        about_origin = motion.angle > 0.0 and case.plan[name].centre is None
+        yield Finding(
+            "error" if far > TOO_FAR else "warning",
+            "plan-far",
+            f"{name} moves by up to {far:.1f} mm",
+            where,
+            f"bone moves by {FAR:g} mm at most in ordinary surgery; tissue would be torn",
+            "give the centre of the turn: without it, it is about the origin of the coordinates"
+            if about_origin
+            else "check translation (mm), sign and frame (LPS: forwards is −P)",
+        )
+    if motion.angle > TURNED:
+        yield Finding(
+            "error" if motion.angle > TOO_TURNED else "warning",
+            "plan-turned",
+            f"{name} turns by {motion.angle:.1f}°",
+            where,
+            f"bone turns by {TURNED:g}° at most in ordinary surgery; linear strain invents volume",
+            "check angle (degrees, not radians) and axis",
+        )
+
+
+def _check_through_skin(
+    evidence: Evidence, name: str, matrix: Floats, body: Body
+) -> Iterator[Finding]:
+    skin = evidence.skin
+    if skin is None:
+        return
+    points = body.samples
+    moved = _moved(matrix, points)
+    inside_before = skin.index.winding_number(points) >= 0.5
+    outside_after = skin.index.winding_number(moved) < 0.5
+    through = np.flatnonzero(inside_before & outside_after)
+    if not len(through):
+        return
+    closest = skin.index.closest(moved[through])[0]
+    depth = np.linalg.norm(closest - moved[through], axis=1)
+    if depth.max() <= THROUGH_SKIN:
+        return
+    worst = int(np.argmax(depth))
+    yield Finding(
+        "warning",
+        "plan-through-skin",
+        f"{name} is moved through the skin at rest, by {depth[worst]:.1f} mm at "
+        f"{place_text(moved[through[worst]])}",
+        evidence.case.where(f"plan.{name}"),
+        "the tissue over it would be pressed flat or turned inside out",
+        "check the plan; a large true advancement is better solved in steps",
+    )
+
+
+def _check_tissue(evidence: Evidence, name: str, body: Body) -> Iterator[Finding]:
+    """A moving bone with no soft tissue beside it, in the region that is meshed."""
+    skin = evidence.skin
+    if skin is None:
+        return
+    vertices = np.asarray(skin.mended.vertices)
+    plane = evidence.case.region.plane(
+        evidence.skull_landmarks, float(vertices[:, 1].min()), float(vertices[:, 1].max())
+    )
+    points = body.samples
+    beside = points + BESIDE_BONE * body.index.closest(points)[1]
+    tissue = (skin.index.winding_number(beside) > 0.5) & (plane.distance(beside) < 0.0)
+    region = evidence.case.region
+    if region.lower is not None:
+        tissue &= beside[:, 2] > region.lower
+    if region.upper is not None:
+        tissue &= beside[:, 2] < region.upper
+    for other in evidence.bones.values():
+        if tissue.any():
+            beside_tissue = np.flatnonzero(tissue)
+            inside = other.index.winding_number(beside[beside_tissue]) > 0.5
+            tissue[beside_tissue[inside]] = False
+    if tissue.any():
+        return
+    yield Finding(
+        "error",
+        "segment-no-tissue",
+        f"{name} touches no soft tissue in the meshed region",
+        body.where,
+        "moving it moves nothing",
+        "check region (posterior plane, lower, upper), and that the skin encloses it",
+    )
+
+
+def _moved(matrix: Floats, points: Floats) -> Floats:
+    return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3], dtype=np.float64)

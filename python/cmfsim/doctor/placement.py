@@ -1,0 +1,408 @@
+"""Whether skin, bones and landmarks lie where a head has them: units, frames, sides, distances."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from cmfsim.case import Finding
+from cmfsim.checks import Floats
+from cmfsim.doctor.evidence import Body, Evidence
+from cmfsim.doctor.places import place_text
+
+__all__ = ["check_placement"]
+
+# Longest extent of a skin surface from a face mask to a head with neck, mm.
+SKIN_EXTENT = (110.0, 420.0)
+# Longest extents that other units give a head, and their name; normalised to 1 or to −1…1.
+OTHER_UNITS: Sequence[tuple[str, float, float, float]] = (
+    ("m", 0.11, 0.42, 1000.0),
+    ("normalised coordinates", 0.42, 2.05, 0.0),
+    ("inch", 4.3, 10.9, 25.4),
+    ("cm", 10.9, 42.0, 10.0),
+    ("um", 110_000.0, 420_000.0, 0.001),
+)
+# Longest extent of a bone as a share of the skin's: a chin is a tenth of a head, a skull less than
+# all of it. Beyond these bounds, the nearest unit tells which of them was meant.
+BONE_SHARE = (0.04, 1.15)
+# Share of a bone's points outside the skin from which on it lies elsewhere, not merely too far out.
+ELSEWHERE_SHARE = 0.4
+# A different frame is the reason if no more than this share stays outside in it.
+FITTING_SHARE = 0.05
+# Depth by which a bone may pass the skin before it is said, mm: the accuracy of two surfaces.
+THROUGH_SKIN = 0.1
+# Distance of a landmark from its surface, mm: twice the placing error of an operator, and so far
+# that it lies on something else.
+LANDMARK_WARNING, LANDMARK_ERROR = 5.0, 15.0
+# A landmark off the middle by less than this does not tell left from right, mm.
+SIDE_MARGIN = 3.0
+# Share of the length of a direction that its main axis must have for the head to be upright.
+MAIN_AXIS = 0.5
+
+FRONT = ("nasion", "glabella", "supradentale", "infradentale", "pogonion", "pronasale", "subnasale")
+BACK = ("supraglenoid", "gonion", "occlusal_line", "exocanthion")
+ABOVE = ("supraglabella", "glabella", "nasion")
+BELOW = ("menton", "pogonion", "infradentale", "labiale_inferius")
+HALF_TURN = np.array([-1.0, -1.0, 1.0])
+
+
+def check_placement(evidence: Evidence) -> list[Finding]:
+    """Findings about where things lie; a fault that makes others is said alone."""
+    sizes = [*_check_skin_size(evidence), *_check_bone_sizes(evidence)]
+    if sizes:
+        return sizes
+    findings: list[Finding] = []
+    turned = False
+    for key, landmarks in _landmark_sets(evidence).items():
+        wrong = list(_check_landmark_fit(evidence, key, landmarks))
+        if not wrong:
+            wrong = list(_check_directions(evidence, key, landmarks))
+            turned = turned or any(f.code == "frame-turned" for f in wrong)
+        if not wrong:
+            wrong = list(_check_sides(evidence, key, landmarks))
+            wrong += _check_distances(evidence, key, landmarks)
+        findings += wrong
+    if not turned:
+        findings += _check_bone_directions(evidence)
+    for name, body in evidence.bones.items():
+        findings += _check_bone_inside(evidence, name, body)
+    findings += _check_bone_overlap(evidence)
+    return findings
+
+
+def _landmark_sets(evidence: Evidence) -> dict[str, Mapping[str, Floats]]:
+    sets = {"skull": evidence.skull_landmarks, "skin": evidence.skin_landmarks}
+    return {key: landmarks for key, landmarks in sets.items() if landmarks}
+
+
+def _extent(points: Floats) -> float:
+    return float(np.ptp(points, axis=0).max())
+
+
+def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
+    if evidence.skin is None:
+        return
+    extent = _extent(np.asarray(evidence.skin.mended.vertices))
+    low, high = SKIN_EXTENT
+    if low <= extent <= high:
+        return
+    stated = evidence.case.surfaces.units if evidence.case.surfaces else "mm"
+    for name, least, most, factor in OTHER_UNITS:
+        if least <= extent <= most:
+            mend = (
+                f'write units = "{name}" under [surfaces]'
+                if factor and stated == "mm"
+                else "export the surfaces in mm, or correct units under [surfaces]"
+            )
+            yield Finding(
+                "error",
+                "surface-units",
+                f"the skin is {extent:.4g} mm long: this looks like {name}, read as {stated}",
+                evidence.skin.where,
+                "every length of the case is mm; a head is 110 to 420 mm long",
+                mend,
+            )
+            return
+    yield Finding(
+        "error" if not 0.5 * low <= extent <= 2.0 * high else "warning",
+        "surface-size",
+        f"the skin is {extent:.4g} mm long",
+        evidence.skin.where,
+        f"a head or face is {low:g} to {high:g} mm long",
+        "check the units, and that the file holds the skin alone",
+    )
+
+
+def _check_bone_sizes(evidence: Evidence) -> Iterator[Finding]:
+    if evidence.skin is None:
+        return
+    skin = _extent(np.asarray(evidence.skin.mended.vertices))
+    low, high = SKIN_EXTENT
+    if not low <= skin <= high:
+        return
+    for name, body in evidence.bones.items():
+        extent = _extent(np.asarray(body.mended.vertices))
+        if BONE_SHARE[0] * skin <= extent <= BONE_SHARE[1] * skin:
+            continue
+        yield Finding(
+            "error",
+            "surface-units",
+            f"bone {name} is {extent:.4g} mm long, the skin {skin:.4g} mm",
+            body.where,
+            "all surfaces of a case have the same units and lie in one frame",
+            "export it in the units of the skin",
+        )
+
+
+def _nearest(bodies: Sequence[Body], points: Floats) -> Floats:
+    nearest = np.full(len(points), np.inf)
+    for body in bodies:
+        closest = body.index.closest(points)[0]
+        nearest = np.minimum(nearest, np.linalg.norm(closest - points, axis=1))
+    return nearest
+
+
+def _bodies(evidence: Evidence, key: str) -> list[Body]:
+    if key == "skull":
+        return list(evidence.bones.values())
+    return [evidence.skin] if evidence.skin else []
+
+
+def _check_landmark_fit(
+    evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
+) -> Iterator[Finding]:
+    """Landmarks that fit their surface only in another frame or in other units."""
+    bodies = _bodies(evidence, key)
+    if not bodies:
+        return
+    points = np.stack(list(landmarks.values()))
+    median = float(np.median(_nearest(bodies, points)))
+    if median <= LANDMARK_ERROR:
+        return
+    where = evidence.case.where(f"landmarks.{key}")
+    surface = "bones" if key == "skull" else "skin"
+    what = f"half of the landmarks lie more than {median:.0f} mm from the {surface}"
+    why = "cuts, muscles and the region are placed from landmarks"
+    tries = {
+        "frame": (HALF_TURN, "turned from RAS to LPS"),
+        "m": (np.full(3, 1000.0), "taken as metres"),
+        "cm": (np.full(3, 10.0), "taken as cm"),
+        "um": (np.full(3, 0.001), "taken as µm"),
+        "inch": (np.full(3, 25.4), "taken as inches"),
+    }
+    for name, (factors, done) in tries.items():
+        fitted = float(np.median(_nearest(bodies, points * factors)))
+        if fitted <= LANDMARK_WARNING:
+            is_frame = name == "frame"
+            yield Finding(
+                "error",
+                "landmark-frame" if is_frame else "landmark-units",
+                f"{what}; {done}, {fitted:.1f} mm",
+                where,
+                why,
+                "correct coordinateSystem in the file (LPS or RAS), or frame under [surfaces] if "
+                "the surfaces are the ones that are turned"
+                if is_frame
+                else "correct coordinateUnits in the file, or save it again in mm",
+            )
+            return
+    yield Finding(
+        "error",
+        "landmark-frame",
+        what,
+        where,
+        why,
+        "check that landmarks and surfaces belong to one patient and one frame",
+    )
+
+
+def _mean(landmarks: Mapping[str, Floats], names: Sequence[str]) -> Floats | None:
+    """The mean of those that are there; of a pair only where both sides are."""
+    found: list[Floats] = []
+    for name in names:
+        if name in landmarks:
+            found.append(landmarks[name])
+        elif f"{name}_L" in landmarks and f"{name}_R" in landmarks:
+            found.append(0.5 * (landmarks[f"{name}_L"] + landmarks[f"{name}_R"]))
+    return np.mean(found, axis=0) if found else None
+
+
+def _pairs(landmarks: Mapping[str, Floats]) -> dict[str, Floats]:
+    """The vector from the right to the left landmark of each pair."""
+    return {
+        name[:-2]: point - landmarks[f"{name[:-2]}_R"]
+        for name, point in landmarks.items()
+        if name.endswith("_L") and f"{name[:-2]}_R" in landmarks
+    }
+
+
+def _difference(one: Floats | None, other: Floats | None) -> Floats | None:
+    """The unit vector from the second to the first point."""
+    if one is None or other is None:
+        return None
+    vector = one - other
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 0.0 else None
+
+
+def _check_directions(
+    evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
+) -> Iterator[Finding]:
+    """A head that does not look along −P with its left along +L and its crown along +S."""
+    pairs = _pairs(landmarks)
+    left = _difference(np.sum(list(pairs.values()), axis=0), np.zeros(3)) if pairs else None
+    back = _difference(_mean(landmarks, BACK), _mean(landmarks, FRONT))
+    up = _difference(_mean(landmarks, ABOVE), _mean(landmarks, BELOW))
+    signs = [
+        0 if v is None or abs(v[axis]) < MAIN_AXIS else int(np.sign(v[axis]))
+        for axis, v in enumerate((left, back, up))
+    ]
+    where = evidence.case.where(f"landmarks.{key}")
+    why = "left and right, front and back would be taken for one another"
+    if signs[0] < 0 and signs[1] < 0:
+        yield Finding(
+            "error",
+            "frame-turned",
+            "the face looks towards +P and its left side lies towards R: these are RAS coordinates "
+            "read as LPS",
+            where,
+            why,
+            'state the frame: "coordinateSystem": "RAS" in the file, and frame = "RAS" under '
+            "[surfaces] if the surfaces are in it as well",
+        )
+    elif signs[0] < 0:
+        yield Finding(
+            "error",
+            "left-right-swapped",
+            f"of {len(pairs)} pairs of landmarks the left ones lie on the right (R) side",
+            where,
+            "either the labels are swapped or the data are mirrored; a plan would move the "
+            "wrong side",
+            "swap the labels _L and _R; if the labels are right, the images or surfaces are "
+            "mirrored: export them again",
+        )
+    elif signs[1] < 0 or signs[2] < 0:
+        what = "the face looks backwards" if signs[1] < 0 else "the head stands on its crown"
+        yield Finding(
+            "error",
+            "frame-turned",
+            f"by its landmarks, {what}",
+            where,
+            why,
+            "check the axes of the program that made the files: LPS is left, posterior, superior",
+        )
+    elif any(v is not None and s == 0 for v, s in zip((left, back, up), signs, strict=True)):
+        yield Finding(
+            "warning",
+            "frame-tilted",
+            "by its landmarks, the head is turned by more than 60° from the axes",
+            where,
+            "default planes are placed along the axes",
+            "turn the data upright, or give posterior_plane and the planes of cuts",
+        )
+
+
+def _check_sides(
+    evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
+) -> Iterator[Finding]:
+    pairs = _pairs(landmarks)
+    wrong = [name for name, vector in pairs.items() if vector[0] < -SIDE_MARGIN]
+    if wrong:
+        names = ", ".join(wrong)
+        yield Finding(
+            "error",
+            "landmark-pair-swapped",
+            f"left and right are swapped in: {names}",
+            evidence.case.where(f"landmarks.{key}"),
+            "cuts and muscles would be placed on the wrong side",
+            "swap the labels _L and _R of these points",
+        )
+
+
+def _check_distances(
+    evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
+) -> Iterator[Finding]:
+    bodies = _bodies(evidence, key)
+    if not bodies:
+        return
+    distances = _nearest(bodies, np.stack(list(landmarks.values())))
+    surface = "bone" if key == "skull" else "skin"
+    for (name, point), distance in zip(landmarks.items(), distances, strict=True):
+        if distance <= LANDMARK_WARNING:
+            continue
+        yield Finding(
+            "error" if distance > LANDMARK_ERROR else "warning",
+            "landmark-far",
+            f"{name} lies {distance:.1f} mm from the {surface}, at {place_text(point)}",
+            evidence.case.where(f"landmarks.{key}"),
+            f"more than {LANDMARK_WARNING:g} mm is no placing error",
+            "place it again, or correct its label",
+        )
+
+
+def _check_bone_directions(evidence: Evidence) -> Iterator[Finding]:
+    """A lower jaw that does not lie in front of and below the cranium."""
+    cranium, mandible = evidence.bones.get("cranium"), evidence.bones.get("mandible")
+    if cranium is None or mandible is None:
+        return
+    lowest, highest = (np.asarray(getattr(cranium.report, n)) for n in ("lowest", "highest"))
+    middle = 0.5 * (lowest + highest)
+    jaw = 0.5 * (np.asarray(mandible.report.lowest) + np.asarray(mandible.report.highest))
+    away = jaw - middle
+    margin = 0.05 * (highest - lowest)
+    if away[1] > margin[1] or away[2] > margin[2]:
+        direction = "behind" if away[1] > margin[1] else "above"
+        yield Finding(
+            "error",
+            "surface-frame",
+            f"the mandible lies {direction} the middle of the cranium",
+            mandible.where,
+            "in LPS the face looks along −P and the crown along +S",
+            'write frame = "RAS" under [surfaces] if the files are in RAS; else check their axes',
+        )
+
+
+def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Finding]:
+    skin = evidence.skin
+    if skin is None:
+        return
+    points = body.samples
+    outside = skin.index.winding_number(points) < 0.5
+    if not outside.any():
+        return
+    depth = np.zeros(len(points))
+    closest = skin.index.closest(points[outside])[0]
+    depth[outside] = np.linalg.norm(closest - points[outside], axis=1)
+    share = float(outside.mean())
+    if share > ELSEWHERE_SHARE:
+        turned = float((skin.index.winding_number(points * HALF_TURN) < 0.5).mean())
+        is_frame = turned <= FITTING_SHARE
+        yield Finding(
+            "error",
+            "surface-frame" if is_frame else "bone-elsewhere",
+            f"{share:.0%} of bone {name} lies outside the skin"
+            + (f", turned from RAS to LPS {turned:.0%}" if is_frame else ""),
+            body.where,
+            "skin and bones of a case lie in one frame",
+            "export skin and bones in the same frame",
+        )
+        return
+    if depth.max() <= THROUGH_SKIN:
+        return
+    worst = int(np.argmax(depth))
+    yield Finding(
+        "warning",
+        "bone-through-skin",
+        f"bone {name} stands out of the skin by {depth[worst]:.1f} mm at "
+        f"{place_text(points[worst])}, with {share:.1%} of its points",
+        body.where,
+        "there is no tissue over it, so that the skin there is bone",
+        "correct the surface there; build cuts the bone off at the skin",
+    )
+
+
+# Points of a bone are taken this far under its surface to ask whether another bone has them, mm:
+# surfaces that touch, as in joints and at cuts, do not count.
+UNDER_SURFACE = 0.5
+# Share of a bone's points within another, from which on it lies in it.
+OVERLAP_SHARE = 0.05
+
+
+def _check_bone_overlap(evidence: Evidence) -> Iterator[Finding]:
+    for name, body in evidence.bones.items():
+        points = body.samples
+        normals = body.index.closest(points)[1]
+        inner = points - UNDER_SURFACE * normals
+        for other_name, other in evidence.bones.items():
+            if other_name == name:
+                continue
+            share = float((other.index.winding_number(inner) > 0.5).mean())
+            if share > OVERLAP_SHARE:
+                yield Finding(
+                    "warning",
+                    "bone-overlap",
+                    f"{share:.0%} of bone {name} lies within bone {other_name}",
+                    body.where,
+                    "the same bone stands in the case twice; where one part moves and the other "
+                    "stays, tissue is held by both",
+                    f"cut {name} out of {other_name}, or drop the file and cut by [[osteotomies]]",
+                )

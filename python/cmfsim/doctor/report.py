@@ -1,0 +1,68 @@
+"""Findings as text: plain lines in a pipe, coloured on a terminal."""
+
+import textwrap
+from collections.abc import Callable, Iterable
+
+from cmfsim.case import SEVERITIES, Finding
+
+__all__ = ["findings_text"]
+
+# ANSI colours of the severities: red, yellow, blue.
+COLOURS = {"error": "31;1", "warning": "33;1", "note": "34"}
+# Columns that a terminal is taken to have, unless it says.
+WIDTH = 100
+
+
+def findings_text(
+    findings: Iterable[Finding],
+    *,
+    colour: bool = False,
+    width: int = WIDTH,
+    escape: Callable[[str], str] = str,
+) -> str:
+    """The findings as lines, with a count at the end.
+
+    Parameters
+    ----------
+    findings : iterable of Finding
+    colour : bool
+        Whether the severity is coloured, for a terminal.
+    width : int
+        Columns at which lines wrap; 0 keeps each finding's parts on one line.
+    escape : callable
+        Makes a text from a file harmless for the terminal.
+
+    Returns
+    -------
+    str
+    """
+    findings = list(findings)
+    lines: list[str] = []
+    for finding in findings:
+        head = finding.severity
+        if colour:
+            head = f"\x1b[{COLOURS[finding.severity]}m{head}\x1b[0m"
+        lines.append(f"{head}: {escape(finding.where or 'case')}: [{finding.code}]")
+        for label, text in (("", finding.what), ("why: ", finding.why), ("mend: ", finding.mend)):
+            if text:
+                lines += _wrapped(label, escape(text), width)
+    counts = [
+        f"{count} {severity}{'' if count == 1 else 's'}"
+        for severity in SEVERITIES
+        if (count := sum(finding.severity == severity for finding in findings))
+    ]
+    lines.append(", ".join(counts) if counts else "nothing found")
+    return "\n".join(lines)
+
+
+def _wrapped(label: str, text: str, width: int) -> list[str]:
+    if not width:
+        return [f"    {label}{text}"]
+    return textwrap.wrap(
+        text,
+        max(width, 40),
+        initial_indent=f"    {label}",
+        subsequent_indent=" " * (4 + len(label)),
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

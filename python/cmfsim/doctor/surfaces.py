@@ -1,0 +1,184 @@
+"""Whether the surfaces of a case are sound, and fine enough to mesh between."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from cmfsim.case import Finding
+from cmfsim.checks import Floats
+from cmfsim.doctor.evidence import Body, Evidence
+from cmfsim.doctor.places import place_text
+
+__all__ = ["check_mesh_size", "check_surfaces"]
+
+# A border longer than this many extents of the skin runs round the face, not the neck: a cap over
+# it replaces the back of the head.
+WIDE_BORDER = 2.0
+# Shares of slivers that are worth a word, and above which normals of a surface are doubtful.
+SOME_SLIVERS, SLIVER_SHARE = 0.01, 0.05
+# Share of crossing triangles above which a surface encloses nothing that could be meant.
+CROSSING_SHARE = 0.02
+# Share of the skin whose tissue is thinner than an edge, above which it is worth a word.
+THIN_SHARE = 0.02
+
+
+def check_surfaces(evidence: Evidence) -> Iterator[Finding]:
+    """Findings about each surface for itself."""
+    bodies = [evidence.skin] if evidence.skin else []
+    for body in [*bodies, *evidence.bones.values()]:
+        yield from _check_body(body)
+
+
+def _check_body(body: Body) -> Iterator[Finding]:
+    report = body.report
+    where = body.where
+    if report.borders:
+        longest = report.borders[0]
+        lengths = ", ".join(f"{loop.length:.1f}" for loop in report.borders[:4])
+        more = ", …" if len(report.borders) > 4 else ""
+        extent = float((report.highest - report.lowest).max())
+        wide = longest.length > WIDE_BORDER * extent
+        yield Finding(
+            "warning" if wide or body.name != "skin" else "note",
+            "surface-open",
+            f"{len(report.borders)} open borders of {lengths}{more} mm, the longest round "
+            f"{place_text(longest.centre)}",
+            where,
+            "inside and outside are only known for a closed surface: caps are put on"
+            + (", and one this wide makes up a part of the head" if wide else ""),
+            "look at the caps after build; if they are wrong, close the surface yourself",
+        )
+    if report.inconsistent or not report.orientable:
+        yield Finding(
+            "warning",
+            "surface-inconsistent",
+            f"{report.inconsistent} edges have triangles that face opposite ways"
+            + ("" if report.orientable else "; a part has only one side (Möbius)"),
+            where,
+            "inside and outside swap from place to place; the smaller part is turned round",
+            "recompute normals in the program that made it",
+        )
+    elif report.volume < 0.0:
+        yield Finding(
+            "warning",
+            "surface-inward",
+            f"normals point inwards (volume {report.volume:.0f} mm³)",
+            where,
+            "inside and outside are swapped; build turns it round",
+            "flip normals in the program that made it",
+        )
+    if len(report.non_manifold):
+        vertex = np.asarray(body.surface.vertices)[report.non_manifold[0, 0]]
+        yield Finding(
+            "warning",
+            "surface-non-manifold",
+            f"{len(report.non_manifold)} edges have more than two triangles, first at "
+            f"{place_text(vertex)}",
+            where,
+            "the surface forks there, so that inside and outside are not known close to it",
+            "remove inner walls and repeated parts, or remesh it",
+        )
+    if report.crossings is None:
+        yield Finding(
+            "warning",
+            "surface-crossings-unknown",
+            "triangles lie so close together that crossings were not looked for",
+            where,
+            "crossing triangles make inside and outside doubtful",
+            "remesh it with triangles of about equal size",
+        )
+    elif len(report.crossings) and report.crossing_points is not None:
+        share = len(np.unique(report.crossings)) / max(report.n_triangles, 1)
+        yield Finding(
+            "warning" if share > CROSSING_SHARE or body.name == "skin" else "note",
+            "surface-crossing",
+            f"{len(report.crossings)} pairs of triangles cut through each other, first at "
+            f"{place_text(report.crossing_points[0])}",
+            where,
+            "what is enclosed twice counts once, and what lies between may count as outside",
+            "smooth or remesh it there",
+        )
+    yield from _check_pieces(body)
+    yield from _check_triangles(body)
+
+
+def _check_pieces(body: Body) -> Iterator[Finding]:
+    """Islands: several pieces, of which the small ones are debris."""
+    report = body.report
+    largest, *others = report.components
+    # Inside out, a piece within another is a hollow and belongs there.
+    solid = [piece for piece in others if piece.volume * report.volume >= 0.0]
+    if not solid:
+        return
+    share = sum(piece.area for piece in solid) / largest.area
+    yield Finding(
+        "warning" if body.name == "skin" else "note",
+        "surface-islands",
+        f"{len(solid)} pieces beside the largest, with {share:.1%} of its area; the next is of "
+        f"{solid[0].n_triangles} triangles at {place_text(solid[0].centre)}",
+        body.where,
+        "debris becomes islands of bone or skin; pieces below 1 % of the largest are dropped",
+        "delete what does not belong, or give each bone a file of its own",
+    )
+
+
+def _check_triangles(body: Body) -> Iterator[Finding]:
+    report = body.report
+    if len(report.degenerate) or len(report.duplicate):
+        yield Finding(
+            "note",
+            "surface-degenerate",
+            f"{len(report.degenerate)} triangles without area and {len(report.duplicate)} repeated",
+            body.where,
+            "they have no normal, or count their space twice; they are dropped",
+            "nothing to do",
+        )
+    share = len(report.slivers) / max(report.n_triangles, 1)
+    if share > SOME_SLIVERS:
+        yield Finding(
+            "warning" if share > SLIVER_SHARE else "note",
+            "surface-slivers",
+            f"{len(report.slivers)} of {report.n_triangles} triangles are slivers, over a hundred "
+            "times longer than high",
+            body.where,
+            "their normals point anywhere, which contact surfaces feel",
+            "remesh it if sliding on it matters" if share <= SLIVER_SHARE else "remesh it",
+        )
+
+
+def check_mesh_size(evidence: Evidence) -> Iterator[Finding]:
+    """Findings about tissue that is thinner than the tets that should fill it."""
+    case, skin = evidence.case, evidence.skin
+    if skin is None or not evidence.bones or case.mesh.file is not None:
+        return
+    points = skin.samples
+    foremost, hindmost = (float(f(points[:, 1])) for f in (np.min, np.max))
+    plane = case.region.plane(evidence.skull_landmarks, foremost, hindmost)
+    points = points[plane.distance(points) < 0.0]
+    if not len(points):
+        return
+    thickness = _thickness(evidence, points)
+    edge = case.mesh.edge_length
+    thin = thickness < edge
+    if thin.mean() <= THIN_SHARE:
+        return
+    place = points[int(np.argmin(thickness))]
+    refined = case.mesh.refine and float(thickness.min()) >= 0.5 * edge
+    yield Finding(
+        "note" if refined else "warning",
+        "edge-length-coarse",
+        f"{thin.mean():.0%} of the skin in front of the posterior plane lies closer to bone than "
+        f"an edge of {edge:g} mm, {thickness.min():.1f} mm at {place_text(place)}",
+        case.where("mesh.edge_length"),
+        "sheets thinner than an edge are lost or stiff" + (" unless refined" if refined else ""),
+        "nothing to do" if refined else f"set edge_length to {0.5 * edge:g} or below, or refine",
+    )
+
+
+def _thickness(evidence: Evidence, points: Floats) -> Floats:
+    """The distance of each point to the nearest bone, mm."""
+    nearest = np.full(len(points), np.inf)
+    for body in evidence.bones.values():
+        closest = body.index.closest(points)[0]
+        nearest = np.minimum(nearest, np.linalg.norm(closest - points, axis=1))
+    return nearest

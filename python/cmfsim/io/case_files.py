@@ -1,0 +1,365 @@
+"""A patient case and its file, `case.toml`: what each table may hold (docs/formats.md).
+
+Only the case file itself is read here. Paths that it names are resolved against its folder.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from types import MappingProxyType
+from typing import Any
+
+from cmfsim.checks import as_text
+from cmfsim.errors import CaseInputError
+from cmfsim.io.files import FORMAT_VERSION
+from cmfsim.io.tables import Table, read_tables
+from cmfsim.patient import (
+    FRAMES,
+    PROCEDURES,
+    UNITS,
+    CaseImage,
+    CaseLandmarks,
+    CaseMesh,
+    CaseMotion,
+    CaseOsteotomy,
+    CaseSurfaces,
+    Plane,
+    Region,
+)
+from cmfsim.planning import decompose_motion, rigid_motion
+from cmfsim.scene import CONTACTS, METHODS, SolverOptions, TissueData
+
+__all__ = ["CASE_FORMAT", "Case"]
+
+CASE_FORMAT = "cmfsim-case"
+TABLES = (
+    "format",
+    "version",
+    "name",
+    "image",
+    "surfaces",
+    "landmarks",
+    "region",
+    "mesh",
+    "osteotomies",
+    "plan",
+    "node_kinds",
+    "tissue",
+    "solver",
+    "output",
+)
+# Edge lengths that make a mesh of a head, mm: below, more tets than any memory; above, no face.
+EDGE_LENGTHS = (0.3, 30.0)
+# Grid spacings that a head can be worked on at, mm.
+WORKING_SPACINGS = (0.2, 5.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A patient: what to read, where to cut, what moves, and how to solve.
+
+    Attributes
+    ----------
+    name : str
+    file : Path
+        The case file.
+    output : Path
+        Folder of everything that is written for the case.
+    image : CaseImage or None
+        Exactly one of `image` and `surfaces` is given.
+    surfaces : CaseSurfaces or None
+    landmarks : CaseLandmarks
+    region : Region
+    mesh : CaseMesh
+    osteotomies : tuple of CaseOsteotomy
+        In the order in which they are made.
+    plan : mapping of str to CaseMotion
+        Segments that it does not name stay.
+    node_kinds : mapping of str to plain values
+        Options of the stage that classifies nodes.
+    tissue : TissueData
+    solver : SolverOptions
+    lines : mapping of str to int
+        The line of each dotted key in the case file, for findings.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> case = cmfsim.Case.load("case.toml")  # doctest: +SKIP
+    """
+
+    name: str
+    file: Path
+    output: Path
+    image: CaseImage | None = None
+    surfaces: CaseSurfaces | None = None
+    landmarks: CaseLandmarks = field(default_factory=CaseLandmarks)
+    region: Region = field(default_factory=Region)
+    mesh: CaseMesh = field(default_factory=CaseMesh)
+    osteotomies: tuple[CaseOsteotomy, ...] = ()
+    plan: Mapping[str, CaseMotion] = field(default_factory=dict)
+    node_kinds: Mapping[str, Any] = field(default_factory=dict)
+    tissue: TissueData = field(default_factory=lambda: TissueData("preset", fraction=0.0))
+    solver: SolverOptions = field(default_factory=SolverOptions)
+    lines: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        as_text("case name", self.name)
+        if (self.image is None) == (self.surfaces is None):
+            raise CaseInputError("a case has either an image or surfaces")
+        for name in ("plan", "node_kinds", "lines"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "Case":
+        """The case that a `case.toml` describes.
+
+        Parameters
+        ----------
+        path : path
+
+        Returns
+        -------
+        Case
+
+        Raises
+        ------
+        FileNotFoundError
+            The case file does not exist. Files that it names are not looked for.
+        CaseError
+            (also `ValueError`) Not TOML, an unknown key, a value of another type or out of range:
+            with file, line and key.
+        """
+        return _read(Path(path))
+
+    def where(self, key: str) -> str:
+        """File, line and key, as findings name a place in the case file."""
+        parts = key.split(".")
+        for length in range(len(parts), 0, -1):
+            line = self.lines.get(".".join(parts[:length]))
+            if line is not None:
+                return f"{self.file.name}:{line} {key}"
+        return f"{self.file.name} {key}"
+
+
+def _read(path: Path) -> Case:
+    document = read_tables(path).only(*TABLES)
+    found = document.text("format")
+    if found != CASE_FORMAT:
+        document.fail("format", f"is {found!r}: {CASE_FORMAT!r} is needed")
+    version = document.need("version", f": write version = {FORMAT_VERSION}")
+    if isinstance(version, bool) or version != FORMAT_VERSION:
+        document.fail("version", f"is {version!r}: this cmfsim reads {FORMAT_VERSION}")
+    folder = path.parent
+    if ("image" in document) == ("surfaces" in document):
+        both = "image" in document
+        document.fail(
+            "surfaces" if both else None,
+            "stands beside [image]: give one of them" if both else "lacks [image] or [surfaces]",
+        )
+    return Case(
+        name=document.text("name", path.resolve().parent.name or "case"),
+        file=path,
+        output=_output(document.table("output").only("folder"), folder),
+        image=_image(document.table("image"), folder) if "image" in document else None,
+        surfaces=_surfaces(document.table("surfaces"), folder) if "surfaces" in document else None,
+        landmarks=_landmarks(document.table("landmarks"), folder),
+        region=_region(document.table("region")),
+        mesh=_mesh(document.table("mesh"), folder),
+        osteotomies=_osteotomies(document),
+        plan=_plan(document.table("plan"), folder),
+        node_kinds=_plain(document.table("node_kinds")),
+        tissue=_tissue(document.table("tissue")),
+        solver=_solver(document.table("solver")),
+        lines=document.all_lines(),
+    )
+
+
+def _file(table: Table, key: str, folder: Path) -> Path:
+    """A path to read; the case is its owner's, so that it may lead to images kept elsewhere."""
+    name = table.text(key)
+    if "\0" in name:
+        table.fail(key, "holds a zero character: no file is called so")
+    return folder / Path(name).expanduser()
+
+
+def _file_or_none(table: Table, key: str, folder: Path) -> Path | None:
+    return _file(table, key, folder) if key in table else None
+
+
+def _output(table: Table, folder: Path) -> Path:
+    """The folder to write to, below that of the case: a case never writes anywhere else."""
+    name = table.text("folder", "out")
+    relative = PurePosixPath(name)
+    plain = not relative.is_absolute() and ".." not in relative.parts
+    if not plain or any(c in name for c in "\\:\0") or relative == PurePosixPath():
+        table.fail(
+            "folder",
+            f"is {name!r}: name a folder below the case's own (another one: cmfsim build -o)",
+        )
+    return folder / relative
+
+
+def _image(table: Table, folder: Path) -> CaseImage:
+    table.only("file", "skin_threshold", "bone_threshold", "working_spacing")
+    skin = table.number("skin_threshold", "HU", low=-1024.0, high=3071.0)
+    bone = table.number("bone_threshold", "HU", low=-1024.0, high=3071.0)
+    if skin is not None and bone is not None and skin >= bone:
+        table.fail("skin_threshold", f"is {skin:g}, bone_threshold {bone:g}: it must be below")
+    low, high = WORKING_SPACINGS
+    spacing = table.number("working_spacing", "mm", low=low, high=high)
+    return CaseImage(_file(table, "file", folder), skin, bone, spacing)
+
+
+def _surfaces(table: Table, folder: Path) -> CaseSurfaces:
+    table.only("skin", "bones", "units", "frame")
+    bones = table.table("bones")
+    names = list(bones)
+    if not names:
+        table.fail("bones" if "bones" in table else None, 'names no bone: cranium = "file.ply"')
+    return CaseSurfaces(
+        skin=_file(table, "skin", folder),
+        bones={_name(bones, name): _file(bones, name, folder) for name in names},
+        units=table.text("units", "mm", tuple(UNITS)),
+        frame=table.text("frame", "LPS", FRAMES),
+    )
+
+
+def _name(table: Table, name: str) -> str:
+    """A name that can stand in a file name: of a bone or segment."""
+    if not name or not all(c.isalnum() or c in "_-+" for c in name) or len(name) > 64:
+        table.fail(name, "is no name: letters, digits, '_', '-' and '+', 64 at most")
+    return name
+
+
+def _landmarks(table: Table, folder: Path) -> CaseLandmarks:
+    table.only("skull", "skin", "frame")
+    return CaseLandmarks(
+        _file_or_none(table, "skull", folder),
+        _file_or_none(table, "skin", folder),
+        table.text("frame", "LPS", FRAMES) if "frame" in table else None,
+    )
+
+
+def _plane(table: Table, key: str) -> Plane:
+    plane = table.table(key).only("point", "normal")
+    point, normal = plane.vector("point"), plane.vector("normal")
+    if point is None or normal is None:
+        table.fail(key, "needs point = [x, y, z] and normal = [x, y, z]")
+    with table.at(key):
+        return Plane(point, normal)
+
+
+def _region(table: Table) -> Region:
+    table.only("posterior_plane", "posterior_depth", "lower", "upper")
+    if "posterior_plane" in table and "posterior_depth" in table:
+        table.fail("posterior_depth", "stands beside posterior_plane: give one of them")
+    plane = _plane(table, "posterior_plane") if "posterior_plane" in table else None
+    with table.at("lower"):
+        return Region(
+            plane,
+            table.number("posterior_depth", "mm", low=-200.0, high=200.0),
+            table.number("lower", "mm"),
+            table.number("upper", "mm"),
+        )
+
+
+def _mesh(table: Table, folder: Path) -> CaseMesh:
+    table.only("edge_length", "refine", "parting", "file")
+    low, high = EDGE_LENGTHS
+    edge_length = table.number("edge_length", "mm", low=low, high=high)
+    parting = table.table("parting").only("surface") if "parting" in table else None
+    default = CaseMesh()
+    return CaseMesh(
+        default.edge_length if edge_length is None else edge_length,
+        table.flag("refine", default=default.refine),
+        None if parting is None else _file(parting, "surface", folder),
+        _file_or_none(table, "file", folder),
+    )
+
+
+def _osteotomies(document: Table) -> tuple[CaseOsteotomy, ...]:
+    cuts: list[CaseOsteotomy] = []
+    made: dict[str, int] = {}
+    for table in document.tables("osteotomies"):
+        if "procedure" in table:
+            procedure = table.text("procedure", choices=tuple(PROCEDURES))
+            options = {key: table.plain(key) for key in table if key != "procedure"}
+            cut = CaseOsteotomy(procedure, options)
+        elif "plane" in table:
+            table.only("plane", "bone", "name")
+            name = _name(table, table.text("name"))
+            cut = CaseOsteotomy(plane=_plane(table, "plane"), bone=table.text("bone"), name=name)
+        else:
+            known = ", ".join(PROCEDURES)
+            table.fail(None, f"needs procedure (one of {known}), or plane, bone and name")
+        for segment in cut.segments:
+            if segment in made:
+                table.fail(None, f"makes {segment!r}, as the one on line {made[segment]} does")
+            made[segment] = table.line()
+        cuts.append(cut)
+    return tuple(cuts)
+
+
+def _plan(table: Table, folder: Path) -> dict[str, CaseMotion]:
+    return {_name(table, name): _motion(table.table(name), folder) for name in table}
+
+
+def _motion(table: Table, folder: Path) -> CaseMotion:
+    if "matrix" in table:
+        matrix = table.only("matrix").matrix("matrix")
+        with table.at("matrix"):
+            decompose_motion(matrix)
+        return CaseMotion(matrix=matrix)
+    if "transform" in table:
+        return CaseMotion(transform=_file(table.only("transform"), "transform", folder))
+    if "moved_surface" in table or "surface" in table:
+        table.only("surface", "moved_surface")
+        surface = _file(table, "surface", folder)
+        return CaseMotion(surface=surface, moved_surface=_file(table, "moved_surface", folder))
+    table.only("translation", "angle", "axis", "centre", "matrix", "transform", "surface")
+    given: dict[str, Any] = {
+        key: vector
+        for key in ("translation", "axis", "centre")
+        if (vector := table.vector(key)) is not None
+    }
+    angle = table.number("angle", "degrees", low=-360.0, high=360.0)
+    with table.at("axis" if "axis" in given else None):
+        matrix = rigid_motion(angle=0.0 if angle is None else angle, **given)
+    return CaseMotion(matrix=matrix, centre=given.get("centre"))
+
+
+def _plain(table: Table) -> dict[str, Any]:
+    return {key: table.plain(key) for key in table}
+
+
+def _tissue(table: Table) -> TissueData:
+    """Fat of the paper's Table 1 unless the case says otherwise."""
+    table.only("preset", "young", "poisson")
+    young = table.number("young", "MPa", above=0.0, high=1e5)
+    poisson = table.number("poisson", above=-1.0, high=0.4999)
+    if young is None and poisson is None:
+        with table.at("preset"):
+            return TissueData("preset", preset=table.text("preset", "kim2010"), fraction=0.0)
+    if "preset" in table:
+        table.fail("preset", "stands beside young or poisson: give the one or the others")
+    if young is None or poisson is None:
+        table.fail(None, "needs both young (MPa) and poisson, or neither")
+    return TissueData("isotropic", young=young, poisson=poisson)
+
+
+def _solver(table: Table) -> SolverOptions:
+    names = tuple(SolverOptions().as_dict())
+    table.only(*names)
+    given: dict[str, Any] = {}
+    for key in table:
+        if key == "method":
+            given[key] = table.text(key, choices=METHODS)
+        elif key == "contact":
+            given[key] = table.text(key, choices=CONTACTS)
+        else:
+            given[key] = table.plain(key)
+            with table.at(key):
+                SolverOptions(**{key: given[key]})
+    return SolverOptions(**given)

@@ -1,0 +1,190 @@
+"""Triangle surfaces in STL, PLY, OBJ and VTP: reading into LPS mm, and writing."""
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.checks import check_one_of
+from cmfsim.errors import CaseInputError
+from cmfsim.io.files import replacing
+from cmfsim.io.meshes import read_mesh
+from cmfsim.io.vtk import data_array, write_vtk
+from cmfsim.patient import FRAMES, UNITS
+from cmfsim.scene import SurfaceData
+
+__all__ = ["read_surface", "read_triangles", "surface_suffixes", "write_surface"]
+
+
+@dataclass(frozen=True)
+class _Weld:
+    """Which vertices of a file were kept when equal ones became one."""
+
+    n_read: int
+    kept: NDArray[np.intp]
+
+
+def read_surface(
+    path: str | os.PathLike[str],
+    crease_angle: float = 60.0,
+    *,
+    units: str = "mm",
+    frame: str = "LPS",
+) -> SurfaceData:
+    """The triangles of a file, in LPS mm, with vertices in the same place made one.
+
+    Parameters
+    ----------
+    path : path
+        STL, PLY, OBJ, VTP, or another file of triangles that meshio reads.
+    crease_angle : float, degrees
+    units : str
+        Of the numbers in the file: "mm", "cm", "m", "um", "inch".
+    frame : str
+        Of the numbers in the file: "LPS" or "RAS".
+
+    Returns
+    -------
+    SurfaceData
+
+    Raises
+    ------
+    FileNotFoundError
+        The file does not exist.
+    CaseError
+        (also `ValueError`) Not a surface, no triangles, a coordinate that is not finite.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> skin = cmfsim.read_surface("skin.stl", units="mm", frame="RAS")  # doctest: +SKIP
+    """
+    check_one_of("units", units, tuple(UNITS))
+    check_one_of("frame", frame, FRAMES)
+    surface = read_triangles(Path(path), crease_angle)[0]
+    if units == "mm" and frame == "LPS":
+        return surface
+    # RAS to LPS is half a turn about the long axis: triangles keep their orientation.
+    signs = np.array([-1.0, -1.0, 1.0] if frame == "RAS" else [1.0, 1.0, 1.0])
+    vertices = np.asarray(surface.vertices) * (UNITS[units] * signs)
+    return SurfaceData(vertices, surface.triangles, crease_angle)
+
+
+def read_triangles(path: Path, crease_angle: float = 60.0) -> tuple[SurfaceData, _Weld]:
+    """A surface with vertices in the same place made one: STL repeats them for each triangle."""
+    mesh = read_mesh(path)
+    triangles = [b.data for b in mesh.cells if b.type == "triangle"]
+    if not triangles or any(b.type not in {"triangle", "vertex", "line"} for b in mesh.cells):
+        found = ", ".join(sorted({b.type for b in mesh.cells})) or "nothing"
+        raise CaseInputError(f"{path.name}: a surface of triangles is needed, found {found}")
+    points = np.asarray(mesh.points)
+    _, first, back = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    # In the order of the file, so that a surface without repetitions keeps its numbers.
+    order = np.argsort(first)
+    number = np.empty(len(first), dtype=np.int64)
+    number[order] = np.arange(len(first))
+    kept = first[order]
+    welded = number[back.reshape(-1)][np.concatenate(triangles)]
+    return SurfaceData(points[kept], welded, crease_angle), _Weld(len(points), kept)
+
+
+def write_surface(path: str | os.PathLike[str], surface: SurfaceData) -> None:
+    """Writes a surface as `.ply`, `.stl`, `.obj` or `.vtp`, LPS mm.
+
+    An existing file is replaced in one step. PLY, OBJ and VTP keep every digit; STL has single
+    precision and repeats the vertices of each triangle.
+
+    Parameters
+    ----------
+    path : path
+    surface : SurfaceData
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Another ending.
+    OSError
+        The folder cannot be written to.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> triangle = cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    >>> cmfsim.write_surface("triangle.stl", triangle)
+    """
+    path = Path(path)
+    if path.suffix not in WRITERS:
+        known = ", ".join(WRITERS)
+        raise CaseInputError(f"{path.name}: a surface is written as {known}, not {path.suffix!r}")
+    with replacing(path) as file:
+        WRITERS[path.suffix](file, surface)
+
+
+def surface_suffixes() -> tuple[str, ...]:
+    """The file endings that `write_surface` knows."""
+    return tuple(WRITERS)
+
+
+def _write_ply(file: BinaryIO, surface: SurfaceData) -> None:
+    vertices = np.asarray(surface.vertices, dtype="<f8")
+    triangles = np.asarray(surface.triangles)
+    rows = np.zeros(len(triangles), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    rows["count"] = 3
+    rows["corners"] = triangles
+    file.write(
+        (
+            "ply\nformat binary_little_endian 1.0\ncomment LPS mm\n"
+            f"element vertex {len(vertices)}\n"
+            "property double x\nproperty double y\nproperty double z\n"
+            f"element face {len(triangles)}\n"
+            "property list uchar int vertex_indices\nend_header\n"
+        ).encode()
+    )
+    file.write(vertices.tobytes())
+    file.write(rows.tobytes())
+
+
+def _write_stl(file: BinaryIO, surface: SurfaceData) -> None:
+    corners = np.asarray(surface.vertices)[np.asarray(surface.triangles)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    # A triangle without area has no normal: zeros, as the format allows.
+    normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
+    rows = np.zeros(len(corners), dtype=[("n", "<f4", 3), ("v", "<f4", (3, 3)), ("a", "<u2")])
+    rows["n"], rows["v"] = normals, corners
+    file.write(b"cmfsim LPS mm".ljust(80, b" "))
+    file.write(np.uint32(len(corners)).astype("<u4").tobytes())
+    file.write(rows.tobytes())
+
+
+def _write_obj(file: BinaryIO, surface: SurfaceData) -> None:
+    file.write(b"# LPS mm\n")
+    lines = [f"v {x!r} {y!r} {z!r}\n" for x, y, z in np.asarray(surface.vertices).tolist()]
+    lines += [f"f {a} {b} {c}\n" for a, b, c in (np.asarray(surface.triangles) + 1).tolist()]
+    file.write("".join(lines).encode())
+
+
+def _write_vtp(file: BinaryIO, surface: SurfaceData) -> None:
+    vertices = np.asarray(surface.vertices, dtype=np.float64)
+    triangles = np.asarray(surface.triangles)
+    n = len(triangles)
+    polys = data_array("connectivity", triangles.reshape(-1).astype(np.int64)) + data_array(
+        "offsets", 3 * np.arange(1, n + 1, dtype=np.int64)
+    )
+    write_vtk(
+        file,
+        "PolyData",
+        f'<Piece NumberOfPoints="{len(vertices)}" NumberOfVerts="0" NumberOfLines="0" '
+        f'NumberOfStrips="0" NumberOfPolys="{n}"><Points>{data_array("points", vertices)}</Points>'
+        f"<Polys>{polys}</Polys></Piece>",
+    )
+
+
+WRITERS: Mapping[str, Callable[[BinaryIO, SurfaceData], None]] = MappingProxyType(
+    {".ply": _write_ply, ".stl": _write_stl, ".obj": _write_obj, ".vtp": _write_vtp}
+)

@@ -1,0 +1,227 @@
+"""Tables of a TOML text with checked values: an error names the file, the key and its line."""
+
+import contextlib
+import difflib
+import math
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.io.files import toml_module
+from cmfsim.io.toml_lines import KeyPath, line_of, toml_lines
+
+__all__ = ["Table", "nearest", "read_tables"]
+
+# A case file above this size is not what it says it is, bytes.
+MAX_CASE_TEXT = 2**20
+LINE_IN_MESSAGE = re.compile(r"\(at line (\d+), column (\d+)\)")
+
+
+def read_tables(path: Path) -> "Table":
+    """The whole of a TOML file as a table.
+
+    Raises
+    ------
+    FileNotFoundError
+        The file does not exist.
+    CaseError
+        (also `ValueError`) Not TOML, not UTF-8, larger than 1 MiB.
+    """
+    if path.is_dir():
+        raise CaseInputError(f"{path.name}: is a folder, not a case file")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    if path.suffix != ".toml":
+        raise CaseInputError(f"{path.name}: a case file ends in .toml, not {path.suffix!r}")
+    if path.stat().st_size > MAX_CASE_TEXT:
+        raise CaseInputError(
+            f"{path.name}: has {path.stat().st_size} bytes, a case file at most {MAX_CASE_TEXT}"
+        )
+    try:
+        text = path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
+        values = toml_module().loads(text)
+    except UnicodeDecodeError as error:
+        raise CaseInputError(f"{path.name}: is not UTF-8 text ({error})") from error
+    except RecursionError as error:
+        raise CaseInputError(f"{path.name}: is nested too deeply") from error
+    except ValueError as error:
+        if isinstance(error, CaseInputError):
+            raise
+        message = str(error)
+        found = LINE_IN_MESSAGE.search(message)
+        place = f":{found[1]}" if found else ""
+        raise CaseInputError(f"{path.name}{place}: is not TOML: {message}") from error
+    return Table(values, (), path.name, toml_lines(text))
+
+
+def nearest(name: str, known: tuple[str, ...]) -> str:
+    """A question that names the known name most like this one; empty if none is."""
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+class Table:
+    """A table of a TOML file that knows where its keys stand."""
+
+    def __init__(
+        self,
+        values: Mapping[str, Any],
+        path: KeyPath,
+        file: str,
+        lines: Mapping[KeyPath, int],
+    ) -> None:
+        self._values = values
+        self._path = path
+        self._file = file
+        self._lines = lines
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def line(self, key: str | None = None) -> int:
+        """The line of a key, or of the table."""
+        return line_of(self._lines, self._path if key is None else (*self._path, key))
+
+    def fail(self, key: str | None, message: str) -> NoReturn:
+        """Raises an error about a key, or about the table."""
+        path = self._path if key is None else (*self._path, key)
+        label = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
+        text = f"{label} {message}" if label else message
+        raise CaseInputError(f"{self._file}:{self.line(key)}: {text}")
+
+    @contextlib.contextmanager
+    def at(self, key: str | None) -> Iterator[None]:
+        """Puts file, line and key before the text of an error about a value."""
+        try:
+            yield
+        except CmfsimError as error:
+            self.fail(key, f"cannot be meant: {error}")
+
+    def all_lines(self) -> dict[str, int]:
+        """The line of each dotted key of the file."""
+        return {".".join(map(str, path)): line for path, line in self._lines.items()}
+
+    def only(self, *known: str) -> "Table":
+        """The table, if it has no other keys."""
+        for key in self._values:
+            if key not in known:
+                self.fail(
+                    key, f"is unknown{nearest(key, known)} (known here: {', '.join(sorted(known))})"
+                )
+        return self
+
+    def need(self, key: str, why: str = "") -> Any:
+        """The value of a key that must be there."""
+        if key not in self._values:
+            self.fail(None, f"lacks {key!r}{why}")
+        return self._values[key]
+
+    def text(self, key: str, default: str | None = None, choices: tuple[str, ...] = ()) -> str:
+        """A text that is not empty, among the choices if there are any."""
+        value = self.need(key) if default is None else self._values.get(key, default)
+        if not isinstance(value, str) or not value.strip():
+            self.fail(key, f"is {value!r}: a text is needed")
+        if choices and value not in choices:
+            hint = nearest(value, choices)
+            self.fail(key, f"is {value!r}{hint} (use one of: {', '.join(choices)})")
+        return value
+
+    def flag(self, key: str, *, default: bool) -> bool:
+        """True or false."""
+        value = self._values.get(key, default)
+        if not isinstance(value, bool):
+            self.fail(key, f"is {value!r}: true or false is needed")
+        return value
+
+    def number(
+        self,
+        key: str,
+        unit: str = "",
+        *,
+        above: float | None = None,
+        low: float | None = None,
+        high: float | None = None,
+    ) -> float | None:
+        """A finite number within its range; None where it is absent."""
+        if key not in self._values:
+            return None
+        value = self._checked_number(key, self._values[key])
+        allowed = [
+            f"above {above:g}" if above is not None else "",
+            f"at least {low:g}" if low is not None else "",
+            f"at most {high:g}" if high is not None else "",
+        ]
+        inside = (
+            (above is None or value > above)
+            and (low is None or value >= low)
+            and (high is None or value <= high)
+        )
+        if not inside:
+            needed = " and ".join(filter(None, allowed))
+            self.fail(key, f"is {value:g}: must be {needed}{' ' + unit if unit else ''}")
+        return value
+
+    def vector(self, key: str) -> Floats | None:
+        """Three finite numbers; None where they are absent."""
+        if key not in self._values:
+            return None
+        value = self._values[key]
+        if not isinstance(value, list) or len(value) != 3:
+            self.fail(key, f"is {value!r}: three numbers [x, y, z] are needed")
+        return np.array([self._checked_number(key, entry) for entry in value])
+
+    def matrix(self, key: str) -> Floats:
+        """A 4 × 4 matrix of finite numbers."""
+        rows = self.need(key)
+        if not isinstance(rows, list) or len(rows) != 4:
+            self.fail(key, "is not a 4 × 4 matrix: four rows of four numbers are needed")
+        for row in rows:
+            if not isinstance(row, list) or len(row) != 4:
+                self.fail(key, f"has the row {row!r}: four numbers are needed")
+        return np.array([[self._checked_number(key, entry) for entry in row] for row in rows])
+
+    def plain(self, key: str) -> Any:
+        """A text, a flag, a number, or a list of numbers or texts, as it stands."""
+        value = self.need(key)
+        entries = value if isinstance(value, list) else [value]
+        for entry in entries:
+            if isinstance(entry, str | bool):
+                continue
+            self._checked_number(key, entry)
+        return value
+
+    def table(self, key: str) -> "Table":
+        """A table below this one; empty where it is absent."""
+        value = self._values.get(key, {})
+        if not isinstance(value, dict):
+            self.fail(key, f"is {value!r}: a table of names and values is needed")
+        return Table(value, (*self._path, key), self._file, self._lines)
+
+    def tables(self, key: str) -> list["Table"]:
+        """The tables of an array of tables; none where it is absent."""
+        value = self._values.get(key, [])
+        if not isinstance(value, list) or any(not isinstance(entry, dict) for entry in value):
+            self.fail(key, f"is no list of tables: write [[{key}]] before each")
+        return [
+            Table(entry, (*self._path, key, number), self._file, self._lines)
+            for number, entry in enumerate(value)
+        ]
+
+    def _checked_number(self, key: str, value: object) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            self.fail(key, f"holds {value!r}: a number is needed")
+        try:
+            number = float(value)
+        except OverflowError:
+            self.fail(key, "holds a whole number that is too large")
+        if not math.isfinite(number):
+            self.fail(key, f"holds {number}: every number must be finite")
+        return number

@@ -1,0 +1,118 @@
+"""How triangles hang together: edges, connected pieces, and consistent orientation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Edges", "component_labels", "connected_labels", "edges_of", "orientation_flips"]
+
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """The edges of a surface and the triangles at them.
+
+    Attributes
+    ----------
+    ends : (e, 2) int64
+        Vertices of each edge, the lower first.
+    counts : (e,) int64
+        Number of triangles at each edge.
+    pairs : (p, 2) int64
+        Triangles on the two sides of each edge that has exactly two.
+    opposed : (p,) bool
+        Whether they run through that edge in opposite directions, as in a consistent surface.
+    border : (b, 2) int64
+        Edges of one triangle, in its direction.
+    border_triangles : (b,) int64
+        That triangle.
+    """
+
+    ends: Integers
+    counts: Integers
+    pairs: Integers
+    opposed: NDArray[np.bool_]
+    border: Integers
+    border_triangles: Integers
+
+
+def edges_of(triangles: Integers) -> Edges:
+    """The edges of triangles; none of them may name a vertex twice."""
+    if not len(triangles):
+        none = np.zeros((0, 2), dtype=np.int64)
+        single = np.zeros(0, dtype=np.int64)
+        return Edges(none, single, none, np.zeros(0, dtype=bool), none, single)
+    directed = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    owner = np.repeat(np.arange(len(triangles)), 3)
+    low, high = directed.min(axis=1), directed.max(axis=1)
+    key = low * (int(high.max()) + 1) + high
+    order = np.argsort(key, kind="stable")
+    key, directed, owner = key[order], directed[order], owner[order]
+    first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+    counts = np.diff(np.concatenate([first, [len(key)]]))
+    two = first[counts == 2]
+    one = first[counts == 1]
+    return Edges(
+        ends=np.sort(directed[first], axis=1),
+        counts=counts,
+        pairs=np.stack([owner[two], owner[two + 1]], axis=1),
+        opposed=directed[two, 0] != directed[two + 1, 0],
+        border=directed[one],
+        border_triangles=owner[one],
+    )
+
+
+def component_labels(edges: Edges, n_triangles: int) -> Integers:
+    """The number of the connected piece of each triangle, pieces in the order of their first one.
+
+    Pieces hang together by edges of two triangles: at a fork nobody knows which belong together.
+    """
+    return connected_labels(edges.pairs, n_triangles)
+
+
+def connected_labels(pairs: Integers, count: int) -> Integers:
+    """The number of the connected component of each of `count` items that pairs join.
+
+    Each round, the smaller label of a pair goes to the label that the other item has, and labels
+    follow themselves to their roots; a few rounds do for any shape.
+    """
+    root = np.arange(count)
+    while True:
+        a, b = root[pairs[:, 0]], root[pairs[:, 1]]
+        apart = a != b
+        if not apart.any():
+            break
+        a, b = a[apart], b[apart]
+        np.minimum.at(root, np.maximum(a, b), np.minimum(a, b))
+        while True:
+            followed = root[root]
+            if np.array_equal(followed, root):
+                break
+            root = followed
+    return np.asarray(np.unique(root, return_inverse=True)[1], dtype=np.int64).reshape(-1)
+
+
+def orientation_flips(edges: Edges, n_triangles: int) -> tuple[NDArray[np.bool_], bool]:
+    """Which triangles to turn round for a consistent surface, and whether there is such a choice.
+
+    Each triangle is taken twice, as it is and turned; edges join the copies that agree. A piece
+    whose two copies are joined has one side only (Möbius) and is left as it is. In each other piece
+    the smaller number of triangles is turned.
+    """
+    same = np.concatenate([edges.pairs, edges.pairs + n_triangles])
+    crossed = np.concatenate(
+        [edges.pairs + [0, n_triangles], edges.pairs + [n_triangles, 0]], axis=0
+    )
+    agree = np.concatenate([edges.opposed, edges.opposed])
+    cover = connected_labels(np.where(agree[:, None], same, crossed), 2 * n_triangles)
+    one_sided = cover[:n_triangles] == cover[n_triangles:]
+    # Labels are numbered by first item, so of the two copies of a piece the one with the first
+    # triangle as it is has the smaller label.
+    turned = cover[:n_triangles] > cover[n_triangles:]
+    piece = np.minimum(cover[:n_triangles], cover[n_triangles:])
+    size = np.bincount(piece, minlength=1)
+    n_turned = np.bincount(piece, weights=turned, minlength=1)
+    flips = np.where(2 * n_turned[piece] > size[piece], ~turned, turned) & ~one_sided
+    return flips, not bool(one_sided.any())
