@@ -106,7 +106,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "scene": "checks errors",
         "case": "checks errors scene",
         "patient": "checks errors",
-        "io": "case checks errors patient planning scene",
+        "model": "case checks scene",
+        "io": "case checks errors model patient planning scene",
         "imaging": "case checks errors scene",
         "meshing": "case checks errors scene _core",
         "template": "case checks errors scene _core",
@@ -117,8 +118,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "simulation": "scene errors _core",
         "evaluation": "case checks errors scene _core",
         "build": (
-            "case checks errors imaging io meshing node_kinds osteotomy patient phantom planning "
-            "scene surface_repair"
+            "case checks doctor errors imaging io meshing model node_kinds osteotomy patient "
+            "pictures scene surface_repair _core"
         ),
         "study": "build case errors template simulation evaluation scene",
         "pictures": "case checks errors scene",
@@ -133,7 +134,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         ),
         "cli": ("cmfsim build case checks doctor errors io pictures report scene simulation study"),
         "__init__": (
-            "_core build case doctor errors evaluation imaging io meshing node_kinds osteotomy "
+            "_core build model case doctor errors evaluation imaging io meshing node_kinds osteotomy "
             "patient phantom planning scene simulation study surface_checks surface_repair "
             "template"
         ),

@@ -20,6 +20,7 @@ from cmfsim._core import (
     Tissue,
     __version__,
 )
+from cmfsim.build import build_case, build_model
 from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.doctor import diagnose
 from cmfsim.errors import (
@@ -39,13 +40,16 @@ from cmfsim.io import (
     Case,
     read_image,
     read_landmarks,
+    read_moved_surface,
     read_plan,
     read_result,
     read_scene,
     read_surface,
+    read_tet_mesh,
     read_transform,
     write_image,
     write_landmarks,
+    write_model,
     write_result,
     write_scene,
     write_surface,
@@ -65,6 +69,7 @@ from cmfsim.meshing import (
     signed_level,
     tissue_level,
 )
+from cmfsim.model import PatientModel
 from cmfsim.node_kinds import (
     ClassifiedNodes,
     KindOptions,
@@ -128,6 +133,7 @@ __all__ = [
     "MovedSurface",
     "Muscle",
     "NodeKinds",
+    "PatientModel",
     "PhantomHead",
     "PlanOperator",
     "Procedure",
@@ -155,6 +161,8 @@ __all__ = [
     "TissueRegion",
     "__version__",
     "anatomy_from_surfaces",
+    "build_case",
+    "build_model",
     "check_surface",
     "classify_nodes",
     "cut_bones",
@@ -171,10 +179,12 @@ __all__ = [
     "procedure_options",
     "read_image",
     "read_landmarks",
+    "read_moved_surface",
     "read_plan",
     "read_result",
     "read_scene",
     "read_surface",
+    "read_tet_mesh",
     "read_transform",
     "repair_surface",
     "rigid_motion",
@@ -188,6 +198,7 @@ __all__ = [
     "tissue_level",
     "write_image",
     "write_landmarks",
+    "write_model",
     "write_result",
     "write_scene",
     "write_surface",

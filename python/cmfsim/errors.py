@@ -53,8 +53,4 @@ class ImageInputError(ImageError, ValueError):
 
 
 class LandmarkInputError(LandmarkError, ValueError):
-    """A landmark that is missing or cannot be meant."""
-
-
-class LandmarkInputError(LandmarkError, ValueError):
     """Landmarks, in memory or on disk, that cannot be meant."""

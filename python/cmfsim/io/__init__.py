@@ -3,9 +3,11 @@
 from cmfsim.io.case_files import Case
 from cmfsim.io.images import read_image, write_image
 from cmfsim.io.landmarks import LandmarkFile, read_landmark_file, read_landmarks, write_landmarks
+from cmfsim.io.meshes import read_tet_mesh
+from cmfsim.io.models import write_model
 from cmfsim.io.results import read_result, result_suffixes, write_result
 from cmfsim.io.scenes import read_plan, read_scene, write_scene
-from cmfsim.io.surfaces import read_surface, write_surface
+from cmfsim.io.surfaces import read_moved_surface, read_surface, write_surface
 from cmfsim.io.transforms import read_transform, write_transform
 
 __all__ = [
@@ -14,14 +16,17 @@ __all__ = [
     "read_image",
     "read_landmark_file",
     "read_landmarks",
+    "read_moved_surface",
     "read_plan",
     "read_result",
     "read_scene",
     "read_surface",
+    "read_tet_mesh",
     "read_transform",
     "result_suffixes",
     "write_image",
     "write_landmarks",
+    "write_model",
     "write_result",
     "write_scene",
     "write_surface",

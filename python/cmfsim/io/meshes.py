@@ -2,6 +2,7 @@
 
 import contextlib
 import io as stdio
+import os
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from cmfsim.io.files import named
 
 __all__ = [
     "read_mesh",
+    "read_tet_mesh",
     "read_tets",
 ]
 
@@ -52,6 +54,29 @@ def _refuse_entities(path: Path) -> None:
         raise CaseInputError(f"{path.name}: XML with a document type is not read")
     if data[:2] in {b"\xff\xfe", b"\xfe\xff"}:
         raise CaseInputError(f"{path.name}: XML in UTF-16 is not read")
+
+
+def read_tet_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
+    """The nodes (n, 3), mm, and tets (m, 4) of a file that meshio reads, all positively oriented.
+
+    Raises
+    ------
+    FileNotFoundError
+        The file does not exist.
+    CaseError
+        (also `ValueError`) No linear tets.
+    """
+    path = Path(path)
+    mesh = read_mesh(path)
+    nodes = np.asarray(mesh.points, dtype=np.float64)
+    tets = np.asarray(read_tets(mesh, path)[0], dtype=np.int64)
+    if tets.size and (tets.min() < 0 or tets.max() >= len(nodes)):
+        raise CaseInputError(f"{path.name}: a tet names a node that is not among {len(nodes)}")
+    # Programs differ in the order of nodes: which one a file has, its volumes say.
+    corners = nodes[tets]
+    negative = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0.0
+    tets[negative] = tets[negative][:, [0, 1, 3, 2]]
+    return nodes, tets.astype(np.uint32)
 
 
 def read_tets(mesh: Any, path: Path) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:

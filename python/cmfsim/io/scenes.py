@@ -12,7 +12,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.archives import member_of, read_archive, write_archive
 from cmfsim.io.files import beside, check_version, known_keys, named, read_document, table_of
 from cmfsim.io.meshes import read_mesh, read_tets
-from cmfsim.io.surfaces import read_surface, read_triangles
+from cmfsim.io.surfaces import read_moved_surface, read_surface
 from cmfsim.planning import rigid_motion
 from cmfsim.scene import (
     TISSUE_ARRAYS,
@@ -274,14 +274,10 @@ def _motion(name: str, plans: Mapping[str, Any], folder: Path) -> NDArray[Any] |
         return np.asarray(known_keys(where, table, ("matrix",))["matrix"])
     if "moved_surface" in table:
         files = known_keys(where, table, ("surface", "moved_surface"))
-        before, weld = read_triangles(beside(folder, f"{where}.surface", files.get("surface")))
-        after = beside(folder, f"{where}.moved_surface", files["moved_surface"])
-        moved = np.asarray(read_mesh(after).points)
-        if len(moved) != weld.n_read:
-            raise CaseInputError(
-                f"{after.name} has {len(moved)} vertices, {files.get('surface')} {weld.n_read}"
-            )
-        return MovedSurface(before, moved[weld.kept])
+        return read_moved_surface(
+            beside(folder, f"{where}.surface", files.get("surface")),
+            beside(folder, f"{where}.moved_surface", files["moved_surface"]),
+        )
     return rigid_motion(**known_keys(where, table, ("translation", "angle", "axis", "centre")))
 
 

@@ -16,9 +16,15 @@ from cmfsim.io.files import replacing
 from cmfsim.io.meshes import read_mesh
 from cmfsim.io.vtk import data_array, write_vtk
 from cmfsim.patient import FRAMES, UNITS
-from cmfsim.scene import SurfaceData
+from cmfsim.scene import MovedSurface, SurfaceData
 
-__all__ = ["read_surface", "read_triangles", "surface_suffixes", "write_surface"]
+__all__ = [
+    "read_moved_surface",
+    "read_surface",
+    "read_triangles",
+    "surface_suffixes",
+    "write_surface",
+]
 
 
 @dataclass(frozen=True)
@@ -73,6 +79,54 @@ def read_surface(
     signs = np.array([-1.0, -1.0, 1.0] if frame == "RAS" else [1.0, 1.0, 1.0])
     vertices = np.asarray(surface.vertices) * (UNITS[units] * signs)
     return SurfaceData(vertices, surface.triangles, crease_angle)
+
+
+def read_moved_surface(
+    before: str | os.PathLike[str],
+    after: str | os.PathLike[str],
+    *,
+    units: str = "mm",
+    frame: str = "LPS",
+) -> MovedSurface:
+    """The motion of a bone given by its surface before and after, vertex by vertex.
+
+    Parameters
+    ----------
+    before, after : path
+        Files with the same vertices in the same order.
+    units, frame : str
+        Of the numbers in both files.
+
+    Returns
+    -------
+    MovedSurface
+
+    Raises
+    ------
+    FileNotFoundError
+        A file does not exist.
+    CaseError
+        (also `ValueError`) Not surfaces, another number of vertices.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> motion = cmfsim.read_moved_surface("mandible.ply", "mandible_post.ply")  # doctest: +SKIP
+    """
+    check_one_of("units", units, tuple(UNITS))
+    check_one_of("frame", frame, FRAMES)
+    scale = UNITS[units] * np.array([-1.0, -1.0, 1.0] if frame == "RAS" else [1.0, 1.0, 1.0])
+    surface, weld = read_triangles(Path(before))
+    moved = np.asarray(read_mesh(Path(after)).points, dtype=np.float64)
+    if len(moved) != weld.n_read:
+        raise CaseInputError(
+            f"{Path(after).name} has {len(moved)} vertices, {Path(before).name} {weld.n_read}: the "
+            "same vertices in the same order are needed"
+        )
+    rest = SurfaceData(
+        np.asarray(surface.vertices) * scale, surface.triangles, surface.crease_angle
+    )
+    return MovedSurface(rest, moved[weld.kept] * scale)
 
 
 def read_triangles(path: Path, crease_angle: float = 60.0) -> tuple[SurfaceData, _Weld]:

@@ -1,0 +1,5 @@
+"""From a case to the patient's model: here alone the stages before a solve are strung together."""
+
+from cmfsim.build.case_model import build_case, build_model
+
+__all__ = ["build_case", "build_model"]

@@ -1,0 +1,387 @@
+"""Builds the patient's model of a case, and writes it."""
+
+import logging
+import platform
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim._core import TetMesh, __version__
+from cmfsim.build.held import held_part
+from cmfsim.build.inputs import input_hashes, read_anatomy, read_case_landmarks, read_motion
+from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
+from cmfsim.checks import Floats
+from cmfsim.doctor import diagnose
+from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.io import Case, read_surface, read_tet_mesh, write_model
+from cmfsim.meshing import (
+    MeshOptions,
+    MeshReport,
+    TissueRegion,
+    mesh_from_level,
+    mesh_report,
+    part_mesh,
+    tissue_level,
+)
+from cmfsim.model import PatientModel
+from cmfsim.node_kinds import ClassifiedNodes, KindOptions, classify_nodes
+from cmfsim.osteotomy import CuttingPlane, Procedure, cut_bones, free_cut, place_procedure
+from cmfsim.pictures import picture_anatomy, picture_node_kinds
+from cmfsim.scene import MovedSurface, Scene, SegmentData
+
+__all__ = ["build_case", "build_model"]
+
+_log = logging.getLogger(__name__)
+
+Progress = Callable[[str], None]
+
+# Bodies of tissue below this volume are specks between bones, mm³.
+LEAST_BODY = 1000.0
+# A cross-section at an end of the head above this share of the largest is a cut, not a crown.
+CUT_SHARE = 0.15
+# Voxels between the end of a head that was cut and the plane that closes its tissue there: the
+# image's own end is ragged where the neck is tilted or a cap was sewn in.
+CUT_MARGIN = 1.5
+
+
+def build_case(case: Case, *, progress: Progress | None = None, check: bool = True) -> PatientModel:
+    """The model of a case, written to its output folder.
+
+    Parameters
+    ----------
+    case : Case
+    progress : callable, optional
+        Called with the name of each stage as it begins.
+    check : bool
+        Whether the doctor looks at the case first; an error that it finds ends the work.
+
+    Returns
+    -------
+    PatientModel
+
+    Raises
+    ------
+    CmfsimError
+        (also `ValueError` where the input is at fault) What a stage cannot work with. Files that an
+        earlier run left are then as they were.
+    OSError
+        The output folder cannot be written to.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> model = cmfsim.build_case(cmfsim.Case.load("case.toml"))  # doctest: +SKIP
+    >>> result = cmfsim.solve_scene(model.scene)  # doctest: +SKIP
+    """
+    model = build_model(case, progress=progress, check=check)
+    stage = progress or _quiet
+    stage("writing the model")
+    write_model(case.output, model)
+    stage("drawing")
+    _draw(case, model)
+    return model
+
+
+def build_model(
+    case: Case, *, progress: Progress | None = None, check: bool = True
+) -> PatientModel:
+    """The model of a case: read, segmented, cut, meshed and classified; nothing is written.
+
+    Parameters
+    ----------
+    case : Case
+    progress : callable, optional
+    check : bool
+
+    Returns
+    -------
+    PatientModel
+
+    Raises
+    ------
+    CmfsimError
+        (also `ValueError` where the input is at fault) What a stage cannot work with.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> model = cmfsim.build_model(cmfsim.Case.load("case.toml"))  # doctest: +SKIP
+    """
+    stages = _Stages(progress or _quiet)
+    findings: list[Finding] = []
+    if check:
+        stages.begin("checking the case")
+        findings += _checked(case)
+    landmarks, noticed = read_case_landmarks(case)
+    findings += [f for f in noticed if f not in findings]
+    skull = landmarks.get("skull", {})
+    anatomy, noticed = read_anatomy(case, skull, stages.begin)
+    findings += noticed
+
+    stages.begin("cutting the bones")
+    cut = cut_bones(anatomy.bones, _procedures(case, skull))
+    findings += cut.findings
+    moved = [*dict.fromkeys([*_cut_segments(case), *case.plan])]
+    known = [segment.name for segment in cut.segments]
+    for name in moved:
+        if name not in known:
+            raise CaseInputError(
+                f"{case.where(f'plan.{name}')}: there is no segment {name!r}; segments are: "
+                f"{', '.join(known)}; an osteotomy makes others"
+            )
+
+    stages.begin("finding the soft tissue")
+    region = _region(case, anatomy, skull)
+    level, noticed = tissue_level(anatomy, region)
+    findings += noticed
+
+    stages.begin("filling the tissue with tets")
+    mesh, report, noticed = _mesh(case, level)
+    findings += noticed
+    _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
+
+    stages.begin("classifying nodes")
+    classified = classify_nodes(
+        mesh.nodes,
+        mesh.boundary_triangles(),
+        anatomy,
+        cut.segments,
+        moved=moved,
+        landmarks=skull,
+        fixed_planes=_planes(region),
+        options=KindOptions(**case.node_kinds),
+    )
+    findings += classified.findings
+    mesh, kinds, noticed = held_part(mesh, classified.kinds)
+    if noticed:
+        report = mesh_report(mesh)
+    findings += noticed
+    findings += _untouched(case, kinds)
+
+    stages.begin("assembling the scene")
+    motions = {name: read_motion(case, motion) for name, motion in case.plan.items()}
+    scene = _scene(case, mesh, kinds, cut.segments, motions)
+    boundary = np.asarray(mesh.boundary_triangles())
+    skin = _on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)
+    stages.end()
+    return PatientModel(
+        name=case.name,
+        scene=scene,
+        kinds=kinds,
+        boundary_triangles=boundary,
+        skin_triangles=boundary[skin],
+        segments=cut.segments,
+        anatomy=anatomy,
+        landmarks=landmarks,
+        findings=tuple(findings),
+        summary=_summary(
+            case, classified, report, anatomy, findings, stages.seconds, cut.procedures
+        ),
+    )
+
+
+def _draw(case: Case, model: PatientModel) -> None:
+    """The pictures beside the model; without PyVista or OpenGL the model stands without them."""
+    nodes = model.scene.nodes
+    try:
+        picture_anatomy(case.output / "anatomy.png", model.skin, model.segments)
+        picture_node_kinds(
+            case.output / "node_kinds.png", nodes, model.boundary_triangles, model.kinds
+        )
+    except CmfsimError as error:
+        _log.warning("no pictures: %s", error)
+
+
+class _Stages:
+    """The stages as they pass, with the seconds that each took."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._name: str | None = None
+        self._begun = 0.0
+        self.seconds: dict[str, float] = {}
+
+    def begin(self, name: str) -> None:
+        self.end()
+        self._name, self._begun = name, time.perf_counter()
+        self._progress(name)
+
+    def end(self) -> None:
+        if self._name is not None:
+            took = time.perf_counter() - self._begun
+            self.seconds[self._name] = self.seconds.get(self._name, 0.0) + took
+            self._name = None
+
+
+def _quiet(stage: str) -> None:
+    del stage
+
+
+def _checked(case: Case) -> tuple[Finding, ...]:
+    findings = diagnose(case)
+    errors = [f for f in findings if f.severity == "error"]
+    if errors:
+        first = errors[0]
+        more = f" ({len(errors) - 1} more: cmfsim doctor shows them)" if len(errors) > 1 else ""
+        raise CaseInputError(f"{first.where}: {first.what}; {first.mend}{more}")
+    return findings
+
+
+def _procedures(case: Case, landmarks: Mapping[str, Floats]) -> list[Procedure]:
+    placed = []
+    for osteotomy in case.osteotomies:
+        if osteotomy.procedure is not None:
+            placed.append(place_procedure(osteotomy.procedure, landmarks, osteotomy.options))
+        elif osteotomy.plane is not None:
+            plane = CuttingPlane(osteotomy.plane.point, osteotomy.plane.normal)
+            placed.append(free_cut(str(osteotomy.bone), str(osteotomy.name), (plane,)))
+    return placed
+
+
+def _cut_segments(case: Case) -> list[str]:
+    return [name for osteotomy in case.osteotomies for name in osteotomy.segments]
+
+
+def _region(case: Case, anatomy: Anatomy, landmarks: Mapping[str, Floats]) -> TissueRegion:
+    """The region of the case; where the head was cut off below or above, tissue ends on a plane."""
+    inside = np.asarray(anatomy.skin.values) > 0.0
+    lowest, spacing = anatomy.skin.lowest, np.asarray(anatomy.skin.spacing)
+    rows = np.flatnonzero(inside.any(axis=(0, 2)))
+    foremost, hindmost = (lowest[1] + spacing[1] * rows[[0, -1]]).tolist()
+    plane = case.region.plane(landmarks, foremost, hindmost)
+    areas = np.count_nonzero(inside, axis=(0, 1))
+    slices = np.flatnonzero(areas)
+    bounds: dict[str, float | None] = {"lower": case.region.lower, "upper": case.region.upper}
+    for name, end, inwards in (("lower", slices[0], 1), ("upper", slices[-1], -1)):
+        # Two slices from the end: the very last may be a cap's rim.
+        if bounds[name] is None and areas[end + 2 * inwards] > CUT_SHARE * areas.max():
+            height = lowest[2] + spacing[2] * (end - 0.5 * inwards)
+            bounds[name] = float(height + inwards * CUT_MARGIN * spacing[2])
+    return TissueRegion(plane.point, plane.normal, **bounds)
+
+
+def _planes(region: TissueRegion) -> dict[str, tuple[ArrayLike, ArrayLike]]:
+    planes: dict[str, tuple[ArrayLike, ArrayLike]] = {"posterior": (region.point, region.normal)}
+    for name, side in (("lower", -1.0), ("upper", 1.0)):
+        height = getattr(region, name)
+        if height is not None:
+            planes[name] = ((0.0, 0.0, height), (0.0, 0.0, side))
+    return planes
+
+
+def _mesh(case: Case, level: ImageData) -> tuple[TetMesh, MeshReport, tuple[Finding, ...]]:
+    if case.mesh.file is not None:
+        mesh = TetMesh(*read_tet_mesh(case.mesh.file))
+        return mesh, mesh_report(mesh), ()
+    options = MeshOptions(
+        edge_length=case.mesh.edge_length,
+        refinements=1 if case.mesh.refine else 0,
+        least_body=LEAST_BODY,
+    )
+    made = mesh_from_level(level, options)
+    if case.mesh.parting is None:
+        return made.mesh, made.report, made.findings
+    units, frame = ("mm", "LPS")
+    if case.surfaces is not None:
+        units, frame = case.surfaces.units, case.surfaces.frame
+    parted = part_mesh(made.mesh, read_surface(case.mesh.parting, units=units, frame=frame))
+    return parted, mesh_report(parted), made.findings
+
+
+def _untouched(case: Case, kinds: NodeKinds) -> list[Finding]:
+    return [
+        Finding(
+            "warning",
+            "segment-touches-no-tissue",
+            f"segment {name!r} moves, but no node of the tissue is joined to it",
+            case.where(f"plan.{name}"),
+            "its motion does not reach the face",
+            "check the cut that makes it, bone_distance in [node_kinds], and the posterior plane",
+        )
+        for name in case.plan
+        if not len(kinds.nodes("joined", name)) and not len(kinds.nodes("sliding", name))
+    ]
+
+
+def _scene(
+    case: Case,
+    mesh: TetMesh,
+    kinds: NodeKinds,
+    segments: tuple[BoneSegment, ...],
+    motions: Mapping[str, Floats | MovedSurface],
+) -> Scene:
+    data: dict[str, SegmentData] = {}
+    plan: dict[str, ArrayLike | MovedSurface] = {}
+    for segment in segments:
+        joined = kinds.nodes("joined", segment.name)
+        sliding = kinds.nodes("sliding", segment.name)
+        if not len(joined) and not len(sliding):
+            continue
+        data[segment.name] = SegmentData(
+            joined=joined,
+            sliding=sliding,
+            contact=segment.surface if len(sliding) else None,
+            gap="rest" if len(sliding) else 0.0,
+        )
+        plan[segment.name] = motions.get(segment.name, np.eye(4))
+    return Scene(
+        nodes=mesh.nodes,
+        tets=mesh.tets,
+        tissue=case.tissue,
+        segments=data,
+        plan=plan,
+        fixed=kinds.nodes("fixed"),
+        options=case.solver,
+    )
+
+
+def _on_skin(
+    nodes: Floats, triangles: NDArray[np.uint32], anatomy: Anatomy, level: ImageData
+) -> NDArray[np.bool_]:
+    """Which boundary triangles are skin: their centroids lie nearer to it than to anything else."""
+    centroids = nodes[triangles].mean(axis=1)
+    others = [*anatomy.bones.values(), *([] if anatomy.air is None else [anatomy.air])]
+    from_skin = np.abs(anatomy.skin.sample(centroids))
+    near = np.ones(len(centroids), dtype=bool)
+    for other in others:
+        near &= from_skin < np.abs(other.sample(centroids))
+    # On a plane that bounds the region, the level is zero well inside the skin.
+    return near & (from_skin <= np.abs(level.sample(centroids)) + 0.25)
+
+
+def _summary(
+    case: Case,
+    classified: ClassifiedNodes,
+    report: MeshReport,
+    anatomy: Anatomy,
+    findings: list[Finding],
+    seconds: Mapping[str, float],
+    procedures: tuple[Procedure, ...],
+) -> dict[str, Any]:
+    grid = anatomy.skin
+    return {
+        "case": case.name,
+        "nodes": dict(classified.counts),
+        "mesh": report.as_dict(),
+        "grid": {
+            "shape": list(grid.values.shape),
+            "spacing": np.asarray(grid.spacing).tolist(),
+            "origin": grid.lowest.tolist(),
+        },
+        "bones": list(anatomy.bones),
+        "osteotomies": [
+            {"procedure": placed.kind, "options": dict(placed.options)} for placed in procedures
+        ],
+        "findings": [asdict(finding) for finding in findings],
+        "timings": dict(seconds),
+        "inputs": input_hashes(case),
+        "versions": {
+            "cmfsim": __version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+    }

@@ -1,0 +1,127 @@
+"""What the files of a case hold: anatomy, landmarks, motions, and the hashes of them all."""
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from cmfsim.case import Anatomy, Finding
+from cmfsim.checks import Floats
+from cmfsim.imaging import SegmentOptions, segment_head
+from cmfsim.io import (
+    Case,
+    read_landmark_file,
+    read_moved_surface,
+    read_surface,
+    read_transform,
+)
+from cmfsim.io.images import read_image_file
+from cmfsim.meshing import anatomy_from_surfaces
+from cmfsim.patient import CaseMotion
+from cmfsim.scene import MovedSurface
+from cmfsim.surface_repair import repair_surface
+
+__all__ = ["input_hashes", "read_anatomy", "read_case_landmarks", "read_motion"]
+
+Progress = Callable[[str], None]
+
+# Voxels of the grid that surfaces are worked on, in edges of the mesh to come, and in mm at least.
+VOXELS_PER_EDGE = 3.0
+LEAST_VOXEL = 0.5
+# Bytes that are hashed at a time.
+CHUNK = 1 << 20
+
+
+def read_case_landmarks(case: Case) -> tuple[dict[str, Mapping[str, Floats]], tuple[Finding, ...]]:
+    """The landmarks of a case, "skull" and "skin", with what was noticed on reading them."""
+    landmarks: dict[str, Mapping[str, Floats]] = {}
+    findings: list[Finding] = []
+    for name in ("skull", "skin"):
+        path = getattr(case.landmarks, name)
+        if path is not None:
+            found = read_landmark_file(path, frame=case.landmarks.frame)
+            landmarks[name] = found.points
+            findings.extend(found.findings)
+    return landmarks, tuple(findings)
+
+
+def read_anatomy(
+    case: Case, landmarks: Mapping[str, Floats], progress: Progress
+) -> tuple[Anatomy, tuple[Finding, ...]]:
+    """The head of a case, from its CT or its surfaces."""
+    if case.image is not None:
+        progress("reading the image")
+        read = read_image_file(case.image.file)
+        given = {
+            name: getattr(case.image, name)
+            for name in ("skin_threshold", "bone_threshold", "working_spacing")
+            if getattr(case.image, name) is not None
+        }
+        anatomy = segment_head(
+            read.image,
+            SegmentOptions(**given),
+            landmarks=landmarks or None,
+            progress=lambda stage: progress(f"segmenting the head: {stage}"),
+        )
+        return anatomy, (*read.findings, *anatomy.findings)
+    given_surfaces = case.surfaces
+    if given_surfaces is None:  # a Case has the one or the other
+        raise AssertionError(case.name)
+    findings: list[Finding] = []
+    surfaces = {}
+    files = {"skin": given_surfaces.skin, **given_surfaces.bones}
+    for name, path in files.items():
+        progress(f"reading surface {name}")
+        surface = read_surface(path, units=given_surfaces.units, frame=given_surfaces.frame)
+        surfaces[name], mended = repair_surface(surface, name)
+        findings.extend(mended)
+    progress("measuring distances from the surfaces")
+    spacing = max(case.mesh.edge_length / VOXELS_PER_EDGE, LEAST_VOXEL)
+    skin = surfaces.pop("skin")
+    anatomy = anatomy_from_surfaces(skin, surfaces, spacing=spacing)
+    return anatomy, (*findings, *anatomy.findings)
+
+
+def read_motion(case: Case, motion: CaseMotion) -> Floats | MovedSurface:
+    """How a segment moves, from its table and the files that this names."""
+    if motion.matrix is not None:
+        return motion.matrix
+    if motion.transform is not None:
+        return read_transform(motion.transform)
+    if motion.surface is None or motion.moved_surface is None:
+        return np.eye(4)
+    units, frame = ("mm", "LPS")
+    if case.surfaces is not None:
+        units, frame = case.surfaces.units, case.surfaces.frame
+    return read_moved_surface(motion.surface, motion.moved_surface, units=units, frame=frame)
+
+
+def input_hashes(case: Case) -> dict[str, str]:
+    """The SHA-256 of every file that a case names, by name; that of a folder is of its files."""
+    return {path.name: _sha256(path) for path in sorted(_files(case))}
+
+
+def _files(case: Case) -> Iterator[Path]:
+    yield case.file
+    if case.image is not None:
+        yield case.image.file
+    if case.surfaces is not None:
+        yield case.surfaces.skin
+        yield from case.surfaces.bones.values()
+    optional = [case.landmarks.skull, case.landmarks.skin, case.mesh.parting, case.mesh.file]
+    for motion in case.plan.values():
+        optional += [motion.transform, motion.surface, motion.moved_surface]
+    yield from (path for path in optional if path is not None)
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        if path.is_dir():
+            digest.update(f"{file.name}\n".encode())
+        with file.open("rb") as stream:
+            while chunk := stream.read(CHUNK):
+                digest.update(chunk)
+    return digest.hexdigest()

@@ -1,0 +1,63 @@
+"""The patient's model: what building a case makes, ready to be solved."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.case import Anatomy, BoneSegment, Finding, NodeKinds
+from cmfsim.checks import Floats, Indices
+from cmfsim.scene import Scene, SurfaceData
+
+__all__ = ["PatientModel"]
+
+
+@dataclass(frozen=True, eq=False)
+class PatientModel:
+    """A patient's soft tissue with everything that holds and moves it.
+
+    Attributes
+    ----------
+    name : str
+    scene : Scene
+        Mesh, tissue, node kinds, contact surfaces and plan: what `solve_scene` takes.
+    kinds : NodeKinds
+    boundary_triangles : (t, 3) uint32
+        Boundary of the mesh, outward, in node indices.
+    skin_triangles : (s, 3) uint32
+        Those of them that are the patient's skin.
+    segments : tuple of BoneSegment
+        All pieces of bone, those that stay included.
+    anatomy : Anatomy
+    landmarks : mapping of str to mapping of str to (3,) float64, mm
+        "skull" and "skin", where given.
+    findings : tuple of Finding
+        What every stage noticed.
+    summary : mapping
+        Counts, quality, timings, versions, hashes of the inputs: plain values, ready for JSON.
+    """
+
+    name: str
+    scene: Scene
+    kinds: NodeKinds
+    boundary_triangles: Indices
+    skin_triangles: Indices
+    segments: tuple[BoneSegment, ...]
+    anatomy: Anatomy
+    landmarks: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
+    summary: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def skin_nodes(self) -> NDArray[np.uint32]:
+        """The nodes on the skin, (k,) uint32, ascending: vertex i of `skin` is node i of these."""
+        return np.unique(self.skin_triangles).astype(np.uint32)
+
+    @property
+    def skin(self) -> SurfaceData:
+        """The patient's skin as the mesh has it, outward."""
+        nodes = self.skin_nodes
+        triangles = np.searchsorted(nodes, self.skin_triangles)
+        return SurfaceData(np.asarray(self.scene.nodes)[nodes], triangles)
