@@ -85,7 +85,8 @@ def segment_head(
         *bone.findings,
         *view_findings(work, skin, bone),
     ]
-    level = bone_level(bone, options)
+    # A smoothed rim may not carry bone past the skin.
+    level = np.minimum(bone_level(bone, options), skin.level)
     bones = {"skull": work.image(level)}
     teeth = None
     if options.part_jaws:

@@ -1,4 +1,4 @@
-"""Level images: from an image that knows the surface between voxels, and a mask that knows where."""
+"""Level images, from an image that knows the surface between voxels and a mask that knows where."""
 
 import numpy as np
 
@@ -37,5 +37,5 @@ def level_of(values: Volume, threshold: float, scale: float, mask: Mask) -> Volu
     weight = np.clip(2.0 * smoothed(np.asfortranarray(near), MASK_SIGMA), 0.0, 1.0)
     weight[near] = 1.0
     soft = smoothed(np.asfortranarray(inside), MASK_SIGMA) * np.float32(2.0) - np.float32(1.0)
-    level[box] = part + weight * (soft - part)
+    level[box] = np.clip(part + weight * (soft - part), -1.0, 1.0)
     return level

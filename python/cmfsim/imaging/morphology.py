@@ -145,7 +145,8 @@ def largest(mask: Mask) -> Mask:
     labels, count = label(mask)
     if count <= 1:
         return mask
-    return labels == np.argmax(sizes_of(labels, count))
+    piece: Mask = labels == np.argmax(sizes_of(labels, count))
+    return piece
 
 
 def reached(mask: Mask, seeds: Mask) -> Mask:
@@ -154,7 +155,8 @@ def reached(mask: Mask, seeds: Mask) -> Mask:
     hit = np.zeros(count + 1, dtype=bool)
     hit[labels[seeds & mask]] = True
     hit[0] = False
-    return hit[labels]
+    pieces: Mask = hit[labels]
+    return pieces
 
 
 def smoothed(
@@ -169,15 +171,15 @@ def smoothed(
 
 
 def binned(
-    values: NDArray[Any], factors: tuple[int, int, int], spacing: NDArray[np.float64]
+    values: NDArray[Any], factors: tuple[int, ...], spacing: NDArray[np.float64]
 ) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float64]]:
     """Means over blocks of voxels, their spacing and the shift of the first centre, mm."""
     if max(factors) == 1:
         return values, spacing, np.zeros(3)
-    factors = tuple(min(f, n) for f, n in zip(factors, values.shape, strict=True))  # type: ignore[assignment]
-    image = simpleitk().BinShrink(as_itk(values, spacing), [int(f) for f in factors])
+    blocks = [min(int(f), n) for f, n in zip(factors, values.shape, strict=True)]
+    image = simpleitk().BinShrink(as_itk(values, spacing), blocks)
     shift = np.array(image.GetOrigin())
-    return as_array(image), spacing * np.array(factors), shift
+    return as_array(image), spacing * np.array(blocks), shift
 
 
 def resampled_to(
@@ -200,7 +202,7 @@ def resampled_to(
     resampler.SetOutputSpacing([float(s) for s in target])
     resampler.SetOutputOrigin([0.0, 0.0, 0.0])
     resampler.SetInterpolator(itk.sitkLinear)
-    resampler.SetUseNearestNeighborExtrapolator(True)
+    resampler.UseNearestNeighborExtrapolatorOn()
     resampler.SetOutputPixelType(itk.sitkFloat32)
     fine: Volume = as_array(resampler.Execute(image))
     return fine

@@ -53,10 +53,10 @@ COUCH_BEHIND = 40.0
 # Part of the slices in which something fixed to the scanner shows.
 IN_ALL_SLICES = 0.9
 # Nostrils, ear canals and open lips narrower than twice this are closed, mm.
-OPENING = 5.0
+OPENING = 7.0
 # A hollow reaching deeper than this behind the closed surface is airway, not a fold; the closed
 # surface is drawn in by the second, so that lips and nostrils keep their edge; mm.
-DEEP = 7.0
+DEEP = 9.0
 DRAWN_IN = 3.0
 # Skin beyond these in a straight cut is said to be cut off, mm².
 CUT_AREA = 150.0
