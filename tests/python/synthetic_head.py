@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from cmfsim import ImageData
 from scipy import ndimage
+
+from cmfsim import ImageData
 
 AIR, SOFT, BONE = -1000.0, 40.0, 900.0
 

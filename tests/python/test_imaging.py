@@ -4,10 +4,11 @@ import json
 import os
 from pathlib import Path
 
-import cmfsim
-import ct_variants as variants
 import numpy as np
 import pytest
+
+import cmfsim
+import ct_variants as variants
 from cmfsim import ImageData, ImageError, SegmentOptions, segment_head
 from synthetic_head import made_head
 
@@ -71,7 +72,9 @@ def test_the_brain_is_inside_the_cranium(head, anatomy):
 def test_the_airway_is_air_inside_the_skin(head, anatomy):
     found, tube = on_truth(anatomy.air, head, head.airway)
     inside, _ = on_truth(anatomy.skin, head, head.skin)
-    deep = tube & (anatomy.air.axes()[1] > -85.0)
+    bone, _ = on_truth(anatomy.bones["cranium"], head, head.skin)
+    # Bone encloses the way past the palate; the nostril's first millimetres lie outside.
+    deep = tube & ~bone & (anatomy.air.axes()[1] > -95.0)
     assert dice(found, deep) > 0.8
     assert inside[found].all()
 
@@ -411,5 +414,6 @@ def test_a_turned_header_gives_the_same_face(
     sitk.WriteImage(sitk.Resample(image, grid, defaultPixelValue=-1024), str(tmp_path / "t.nrrd"))
     _, points = _skin_of(cmfsim.read_image(tmp_path / "t.nrrd"), phantom_landmarks)
     distance = _distances(points[points[:, 2] > 340.0], reference["skin"])
-    assert np.median(distance) < 0.4
+    # Voxels of 2 mm, interpolated twice.
+    assert np.median(distance) < 0.6
     assert np.percentile(distance, 95.0) < 1.5

@@ -95,7 +95,8 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
     tissue = np.asfortranarray(coarse > options.skin_threshold)
     if metal.mask is not None:
         # Dark streaks would cut the head in two.
-        tissue = _filled(closed(tissue, STREAK_GAP, steps))
+        tissue = closed(tissue, STREAK_GAP, steps)
+    tissue = _filled_in_layers(tissue)
     free, removed = _without_couch(tissue, steps)
     bone = largest(free & (coarse > options.bone_threshold))
     head, more = _without_rests(free, bone, steps)
@@ -110,7 +111,7 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
     mask, hollow = _with_hollows(solid, work)
     level = level_of(metal.hu, options.skin_threshold, SKIN_SCALE, mask)
     # Where a rest was cut off in contact, the surface is that of the distance.
-    np.minimum(level, near, out=level, where=~hollow)
+    np.minimum(level, np.clip(near, -1.0, 1.0), out=level, where=~hollow)
     findings = []
     table = np.count_nonzero(removed | more) * float(np.prod(steps))
     if table > LARGEST_EAR / 5.0:
@@ -127,6 +128,14 @@ def _rest_removed(volume: float) -> Finding:
         why="where it touched, the skin is drawn from the head's shape, not from the image",
         mend="check the back of the head by eye if it matters",
     )
+
+
+def _filled_in_layers(tissue: Mask) -> Mask:
+    """The mask with what each layer encloses: the windpipe would part the throat from the neck."""
+    filled = tissue.copy(order="F")
+    for k in range(tissue.shape[2]):
+        filled[:, :, k] = ndimage().binary_fill_holes(tissue[:, :, k])
+    return filled
 
 
 def _without_couch(tissue: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, Mask]:

@@ -1,6 +1,6 @@
 """The grid that the segmentation works on: the head's part of the image, no finer than needed."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -106,13 +106,14 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     return Working(hu, target, origin, border, spacing), tuple(findings)
 
 
-def without_noise(work: Working) -> Working:
-    """HU smoothed as far as the noise asks for: not at all in most clinical scans."""
-    noise = noise_of(work.hu)
+def without_noise(hu: Volume) -> Volume:
+    """HU smoothed as far as the noise asks for: not at all in most clinical scans.
+
+    For bone only: the skin stands out of any noise, and smoothing would draw it in.
+    """
+    noise = noise_of(hu)
     sigma = next((sigma for least, sigma in SMOOTHING if noise >= least), 0.0)
-    if sigma == 0.0:
-        return work
-    return replace(work, hu=smoothed(work.hu, sigma))
+    return smoothed(hu, sigma) if sigma > 0.0 else hu
 
 
 def coarse_of(
