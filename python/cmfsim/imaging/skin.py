@@ -217,7 +217,9 @@ def _beyond_scalp(
     for k in np.flatnonzero(down < ABOVE_NAPE):
         vault[:, :, k] = ndimage().binary_fill_holes(vault[:, :, k])
     away = -depth(np.asfortranarray(vault), spacing)
-    skin = tissue & ~ndimage().binary_erosion(tissue) & (down < ABOVE_EARS)[None, None, :]
+    # In front of the ears nothing lies on the scalp, so its thickness is known there.
+    skin = tissue & ~ndimage().binary_erosion(tissue)
+    skin &= (down < ABOVE_EARS)[None, None, :] & (y < 0.0)[None, :, None]
     thickness = away[skin & (away > 0.0)]
     if not thickness.size:
         return nothing
