@@ -87,6 +87,19 @@ def test_no_voxel_is_both_bone_and_outside_or_two_bones(anatomy):
     assert max(np.abs(level.values).max() for level in anatomy.bones.values()) <= 1.0
 
 
+def test_no_level_comes_near_zero_away_from_its_surface(anatomy):
+    from scipy import ndimage  # noqa: PLC0415
+
+    cube = np.ones((3, 3, 3))
+    levels = {"skin": anatomy.skin, "cranium": anatomy.bones["cranium"], "air": anatomy.air}
+    for level in levels.values():
+        inside = level.values > 0.0
+        deep = ndimage.binary_erosion(inside, cube, iterations=2)
+        far = ndimage.binary_erosion(~inside, cube, iterations=2)
+        assert deep.any()
+        assert np.abs(level.values[deep | far]).min() > 0.3
+
+
 def test_the_jaws_are_parted_without_landmarks_and_it_is_said(head):
     guessed = segment_head(head.image)
     assert "jaws-parted-by-shape" in codes(guessed)
