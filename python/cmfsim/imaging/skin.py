@@ -20,6 +20,7 @@ from cmfsim.imaging.morphology import (
     opened,
     reached,
     resampled_to,
+    shrunk,
     sizes_of,
 )
 from cmfsim.imaging.options import SegmentOptions
@@ -111,7 +112,8 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
     mask, hollow = _with_hollows(solid, work)
     level = level_of(metal.hu, options.skin_threshold, SKIN_SCALE, mask)
     # Where a rest was cut off in contact, the surface is that of the distance.
-    np.minimum(level, np.clip(near, -1.0, 1.0), out=level, where=~hollow)
+    rim = ~hollow & ~shrunk(mask)
+    np.minimum(level, np.clip(near, -1.0, 1.0), out=level, where=rim)
     findings = []
     table = np.count_nonzero(removed | more) * float(np.prod(steps))
     if table > LARGEST_EAR / 5.0:
