@@ -72,7 +72,7 @@ def guessed_landmarks(work: Working, bone: Bone) -> dict[str, Floats] | None:
 def _profile(strip: Mask, y: Floats) -> Floats:
     """The foremost y of bone in each layer, mm; NaN where there is none."""
     any_bone = strip.any(axis=0)
-    first = y[np.argmax(any_bone, axis=0)].astype(np.float64)
+    first: Floats = y[np.argmax(any_bone, axis=0)].astype(np.float64)
     first[~any_bone.any(axis=0)] = np.nan
     return first
 

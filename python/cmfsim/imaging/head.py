@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -71,12 +72,12 @@ def segment_head(
     say("grid")
     work, findings = working_grid(image, options)
     all_findings: list[Finding] = list(findings)
-    work = without_noise(work)
     say("metal")
     metal = find_metal(work, options)
     say("skin")
     skin = find_skin(work, metal, options)
     say("bone")
+    metal = replace(metal, hu=without_noise(metal.hu))
     bone = find_bone(work, metal, skin, options)
     all_findings += [
         *weak_bone(work.hu[skin.mask], options.bone_threshold),
@@ -85,7 +86,8 @@ def segment_head(
         *bone.findings,
         *view_findings(work, skin, bone),
     ]
-    level = bone_level(bone, options)
+    # A smoothed rim may not carry bone past the skin.
+    level = np.minimum(bone_level(bone, options), skin.level)
     bones = {"skull": work.image(level)}
     teeth = None
     if options.part_jaws:

@@ -118,7 +118,8 @@ def part_jaws(work: Working, bone: Bone, landmarks: Mapping[str, Floats] | None)
     if reason:
         return Jaws(None, None, None, (_not_parted(reason),))
     rest = bone.mask & ~mandible
-    side = smoothed(mandible, 1.0) - smoothed(rest, 1.0)
+    # Threefold, so that smoothing leaves thin parts their size.
+    side = np.clip(3.0 * (smoothed(mandible, 1.0) - smoothed(rest, 1.0)), -1.0, 1.0)
     height = 0.5 * float(landmarks["supradentale"][2] + landmarks["infradentale"][2])
     return Jaws(side, mandible, height, tuple(findings))
 

@@ -20,13 +20,13 @@ __all__ = [
     "binned",
     "closed",
     "depth",
-    "dilated",
     "label",
     "largest",
     "ndimage",
     "opened",
     "reached",
     "resampled_to",
+    "shrunk",
     "simpleitk",
     "sizes_of",
     "smoothed",
@@ -118,9 +118,11 @@ def closed(mask: Mask, radius: float, spacing: NDArray[np.float64]) -> Mask:
     return np.asfortranarray((depth(grown, spacing) > radius)[inner]) | mask
 
 
-def dilated(mask: Mask, radius: float, spacing: NDArray[np.float64]) -> Mask:
-    """The voxels less than a radius (mm) from the mask."""
-    return depth(mask, spacing) > -radius
+def shrunk(mask: Mask) -> Mask:
+    """The voxels all of whose 26 neighbours are in the mask; beyond the border it goes on."""
+    itk = simpleitk()
+    image = itk.BinaryErode(as_itk(mask, np.ones(3)), [1, 1, 1], itk.sitkBox, 0.0, 1.0, True)  # noqa: FBT003
+    return as_array(image).view(np.bool_)
 
 
 def label(mask: Mask, *, corners: bool = False) -> tuple[NDArray[np.int32], int]:
@@ -145,7 +147,8 @@ def largest(mask: Mask) -> Mask:
     labels, count = label(mask)
     if count <= 1:
         return mask
-    return labels == np.argmax(sizes_of(labels, count))
+    piece: Mask = labels == np.argmax(sizes_of(labels, count))
+    return piece
 
 
 def reached(mask: Mask, seeds: Mask) -> Mask:
@@ -154,7 +157,8 @@ def reached(mask: Mask, seeds: Mask) -> Mask:
     hit = np.zeros(count + 1, dtype=bool)
     hit[labels[seeds & mask]] = True
     hit[0] = False
-    return hit[labels]
+    pieces: Mask = hit[labels]
+    return pieces
 
 
 def smoothed(
@@ -169,15 +173,15 @@ def smoothed(
 
 
 def binned(
-    values: NDArray[Any], factors: tuple[int, int, int], spacing: NDArray[np.float64]
+    values: NDArray[Any], factors: tuple[int, ...], spacing: NDArray[np.float64]
 ) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float64]]:
     """Means over blocks of voxels, their spacing and the shift of the first centre, mm."""
     if max(factors) == 1:
         return values, spacing, np.zeros(3)
-    factors = tuple(min(f, n) for f, n in zip(factors, values.shape, strict=True))  # type: ignore[assignment]
-    image = simpleitk().BinShrink(as_itk(values, spacing), [int(f) for f in factors])
+    blocks = [min(int(f), n) for f, n in zip(factors, values.shape, strict=True)]
+    image = simpleitk().BinShrink(as_itk(values, spacing), blocks)
     shift = np.array(image.GetOrigin())
-    return as_array(image), spacing * np.array(factors), shift
+    return as_array(image), spacing * np.array(blocks), shift
 
 
 def resampled_to(
@@ -200,7 +204,7 @@ def resampled_to(
     resampler.SetOutputSpacing([float(s) for s in target])
     resampler.SetOutputOrigin([0.0, 0.0, 0.0])
     resampler.SetInterpolator(itk.sitkLinear)
-    resampler.SetUseNearestNeighborExtrapolator(True)
+    resampler.UseNearestNeighborExtrapolatorOn()
     resampler.SetOutputPixelType(itk.sitkFloat32)
     fine: Volume = as_array(resampler.Execute(image))
     return fine

@@ -20,6 +20,7 @@ from cmfsim.imaging.morphology import (
     opened,
     reached,
     resampled_to,
+    shrunk,
     sizes_of,
 )
 from cmfsim.imaging.options import SegmentOptions
@@ -53,10 +54,10 @@ COUCH_BEHIND = 40.0
 # Part of the slices in which something fixed to the scanner shows.
 IN_ALL_SLICES = 0.9
 # Nostrils, ear canals and open lips narrower than twice this are closed, mm.
-OPENING = 5.0
+OPENING = 7.0
 # A hollow reaching deeper than this behind the closed surface is airway, not a fold; the closed
 # surface is drawn in by the second, so that lips and nostrils keep their edge; mm.
-DEEP = 7.0
+DEEP = 9.0
 DRAWN_IN = 3.0
 # Skin beyond these in a straight cut is said to be cut off, mm².
 CUT_AREA = 150.0
@@ -95,7 +96,8 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
     tissue = np.asfortranarray(coarse > options.skin_threshold)
     if metal.mask is not None:
         # Dark streaks would cut the head in two.
-        tissue = _filled(closed(tissue, STREAK_GAP, steps))
+        tissue = closed(tissue, STREAK_GAP, steps)
+    tissue = _filled_in_layers(tissue)
     free, removed = _without_couch(tissue, steps)
     bone = largest(free & (coarse > options.bone_threshold))
     head, more = _without_rests(free, bone, steps)
@@ -110,7 +112,8 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
     mask, hollow = _with_hollows(solid, work)
     level = level_of(metal.hu, options.skin_threshold, SKIN_SCALE, mask)
     # Where a rest was cut off in contact, the surface is that of the distance.
-    np.minimum(level, near, out=level, where=~hollow)
+    rim = ~hollow & ~shrunk(mask)
+    np.minimum(level, np.clip(near, -1.0, 1.0), out=level, where=rim)
     findings = []
     table = np.count_nonzero(removed | more) * float(np.prod(steps))
     if table > LARGEST_EAR / 5.0:
@@ -127,6 +130,14 @@ def _rest_removed(volume: float) -> Finding:
         why="where it touched, the skin is drawn from the head's shape, not from the image",
         mend="check the back of the head by eye if it matters",
     )
+
+
+def _filled_in_layers(tissue: Mask) -> Mask:
+    """The mask with what each layer encloses: the windpipe would part the throat from the neck."""
+    filled = tissue.copy(order="F")
+    for k in range(tissue.shape[2]):
+        filled[:, :, k] = ndimage().binary_fill_holes(tissue[:, :, k])
+    return filled
 
 
 def _without_couch(tissue: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, Mask]:
@@ -208,7 +219,9 @@ def _beyond_scalp(
     for k in np.flatnonzero(down < ABOVE_NAPE):
         vault[:, :, k] = ndimage().binary_fill_holes(vault[:, :, k])
     away = -depth(np.asfortranarray(vault), spacing)
-    skin = tissue & ~ndimage().binary_erosion(tissue) & (down < ABOVE_EARS)[None, None, :]
+    # In front of the ears nothing lies on the scalp, so its thickness is known there.
+    skin = tissue & ~ndimage().binary_erosion(tissue)
+    skin &= (down < ABOVE_EARS)[None, None, :] & (y < 0.0)[None, :, None]
     thickness = away[skin & (away > 0.0)]
     if not thickness.size:
         return nothing

@@ -1,6 +1,7 @@
 """The grid that the segmentation works on: the head's part of the image, no finer than needed."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,30 +99,29 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     if not np.array_equal(target, bins):
         if (target > 1.01 * bins).any():
             findings.append(_coarsened(target, options))
-        shape = tuple(
-            int(np.floor((n - 1) * b / t + 1e-6)) + 1
-            for n, b, t in zip(hu.shape, bins, target, strict=True)
-        )
+        steps = np.floor((np.array(hu.shape) - 1) * bins / target + 1e-6)
+        shape = tuple(int(n) + 1 for n in steps)
         hu = resampled_to(hu, bins, np.zeros(3), shape, target)
     np.clip(hu, -1024.0, 4000.0, out=hu)
     return Working(hu, target, origin, border, spacing), tuple(findings)
 
 
-def without_noise(work: Working) -> Working:
-    """HU smoothed as far as the noise asks for: not at all in most clinical scans."""
-    noise = noise_of(work.hu)
+def without_noise(hu: Volume) -> Volume:
+    """HU smoothed as far as the noise asks for: not at all in most clinical scans.
+
+    For bone only: the skin stands out of any noise, and smoothing would draw it in.
+    """
+    noise = noise_of(hu)
     sigma = next((sigma for least, sigma in SMOOTHING if noise >= least), 0.0)
-    if sigma == 0.0:
-        return work
-    return replace(work, hu=smoothed(work.hu, sigma))
+    return smoothed(hu, sigma) if sigma > 0.0 else hu
 
 
 def coarse_of(
-    hu: Volume, spacing: NDArray[np.float64], size: float = COARSE
+    hu: NDArray[Any], spacing: NDArray[np.float64], size: float = COARSE
 ) -> tuple[Volume, NDArray[np.float64], NDArray[np.float64]]:
     """HU in voxels of about `size` mm, their spacing and first centre, mm."""
-    factors = tuple(max(1, int(round(size / s))) for s in spacing)
-    coarse, steps, shift = binned(hu, factors, spacing)  # type: ignore[arg-type]
+    factors = tuple(max(1, round(size / s)) for s in spacing)
+    coarse, steps, shift = binned(hu, factors, spacing)
     return coarse, steps, shift
 
 
@@ -200,7 +200,7 @@ def _head_box(
     values: NDArray[np.generic], spacing: NDArray[np.float64], scale: Calibration
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The first and past-the-last voxel of the head with a margin, along each axis."""
-    coarse, steps, _ = coarse_of(values, spacing, 4.0)  # type: ignore[arg-type]
+    coarse, steps, _ = coarse_of(values, spacing, 4.0)
     tissue: Mask = np.asfortranarray(coarse * scale.slope + scale.offset > TISSUE)
     core = opened(tissue, OPENING, steps)
     labels, count = label(core)

@@ -93,7 +93,7 @@ def read_image_file(path: str | os.PathLike[str]) -> ImageFile:
     itk = _simpleitk()
     shown = bool(itk.ProcessObject.GetGlobalWarningDisplay())
     # ITK prints its warnings; what matters of them is found here.
-    itk.ProcessObject.SetGlobalWarningDisplay(False)
+    itk.ProcessObject.GlobalWarningDisplayOff()
     try:
         if path.is_dir():
             image, modality, findings = _read_series(itk, path)
@@ -101,7 +101,8 @@ def read_image_file(path: str | os.PathLike[str]) -> ImageFile:
             image, modality, findings = _read_file(itk, path)
         return _in_lps(itk, image, modality, findings, path)
     finally:
-        itk.ProcessObject.SetGlobalWarningDisplay(shown)
+        if shown:
+            itk.ProcessObject.GlobalWarningDisplayOn()
 
 
 def write_image(image: ImageData, path: str | os.PathLike[str]) -> None:
@@ -229,7 +230,7 @@ def _nifti_length(header: bytes) -> int:
     voxels = 1
     for n in shape[1 : shape[0] + 1]:
         voxels *= int(n)
-    return int(start) + voxels * bits // 8
+    return int(start) + voxels * int(bits) // 8
 
 
 def _check_shape(path: Path, size: list[int], components: int) -> None:
@@ -344,8 +345,8 @@ def _check_slices(itk: Any, folder: Path, files: list[str]) -> None:
         across = _numbers(_tag(reader, _ORIENTATION), 6)
         if position is None or across is None:
             raise ImageInputError(
-                f"{folder.name}: slice {Path(file).name} does not say where it lies (tags 0020,0032 "
-                "and 0020,0037)"
+                f"{folder.name}: slice {Path(file).name} does not say where it lies (DICOM tags "
+                "0020,0032 and 0020,0037)"
             )
         if normal is None:
             normal = np.cross(across[:3], across[3:])
