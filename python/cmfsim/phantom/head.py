@@ -73,8 +73,8 @@ def _head(p: HeadParameters) -> list[Step | Engraving]:
     lower_face = Blend(
         (
             Step("join", face),
-            Step("meet", jaw, 15.0),
-            Step("meet", Plane((0, 0, 62), (0, 0, 1)), 16.0),
+            Step("meet", jaw, 12.0),
+            Step("meet", Plane((0, 0, 62), (0, 0, 1)), 12.0),
         ),
         face.box,
     )
@@ -91,15 +91,15 @@ def _head(p: HeadParameters) -> list[Step | Engraving]:
     return [
         Step("join", vault),
         Step("join", lower_face, 10.0),
-        Step("join", neck, 16.0),
+        Step("join", neck, 12.0),
         # Cheekbones, cheeks, the muzzle that the lips lie on, and the chin.
         Step("join", Egg((42, -58, -4), (22 + 0.4 * fat, 24, 17)), 12.0),
-        Step("join", Egg((36, -62, -30), (16 + fat, 18 + 0.5 * fat, 20)), 14.0),
+        Step("join", Egg((36, -62, -30), (16 + fat, 18 + 0.5 * fat, 20)), 12.0),
         Step("join", Egg((0, -72, -40), (31, 27, 28), power=2.3), 10.0),
         Step("join", Egg((0, -86, -30), (15, 15.5, 15)), 10.0),
         Step("join", Egg((20, -77, -18), (15, 14, 20)), 12.0),
-        Step("join", Egg((0, -81 + chin, -75), (24, 18, 15), power=2.2), 14.0),
-        Step("join", Egg((42, -25, -55), (13 + fat, 18, 14)), 14.0),
+        Step("join", Egg((0, -81 + chin, -75), (24, 18, 15), power=2.2), 12.0),
+        Step("join", Egg((42, -25, -55), (13 + fat, 18, 14)), 12.0),
         # Brow ridge and glabella.
         Step(
             "join",

@@ -16,6 +16,8 @@ __all__ = ["find_skin_landmarks", "find_skull_landmarks"]
 
 # Rays are sampled at this step before the crossing is halved down, mm.
 RAY_STEP = 1.0
+# Halvings of the last step of a ray; the projection onto the surface does the rest.
+HALVINGS = 10
 # Lines on which extremes are sought lie this far apart, mm.
 SCAN_STEP, SIDE_STEP = 0.25, 1.0
 FRONT, BACK, UP = np.array([0.0, -1, 0]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1])
@@ -50,7 +52,7 @@ def _first_hit(field: Field, starts: Floats, direction: Floats, length: float) -
     first = np.argmax(inside, axis=1)
     high = steps[first]
     low = high - RAY_STEP
-    for _ in range(30):
+    for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
         deep = field(*(starts + middle[:, None] * direction).T) > 0.0
         high, low = np.where(deep, middle, high), np.where(deep, low, middle)
