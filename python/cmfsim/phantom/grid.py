@@ -24,6 +24,8 @@ DIFFERENCE = 1e-3
 LEAST_SLOPE = 0.2
 # Vertices are projected cell by cell of this size, mm, so that few shapes matter to each.
 CELL = 24.0
+# Marching cubes keep vertices this far from grid points, as a share of the spacing.
+NEAREST = 0.05
 # A projected point counts as on the surface below this level, mm.
 ON_SURFACE = 1e-6
 
@@ -135,6 +137,9 @@ def level_surface(field: Field, low: Floats, high: Floats, spacing: float) -> Su
         raise CaseInputError(
             f"spacing is {spacing:g} mm: no grid point lies inside the part; use a smaller spacing"
         )
+    # A surface through a grid point would give triangles without area.
+    least = NEAREST * spacing
+    values = np.where(np.abs(values) < least, np.copysign(least, values), values)
     corners, triangles, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
         values, 0.0, spacing=(spacing,) * 3, gradient_direction="ascent"
     )

@@ -54,11 +54,12 @@ def _head(p: HeadParameters) -> list[Step | Engraving]:
     """Vault, face without features, jaw, chin and neck."""
     fat = p.fat_thickness
     vault = Egg((0, 4, 50), (77, 101, 70), (77, 97, 84), power=2.25)
-    z = (-95.0, -80.0, -65.0, -50.0, -35.0, -20.0, -5.0, 10.0, 25.0, 40.0, 55.0)
-    front = (-86.0, -92.0, -93.0, -93.0, -93.0, -92.0, -90.0, -88.0, -90.0, -95.0, -95.5)
-    width = (48.0, 53.0, 57.5, 61.0, 64.0, 68.5, 72.5, 73.5, 73.0, 73.0, 73.0)
-    power = (1.9, 1.95, 2.0, 2.1, 2.15, 2.25, 2.35, 2.3, 2.2, 2.2, 2.2)
-    back = (0.0, 4.0, 8.0, 14.0, 20.0, 28.0, 35.0, 40.0, 45.0, 48.0, 50.0)
+    # The section widens to the cheekbones and dives under the vault above the brows.
+    z = (-95.0, -80.0, -65.0, -50.0, -35.0, -20.0, -5.0, 10.0, 25.0, 40.0, 55.0, 70.0)
+    front = (-86.0, -92.0, -93.0, -93.0, -93.0, -92.0, -90.0, -88.0, -90.0, -93.0, -87.0, -72.0)
+    width = (48.0, 53.0, 57.5, 61.0, 64.0, 68.5, 72.5, 73.5, 73.0, 70.0, 62.0, 50.0)
+    power = (1.9, 1.95, 2.0, 2.1, 2.15, 2.25, 2.35, 2.3, 2.2, 2.2, 2.2, 2.2)
+    back = (0.0, 4.0, 8.0, 14.0, 20.0, 28.0, 35.0, 40.0, 42.0, 40.0, 34.0, 24.0)
     face = Loft(
         middle=-16.0,
         front=Table(z, [v - 0.5 * fat for v in front]),
@@ -73,8 +74,8 @@ def _head(p: HeadParameters) -> list[Step | Engraving]:
     lower_face = Blend(
         (
             Step("join", face),
-            Step("meet", jaw, 15.0),
-            Step("meet", Plane((0, 0, 62), (0, 0, 1)), 16.0),
+            Step("meet", jaw, 12.0),
+            Step("meet", Plane((0, 0, 62), (0, 0, 1)), 12.0),
         ),
         face.box,
     )
@@ -85,21 +86,22 @@ def _head(p: HeadParameters) -> list[Step | Engraving]:
             [0, 14, -55, 47 + 0.5 * fat],
             [0, 18, -20, 48],
             [0, 22, 15, 48],
-        ]
+        ],
+        12,
     )
     chin = -p.chin_projection
     return [
         Step("join", vault),
         Step("join", lower_face, 10.0),
-        Step("join", neck, 16.0),
+        Step("join", neck, 12.0),
         # Cheekbones, cheeks, the muzzle that the lips lie on, and the chin.
         Step("join", Egg((42, -58, -4), (22 + 0.4 * fat, 24, 17)), 12.0),
-        Step("join", Egg((36, -62, -30), (16 + fat, 18 + 0.5 * fat, 20)), 14.0),
+        Step("join", Egg((36, -62, -30), (16 + fat, 18 + 0.5 * fat, 20)), 12.0),
         Step("join", Egg((0, -72, -40), (31, 27, 28), power=2.3), 10.0),
         Step("join", Egg((0, -86, -30), (15, 15.5, 15)), 10.0),
         Step("join", Egg((20, -77, -18), (15, 14, 20)), 12.0),
-        Step("join", Egg((0, -81 + chin, -75), (24, 18, 15), power=2.2), 14.0),
-        Step("join", Egg((42, -25, -55), (13 + fat, 18, 14)), 14.0),
+        Step("join", Egg((0, -81 + chin, -75), (24, 18, 15), power=2.2), 12.0),
+        Step("join", Egg((42, -25, -55), (13 + fat, 18, 14)), 12.0),
         # Brow ridge and glabella.
         Step(
             "join",
@@ -109,7 +111,9 @@ def _head(p: HeadParameters) -> list[Step | Engraving]:
                     [14, -88, 41, 8.5],
                     [30, -83, 42, 8],
                     [46, -71, 37, 7],
-                    [56, -56, 26, 4],
+                    [53.5, -61, 25, 6.5],
+                    [54.5, -59.5, 12, 6.5],
+                    [54, -60, 2, 5],
                 ]
             ),
             9.0,

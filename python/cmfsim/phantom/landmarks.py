@@ -16,8 +16,10 @@ __all__ = ["find_skin_landmarks", "find_skull_landmarks"]
 
 # Rays are sampled at this step before the crossing is halved down, mm.
 RAY_STEP = 1.0
+# Halvings of the last step of a ray; the projection onto the surface does the rest.
+HALVINGS = 10
 # Lines on which extremes are sought lie this far apart, mm.
-SCAN_STEP, SIDE_STEP = 0.25, 1.0
+SCAN_STEP, SIDE_STEP = 0.25, 1.5
 FRONT, BACK, UP = np.array([0.0, -1, 0]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1])
 INWARD = np.array([-1.0, 0, 0])
 # Height above the glabella where the forehead begins to rise, mm.
@@ -50,7 +52,7 @@ def _first_hit(field: Field, starts: Floats, direction: Floats, length: float) -
     first = np.argmax(inside, axis=1)
     high = steps[first]
     low = high - RAY_STEP
-    for _ in range(30):
+    for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
         deep = field(*(starts + middle[:, None] * direction).T) > 0.0
         high, low = np.where(deep, middle, high), np.where(deep, low, middle)
@@ -63,10 +65,10 @@ def _front(field: Field, x: float, low: float, high: float) -> Floats:
     """The foremost points in the sagittal section at x, from z = low to high."""
     z = np.arange(low, high + SCAN_STEP, SCAN_STEP)
     starts = np.column_stack([np.full_like(z, x), np.full_like(z, -135.0), z])
-    return _hits(_first_hit(field, starts, BACK, 110.0))
+    return _hits(_first_hit(field, starts, BACK, 75.0))
 
 
-def _side(field: Field, y: Floats, z: Floats, start: float = 80.0, length: float = 60.0) -> Floats:
+def _side(field: Field, y: Floats, z: Floats, start: float = 74.0, length: float = 48.0) -> Floats:
     """The outermost points at places of y and z, all pairs."""
     v, w = (np.arange(a[0], a[-1] + 0.1, SIDE_STEP) for a in (y, z))
     v, w = (grid.ravel() for grid in np.meshgrid(v, w))

@@ -272,15 +272,19 @@ class PhantomHead:
         self, axes: tuple[Floats, Floats, Floats], clip: float, names: tuple[str, ...]
     ) -> dict[str, NDArray[np.float32]]:
         """Levels on a grid by name; "skin", "bone" and "air" follow from the parts."""
-        parts = {name: self._part_grid(name, axes, clip) for name in (*BONES, "air", *names)}
-        bone = np.maximum.reduce([parts[name] for name in BONES])
-        drawn = level_grid(self.field("drawn_skin"), axes, clip)
         scale = self.parameters.scale
+        # The cover feels bone from further away than the clip.
+        wide = max(clip, scale * (LEAST_COVER + COVER_MELT) + clip)
+        parts = {name: self._part_grid(name, axes, wide) for name in (*BONES, "air", *names)}
+        bone = np.maximum.reduce([parts[name] for name in BONES])
+        drawn = level_grid(self.field("drawn_skin"), axes, wide)
         skin = scale * _covered(drawn / scale, bone / scale)
-        parts["skin"] = np.clip(skin, -clip, clip).astype(np.float32)
+        parts["skin"] = skin.astype(np.float32)
         parts["bone"] = bone
         airway = scale * _airway(parts["air"] / scale, parts["skin"] / scale, bone / scale)
-        parts["air"] = np.clip(airway, -clip, clip).astype(np.float32)
+        parts["air"] = airway.astype(np.float32)
+        for level in parts.values():
+            np.clip(level, -clip, clip, out=level)
         return parts
 
     def _part_grid(

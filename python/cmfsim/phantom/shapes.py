@@ -2,9 +2,9 @@
 
 A level is close to the signed distance in mm near its surface. Coordinates come as three arrays
 that broadcast, so that a grid is evaluated from its axes and what depends on one axis alone is
-computed once per line. Shapes further than REACH from the asked box are left out: they cannot move
-what is nearer to a surface than REACH less the widest melt, so levels above −4 mm do not depend on
-which points are asked together.
+computed once per line. Shapes further than REACH from the asked box are left out. They could not
+have moved what is near a surface, so that levels there do not depend on which points are asked
+together; far outside a level is merely negative.
 """
 
 from collections.abc import Sequence
@@ -31,12 +31,13 @@ __all__ = [
     "Tube",
 ]
 
-# Shapes further away than this are left out, mm; melts are 16 mm wide at most.
-REACH = 20.0
+# Shapes further away than this are left out, mm: twice the widest melt, so that not even a melt of
+# melts feels them.
+REACH = 24.0
 # No section of a loft is larger than this, mm.
 LARGEST_RADIUS = 150.0
 # The level where no shape is near, mm.
-FAR = -100.0
+FAR = -REACH
 # Smallest length that is divided by, mm.
 TINY = 1e-6
 
