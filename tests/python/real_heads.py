@@ -97,22 +97,38 @@ def anatomy(head, spacing=2.0):
     )
 
 
-def tissue_mesh(head, edge=6.0, *, posterior=None, spacing=2.0):
-    """Soft tissue of a head as voxels cut into Kuhn's six tets: nodes and tets, not snapped.
+def tissue_mesh(head, edge=6.0, *, posterior, spacing=2.0):
+    """Soft tissue of a head as voxels cut into Kuhn's six tets: nodes and tets.
 
-    What lies behind the coronal plane y = posterior is left out.
+    What lies behind the coronal plane y = posterior is left out. Boundary nodes are drawn onto
+    bones as far as the tets stay whole.
     """
     whole = anatomy(head, spacing)
     low, high = whole.skin.lowest, whole.skin.highest
     counts = np.floor((high - low) / edge).astype(int)
     centres = low + edge * (0.5 + np.stack(np.indices(counts), axis=-1).reshape(-1, 3))
-    level = whole.skin.sample(centres)
+    level = np.minimum(whole.skin.sample(centres), posterior - centres[:, 1])
     for bone in whole.bones.values():
         level = np.minimum(level, -bone.sample(centres))
-    if posterior is not None:
-        level = np.minimum(level, posterior - centres[:, 1])
-    cells = (level > 0.0).reshape(counts)
-    return voxel_tets(cells, low, edge)
+    nodes, tets = voxel_tets((level > 0.0).reshape(counts), low, edge)
+    outer = meshes.outer_nodes(tets)
+    outer = outer[nodes[outer, 1] < nodes[:, 1].max()]
+    target, nearest = nodes.copy(), np.full(len(nodes), 0.9 * edge)
+    for name in whole.bones:
+        surface = read_ply(head, name)
+        found, _, _ = cmfsim.Surface(surface.vertices, surface.triangles).closest(nodes[outer])
+        distance = np.linalg.norm(found - nodes[outer], axis=1)
+        nearer = distance < nearest[outer]
+        target[outer[nearer]] = found[nearer]
+        nearest[outer[nearer]] = distance[nearer]
+    whole_volume, part = meshes.volumes(nodes, tets), np.ones((len(nodes), 1))
+    for _ in range(50):
+        moved = nodes + part * (target - nodes)
+        squeezed = meshes.volumes(moved, tets) < 0.15 * whole_volume
+        if not squeezed.any():
+            break
+        part[np.unique(tets[squeezed])] *= 0.7
+    return moved, tets
 
 
 def voxel_tets(cells, origin, edge):
