@@ -144,6 +144,13 @@ def test_given_regions_slide_and_everything_else_of_the_bone_is_joined(head):
     assert data["maxilla"].contact is segments[1].surface
     assert np.array_equal(data["maxilla"].joined, kinds.nodes("joined", "maxilla"))
     assert len(data["cranium"].joined) == 0
+    other = segments[0].surface
+    assert (
+        cmfsim.segment_data(kinds, segments, contacts={"maxilla": other})["maxilla"].contact
+        is other
+    )
+    with pytest.raises(cmfsim.CaseError, match="contact of 'chin'"):
+        cmfsim.segment_data(kinds, segments, contacts={"chin": other})
 
 
 def arches():
@@ -346,23 +353,24 @@ def test_a_real_head_gets_kinds_that_hold_it_and_solve(head_name):
     bite = 0.5 * (points["supradentale"] + points["infradentale"])
     assert np.abs(sliding[:, 2] - bite[2]).max() < 35
     assert sliding[:, 1].max() < points["occlusal_line_L"][1]
-    segments = cmfsim.segment_data(kinds, bones.segments)
+    contacts = {n: cmfsim.contact_surface(bones[n]) for n in ("maxilla", "mandible_body")}
+    segments = cmfsim.segment_data(kinds, bones.segments, contacts=contacts)
     assert sorted(segments) == ["chin", "mandible_body", "maxilla"]
     scene = cmfsim.Scene(
         nodes,
         tets,
         cmfsim.TissueData("isotropic", young=0.003, poisson=0.45),
         segments,
-        {name: cmfsim.rigid_motion((0, -5, 0)) for name in segments},
+        {name: cmfsim.rigid_motion((2, -4, 3)) for name in segments},
         kinds.nodes("fixed"),
     )
     result = cmfsim.solve_scene(scene)
     moved = result.displacements
     joined = kinds.nodes("joined")
-    np.testing.assert_allclose(moved[joined], np.tile([0, -5, 0], (len(joined), 1)), atol=1e-9)
+    np.testing.assert_allclose(moved[joined], np.tile([2, -4, 3], (len(joined), 1)), atol=1e-9)
     skin = np.flatnonzero(kinds.kind == 0)
     lip = skin[np.argmin(np.linalg.norm(nodes[skin] - (bite + [0, -10, 0]), axis=1))]
     brow = skin[np.argmin(np.linalg.norm(nodes[skin] - points["glabella"], axis=1))]
-    assert -5.5 < moved[lip, 1] < -1.5
+    assert -4.5 < moved[lip, 1] < -1.0
     assert abs(moved[brow, 1]) < 0.2
     assert np.abs(moved).max() < 12.0

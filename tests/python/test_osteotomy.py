@@ -129,6 +129,30 @@ def test_surfaces_are_decimated_to_the_wanted_size_and_stay_closed():
     assert np.linalg.norm(closest - fine.vertices, axis=1).max() < 1.0
 
 
+def test_a_contact_surface_bridges_the_gaps_between_teeth(box):
+    """Slots of 2 mm between ridges of 4 mm: the blurred surface stays near the ridges' tops."""
+    x, _, z = box.axes()
+    slots = np.where((x % 6.0) < 2.0, 14.5 - z, 100.0)
+    combed = box.with_values(np.minimum(box.values, slots).astype(np.float32))
+    bone = cmfsim.BoneSegment("maxilla", combed, surface_of_level("maxilla", combed))
+    contact = cmfsim.contact_surface(bone, relief=2.0)
+    surface = cmfsim.Surface(contact.vertices, contact.triangles)
+    assert surface.is_closed
+    inner = np.abs(np.asarray(contact.vertices) - [18, 15.5, 20])
+    top = np.asarray(contact.vertices)[(inner < [8, 5, 9]).all(axis=1)][:, 2]
+    tops = np.asarray(bone.surface.vertices)
+    own = tops[(np.abs(tops - [18, 15.5, 20]) < [8, 5, 9]).all(axis=1)][:, 2]
+    assert np.ptp(own) > 5.0
+    assert np.ptp(top) < 2.0
+    assert 16.0 < top.mean() < 20.5
+    # A flat face far from edges stays where it is.
+    low = np.asarray(contact.vertices)
+    floor = low[(np.abs(low - [18, 15.5, 5.5]) < [4, 3, 3]).all(axis=1)][:, 2]
+    assert np.abs(floor - 5.5).max() < 0.6
+    with pytest.raises(cmfsim.CaseError, match="relief is 0"):
+        cmfsim.contact_surface(bone, relief=0)
+
+
 def test_ready_surfaces_are_segments_as_they_are(box):
     ready = surface_of_level("maxilla", box)
     segments = cmfsim.segments_from_surfaces(
