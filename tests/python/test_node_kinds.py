@@ -327,9 +327,7 @@ def test_a_real_head_gets_kinds_that_hold_it_and_solve(head_name):
     rear = points["gonion_L"][1] + 15.0
     nodes, tets = real_heads.tissue_mesh(head_name, 6.0, posterior=rear)
     mesh = cmfsim.TetMesh(nodes, tets)
-    bones = cmfsim.cut_bones(
-        anatomy.bones, {"le_fort_1": {}, "bsso": {}, "genioplasty": {}}, landmarks=points
-    )
+    bones = real_heads.cut(head_name)
     back = nodes[:, 1].max()
     found = cmfsim.classify_nodes(
         nodes,

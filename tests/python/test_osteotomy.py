@@ -20,6 +20,7 @@ pytest.importorskip("skimage")
 pytest.importorskip("scipy")
 
 SPACING = 1.0
+UNDECIMATED = SurfaceOptions(max_triangles=10**6, smoothing=0)
 # BodyParts3D file numbers of the teeth, one side after the other.
 UPPER_TEETH = (55680, 55681, 55682, 55683, *range(55688, 55692), *range(55697, 55701), 55798, 55799)
 LOWER_TEETH = (57140, 57141, 57142, 57143, *range(55692, 55696), *range(55703, 55707), 55686, 55687)
@@ -370,10 +371,7 @@ def cut_head(request):
     pytest.importorskip("pyvista")
     anatomy = real_heads.anatomy(request.param)
     points = real_heads.landmarks(request.param)
-    found = cmfsim.cut_bones(
-        anatomy.bones, {"genioplasty": {}, "bsso": {}, "le_fort_1": {}}, landmarks=points
-    )
-    return request.param, anatomy, points, found
+    return request.param, anatomy, points, real_heads.cut(request.param)
 
 
 def test_le_fort_bsso_and_genioplasty_together_cut_a_real_head(cut_head):
@@ -413,7 +411,8 @@ def test_le_fort_bsso_and_genioplasty_together_cut_a_real_head(cut_head):
 def test_le_fort_3_takes_nose_and_zygomas_and_leaves_the_brow(cut_head):
     head, anatomy, points, _ = cut_head
     bones = {"cranium": anatomy.bones["cranium"]}
-    found = cmfsim.cut_bones(bones, {"le_fort_3": {}}, landmarks=points)
+    options = CutOptions(surface=UNDECIMATED)
+    found = cmfsim.cut_bones(bones, {"le_fort_3": {}}, landmarks=points, options=options)
     assert [s.name for s in found.segments] == ["cranium", "midface"]
     volume(found["midface"])
     surfaces = {
@@ -436,7 +435,9 @@ def test_le_fort_3_takes_nose_and_zygomas_and_leaves_the_brow(cut_head):
 def test_le_fort_1_inside_le_fort_3_makes_three_pieces():
     anatomy, points = real_heads.anatomy("ct_phantom"), real_heads.landmarks("ct_phantom")
     bones = {"cranium": anatomy.bones["cranium"]}
-    found = cmfsim.cut_bones(bones, {"le_fort_1": {}, "le_fort_3": {}}, landmarks=points)
+    options = CutOptions(surface=UNDECIMATED)
+    plan = {"le_fort_1": {}, "le_fort_3": {}}
+    found = cmfsim.cut_bones(bones, plan, landmarks=points, options=options)
     assert [s.name for s in found.segments] == ["cranium", "midface", "maxilla"]
 
 
