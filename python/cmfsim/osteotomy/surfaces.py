@@ -16,8 +16,8 @@ __all__ = ["SurfaceOptions", "contact_surface", "surface_of_level"]
 
 # Taubin (1995): a shrinking step and a slightly larger growing one, which keep the volume.
 SHRINK, GROW = 0.5, -0.53
-# Blur of a contact surface, mm: with 3 mm, 5 mm advancements of both jaws settled on two real heads
-# with tets of 4 to 6 mm where crowns and gaps did not let them.
+# Blur of a contact surface, mm. On two real heads with tets of 4, 5 and 6 mm and two plans of about
+# 5 mm, sliding settled in 9 of 12 runs with it, in 4 of 12 on the bare crowns.
 CONTACT_RELIEF = 3.0
 # Where the blur is cut off, in standard deviations.
 BLUR_REACH = 3.0
