@@ -38,12 +38,20 @@ def landmarks(head, kind="skull"):
     )
 
 
+@functools.cache
 def read_ply(head, name):
     """A surface of a head as SurfaceData."""
     pv = pytest.importorskip("pyvista")
     mesh = pv.read(data_folder() / head / f"{name}.ply")
     triangles = mesh.regular_faces
     return cmfsim.SurfaceData(np.asarray(mesh.points, dtype=float), triangles)
+
+
+@functools.cache
+def core_surface(head, name):
+    """The same, ready to be searched."""
+    surface = read_ply(head, name)
+    return cmfsim.Surface(surface.vertices, surface.triangles)
 
 
 def level_of(surface, spacing, origin, shape):
@@ -72,7 +80,7 @@ def level_of(surface, spacing, origin, shape):
     level = np.where(inside, limit, -limit).astype(np.float32)
     index = np.argwhere(band)
     points = np.asarray(origin) + index * spacing
-    closest, normals, _ = cmfsim.Surface(surface.vertices, surface.triangles).closest(points)
+    closest, normals, _ = surface.closest(points)
     distance = np.einsum("na,na->n", closest - points, normals)
     size = np.linalg.norm(closest - points, axis=1)
     # The stencil decides the side but in the layer where rounding might: there the normal does.
@@ -84,8 +92,8 @@ def level_of(surface, spacing, origin, shape):
 @functools.cache
 def anatomy(head, spacing=2.0):
     """A head as levels of its closed skin, cranium and mandible."""
-    surfaces = {name: read_ply(head, name) for name in ("skin", "cranium", "mandible")}
-    vertices = np.asarray(surfaces["skin"].vertices)
+    surfaces = {name: core_surface(head, name) for name in ("skin", "cranium", "mandible")}
+    vertices = surfaces["skin"].vertices
     origin = np.floor(vertices.min(0)) - 3 * spacing
     shape = tuple(np.ceil((vertices.max(0) - origin) / spacing + 4).astype(int).tolist())
     levels = {
@@ -97,22 +105,44 @@ def anatomy(head, spacing=2.0):
     )
 
 
-def tissue_mesh(head, edge=6.0, *, posterior=None, spacing=2.0):
-    """Soft tissue of a head as voxels cut into Kuhn's six tets: nodes and tets, not snapped.
+@functools.cache
+def cut(head):
+    """Le Fort I, BSSO and genioplasty with their default options."""
+    plan = {"genioplasty": {}, "bsso": {}, "le_fort_1": {}}
+    return cmfsim.cut_bones(anatomy(head).bones, plan, landmarks=landmarks(head))
 
-    What lies behind the coronal plane y = posterior is left out.
+
+def tissue_mesh(head, edge=6.0, *, posterior, spacing=2.0):
+    """Soft tissue of a head as voxels cut into Kuhn's six tets: nodes and tets.
+
+    What lies behind the coronal plane y = posterior is left out. Boundary nodes are drawn onto
+    bones as far as the tets stay whole.
     """
     whole = anatomy(head, spacing)
     low, high = whole.skin.lowest, whole.skin.highest
     counts = np.floor((high - low) / edge).astype(int)
     centres = low + edge * (0.5 + np.stack(np.indices(counts), axis=-1).reshape(-1, 3))
-    level = whole.skin.sample(centres)
+    level = np.minimum(whole.skin.sample(centres), posterior - centres[:, 1])
     for bone in whole.bones.values():
         level = np.minimum(level, -bone.sample(centres))
-    if posterior is not None:
-        level = np.minimum(level, posterior - centres[:, 1])
-    cells = (level > 0.0).reshape(counts)
-    return voxel_tets(cells, low, edge)
+    nodes, tets = voxel_tets((level > 0.0).reshape(counts), low, edge)
+    outer = meshes.outer_nodes(tets)
+    outer = outer[nodes[outer, 1] < nodes[:, 1].max()]
+    target, nearest = nodes.copy(), np.full(len(nodes), 0.9 * edge)
+    for name in whole.bones:
+        found, _, _ = core_surface(head, name).closest(nodes[outer])
+        distance = np.linalg.norm(found - nodes[outer], axis=1)
+        nearer = distance < nearest[outer]
+        target[outer[nearer]] = found[nearer]
+        nearest[outer[nearer]] = distance[nearer]
+    whole_volume, part = meshes.volumes(nodes, tets), np.ones((len(nodes), 1))
+    for _ in range(50):
+        moved = nodes + part * (target - nodes)
+        squeezed = meshes.volumes(moved, tets) < 0.15 * whole_volume
+        if not squeezed.any():
+            break
+        part[np.unique(tets[squeezed])] *= 0.7
+    return moved, tets
 
 
 def voxel_tets(cells, origin, edge):

@@ -144,6 +144,13 @@ def test_given_regions_slide_and_everything_else_of_the_bone_is_joined(head):
     assert data["maxilla"].contact is segments[1].surface
     assert np.array_equal(data["maxilla"].joined, kinds.nodes("joined", "maxilla"))
     assert len(data["cranium"].joined) == 0
+    other = segments[0].surface
+    assert (
+        cmfsim.segment_data(kinds, segments, contacts={"maxilla": other})["maxilla"].contact
+        is other
+    )
+    with pytest.raises(cmfsim.CaseError, match="contact of 'chin'"):
+        cmfsim.segment_data(kinds, segments, contacts={"chin": other})
 
 
 def arches():
@@ -169,9 +176,9 @@ def test_tissue_slides_between_the_vestibules_of_both_arches(head):
         upper_front=3, upper_molars=3, lower_front=2, lower_molars=2, behind=4, beside=3
     )
 
-    def classify(options, anatomy=anatomy, landmarks=arches()):
+    def classify(options, anatomy=anatomy, landmarks=None):
         return cmfsim.classify_nodes(
-            nodes, triangles, anatomy, [whole], moved=["skull"], landmarks=landmarks,
+            nodes, triangles, anatomy, [whole], moved=["skull"], landmarks=landmarks or arches(),
             options=options,
         )  # fmt: skip
 
@@ -320,9 +327,7 @@ def test_a_real_head_gets_kinds_that_hold_it_and_solve(head_name):
     rear = points["gonion_L"][1] + 15.0
     nodes, tets = real_heads.tissue_mesh(head_name, 6.0, posterior=rear)
     mesh = cmfsim.TetMesh(nodes, tets)
-    bones = cmfsim.cut_bones(
-        anatomy.bones, {"le_fort_1": {}, "bsso": {}, "genioplasty": {}}, landmarks=points
-    )
+    bones = real_heads.cut(head_name)
     back = nodes[:, 1].max()
     found = cmfsim.classify_nodes(
         nodes,
@@ -332,8 +337,6 @@ def test_a_real_head_gets_kinds_that_hold_it_and_solve(head_name):
         moved=["maxilla", "mandible_body", "chin"],
         landmarks=points,
         fixed_planes={"posterior": ((0, back, 0), (0, 1, 0))},
-        # Voxels were not snapped to the bone: their corners lie up to 0.87 of an edge away.
-        options=cmfsim.KindOptions(bone_distance=0.9),
     )
     kinds, counts = found.kinds, found.counts
     assert found.findings == ()
@@ -347,24 +350,25 @@ def test_a_real_head_gets_kinds_that_hold_it_and_solve(head_name):
     sliding = nodes[kinds.nodes("sliding")]
     bite = 0.5 * (points["supradentale"] + points["infradentale"])
     assert np.abs(sliding[:, 2] - bite[2]).max() < 35
-    assert sliding[:, 1].max() < points["gonion_L"][1]
-    segments = cmfsim.segment_data(kinds, bones.segments)
+    assert sliding[:, 1].max() < points["occlusal_line_L"][1]
+    contacts = {n: cmfsim.contact_surface(bones[n]) for n in ("maxilla", "mandible_body")}
+    segments = cmfsim.segment_data(kinds, bones.segments, contacts=contacts)
     assert sorted(segments) == ["chin", "mandible_body", "maxilla"]
     scene = cmfsim.Scene(
         nodes,
         tets,
         cmfsim.TissueData("isotropic", young=0.003, poisson=0.45),
         segments,
-        {name: cmfsim.rigid_motion((0, -5, 0)) for name in segments},
+        {name: cmfsim.rigid_motion((2, -4, 3)) for name in segments},
         kinds.nodes("fixed"),
     )
     result = cmfsim.solve_scene(scene)
     moved = result.displacements
     joined = kinds.nodes("joined")
-    np.testing.assert_allclose(moved[joined], np.tile([0, -5, 0], (len(joined), 1)), atol=1e-9)
+    np.testing.assert_allclose(moved[joined], np.tile([2, -4, 3], (len(joined), 1)), atol=1e-9)
     skin = np.flatnonzero(kinds.kind == 0)
     lip = skin[np.argmin(np.linalg.norm(nodes[skin] - (bite + [0, -10, 0]), axis=1))]
     brow = skin[np.argmin(np.linalg.norm(nodes[skin] - points["glabella"], axis=1))]
-    assert -5.5 < moved[lip, 1] < -1.5
+    assert -4.5 < moved[lip, 1] < -1.0
     assert abs(moved[brow, 1]) < 0.2
     assert np.abs(moved).max() < 12.0

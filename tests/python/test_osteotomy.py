@@ -20,6 +20,7 @@ pytest.importorskip("skimage")
 pytest.importorskip("scipy")
 
 SPACING = 1.0
+UNDECIMATED = SurfaceOptions(max_triangles=10**6, smoothing=0)
 # BodyParts3D file numbers of the teeth, one side after the other.
 UPPER_TEETH = (55680, 55681, 55682, 55683, *range(55688, 55692), *range(55697, 55701), 55798, 55799)
 LOWER_TEETH = (57140, 57141, 57142, 57143, *range(55692, 55696), *range(55703, 55707), 55686, 55687)
@@ -127,6 +128,30 @@ def test_surfaces_are_decimated_to_the_wanted_size_and_stay_closed():
     assert surfaces[1].volume == pytest.approx(surfaces[0].volume, rel=0.01)
     closest, _, _ = surfaces[1].closest(fine.vertices)
     assert np.linalg.norm(closest - fine.vertices, axis=1).max() < 1.0
+
+
+def test_a_contact_surface_bridges_the_gaps_between_teeth(box):
+    """Slots of 2 mm between ridges of 4 mm: the blurred surface stays near the ridges' tops."""
+    x, _, z = box.axes()
+    slots = np.where((x % 6.0) < 2.0, 14.5 - z, 100.0)
+    combed = box.with_values(np.minimum(box.values, slots).astype(np.float32))
+    bone = cmfsim.BoneSegment("maxilla", combed, surface_of_level("maxilla", combed))
+    contact = cmfsim.contact_surface(bone, relief=2.0)
+    surface = cmfsim.Surface(contact.vertices, contact.triangles)
+    assert surface.is_closed
+    inner = np.abs(np.asarray(contact.vertices) - [18, 15.5, 20])
+    top = np.asarray(contact.vertices)[(inner < [8, 5, 9]).all(axis=1)][:, 2]
+    tops = np.asarray(bone.surface.vertices)
+    own = tops[(np.abs(tops - [18, 15.5, 20]) < [8, 5, 9]).all(axis=1)][:, 2]
+    assert np.ptp(own) > 5.0
+    assert np.ptp(top) < 2.0
+    assert 16.0 < top.mean() < 20.5
+    # A flat face far from edges stays where it is.
+    low = np.asarray(contact.vertices)
+    floor = low[(np.abs(low - [18, 15.5, 5.5]) < [4, 3, 3]).all(axis=1)][:, 2]
+    assert np.abs(floor - 5.5).max() < 0.6
+    with pytest.raises(cmfsim.CaseError, match="relief is 0"):
+        cmfsim.contact_surface(bone, relief=0)
 
 
 def test_ready_surfaces_are_segments_as_they_are(box):
@@ -346,10 +371,7 @@ def cut_head(request):
     pytest.importorskip("pyvista")
     anatomy = real_heads.anatomy(request.param)
     points = real_heads.landmarks(request.param)
-    found = cmfsim.cut_bones(
-        anatomy.bones, {"genioplasty": {}, "bsso": {}, "le_fort_1": {}}, landmarks=points
-    )
-    return request.param, anatomy, points, found
+    return request.param, anatomy, points, real_heads.cut(request.param)
 
 
 def test_le_fort_bsso_and_genioplasty_together_cut_a_real_head(cut_head):
@@ -389,7 +411,8 @@ def test_le_fort_bsso_and_genioplasty_together_cut_a_real_head(cut_head):
 def test_le_fort_3_takes_nose_and_zygomas_and_leaves_the_brow(cut_head):
     head, anatomy, points, _ = cut_head
     bones = {"cranium": anatomy.bones["cranium"]}
-    found = cmfsim.cut_bones(bones, {"le_fort_3": {}}, landmarks=points)
+    options = CutOptions(surface=UNDECIMATED)
+    found = cmfsim.cut_bones(bones, {"le_fort_3": {}}, landmarks=points, options=options)
     assert [s.name for s in found.segments] == ["cranium", "midface"]
     volume(found["midface"])
     surfaces = {
@@ -412,7 +435,9 @@ def test_le_fort_3_takes_nose_and_zygomas_and_leaves_the_brow(cut_head):
 def test_le_fort_1_inside_le_fort_3_makes_three_pieces():
     anatomy, points = real_heads.anatomy("ct_phantom"), real_heads.landmarks("ct_phantom")
     bones = {"cranium": anatomy.bones["cranium"]}
-    found = cmfsim.cut_bones(bones, {"le_fort_1": {}, "le_fort_3": {}}, landmarks=points)
+    options = CutOptions(surface=UNDECIMATED)
+    plan = {"le_fort_1": {}, "le_fort_3": {}}
+    found = cmfsim.cut_bones(bones, plan, landmarks=points, options=options)
     assert [s.name for s in found.segments] == ["cranium", "midface", "maxilla"]
 
 

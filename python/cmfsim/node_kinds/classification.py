@@ -17,7 +17,7 @@ from cmfsim.checks import Floats, Indices, as_index_rows, as_rows, check_instanc
 from cmfsim.errors import CaseInputError
 from cmfsim.node_kinds.options import BORDERS, KindOptions
 from cmfsim.node_kinds.sliding import sliding_nodes
-from cmfsim.scene import SegmentData
+from cmfsim.scene import SegmentData, SurfaceData
 
 __all__ = ["ClassifiedNodes", "classify_nodes", "segment_data"]
 
@@ -150,7 +150,11 @@ def classify_nodes(
 
 
 def segment_data(
-    kinds: NodeKinds, segments: Sequence[BoneSegment], *, gap: ArrayLike | str = "rest"
+    kinds: NodeKinds,
+    segments: Sequence[BoneSegment],
+    *,
+    contacts: Mapping[str, SurfaceData] | None = None,
+    gap: ArrayLike | str = "rest",
 ) -> dict[str, SegmentData]:
     """The segments of a scene: the nodes that each carries, and the surface that others slide on.
 
@@ -159,6 +163,8 @@ def segment_data(
     kinds : NodeKinds
     segments : sequence of BoneSegment
         Those that the kinds were found with.
+    contacts : mapping of str to SurfaceData, optional
+        Contact surfaces in place of the segments' own, by segment (see `contact_surface`).
     gap : float, mm, or "rest"
         As in `SegmentData`.
 
@@ -179,13 +185,17 @@ def segment_data(
     >>> cmfsim.segment_data(found.kinds, segments)  # doctest: +SKIP
     """
     known = {segment.name: segment for segment in segments}
+    for name in contacts or {}:
+        if name not in known:
+            raise CaseInputError(f"contact of {name!r}; segments are: {', '.join(known)}")
     data = {}
     for name in kinds.segments:
         if name not in known:
             raise CaseInputError(f"there is no segment {name!r}; segments: {', '.join(known)}")
         joined, sliding = kinds.nodes("joined", name), kinds.nodes("sliding", name)
         if len(joined) or len(sliding):
-            contact = known[name].surface if len(sliding) else None
+            own = (contacts or {}).get(name, known[name].surface)
+            contact = own if len(sliding) else None
             data[name] = SegmentData(joined, sliding, contact, gap if len(sliding) else 0.0)
     return data
 

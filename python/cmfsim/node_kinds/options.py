@@ -98,7 +98,8 @@ class KindOptions:
         How far below infradentale, and below sub-M2, it slides on the lower jaw. Sub-M2 lies at
         mid-height of the body, as deep as the vestibule is there.
     behind : float, mm
-        How far behind the second molars' landmarks.
+        How far behind the second molars' landmarks. Further back nodes would slide round the
+        tuberosity and the edges of the cuts, where contact does not settle.
     beside : float, mm
         How far beside them.
     teeth_distance : float, mm
@@ -116,7 +117,7 @@ class KindOptions:
     upper_molars: float = 5.0
     lower_front: float = 8.0
     lower_molars: float = 0.0
-    behind: float = 10.0
+    behind: float = 0.0
     beside: float = 8.0
     teeth_distance: float = 12.0
     regions: tuple[SlidingBox | SlidingSphere, ...] = ()

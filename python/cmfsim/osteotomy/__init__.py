@@ -3,7 +3,7 @@
 from cmfsim.osteotomy.cutting import CutBones, CutOptions, cut_bones, segments_from_surfaces
 from cmfsim.osteotomy.planes import Cut, CuttingPlane, Procedure, free_cut
 from cmfsim.osteotomy.procedures import PROCEDURES, place_procedure, procedure_options
-from cmfsim.osteotomy.surfaces import SurfaceOptions, surface_of_level
+from cmfsim.osteotomy.surfaces import SurfaceOptions, contact_surface, surface_of_level
 
 __all__ = [
     "PROCEDURES",
@@ -13,6 +13,7 @@ __all__ = [
     "CuttingPlane",
     "Procedure",
     "SurfaceOptions",
+    "contact_surface",
     "cut_bones",
     "free_cut",
     "place_procedure",
