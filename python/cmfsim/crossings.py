@@ -15,10 +15,12 @@ __all__ = ["crossing_pairs"]
 
 Integers = NDArray[np.int64]
 
+# Width of a cell, in mean sizes of a triangle.
+CELL = 1.2
 # Cells that a triangle may lie in on average; larger ones make the grid coarser.
 CELLS_PER_TRIANGLE = 16
-# Candidates that are tested at once: arrays of some 100 MB.
-CHUNK = 1_000_000
+# Candidates that are tested at once: arrays that fit the cache.
+CHUNK = 100_000
 # Candidates above which the search is given up: hostile or broken files, not anatomy.
 MAX_CANDIDATES = 400_000_000
 # Largest number of cells along an axis: three fit one 63-bit key.
@@ -58,8 +60,8 @@ class _Grid:
     def __init__(self, low: Floats, high: Floats) -> None:
         origin, end = low.min(axis=0), high.max(axis=0)
         extents = high - low
-        # Twice the mean size, so that most triangles lie in one cell or in two.
-        cell = 2.0 * float(extents.max(axis=1).mean())
+        # About the mean size: smaller cells have fewer candidates, but more cells a triangle.
+        cell = CELL * float(extents.max(axis=1).mean())
         cell = max(cell, float((end - origin).max()) / (MAX_CELLS - 1), np.finfo(float).tiny)
         while True:
             first = ((low - origin) / cell).astype(np.int64)

@@ -145,9 +145,9 @@ def check_surface(surface: SurfaceData, *, crossings: bool = True) -> SurfaceRep
     triangles = np.asarray(surface.triangles).astype(np.int64)
     degenerate, slivers = thin_triangles(vertices, triangles)
     duplicate = duplicate_triangles(triangles)
-    # Lines and repetitions would look like borders and forks of what is otherwise sound.
-    keep = np.ones(len(triangles), dtype=bool)
-    keep[degenerate] = False
+    # Repetitions would look like forks. A triangle without area still joins its neighbours, unless
+    # it names a vertex twice, when they are joined without it.
+    keep = has_three_corners(triangles)
     keep[duplicate] = False
     kept = triangles[keep]
     edges = edges_of(kept)
@@ -156,11 +156,13 @@ def check_surface(surface: SurfaceData, *, crossings: bool = True) -> SurfaceRep
     areas, volumes = _areas_volumes(vertices, kept)
     found = points = None
     if crossings:
-        pairs = crossing_pairs(vertices, kept)
+        solid = keep.copy()
+        solid[degenerate] = False
+        numbers = np.flatnonzero(solid)
+        pairs = crossing_pairs(vertices, triangles[solid])
         if pairs is not None:
-            numbers = np.flatnonzero(keep)
-            points = vertices[kept[pairs]].mean(axis=(1, 2)) if len(pairs) else np.zeros((0, 3))
             found = numbers[pairs].reshape(-1, 2)
+            points = vertices[triangles[found]].mean(axis=(1, 2))
     return SurfaceReport(
         n_vertices=len(vertices),
         n_triangles=len(triangles),
@@ -193,6 +195,12 @@ def thin_triangles(
     flat = twice_area <= DEGENERATE_HEIGHT * longest * longest
     sliver = ~flat & (twice_area < SLIVER_HEIGHT * longest * longest)
     return np.flatnonzero(flat), np.flatnonzero(sliver)
+
+
+def has_three_corners(triangles: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which triangles name no vertex twice."""
+    a, b, c = triangles.T
+    return np.asarray((a != b) & (b != c) & (c != a), dtype=np.bool_)
 
 
 def duplicate_triangles(triangles: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -11,7 +11,12 @@ from cmfsim.case import Finding
 from cmfsim.checks import Floats, as_number
 from cmfsim.errors import CaseInputError
 from cmfsim.scene import SurfaceData
-from cmfsim.surface_checks import border_loops, duplicate_triangles, thin_triangles
+from cmfsim.surface_checks import (
+    border_loops,
+    duplicate_triangles,
+    has_three_corners,
+    thin_triangles,
+)
 from cmfsim.topology import component_labels, connected_labels, edges_of, orientation_flips
 
 __all__ = ["RepairOptions", "clean_surface", "repair_surface"]
@@ -112,14 +117,9 @@ def repair_surface(
     vertices, triangles, n_welded = _welded(vertices, triangles, options.weld_distance)
     if n_welded:
         note("surface-welded", f"{n_welded} vertices became one with others", "they hid edges")
-    keep = np.ones(len(triangles), dtype=bool)
-    keep[thin_triangles(vertices, triangles)[0]] = False
-    n_flat = int((~keep).sum())
-    keep[duplicate_triangles(triangles)] = False
-    n_again = int((~keep).sum()) - n_flat
-    triangles = triangles[keep]
+    triangles, n_flat, n_again = _without_flat(vertices, triangles)
     if n_flat or n_again:
-        what = f"{n_flat} triangles without area and {n_again} repeated ones are dropped"
+        what = f"{n_flat} triangles without area and {n_again} repeated ones are removed"
         note("surface-cleaned", what, "they have no normal, or count their space twice")
     if not len(triangles):
         raise CaseInputError(f"{name}: no triangle with an area is left")
@@ -138,6 +138,10 @@ def repair_surface(
             if len(loop.vertices) < 3:
                 continue
             cap, bulge = cap_loop(vertices, loop.vertices)
+            # What lies on a line closes a slit that is closed already.
+            cap = np.delete(cap, thin_triangles(vertices, cap)[0], axis=0)
+            if not len(cap):
+                continue
             caps.append(cap)
             findings.append(_cap_finding(name, loop.length, loop.centre, bulge))
         triangles = np.concatenate([triangles, *caps])
@@ -199,6 +203,72 @@ def _near_pairs(vertices: Floats, distance: float) -> Integers:
         near &= np.linalg.norm(vertices[one] - vertices[other], axis=1) <= distance
         pairs.append(np.stack([one[near], other[near]], axis=1))
     return np.concatenate(pairs)
+
+
+# Rounds and number of flat triangles up to which they are removed without opening a slit; a surface
+# with more is broken in another way.
+FLAT_ROUNDS, MAX_FLAT = 8, 2000
+# Share of the longest edge below which the shortest is a point.
+POINT_SHARE = 1e-3
+
+
+def _without_flat(vertices: Floats, triangles: Integers) -> tuple[Integers, int, int]:
+    """Triangles without those that have no area or repeat others, and how many of each went.
+
+    Dropping a flat triangle would leave a slit of no width. One with two corners in the same place
+    goes when these become one; one with a corner on its longest edge takes that edge from the
+    triangle across, which is then cut in two at the corner.
+    """
+    n_flat = len(thin_triangles(vertices, triangles)[0])
+    n_again = 0
+    for _ in range(FLAT_ROUNDS):
+        triangles = triangles[has_three_corners(triangles)]
+        before = len(triangles)
+        triangles = np.delete(triangles, duplicate_triangles(triangles), axis=0)
+        n_again += before - len(triangles)
+        flat = thin_triangles(vertices, triangles)[0]
+        if not 0 < len(flat) <= MAX_FLAT:
+            break
+        corners = vertices[triangles[flat]]
+        # Edge i lies opposite corner i.
+        lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1), axis=2)
+        is_point = lengths.min(axis=1) <= POINT_SHARE * lengths.max(axis=1)
+        if is_point.any():
+            short = lengths[is_point].argmin(axis=1)
+            rows = triangles[flat[is_point]]
+            ends = [rows[np.arange(len(rows)), (short + step) % 3] for step in (1, 2)]
+            labels = connected_labels(np.stack(ends, axis=1), len(vertices))
+            _, first = np.unique(labels, return_index=True)
+            triangles = first[labels][triangles]
+        else:
+            triangles = _with_turned_edges(triangles, flat, lengths.argmax(axis=1))
+    flat = thin_triangles(vertices, triangles)[0]
+    triangles = np.delete(triangles, flat, axis=0)
+    return triangles, n_flat, n_again
+
+
+def _with_turned_edges(triangles: Integers, flat: Integers, longest: Integers) -> Integers:
+    """Triangles where each flat one and its neighbour across its longest edge are cut anew."""
+    triangles = triangles.copy()
+    done: set[int] = set()
+    for number, corner in zip(flat.tolist(), longest.tolist(), strict=True):
+        tip, start, end = np.roll(triangles[number], -corner)
+        across = np.flatnonzero(
+            (triangles == start).any(axis=1) & (triangles == end).any(axis=1)
+        ).tolist()
+        others = [t for t in across if t != number]
+        if len(others) != 1 or {number, others[0]} & done:
+            continue
+        other = others[0]
+        far = next(v for v in triangles[other].tolist() if v not in {start, end})
+        # The neighbour runs from end to start; if it does not, the surface is inconsistent there.
+        row = triangles[other].tolist()
+        if row[(row.index(end) + 1) % 3] != start:
+            continue
+        triangles[number] = (tip, start, far)
+        triangles[other] = (tip, far, end)
+        done |= {number, other}
+    return triangles
 
 
 def _without_debris(

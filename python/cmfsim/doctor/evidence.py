@@ -7,11 +7,12 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmfsim._core import PRESETS, Surface
 from cmfsim.case import Finding
 from cmfsim.checks import Floats
-from cmfsim.errors import CmfsimError
+from cmfsim.errors import CaseError, CmfsimError
 from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.patient import CaseMotion, CaseSurfaces
 from cmfsim.scene import SurfaceData
@@ -87,6 +88,32 @@ class Evidence:
     motions: Mapping[str, Floats] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
 
+    def in_region(self, points: Floats) -> NDArray[np.bool_]:
+        """Which of (n, 3) points lie in the part of the head that is meshed.
+
+        Where there is no skin, all of them.
+        """
+        if self.skin is None:
+            return np.ones(len(points), dtype=bool)
+        depths = np.asarray(self.skin.mended.vertices)[:, 1]
+        region = self.case.region
+        try:
+            plane = region.plane(self.skull_landmarks, float(depths.min()), float(depths.max()))
+        except CaseError:
+            # Landmarks that the plane is placed from are missing, which is said elsewhere.
+            return np.ones(len(points), dtype=bool)
+        inside = plane.distance(points) < 0.0
+        if region.lower is not None:
+            inside &= points[:, 2] > region.lower
+        if region.upper is not None:
+            inside &= points[:, 2] < region.upper
+        return np.asarray(inside, dtype=np.bool_)
+
+    @property
+    def has_all_bones(self) -> bool:
+        """Whether every bone that the case names could be read."""
+        return self.case.surfaces is not None and set(self.bones) == set(self.case.surfaces.bones)
+
 
 def gather(case: Case) -> Evidence:
     """What can be read of a case, with a finding for each file that cannot."""
@@ -117,6 +144,19 @@ def gather(case: Case) -> Evidence:
         _check_motion_files(case, name, motion, findings)
         if motion.matrix is not None:
             motions[name] = motion.matrix
+    try:
+        case.region.plane(skull, 0.0, 0.0)
+    except CaseError as error:
+        findings.append(
+            Finding(
+                "error",
+                "region-unplaced",
+                str(error),
+                case.where("region.posterior_depth"),
+                "the face cannot be parted from the rest of the head",
+                "place these landmarks, or give posterior_plane",
+            )
+        )
     if case.tissue.kind == "preset" and case.tissue.preset not in PRESETS:
         findings.append(
             Finding(

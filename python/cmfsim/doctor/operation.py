@@ -132,18 +132,9 @@ def _check_tissue(evidence: Evidence, name: str, body: Body) -> Iterator[Finding
     skin = evidence.skin
     if skin is None:
         return
-    vertices = np.asarray(skin.mended.vertices)
-    plane = evidence.case.region.plane(
-        evidence.skull_landmarks, float(vertices[:, 1].min()), float(vertices[:, 1].max())
-    )
     points = body.samples
     beside = points + BESIDE_BONE * body.index.closest(points)[1]
-    tissue = (skin.index.winding_number(beside) > 0.5) & (plane.distance(beside) < 0.0)
-    region = evidence.case.region
-    if region.lower is not None:
-        tissue &= beside[:, 2] > region.lower
-    if region.upper is not None:
-        tissue &= beside[:, 2] < region.upper
+    tissue = (skin.index.winding_number(beside) > 0.5) & evidence.in_region(beside)
     for other in evidence.bones.values():
         if tissue.any():
             beside_tissue = np.flatnonzero(tissue)

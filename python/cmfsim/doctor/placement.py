@@ -35,6 +35,8 @@ THROUGH_SKIN = 0.1
 LANDMARK_WARNING, LANDMARK_ERROR = 5.0, 15.0
 # A landmark off the middle by less than this does not tell left from right, mm.
 SIDE_MARGIN = 3.0
+# Distance of two groups of landmarks below which they give no direction, mm.
+SHORTEST = 5.0
 # Share of the length of a direction that its main axis must have for the head to be upright.
 MAIN_AXIS = 0.5
 
@@ -51,6 +53,10 @@ def check_placement(evidence: Evidence) -> list[Finding]:
     if sizes:
         return sizes
     findings: list[Finding] = []
+    for name, body in evidence.bones.items():
+        findings += _check_bone_inside(evidence, name, body)
+    if any(finding.severity == "error" for finding in findings):
+        return findings
     turned = False
     for key, landmarks in _landmark_sets(evidence).items():
         wrong = list(_check_landmark_fit(evidence, key, landmarks))
@@ -63,8 +69,6 @@ def check_placement(evidence: Evidence) -> list[Finding]:
         findings += wrong
     if not turned:
         findings += _check_bone_directions(evidence)
-    for name, body in evidence.bones.items():
-        findings += _check_bone_inside(evidence, name, body)
     findings += _check_bone_overlap(evidence)
     return findings
 
@@ -143,7 +147,8 @@ def _nearest(bodies: Sequence[Body], points: Floats) -> Floats:
 
 def _bodies(evidence: Evidence, key: str) -> list[Body]:
     if key == "skull":
-        return list(evidence.bones.values())
+        # With a bone missing, its landmarks would seem to lie far from the others.
+        return list(evidence.bones.values()) if evidence.has_all_bones else []
     return [evidence.skin] if evidence.skin else []
 
 
@@ -215,13 +220,20 @@ def _pairs(landmarks: Mapping[str, Floats]) -> dict[str, Floats]:
     }
 
 
-def _difference(one: Floats | None, other: Floats | None) -> Floats | None:
-    """The unit vector from the second to the first point."""
+def _direction(
+    one: Floats | None, other: Floats | None, across: Floats | None = None
+) -> Floats | None:
+    """The unit vector from the second to the first point, at right angles to another if given."""
     if one is None or other is None:
         return None
     vector = one - other
+    return _unit(vector if across is None else vector - (vector @ across) * across)
+
+
+def _unit(vector: Floats) -> Floats | None:
+    """The vector at length 1; None if it is too short to point anywhere."""
     length = float(np.linalg.norm(vector))
-    return vector / length if length > 0.0 else None
+    return vector / length if length > SHORTEST else None
 
 
 def _check_directions(
@@ -229,9 +241,10 @@ def _check_directions(
 ) -> Iterator[Finding]:
     """A head that does not look along −P with its left along +L and its crown along +S."""
     pairs = _pairs(landmarks)
-    left = _difference(np.sum(list(pairs.values()), axis=0), np.zeros(3)) if pairs else None
-    back = _difference(_mean(landmarks, BACK), _mean(landmarks, FRONT))
-    up = _difference(_mean(landmarks, ABOVE), _mean(landmarks, BELOW))
+    left = _unit(np.mean(list(pairs.values()), axis=0)) if pairs else None
+    up = _direction(_mean(landmarks, ABOVE), _mean(landmarks, BELOW))
+    # At right angles to the face, or points that lie behind and above it would point upwards.
+    back = _direction(_mean(landmarks, BACK), _mean(landmarks, FRONT), up)
     signs = [
         0 if v is None or abs(v[axis]) < MAIN_AXIS else int(np.sign(v[axis]))
         for axis, v in enumerate((left, back, up))
@@ -345,7 +358,9 @@ def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Fi
     skin = evidence.skin
     if skin is None:
         return
-    points = body.samples
+    # Behind the region, a face mask has no skin.
+    points = body.samples[evidence.in_region(body.samples)]
+    points = points if len(points) else body.samples
     outside = skin.index.winding_number(points) < 0.5
     if not outside.any():
         return
@@ -389,11 +404,11 @@ OVERLAP_SHARE = 0.05
 
 def _check_bone_overlap(evidence: Evidence) -> Iterator[Finding]:
     for name, body in evidence.bones.items():
-        points = body.samples
-        normals = body.index.closest(points)[1]
-        inner = points - UNDER_SURFACE * normals
+        inner = body.samples - UNDER_SURFACE * body.index.closest(body.samples)[1]
         for other_name, other in evidence.bones.items():
-            if other_name == name:
+            # Each pair once: the smaller bone is the one that lies in the other.
+            size, other_size = body.report.area, other.report.area
+            if (size, name) >= (other_size, other_name):
                 continue
             share = float((other.index.winding_number(inner) > 0.5).mean())
             if share > OVERLAP_SHARE:

@@ -151,10 +151,7 @@ def check_mesh_size(evidence: Evidence) -> Iterator[Finding]:
     case, skin = evidence.case, evidence.skin
     if skin is None or not evidence.bones or case.mesh.file is not None:
         return
-    points = skin.samples
-    foremost, hindmost = (float(f(points[:, 1])) for f in (np.min, np.max))
-    plane = case.region.plane(evidence.skull_landmarks, foremost, hindmost)
-    points = points[plane.distance(points) < 0.0]
+    points = skin.samples[evidence.in_region(skin.samples)]
     if not len(points):
         return
     thickness = _thickness(evidence, points)
@@ -163,11 +160,11 @@ def check_mesh_size(evidence: Evidence) -> Iterator[Finding]:
     if thin.mean() <= THIN_SHARE:
         return
     place = points[int(np.argmin(thickness))]
-    refined = case.mesh.refine and float(thickness.min()) >= 0.5 * edge
+    refined = case.mesh.refine
     yield Finding(
         "note" if refined else "warning",
         "edge-length-coarse",
-        f"{thin.mean():.0%} of the skin in front of the posterior plane lies closer to bone than "
+        f"{thin.mean():.0%} of the skin of the region lies closer to bone than "
         f"an edge of {edge:g} mm, {thickness.min():.1f} mm at {place_text(place)}",
         case.where("mesh.edge_length"),
         "sheets thinner than an edge are lost or stiff" + (" unless refined" if refined else ""),

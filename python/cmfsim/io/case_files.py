@@ -220,16 +220,16 @@ def _surfaces(table: Table, folder: Path) -> CaseSurfaces:
         table.fail("bones" if "bones" in table else None, 'names no bone: cranium = "file.ply"')
     return CaseSurfaces(
         skin=_file(table, "skin", folder),
-        bones={_name(bones, name): _file(bones, name, folder) for name in names},
+        bones={_name(bones, name, name): _file(bones, name, folder) for name in names},
         units=table.text("units", "mm", tuple(UNITS)),
         frame=table.text("frame", "LPS", FRAMES),
     )
 
 
-def _name(table: Table, name: str) -> str:
+def _name(table: Table, key: str, name: str) -> str:
     """A name that can stand in a file name: of a bone or segment."""
     if not name or not all(c.isalnum() or c in "_-+" for c in name) or len(name) > 64:
-        table.fail(name, "is no name: letters, digits, '_', '-' and '+', 64 at most")
+        table.fail(key, f"is no name ({name!r}): letters, digits, '_', '-' and '+', 64 at most")
     return name
 
 
@@ -289,7 +289,7 @@ def _osteotomies(document: Table) -> tuple[CaseOsteotomy, ...]:
             cut = CaseOsteotomy(procedure, options)
         elif "plane" in table:
             table.only("plane", "bone", "name")
-            name = _name(table, table.text("name"))
+            name = _name(table, "name", table.text("name"))
             cut = CaseOsteotomy(plane=_plane(table, "plane"), bone=table.text("bone"), name=name)
         else:
             known = ", ".join(PROCEDURES)
@@ -303,7 +303,7 @@ def _osteotomies(document: Table) -> tuple[CaseOsteotomy, ...]:
 
 
 def _plan(table: Table, folder: Path) -> dict[str, CaseMotion]:
-    return {_name(table, name): _motion(table.table(name), folder) for name in table}
+    return {_name(table, name, name): _motion(table.table(name), folder) for name in table}
 
 
 def _motion(table: Table, folder: Path) -> CaseMotion:

@@ -19,6 +19,9 @@ __all__ = [
     "read_tets",
 ]
 
+# Length of a PLY header with any number of properties and comments, bytes.
+MAX_PLY_HEADER = 2**16
+
 
 def _meshio() -> Any:
     try:
@@ -35,6 +38,7 @@ def read_mesh(path: Path) -> Any:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     _refuse_entities(path)
+    _refuse_headless(path)
     with named(path):
         try:
             # meshio prints what it finds and, in some readers, exits: neither is the caller's.
@@ -42,7 +46,7 @@ def read_mesh(path: Path) -> Any:
                 contextlib.redirect_stdout(stdio.StringIO()),
                 contextlib.redirect_stderr(stdio.StringIO()),
             ):
-                return meshio.read(path)
+                return _read_vtp(path) if path.suffix == ".vtp" else meshio.read(path)
         except (Exception, SystemExit) as error:
             raise CaseInputError(f"cannot be read as a mesh ({error})") from error
 
@@ -77,6 +81,33 @@ def read_tet_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], ND
     negative = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0.0
     tets[negative] = tets[negative][:, [0, 1, 3, 2]]
     return nodes, tets.astype(np.uint32)
+
+
+def _read_vtp(path: Path) -> Any:
+    """The triangles of VTK's surface format, which meshio does not know, as a mesh of meshio."""
+    try:
+        pyvista = import_module("pyvista")
+    except ModuleNotFoundError as error:
+        raise CaseInputError("VTP is read with pyvista: pip install 'cmfsim[mesh]'") from error
+    # VTK prints what it finds wrong and goes on with nothing.
+    shown = pyvista.vtk_verbosity()
+    pyvista.vtk_verbosity("off")
+    try:
+        surface = pyvista.read(path).triangulate()
+    finally:
+        pyvista.vtk_verbosity(shown)
+    triangles = surface.faces.reshape(-1, 4)[:, 1:]
+    return _meshio().Mesh(surface.points, [("triangle", triangles)] if len(triangles) else [])
+
+
+def _refuse_headless(path: Path) -> None:
+    """Refuses a PLY whose header does not end, for which meshio 5.3 waits for ever."""
+    if path.suffix.lower() != ".ply":
+        return
+    with path.open("rb") as file:
+        head = file.read(MAX_PLY_HEADER)
+    if b"end_header" not in head:
+        raise CaseInputError(f"{path.name}: is no PLY file, or is cut short in its header")
 
 
 def read_tets(mesh: Any, path: Path) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:

@@ -1,0 +1,108 @@
+"""`cmfsim build` reads the case, asks the doctor first, and names its stages."""
+
+import io
+import json
+import sys
+import types
+
+import pytest
+
+import cmfsim
+from cmfsim.cli import main
+from cmfsim.cli.terminal import StageProgress, in_colour
+from head_case import HeadCase
+
+
+@pytest.fixture
+def built(monkeypatch):
+    """The cases that a stand-in for the build stage was given."""
+    cases = []
+
+    def build_case(case, progress):
+        cases.append(case)
+        progress("segmenting")
+        progress("meshing")
+        return types.SimpleNamespace(summary={"n_tets": 7, "name\x1b[2J": case.name})
+
+    monkeypatch.setitem(sys.modules, "cmfsim.build", types.SimpleNamespace(build_case=build_case))
+    return cases
+
+
+def test_build_passes_the_case_and_names_its_stages(built, tmp_path, capsys):
+    """Plain lines in a pipe; overrides of folder and edge length reach the stage."""
+    path = HeadCase().write(tmp_path)
+    words = ["build", str(path), "-o", str(tmp_path / "there"), "--edge-length", "2.5"]
+    assert main(words) == 0
+    out, err = capsys.readouterr()
+    assert err.splitlines() == [
+        f"cmfsim: {s}" for s in ("checking the case", "segmenting", "meshing")
+    ]
+    assert "\x1b" not in out + err
+    assert "n_tets               7" in out
+    assert (built[0].output, built[0].mesh.edge_length) == (tmp_path / "there", 2.5)
+    assert main([*words, "--json", "-q"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert json.loads(out)["n_tets"] == 7
+
+
+def test_build_stops_at_an_error_of_the_doctor(built, tmp_path, capsys):
+    """Findings on standard error, exit code 2, nothing built; unless told not to ask."""
+    head = HeadCase()
+    head.replace("skin.ply", "face.ply")
+    path = head.write(tmp_path)
+    assert main(["build", str(path)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "file-missing" in err
+    assert built == []
+    assert main(["build", str(path), "--no-doctor"]) == 0
+    assert len(built) == 1
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf"])
+def test_a_faulty_edge_length_is_bad_input(value, built, tmp_path, capsys):
+    """Before anything is read of the case's files."""
+    path = HeadCase().write(tmp_path)
+    assert main(["build", str(path), f"--edge-length={value}"]) == 2
+    assert "--edge-length is" in capsys.readouterr().err
+    assert built == []
+
+
+class Terminal(io.StringIO):
+    """A stream that says it is a terminal."""
+
+    def isatty(self):
+        """Always."""
+        return True
+
+
+def test_a_terminal_gets_one_line_that_is_erased_at_the_end():
+    """Each update begins at the start of the line; a name cannot steer the terminal."""
+    stream = Terminal()
+    with StageProgress(stream) as progress:
+        progress.stage("mesh\x1bing")
+    text = stream.getvalue()
+    assert "\n" not in text
+    assert text.startswith("\r\x1b[Kcmfsim: mesh\\x1bing 0.0 s")
+    assert text.endswith("\r\x1b[K")
+
+
+def test_a_quiet_display_says_nothing():
+    """Neither on a terminal nor in a pipe."""
+    for stream in (Terminal(), io.StringIO()):
+        with StageProgress(stream, quiet=True) as progress:
+            progress.stage("meshing")
+        assert stream.getvalue() == ""
+
+
+def test_colours_follow_the_terminal_and_no_color(monkeypatch):
+    """https://no-color.org: any value of NO_COLOR but the empty one turns them off."""
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    assert in_colour(Terminal())
+    assert not in_colour(io.StringIO())
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert not in_colour(Terminal())
+    finding = cmfsim.Finding("error", "x", "something")
+    assert "\x1b[31;1merror\x1b[0m" in cmfsim.doctor.findings_text([finding], colour=True)
