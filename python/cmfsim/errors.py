@@ -25,6 +25,7 @@ __all__ = [
     "CmfsimError",
     "ContactError",
     "ImageError",
+    "ImageInputError",
     "LandmarkError",
     "LandmarkInputError",
     "MaterialError",
@@ -44,3 +45,7 @@ class CaseInputError(CaseError, ValueError):
 
 class LandmarkInputError(LandmarkError, ValueError):
     """Landmarks, in memory or on disk, that cannot be meant."""
+
+
+class ImageInputError(ImageError, ValueError):
+    """An image that cannot be meant: not three axes, no CT, damaged, no head in it."""

@@ -1,6 +1,7 @@
 """Files and values: each format's reader beside its writer, one file per subject."""
 
 from cmfsim.io.case_files import Case
+from cmfsim.io.images import read_image, write_image
 from cmfsim.io.landmarks import LandmarkFile, read_landmark_file, read_landmarks, write_landmarks
 from cmfsim.io.results import read_result, result_suffixes, write_result
 from cmfsim.io.scenes import read_plan, read_scene, write_scene
@@ -9,6 +10,7 @@ from cmfsim.io.surfaces import read_surface, write_surface
 __all__ = [
     "Case",
     "LandmarkFile",
+    "read_image",
     "read_landmark_file",
     "read_landmarks",
     "read_plan",
@@ -16,6 +18,7 @@ __all__ = [
     "read_scene",
     "read_surface",
     "result_suffixes",
+    "write_image",
     "write_landmarks",
     "write_result",
     "write_scene",

@@ -1,0 +1,113 @@
+"""The way from a CT to an anatomy, stage by stage."""
+
+import logging
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim.case import Anatomy, Finding, ImageData
+from cmfsim.checks import Floats, as_rows
+from cmfsim.imaging.air import air_level
+from cmfsim.imaging.bone import bone_level, find_bone, teeth_level
+from cmfsim.imaging.intensity import weak_bone
+from cmfsim.imaging.jaw import part_jaws
+from cmfsim.imaging.metal import find_metal
+from cmfsim.imaging.options import SegmentOptions
+from cmfsim.imaging.skin import find_skin
+from cmfsim.imaging.view import view_findings
+from cmfsim.imaging.working import without_noise, working_grid
+
+__all__ = ["segment_head"]
+
+_LOG = logging.getLogger(__name__)
+
+
+def segment_head(
+    image: ImageData,
+    options: SegmentOptions | None = None,
+    *,
+    landmarks: Mapping[str, ArrayLike] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Anatomy:
+    """Skin, bones, air and teeth of a head CT, as level images on one grid, with findings.
+
+    Parameters
+    ----------
+    image : ImageData
+        A CT in LPS; in HU, or in a scale that its histogram gives away (a finding says so).
+    options : SegmentOptions, optional
+    landmarks : mapping of str to (3,) float64, mm, optional
+        Of the skull, LPS: they tell the mandible from the rest. Without them its shape does.
+    progress : callable, optional
+        Called with the name of each stage: "grid", "metal", "skin", "bone", "jaw", "air".
+
+    Returns
+    -------
+    Anatomy
+        With bones "cranium" (with the cervical spine) and "mandible", or "skull".
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) Too small, not finite, no CT, no head, no bone.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> image = cmfsim.read_image("ct.nii.gz")  # doctest: +SKIP
+    >>> anatomy = cmfsim.segment_head(image)  # doctest: +SKIP
+    >>> sorted(anatomy.bones)  # doctest: +SKIP
+    ['cranium', 'mandible']
+    """
+    options = SegmentOptions() if options is None else options
+
+    def say(stage: str) -> None:
+        _LOG.info("imaging: %s", stage)
+        if progress is not None:
+            progress(stage)
+
+    points = None if landmarks is None else _checked(landmarks)
+    say("grid")
+    work, findings = working_grid(image, options)
+    all_findings: list[Finding] = list(findings)
+    work = without_noise(work)
+    say("metal")
+    metal = find_metal(work, options)
+    say("skin")
+    skin = find_skin(work, metal, options)
+    say("bone")
+    bone = find_bone(work, metal, skin, options)
+    all_findings += [
+        *weak_bone(work.hu[skin.mask], options.bone_threshold),
+        *metal.findings,
+        *skin.findings,
+        *bone.findings,
+        *view_findings(work, skin, bone),
+    ]
+    # A smoothed rim may not carry bone past the skin.
+    level = np.minimum(bone_level(bone, options), skin.level)
+    bones = {"skull": work.image(level)}
+    teeth = None
+    if options.part_jaws:
+        say("jaw")
+        jaws = part_jaws(work, bone, points)
+        all_findings += jaws.findings
+        if jaws.side is not None:
+            bones = {
+                "cranium": work.image(np.minimum(level, -jaws.side)),
+                "mandible": work.image(np.minimum(level, jaws.side)),
+            }
+        dense = teeth_level(bone, work, jaws.occlusal_height)
+        teeth = None if dense is None else work.image(dense)
+    say("air")
+    hollow = air_level(work, skin, bone, options)
+    air = None if hollow is None else work.image(hollow)
+    return Anatomy(work.image(skin.level), bones, air, teeth, tuple(all_findings))
+
+
+def _checked(landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:
+    return {
+        name: as_rows(f"landmark {name!r}", np.reshape(np.asarray(place), (1, -1)), 3)[0]
+        for name, place in landmarks.items()
+    }

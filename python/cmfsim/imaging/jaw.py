@@ -1,0 +1,284 @@
+"""The mandible told from the rest of the skull, though teeth and joints touch it."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.case import Finding
+from cmfsim.checks import Floats
+from cmfsim.imaging.bone import Bone
+from cmfsim.imaging.guess import guessed_landmarks
+from cmfsim.imaging.morphology import Mask, Volume, depth, reached, smoothed, watershed
+from cmfsim.imaging.working import Working
+
+__all__ = ["Jaws", "part_jaws"]
+
+# Landmarks (Phillips & Smuts 1996) that lie on each bone.
+ON_MANDIBLE = (
+    "menton",
+    "pogonion",
+    "supramentale",
+    "gonion_L",
+    "gonion_R",
+    "sub_m2_L",
+    "sub_m2_R",
+)
+ON_CRANIUM = (
+    "supraglabella",
+    "glabella",
+    "nasion",
+    "rhinion",
+    "mid_philtrum",
+    "frontal_eminence_L",
+    "frontal_eminence_R",
+    "supraorbital_L",
+    "supraorbital_R",
+    "suborbital_L",
+    "suborbital_R",
+    "inferior_malar_L",
+    "inferior_malar_R",
+    "lateral_orbit_L",
+    "lateral_orbit_R",
+    "zygomatic_arch_L",
+    "zygomatic_arch_R",
+    "supraglenoid_L",
+    "supraglenoid_R",
+    "supra_m2_L",
+    "supra_m2_R",
+)
+# A landmark farther than this from bone is not used, mm; a seed is a ball of the second radius.
+FARTHEST_SEED = 6.0
+SEED_RADIUS = 3.0
+# All bone higher than this above the arches' roots is the cranium's, mm.
+ABOVE_JOINT = 20.0
+# Crowns and alveolar bone between these distances from the occlusal plane are seeds, mm.
+CROWN = (2.0, 16.0)
+# The mandible's front edge of the ramus ends the tooth row, mm in front of the occlusal landmark.
+BEFORE_RAMUS = 5.0
+# The middle of the condyle from the supraglenoid landmark: towards the midline, back, up, mm;
+# within 2 mm in the four joints of two skulls in which it was measured.
+CONDYLE = (15.0, 0.5, -12.0)
+# Depth in bone that counts as much as FLOOD_HU, mm.
+FLOOD_DEPTH = 3.0
+# A joint space is dark before it is open, HU.
+FLOOD_HU = 700.0
+# Mandibles have volumes (with marrow, mm³) and widths (mm) in these ranges, children's included.
+VOLUMES = (8_000.0, 250_000.0)
+WIDTHS = (45.0, 150.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Jaws:
+    """The mandible in the bone.
+
+    Attributes
+    ----------
+    side : (nx, ny, nz) float32 or None
+        Positive towards the mandible, negative towards the rest; None if it was not found.
+    mandible : (nx, ny, nz) bool or None
+    occlusal_height : float or None
+        z of the occlusal plane at the incisors, mm.
+    findings : tuple of Finding
+    """
+
+    side: Volume | None
+    mandible: Mask | None
+    occlusal_height: float | None
+    findings: tuple[Finding, ...]
+
+
+def part_jaws(work: Working, bone: Bone, landmarks: Mapping[str, Floats] | None) -> Jaws:
+    """The mandible by a flood from seeds, which stops where bones touch most narrowly."""
+    findings: list[Finding] = []
+    if landmarks is None or _occlusal_points(landmarks) is None:
+        guess = guessed_landmarks(work, bone)
+        if guess is None:
+            return Jaws(None, None, None, (_not_parted("no tooth row or chin was recognised"),))
+        landmarks = guess | dict(landmarks or {})
+        findings.append(_guessed())
+    landmarks = dict(landmarks)
+    box = _box(work, landmarks)
+    domain = np.asfortranarray(bone.mask[box])
+    seeds = _seeds(work, bone, landmarks, box)
+    if not ((seeds == 1).any() and (seeds == 2).any()):
+        return Jaws(None, None, None, (_not_parted("the landmarks lie far from bone"),))
+    deep = depth(domain, work.spacing) / np.float32(FLOOD_DEPTH)
+    dense = np.clip(smoothed(bone.hu[box], 0.7, work.spacing) / np.float32(FLOOD_HU), 0.0, 2.0)
+    basins = watershed(-(deep + dense), seeds, domain)
+    mandible = np.zeros(bone.mask.shape, dtype=bool, order="F")
+    mandible[box] = basins == 1
+    # Scraps that the flood cut off elsewhere are not the mandible.
+    seeded = np.zeros_like(mandible)
+    seeded[box] = seeds == 1
+    mandible = reached(mandible, seeded)
+    reason = _implausible(mandible, work)
+    if reason:
+        return Jaws(None, None, None, (_not_parted(reason),))
+    rest = bone.mask & ~mandible
+    side = np.clip(smoothed(mandible, 1.0) - smoothed(rest, 1.0), -1.0, 1.0)
+    height = 0.5 * float(landmarks["supradentale"][2] + landmarks["infradentale"][2])
+    return Jaws(side, mandible, height, tuple(findings))
+
+
+def _not_parted(reason: str) -> Finding:
+    return Finding(
+        "warning",
+        "jaws-not-parted",
+        f"the mandible was not told from the skull: {reason}",
+        where="bone",
+        why="mandible and cranium would move as one",
+        mend="give skull landmarks (menton, gonion_L, gonion_R, supradentale, infradentale, …) or "
+        "ready surfaces of both bones",
+    )
+
+
+def _guessed() -> Finding:
+    return Finding(
+        "note",
+        "jaws-parted-by-shape",
+        "the mandible was told from the skull by shape alone, without landmarks",
+        where="bone",
+        why="the cut between the tooth rows may be some millimetres off",
+        mend="give skull landmarks",
+    )
+
+
+def _implausible(mandible: Mask, work: Working) -> str | None:
+    volume = np.count_nonzero(mandible) * float(np.prod(work.spacing))
+    if not VOLUMES[0] <= volume <= VOLUMES[1]:
+        return (
+            f"what was found has {volume / 1000.0:.0f} cm³ ({VOLUMES[0] / 1000.0:.0f} to "
+            f"{VOLUMES[1] / 1000.0:.0f} expected)"
+        )
+    across = np.flatnonzero(mandible.any(axis=(1, 2)))
+    width = float(across[-1] - across[0] + 1) * float(work.spacing[0])
+    if not WIDTHS[0] <= width <= WIDTHS[1]:
+        return (
+            f"what was found is {width:.0f} mm wide ({WIDTHS[0]:.0f} to {WIDTHS[1]:.0f} expected)"
+        )
+    return None
+
+
+def _box(work: Working, landmarks: Mapping[str, Floats]) -> tuple[slice, ...]:
+    """The layers from below the chin to above the joints."""
+    top = _joint_height(landmarks) + ABOVE_JOINT + 10.0
+    end = int((top - work.origin[2]) / work.spacing[2])
+    return slice(None), slice(None), slice(0, min(max(end, 2), work.hu.shape[2]))
+
+
+def _joint_height(landmarks: Mapping[str, Floats]) -> float:
+    names = [n for n in ("supraglenoid_L", "supraglenoid_R") if n in landmarks]
+    names = names or [n for n in ("zygomatic_arch_L", "zygomatic_arch_R") if n in landmarks]
+    if names:
+        return float(np.mean([landmarks[n][2] for n in names]))
+    # The joints lie some 30 mm above the upper incisors' necks.
+    return float(landmarks["supradentale"][2]) + 30.0
+
+
+def _seeds(
+    work: Working, bone: Bone, landmarks: dict[str, Floats], box: tuple[slice, ...]
+) -> NDArray[np.int32]:
+    """1 mandible, 2 the rest, 0 to be flooded."""
+    domain = bone.mask[box]
+    seeds = np.zeros(domain.shape, dtype=np.int32, order="F")
+    x, y, z = (
+        (o + s * np.arange(n)).reshape([-1 if a == b else 1 for b in range(3)])
+        for a, (o, s, n) in enumerate(zip(work.origin, work.spacing, domain.shape, strict=True))
+    )
+    seeds[:, :, (z > _joint_height(landmarks) + ABOVE_JOINT).ravel()] = 2
+    if bone.cavity is not None:
+        seeds[bone.cavity[box]] = 2
+    _tooth_rows(seeds, landmarks, x, y, z)
+    # Landmarks last: they are what a person said.
+    _balls(seeds, domain, work, landmarks, ON_CRANIUM, 2)
+    condyles = _condyles(landmarks)
+    _balls(seeds, domain, work, landmarks | condyles, (*ON_MANDIBLE, *condyles), 1)
+    seeds[~domain] = 0
+    return seeds
+
+
+def _condyles(landmarks: Mapping[str, Floats]) -> dict[str, Floats]:
+    """The middles of the condyles, where the joints' landmarks are given."""
+    names = [f"supraglenoid_{side}" for side in ("L", "R")]
+    if not set(names) <= set(landmarks):
+        return {}
+    middle = 0.5 * (landmarks[names[0]] + landmarks[names[1]])
+    inwards, back, up = CONDYLE
+    return {
+        f"condyle_{name[-1]}": landmarks[name]
+        + np.array([inwards * np.sign(middle[0] - landmarks[name][0]), back, up])
+        for name in names
+    }
+
+
+def _tooth_rows(
+    seeds: NDArray[np.int32], landmarks: Mapping[str, Floats], x: Any, y: Any, z: Any
+) -> None:
+    """Seeds above and below the occlusal plane, in front of the rami."""
+    plane = _occlusal_points(landmarks)
+    if plane is None:
+        return
+    incisal, left, right = plane
+    normal = np.cross(left - incisal, right - incisal)
+    normal *= np.sign(normal[2]) / np.linalg.norm(normal)
+    height = normal[0] * (x - incisal[0]) + normal[1] * (y - incisal[1])
+    height = height + normal[2] * (z - incisal[2])
+    behind = 0.5 * (left[1] + right[1]) - BEFORE_RAMUS
+    # Laterally the row ends where the rami begin.
+    low, high = sorted((left[0], right[0]))
+    row = (y < behind) & (x > low - BEFORE_RAMUS) & (x < high + BEFORE_RAMUS)
+    near, far = CROWN
+    seeds[row & (height > near) & (height < far)] = 2
+    seeds[row & (height < -near) & (height > -far)] = 1
+
+
+def _occlusal_points(landmarks: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats] | None:
+    """The occlusal plane at the incisors, left and right."""
+    if not {"supradentale", "infradentale"} <= set(landmarks):
+        return None
+    points = [0.5 * (landmarks["supradentale"] + landmarks["infradentale"])]
+    for side in ("L", "R"):
+        if f"occlusal_line_{side}" in landmarks:
+            points.append(landmarks[f"occlusal_line_{side}"])
+        elif {f"supra_m2_{side}", f"sub_m2_{side}"} <= set(landmarks):
+            points.append(
+                0.5 * (landmarks[f"supra_m2_{side}"] + landmarks[f"sub_m2_{side}"])
+                + np.array([0.0, BEFORE_RAMUS, 0.0])
+            )
+        else:
+            return None
+    return points[0], points[1], points[2]
+
+
+def _balls(
+    seeds: NDArray[np.int32],
+    domain: Mask,
+    work: Working,
+    landmarks: Mapping[str, Floats],
+    names: Iterable[str],
+    value: int,
+) -> None:
+    """A ball of bone at each landmark, moved to the bone nearest to it."""
+    reach = FARTHEST_SEED + SEED_RADIUS
+    for name in names:
+        if name not in landmarks:
+            continue
+        place = (np.asarray(landmarks[name]) - work.origin) / work.spacing
+        low = np.maximum(np.floor(place - reach / work.spacing).astype(int), 0)
+        high = np.minimum(np.ceil(place + reach / work.spacing).astype(int) + 1, domain.shape)
+        if (high <= low).any():
+            continue
+        part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        index = np.argwhere(domain[part])
+        if not len(index):
+            continue
+        offsets = (index + low - place) * work.spacing
+        distance = np.linalg.norm(offsets, axis=1)
+        nearest = int(np.argmin(distance))
+        if distance[nearest] > FARTHEST_SEED:
+            continue
+        ball = np.linalg.norm(offsets - offsets[nearest], axis=1) < SEED_RADIUS
+        seeds[part][tuple(index[ball].T)] = value

@@ -1,0 +1,130 @@
+"""Metal of fillings, crowns and plates, and its streaks taken out of a CT."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.case import Finding
+from cmfsim.imaging.morphology import (
+    Mask,
+    Volume,
+    as_array,
+    as_itk,
+    closed,
+    depth,
+    label,
+    opened,
+    simpleitk,
+    sizes_of,
+)
+from cmfsim.imaging.options import SegmentOptions
+from cmfsim.imaging.working import Working
+
+__all__ = ["Metal", "find_metal", "without_streaks"]
+
+# Metal of less than this is a point of noise or dense enamel, mm³.
+LEAST_METAL = 15.0
+# Farther from metal than this, streaks are weaker than bone, and thin bone (the vault) is kept, mm.
+FAR_FROM_METAL = 35.0
+# Streaks lie in the slices of the metal, and this far above and below, mm.
+STREAK_REACH = 3.0
+# Streaks are narrow: across them the median over this half width, mm, is what was there.
+STREAK_WIDTH = 2.0
+# Bone within this of metal is not judged by its width, mm: roots and alveolar walls are thin.
+NEAR_METAL = 3.0
+# What stands out farther than the second from what a ball of the first can sweep, is a spike; gaps
+# up to twice the third are dark streaks; mm.
+SKIN_WIDTHS = (3.0, 4.0, 3.0)
+BONE_WIDTHS = (1.4, 3.0, 1.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Metal:
+    """Metal in an image.
+
+    Attributes
+    ----------
+    mask : (nx, ny, nz) bool or None
+    layers : slice
+        The slices with streaks.
+    hu : (nx, ny, nz) float32
+        The image with the median across streaks in those slices; itself where there is no metal.
+    findings : tuple of Finding
+    """
+
+    mask: Mask | None
+    layers: slice
+    hu: Volume
+    findings: tuple[Finding, ...]
+
+
+def find_metal(work: Working, options: SegmentOptions) -> Metal:
+    """The metal of a head, and the image without its streaks."""
+    bright = work.hu > options.metal_threshold
+    volume = float(np.prod(work.spacing))
+    nothing = Metal(None, slice(0, 0), work.hu, ())
+    if np.count_nonzero(bright) * volume < LEAST_METAL:
+        return nothing
+    labels, count = label(bright, corners=True)
+    large = sizes_of(labels, count) * volume >= LEAST_METAL
+    if not large.any():
+        return nothing
+    mask: Mask = large[labels]
+    layers = np.flatnonzero(mask.any(axis=(0, 1)))
+    more = int(np.ceil(STREAK_REACH / work.spacing[2]))
+    zone = slice(max(int(layers[0]) - more, 0), min(int(layers[-1]) + more + 1, mask.shape[2]))
+    hu = work.hu.copy(order="F")
+    part = hu[:, :, zone]
+    hu[:, :, zone] = np.where(mask[:, :, zone], part, _median(part, work.spacing))
+    low, high = (work.origin[2] + work.spacing[2] * layers[i] for i in (0, -1))
+    finding = Finding(
+        "warning",
+        "metal",
+        f"{int(np.count_nonzero(large))} pieces of metal, "
+        f"{np.count_nonzero(mask) * volume / 1000.0:.1f} cm³, between z = {low:.0f} and "
+        f"{high:.0f} mm",
+        where="image",
+        why="streaks hide skin and bone at that height; they were smoothed and spikes removed",
+        mend="check lips, cheeks and tooth rows by eye",
+    )
+    return Metal(mask, zone, hu, (finding,))
+
+
+def _median(part: Volume, spacing: NDArray[np.float64]) -> Volume:
+    across = [max(1, round(STREAK_WIDTH / s)) for s in spacing[:2]]
+    image = simpleitk().Median(as_itk(np.asfortranarray(part), spacing), [*across, 0])
+    median: Volume = as_array(image)
+    return median
+
+
+def without_streaks(
+    mask: Mask,
+    metal: Metal,
+    spacing: NDArray[np.float64],
+    *,
+    bone: bool = False,
+) -> Mask:
+    """The mask without thin pieces that stand far out from it in the slices of the metal.
+
+    Notches that dark streaks cut into it there are closed.
+    """
+    if metal.mask is None:
+        return mask
+    cleaned = mask.copy(order="F")
+    radius, reach, notch = BONE_WIDTHS if bone else SKIN_WIDTHS
+    part = closed(np.asfortranarray(mask[:, :, metal.layers]), notch, spacing)
+    cleaned[:, :, metal.layers] = part
+    thick = opened(part, radius, spacing)
+    if not thick.any():
+        return cleaned
+    around = depth(thick, spacing)
+    rest = part & (around < -0.5 * float(spacing.max()))
+    if bone:
+        near = depth(np.asfortranarray(metal.mask[:, :, metal.layers]), spacing)
+        rest &= (near < -NEAR_METAL) & (near > -FAR_FROM_METAL)
+    labels, count = label(rest, corners=True)
+    farthest = np.zeros(count + 1)
+    np.maximum.at(farthest, labels[rest], -around[rest])
+    cleaned[:, :, metal.layers] &= ~((farthest > reach)[labels] & rest)
+    return cleaned

@@ -1,0 +1,61 @@
+"""What a person may set in the segmentation of a head."""
+
+from dataclasses import dataclass
+
+from cmfsim.checks import as_number, as_positive
+from cmfsim.errors import ImageInputError
+
+__all__ = ["SegmentOptions"]
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    """Thresholds and lengths of the segmentation; the defaults suit an adult's CT in HU.
+
+    Attributes
+    ----------
+    skin_threshold : float, HU
+        Between air (−1000) and fat (−100); −300 lies near half way to muscle.
+    bone_threshold : float, HU
+        Between soft tissue (up to 100) and compact bone (700 and more).
+    metal_threshold : float, HU
+        Above enamel (up to 2200): fillings, crowns, plates.
+    working_spacing : float, mm
+        Finer voxels are averaged until they would be larger than this; coarser ones are kept.
+    most_voxels : int
+        The working grid is made coarser, with a finding, where it would have more voxels.
+    closing : float, mm
+        Holes of bone up to twice this wide are bridged where a hollow lies behind.
+    least_skin : float, mm
+        Bone nearer to the skin's surface than this counts as soft tissue.
+    island : float, mm³
+        Pieces of bone below this volume are dropped.
+    part_jaws : bool
+        Whether to look for the mandible; else the bone is one "skull".
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) Thresholds out of order, a length not above 0.
+    """
+
+    skin_threshold: float = -300.0
+    bone_threshold: float = 250.0
+    metal_threshold: float = 2500.0
+    working_spacing: float = 1.0
+    most_voxels: int = 40_000_000
+    closing: float = 2.5
+    least_skin: float = 1.0
+    island: float = 1500.0
+    part_jaws: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("skin_threshold", "bone_threshold", "metal_threshold"):
+            as_number(name, getattr(self, name))
+        for name in ("working_spacing", "most_voxels", "closing", "least_skin", "island"):
+            as_positive(name, getattr(self, name))
+        if not -1000.0 < self.skin_threshold < self.bone_threshold < self.metal_threshold:
+            raise ImageInputError(
+                f"thresholds are skin {self.skin_threshold:g}, bone {self.bone_threshold:g}, metal "
+                f"{self.metal_threshold:g} HU: they must ascend and lie above −1000"
+            )

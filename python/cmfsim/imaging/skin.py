@@ -1,0 +1,270 @@
+"""The outer surface of the head: what lies with it taken away, what opens into it closed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.case import Finding
+from cmfsim.errors import ImageInputError
+from cmfsim.imaging.levels import level_of
+from cmfsim.imaging.metal import Metal, without_streaks
+from cmfsim.imaging.morphology import (
+    Mask,
+    Volume,
+    closed,
+    depth,
+    label,
+    largest,
+    ndimage,
+    opened,
+    reached,
+    resampled_to,
+    sizes_of,
+)
+from cmfsim.imaging.options import SegmentOptions
+from cmfsim.imaging.working import Working, coarse_of
+
+__all__ = ["Skin", "find_skin"]
+
+# Full range of the skin's level, HU: half of the step from air to fat.
+SKIN_SCALE = 400.0
+# A ball of this radius fits into head and neck, but not into a couch's shell, a head-rest or an
+# ear, mm.
+CORE_RADIUS = 20.0
+# Behind this distance from the middle of the head nothing stands out from it, mm: ears end there.
+BEHIND = 32.0
+# Layers less than these below the vertex hold no ears, and no muscle of the neck, mm.
+ABOVE_EARS = 85.0
+ABOVE_NAPE = 115.0
+# Scalp with hair pressed on it, mm.
+THICKEST_SCALP = 15.0
+# Dark streaks as wide as twice this do not part the head, mm.
+STREAK_GAP = 5.0
+# An ear is no larger than this: what is, and lies beside the head, is a holder; mm³ and mm.
+LARGEST_EAR = 25_000.0
+FARTHEST_EAR = 45.0
+# What stands out behind the head by more than these is a rest, not the nape; mm³ and mm.
+REST = 6_000.0
+REST_REACH = 12.0
+# A couch is wider than this, and its middle farther behind the head's, mm.
+COUCH_WIDTH = 60.0
+COUCH_BEHIND = 40.0
+# Part of the slices in which something fixed to the scanner shows.
+IN_ALL_SLICES = 0.9
+# Nostrils, ear canals and open lips narrower than twice this are closed, mm.
+OPENING = 7.0
+# A hollow reaching deeper than this behind the closed surface is airway, not a fold; the closed
+# surface is drawn in by the second, so that lips and nostrils keep their edge; mm.
+DEEP = 9.0
+DRAWN_IN = 3.0
+# Skin beyond these in a straight cut is said to be cut off, mm².
+CUT_AREA = 150.0
+# Heads are this large from vertex to chin at least, mm; lower parts do not count for the middle.
+HEAD_HEIGHT = 220.0
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """The head's inside, hollows included.
+
+    Attributes
+    ----------
+    level : (nx, ny, nz) float32
+    mask : (nx, ny, nz) bool
+    hollow : (nx, ny, nz) bool
+        Inside and below the skin's threshold.
+    findings : tuple of Finding
+    """
+
+    level: Volume
+    mask: Mask
+    hollow: Mask
+    findings: tuple[Finding, ...]
+
+
+def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
+    """The skin of the head on the working grid.
+
+    Errors
+    ------
+    ImageError
+        (also `ValueError`) Nothing as large as a head.
+    """
+    coarse, steps, shift = coarse_of(metal.hu, work.spacing)
+    tissue = np.asfortranarray(coarse > options.skin_threshold)
+    if metal.mask is not None:
+        # Dark streaks would cut the head in two.
+        tissue = _filled(closed(tissue, STREAK_GAP, steps))
+    free, removed = _without_couch(tissue, steps)
+    bone = largest(free & (coarse > options.bone_threshold))
+    head, more = _without_rests(free, bone, steps)
+    # Off the coarse grid the head is known to a voxel: the threshold places its surface.
+    margin = 1.2 * float(steps.max())
+    near = resampled_to(depth(head, steps), steps, shift, work.hu.shape, work.spacing)
+    near += np.float32(margin)
+    above = without_streaks(metal.hu > options.skin_threshold, metal, work.spacing)
+    solid = largest(above & (near > 0.0))
+    if not solid.any():
+        raise ImageInputError("the image holds no head above the skin's threshold")
+    mask, hollow = _with_hollows(solid, work)
+    level = level_of(metal.hu, options.skin_threshold, SKIN_SCALE, mask)
+    # Where a rest was cut off in contact, the surface is that of the distance.
+    np.minimum(level, near, out=level, where=~hollow)
+    findings = []
+    table = np.count_nonzero(removed | more) * float(np.prod(steps))
+    if table > LARGEST_EAR / 5.0:
+        findings.append(_rest_removed(table))
+    return Skin(level, mask, hollow, tuple(findings))
+
+
+def _rest_removed(volume: float) -> Finding:
+    return Finding(
+        "note",
+        "rest-removed",
+        f"{volume / 1000.0:.0f} cm³ of couch, pillow or head-rest was taken away",
+        where="behind or beside the head",
+        why="where it touched, the skin is drawn from the head's shape, not from the image",
+        mend="check the back of the head by eye if it matters",
+    )
+
+
+def _without_couch(tissue: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, Mask]:
+    """What is left without that which shows alike in all slices; and that."""
+    part = tissue.mean(axis=2)
+    always = part > IN_ALL_SLICES
+    # The head changes from slice to slice: what shows in some slices tells where it is.
+    some = (part > 0.2) & ~always
+    labels, count = ndimage().label(always)
+    if not count or not some.any():
+        return tissue, np.zeros_like(tissue)
+    middle = np.nonzero(some)[1].mean()
+    couch, in_front = np.zeros_like(always), np.zeros_like(always)
+    for i, box in enumerate(ndimage().find_objects(labels)):
+        piece = labels == i + 1
+        width = (box[0].stop - box[0].start) * spacing[0]
+        behind = (np.nonzero(piece)[1].mean() - middle) * spacing[1]
+        if behind > COUCH_BEHIND and width > COUCH_WIDTH:
+            couch |= piece
+        elif -behind > COUCH_BEHIND and width > COUCH_WIDTH:
+            in_front |= piece
+    # All that lies behind the couch's top belongs to it; patients who lie prone have it in front.
+    beyond = np.maximum.accumulate(couch, axis=1)
+    beyond |= np.maximum.accumulate(in_front[:, ::-1], axis=1)[:, ::-1]
+    gone = tissue & beyond[:, :, None]
+    return tissue & ~gone, gone
+
+
+def _without_rests(tissue: Mask, bone: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, Mask]:
+    """The head without pillow and head-holder, and these."""
+    head = _core(tissue, spacing)
+    column = np.flatnonzero(head.any(axis=(0, 1)))
+    low = max(column[0], column[-1] - int(HEAD_HEIGHT / spacing[2]))
+    weights = head[:, :, low : column[-1] + 1].sum(axis=(0, 2))
+    middle = float(np.average(np.arange(len(weights)), weights=weights))
+    y = (np.arange(tissue.shape[1]) - middle) * spacing[1]
+    free = tissue & ~_beyond_scalp(tissue, bone, y, spacing)
+    head = _core(free, spacing)
+    around = depth(head, spacing)
+    # The opened head, a voxel wider, is the head; ears, nose and chin stand out from it.
+    near = around > -float(spacing.max())
+    behind = (y > BEHIND)[None, :, None]
+    rest = free & ~near & behind
+    out = _standing_out(rest, around, spacing, REST, REST_REACH)
+    # At the bottom border the nape widens into the back, and is no rest.
+    nape = reached(rest, _bottom(rest))
+    nape &= ~_standing_out(nape, around, spacing, np.inf, FARTHEST_EAR)
+    kept = free & ~(out & ~nape)
+    kept = reached(kept, head)
+    beside = kept & ~near & (y > -BEHIND)[None, :, None]
+    kept &= ~_standing_out(beside, around, spacing, LARGEST_EAR, FARTHEST_EAR)
+    kept = reached(kept, head)
+    return kept, tissue & ~kept
+
+
+def _core(tissue: Mask, spacing: NDArray[np.float64]) -> Mask:
+    """The thick part of head and neck."""
+    radius = min(CORE_RADIUS, 0.6 * float(depth(tissue, spacing).max()))
+    core = opened(tissue, radius, spacing)
+    if not core.any():
+        raise ImageInputError("the image holds nothing as thick as a head")
+    return largest(core)
+
+
+def _beyond_scalp(
+    tissue: Mask, bone: Mask, y: NDArray[np.float64], spacing: NDArray[np.float64]
+) -> Mask:
+    """What lies behind or beside the skull's vault, farther from it than the scalp is thick."""
+    nothing = np.zeros_like(tissue)
+    layers = np.flatnonzero(bone.any(axis=(0, 1)))
+    if not len(layers) or bone[:, :, -1].any():
+        # Without the vertex nobody knows which layer lies above the ears.
+        return nothing
+    down = (layers[-1] - np.arange(bone.shape[2])) * spacing[2]
+    beside = (down < ABOVE_EARS)[None, None, :] & (y > 0.0)[None, :, None]
+    behind = (down < ABOVE_NAPE)[None, None, :] & (y > BEHIND)[None, :, None]
+    # The vault with what it encloses: the skull is a ring in each layer there.
+    vault = ndimage().binary_closing(bone, iterations=2) | bone
+    for k in np.flatnonzero(down < ABOVE_NAPE):
+        vault[:, :, k] = ndimage().binary_fill_holes(vault[:, :, k])
+    away = -depth(np.asfortranarray(vault), spacing)
+    skin = tissue & ~ndimage().binary_erosion(tissue) & (down < ABOVE_EARS)[None, None, :]
+    thickness = away[skin & (away > 0.0)]
+    if not thickness.size:
+        return nothing
+    scalp = min(float(np.percentile(thickness, 60.0)) + float(spacing.max()), THICKEST_SCALP)
+    gone: Mask = (beside | behind) & (away > scalp)
+    return tissue & gone
+
+
+def _bottom(mask: Mask) -> Mask:
+    """The voxels of the lowest layer."""
+    layer = np.zeros_like(mask)
+    layer[:, :, 0] = mask[:, :, 0]
+    return layer
+
+
+def _standing_out(
+    rest: Mask, around: Volume, spacing: NDArray[np.float64], volume: float, reach: float
+) -> Mask:
+    """The pieces above a volume (mm³) or farther out than a reach (mm)."""
+    labels, count = label(rest)
+    if not count:
+        return rest
+    large = sizes_of(labels, count) * float(np.prod(spacing)) > volume
+    farthest = -ndimage().minimum(around.T, labels.T, np.arange(1, count + 1))
+    large[1:] |= np.asarray(farthest) > reach
+    large[0] = False
+    gone: Mask = large[labels]
+    return gone
+
+
+def _with_hollows(solid: Mask, work: Working) -> tuple[Mask, Mask]:
+    """The head with airway and other hollows, and these."""
+    # Hollows behind narrow openings, judged on voxels of about 1.6 mm.
+    factors = tuple(max(1, int(1.6 / s)) for s in work.spacing)
+    blocks = tuple(slice(f // 2, None, f) for f in factors)
+    small = np.asfortranarray(solid[blocks])
+    steps = work.spacing * np.array(factors)
+    shift = work.spacing * (np.array(factors) // 2)
+    sealed = _filled(closed(small, OPENING, steps))
+    within = depth(sealed, steps)
+    inside = resampled_to(within, steps, shift, solid.shape, work.spacing)
+    candidate = ~solid & (inside > DRAWN_IN)
+    hollow = reached(candidate, candidate & (inside > DEEP))
+    mask = solid | hollow
+    filled = _filled(mask)
+    return filled, filled & ~solid
+
+
+def _filled(mask: Mask) -> Mask:
+    """The mask with every hollow that does not reach the front, back or sides of the image.
+
+    The bottom and the top are no way out: trachea and neck are cut there.
+    """
+    labels, count = label(~mask)
+    outside = np.zeros(count + 1, dtype=bool)
+    for face in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        outside[np.unique(face)] = True
+    outside[0] = False
+    return ~outside[labels]

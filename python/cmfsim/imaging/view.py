@@ -1,0 +1,120 @@
+"""What of the head the image leaves out, and whether it shows it the right way round."""
+
+import numpy as np
+
+from cmfsim.case import Finding
+from cmfsim.imaging.bone import Bone
+from cmfsim.imaging.morphology import depth
+from cmfsim.imaging.skin import Skin
+from cmfsim.imaging.working import COARSE, Working
+
+__all__ = ["view_findings"]
+
+# Skin or bone that meets a border of the image over less than this is not cut off, mm².
+CUT_SKIN = 150.0
+CUT_BONE = 60.0
+# Face, jaws and spine lie farther than this from the brain's cavity, the vault does not, mm.
+VAULT = 15.0
+# The middle of face, jaws and spine lies some 40 mm in front of the brain's and 80 mm below it: it
+# may not lie behind it or above it by more than this, mm.
+LEAST_OFFSET = 5.0
+
+
+def view_findings(work: Working, skin: Skin, bone: Bone) -> tuple[Finding, ...]:
+    """Findings on cut-off parts and on the head's direction."""
+    wrong = _direction(work, bone)
+    return (*wrong, *([] if wrong else _cut_off(work, skin, bone)))
+
+
+def _direction(work: Working, bone: Bone) -> tuple[Finding, ...]:
+    """An error where the face looks backwards or the head stands on its vertex.
+
+    Left and right cannot be told apart in a head; nothing here finds a mirrored one.
+    """
+    if bone.cavity is None:
+        return ()
+    steps = tuple(max(1, int(COARSE / h)) for h in work.spacing)
+    blocks = tuple(slice(None, None, n) for n in steps)
+    spacing = work.spacing * np.array(steps)
+    cavity = np.asfortranarray(bone.cavity[blocks])
+    beyond = bone.solid[blocks] & (depth(cavity, spacing) < -VAULT)
+    if not beyond.any():
+        return ()
+    away = (np.argwhere(beyond).mean(axis=0) - np.argwhere(cavity).mean(axis=0)) * spacing
+    findings = []
+    if away[2] > LEAST_OFFSET:
+        findings.append(_turned("upside-down", "the head stands on its vertex"))
+    if away[1] > LEAST_OFFSET:
+        findings.append(_turned("facing-back", "the face looks to the back (+y, posterior)"))
+    return tuple(findings)
+
+
+def _turned(code: str, what: str) -> Finding:
+    return Finding(
+        "error",
+        f"ct-{code}",
+        f"{what}: the image is flipped, or its header lies",
+        where="image",
+        why="front and back, or up and down, would be taken for one another; left and right may "
+        "be swapped as well, which no image shows",
+        mend="export the image again with its orientation, and check left and right",
+    )
+
+
+def _cut_off(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
+    """A finding for each part of the face that the image's border cuts."""
+    findings = []
+    x, y, z = work.spacing
+    front = float(np.count_nonzero(skin.mask[:, 0]) * x * z)
+    if work.border[0, 1] and front > CUT_SKIN:
+        findings.append(
+            _missing("front", "nose or face", f"skin meets the front border over {front:.0f} mm²")
+        )
+    for side, layer, begin in (("right", 0, 0), ("left", -1, 1)):
+        area = float(np.count_nonzero(skin.mask[layer]) * y * z)
+        if work.border[begin, 0] and area > CUT_SKIN:
+            findings.append(
+                _missing(side, f"{side} side", f"skin meets the border over {area:.0f} mm²")
+            )
+    top = float(np.count_nonzero(bone.solid[:, :, -1]) * x * y)
+    if work.border[1, 2] and top > CUT_BONE:
+        findings.append(_top(bone, top))
+    chin = _chin_area(work, bone, skin)
+    if work.border[0, 2] and chin > CUT_BONE:
+        findings.append(
+            _missing("bottom", "chin", f"bone of the jaw meets the border over {chin:.0f} mm²")
+        )
+    return findings
+
+
+def _top(bone: Bone, area: float) -> Finding:
+    """The forehead is missing if the border cuts the skull below its widest layer."""
+    per_layer = bone.mask.sum(axis=(0, 1))
+    what = f"bone of the skull meets the border over {area:.0f} mm²"
+    if per_layer[-1] > 0.75 * per_layer.max():
+        return _missing("top", "forehead", what)
+    return Finding(
+        "note",
+        "ct-cut-vertex",
+        f"the vertex is cut off: {what}",
+        where="top border of the image",
+        why="the skull is closed flat there; the face is not concerned",
+    )
+
+
+def _chin_area(work: Working, bone: Bone, skin: Skin) -> float:
+    """Bone at the bottom border in the front half of the head, mm²."""
+    middle = int(np.average(np.arange(skin.mask.shape[1]), weights=skin.mask.sum(axis=(0, 2))))
+    layer = bone.solid[:, : max(middle - int(25.0 / work.spacing[1]), 1), 0]
+    return float(np.count_nonzero(layer) * work.spacing[0] * work.spacing[1])
+
+
+def _missing(side: str, part: str, what: str) -> Finding:
+    return Finding(
+        "warning",
+        f"ct-cut-{side}",
+        f"{part} cut off: {what}",
+        where=f"{side} border of the image",
+        why="the surface is closed flat there, and the prediction near it means nothing",
+        mend="use an image that holds the whole face, or leave that region out of the evaluation",
+    )
