@@ -105,7 +105,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "phantom": "case checks errors scene",
         "planning": "errors",
         "osteotomy": "case checks errors planning scene",
-        "node_kinds": "case checks errors scene",
+        "node_kinds": "case checks errors scene _core",
         "simulation": "scene errors _core",
         "evaluation": "case checks errors scene _core",
         "build": (
@@ -113,7 +113,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "scene surface_repair"
         ),
         "study": "build case errors template simulation evaluation scene",
-        "pictures": "case errors scene",
+        "pictures": "case checks errors scene",
         "report": "case errors scene",
         "topology": "",
         "crossings": "checks",

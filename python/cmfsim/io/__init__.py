@@ -6,6 +6,7 @@ from cmfsim.io.landmarks import LandmarkFile, read_landmark_file, read_landmarks
 from cmfsim.io.results import read_result, result_suffixes, write_result
 from cmfsim.io.scenes import read_plan, read_scene, write_scene
 from cmfsim.io.surfaces import read_surface, write_surface
+from cmfsim.io.transforms import read_transform, write_transform
 
 __all__ = [
     "Case",
@@ -17,10 +18,12 @@ __all__ = [
     "read_result",
     "read_scene",
     "read_surface",
+    "read_transform",
     "result_suffixes",
     "write_image",
     "write_landmarks",
     "write_result",
     "write_scene",
     "write_surface",
+    "write_transform",
 ]

@@ -1,0 +1,16 @@
+"""What each node does: fixed, joined to a moved bone, sliding on teeth and mucosa, or free.
+
+Kim et al. (2010), section 2.5 and Figure 4. Only nodes on the boundary of the mesh get a kind.
+"""
+
+from cmfsim.node_kinds.classification import ClassifiedNodes, classify_nodes, segment_data
+from cmfsim.node_kinds.options import KindOptions, SlidingBox, SlidingSphere
+
+__all__ = [
+    "ClassifiedNodes",
+    "KindOptions",
+    "SlidingBox",
+    "SlidingSphere",
+    "classify_nodes",
+    "segment_data",
+]

@@ -1,0 +1,138 @@
+"""Distances and regions that decide the kinds of nodes."""
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim.checks import Floats, as_number, as_positive, as_rows, as_text, check_one_of
+from cmfsim.errors import CaseInputError
+
+__all__ = ["BORDERS", "KindOptions", "SlidingBox", "SlidingSphere"]
+
+BORDERS = ("left", "right", "anterior", "posterior", "inferior", "superior")
+
+
+@dataclass(frozen=True, eq=False)
+class SlidingBox:
+    """A box in which nodes on a segment slide.
+
+    Attributes
+    ----------
+    segment : str
+    low, high : (3,) float64, mm
+        Opposite corners, LPS.
+    """
+
+    segment: str
+    low: ArrayLike
+    high: ArrayLike
+
+    def __post_init__(self) -> None:
+        as_text("segment of a sliding box", self.segment)
+        where = f"sliding box on {self.segment!r}"
+        corners = as_rows(where, [np.asarray(self.low), np.asarray(self.high)], 3)
+        if (corners[0] >= corners[1]).any():
+            raise CaseInputError(f"{where}: low {corners[0]} must lie below high {corners[1]}")
+        object.__setattr__(self, "low", corners[0])
+        object.__setattr__(self, "high", corners[1])
+
+    def holds(self, points: Floats) -> NDArray[np.bool_]:
+        """Which of the points (n, 3) lie in the box."""
+        inside = (points >= np.asarray(self.low)) & (points <= np.asarray(self.high))
+        return cast("NDArray[np.bool_]", inside.all(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class SlidingSphere:
+    """A ball in which nodes on a segment slide.
+
+    Attributes
+    ----------
+    segment : str
+    centre : (3,) float64, mm
+        LPS.
+    radius : float, mm
+    """
+
+    segment: str
+    centre: ArrayLike
+    radius: float
+
+    def __post_init__(self) -> None:
+        as_text("segment of a sliding sphere", self.segment)
+        where = f"sliding sphere on {self.segment!r}"
+        centre = as_rows(f"{where} centre", np.reshape(self.centre, (1, -1)), 3)[0]
+        object.__setattr__(self, "centre", centre)
+        object.__setattr__(self, "radius", as_positive(f"{where} radius", self.radius))
+
+    def holds(self, points: Floats) -> NDArray[np.bool_]:
+        """Which of the points (n, 3) lie in the ball."""
+        distance = np.linalg.norm(points - np.asarray(self.centre), axis=1)
+        return cast("NDArray[np.bool_]", distance <= self.radius)
+
+
+@dataclass(frozen=True)
+class KindOptions:
+    """Distances and regions that decide the kinds.
+
+    Attributes
+    ----------
+    bone_distance : float
+        How far from a bone's surface a node still lies on it, as a part of the mean length of the
+        boundary edges at the node.
+    facing : float
+        Least part of a node's boundary area that faces the bone, from 0 to 1.
+    plane_distance : float
+        As `bone_distance`, from a plane that fixes.
+    fixed_borders : tuple of str
+        Borders of the image on which nodes are fixed: "left", "right", "anterior", "posterior",
+        "inferior", "superior"; the neck of most CTs ends on "inferior".
+    sliding : bool
+        False: what would slide is joined or fixed with its bone.
+    upper_front, upper_molars : float, mm
+        How far above supradentale, and above supra-M2, tissue slides on the upper jaw: the depth
+        of the vestibule.
+    lower_front, lower_molars : float, mm
+        How far below infradentale, and below sub-M2, it slides on the lower jaw. Sub-M2 lies at
+        mid-height of the body, as deep as the vestibule is there.
+    behind : float, mm
+        How far behind the second molars' landmarks. Further back nodes would slide round the
+        tuberosity and the edges of the cuts, where contact does not settle.
+    beside : float, mm
+        How far beside them.
+    teeth_distance : float, mm
+        Largest distance from the teeth, where these are known apart from bone.
+    regions : tuple of SlidingBox or SlidingSphere
+        Where nodes slide on the segments that they name, instead of the above.
+    """
+
+    bone_distance: float = 0.5
+    facing: float = 0.2
+    plane_distance: float = 0.25
+    fixed_borders: tuple[str, ...] = ()
+    sliding: bool = True
+    upper_front: float = 8.0
+    upper_molars: float = 5.0
+    lower_front: float = 8.0
+    lower_molars: float = 0.0
+    behind: float = 0.0
+    beside: float = 8.0
+    teeth_distance: float = 12.0
+    regions: tuple[SlidingBox | SlidingSphere, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("bone_distance", "plane_distance", "teeth_distance"):
+            as_positive(name, getattr(self, name))
+        for name in ("upper_front", "upper_molars", "lower_front", "lower_molars"):
+            as_number(name, getattr(self, name))
+        for name in ("behind", "beside"):
+            as_number(name, getattr(self, name))
+        if not 0.0 <= as_number("facing", self.facing) <= 1.0:
+            raise CaseInputError(f"facing is {self.facing:g}: 0 to 1 is allowed")
+        for border in self.fixed_borders:
+            check_one_of("fixed border", border, BORDERS)
+        for region in self.regions:
+            if not isinstance(region, SlidingBox | SlidingSphere):
+                raise CaseInputError(f"region is {region!r}: a SlidingBox or SlidingSphere needed")

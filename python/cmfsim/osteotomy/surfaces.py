@@ -1,0 +1,212 @@
+"""Closed, lightly smoothed surfaces of levels, of a size that contact can be searched on."""
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.case import ImageData
+from cmfsim.checks import Floats, Indices, as_number
+from cmfsim.errors import CaseInputError
+from cmfsim.scene import SurfaceData
+
+__all__ = ["SurfaceOptions", "surface_of_level"]
+
+# Taubin (1995): a shrinking step and a slightly larger growing one, which keep the volume.
+SHRINK, GROW = 0.5, -0.53
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """How the surface of a level is made.
+
+    Attributes
+    ----------
+    max_triangles : int
+        Surfaces with more are decimated (quadrics; Garland and Heckbert 1997) to about this many.
+    smoothing : int
+        Rounds of Taubin smoothing (1995), which take away the steps of the voxels and keep the
+        volume; 0 for none.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Fewer than 100 triangles, rounds below 0 or above 100.
+    """
+
+    max_triangles: int = 30_000
+    smoothing: int = 6
+
+    def __post_init__(self) -> None:
+        if as_number("max_triangles", self.max_triangles) < 100:
+            raise CaseInputError(f"max_triangles is {self.max_triangles}: at least 100 is needed")
+        if not 0 <= as_number("smoothing", self.smoothing) <= 100:
+            raise CaseInputError(f"smoothing is {self.smoothing}: 0 to 100 rounds are allowed")
+
+
+def surface_of_level(
+    name: str, level: ImageData, options: SurfaceOptions | None = None
+) -> SurfaceData:
+    """The zero surface of a level, closed also where the level reaches the image's border.
+
+    Marching cubes (Lewiner 2003, scikit-image), smoothed, and decimated where it is too fine.
+
+    Parameters
+    ----------
+    name : str
+        Of the bone, for messages.
+    level : ImageData
+        Positive inside.
+    options : SurfaceOptions, optional
+
+    Returns
+    -------
+    SurfaceData
+        Outward normals, mm.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A level without an inside; scikit-image, or PyVista where the surface
+        has to be decimated, is missing.
+    """
+    options = options or SurfaceOptions()
+    values = np.asarray(level.values, dtype=np.float32)
+    index = np.argwhere(values > 0.0)
+    if not len(index):
+        raise CaseInputError(f"{name!r} has no voxel inside: its surface would be empty")
+    measure = _module("skimage.measure", "imaging", "surfaces of levels are made with scikit-image")
+    # Only the block that holds the piece, with a border of outside, so that the surface closes.
+    low = np.maximum(index.min(0) - 1, 0)
+    high = np.minimum(index.max(0) + 2, values.shape)
+    block = values[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    outside = float(min(values.min(), -np.abs(values).max()))
+    block = np.pad(block, 1, constant_values=outside)
+    spacing = np.asarray(level.spacing)
+    vertices, triangles, _, _ = measure.marching_cubes(block, 0.0, gradient_direction="descent")
+    points = np.asarray(vertices, dtype=np.float64) + (low - 1)
+    corners, points = _without_slits(np.asarray(triangles, dtype=np.int64), points)
+    points = level.lowest + points * spacing
+    points = _smoothed(points, corners, options.smoothing)
+    if len(corners) > options.max_triangles:
+        points, corners = _decimated(name, points, corners, options.max_triangles)
+    return SurfaceData(points, _outward(points, corners))
+
+
+def _module(name: str, extra: str, purpose: str) -> Any:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        raise CaseInputError(f"{purpose}: pip install 'cmfsim[{extra}]'") from error
+
+
+def _without_slits(
+    triangles: NDArray[np.int64], points: Floats
+) -> tuple[NDArray[np.int64], Floats]:
+    """Vertices in the same place made one, triangles that thereby lose a corner dropped."""
+    _, first, back = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    number = np.empty(len(first), dtype=np.int64)
+    number[order] = np.arange(len(first))
+    joined = number[back.reshape(-1)][triangles]
+    kept = (
+        (joined[:, 0] != joined[:, 1])
+        & (joined[:, 1] != joined[:, 2])
+        & (joined[:, 2] != joined[:, 0])
+    )
+    return joined[kept], points[first[order]]
+
+
+def _smoothed(points: Floats, triangles: NDArray[np.int64], rounds: int) -> Floats:
+    if not rounds:
+        return points
+    sparse = _module("scipy.sparse", "imaging", "surfaces are smoothed with scipy")
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    n = len(points)
+    near = sparse.coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
+    near = (near + near.T).tocsr()
+    near.data[:] = 1.0
+    count = np.asarray(near.sum(axis=1))
+    for _ in range(rounds):
+        for step in (SHRINK, GROW):
+            points = points + step * (near @ points / count - points)
+    return points
+
+
+def _decimated(
+    name: str, points: Floats, triangles: NDArray[np.int64], wanted: int
+) -> tuple[Floats, NDArray[np.int64]]:
+    pv = _module(
+        "pyvista",
+        "mesh",
+        f"the surface of {name!r} has {len(triangles)} triangles and is decimated to {wanted} "
+        "with PyVista (or raise max_triangles)",
+    )
+    mesh = pv.PolyData.from_regular_faces(points, triangles)
+    # Quadric decimation stays within a tenth of a voxel, but here and there it folds a sheet.
+    less = mesh.decimate(1.0 - wanted / len(triangles))
+    return _closed(
+        np.asarray(less.points, dtype=np.float64), np.asarray(less.regular_faces, dtype=np.int64)
+    )
+
+
+def _closed(points: Floats, triangles: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
+    """The surface with triangles at edges that more than two share removed, and holes filled."""
+    while True:
+        _, number, count = np.unique(
+            np.sort(_half_edges(triangles), axis=1), axis=0, return_inverse=True, return_counts=True
+        )
+        shared = (count[number.reshape(-1)] > 2).reshape(3, -1).any(axis=0)
+        if not shared.any():
+            break
+        triangles = triangles[~shared]
+    edges = _half_edges(triangles)
+    n = len(points)
+    lone = ~np.isin(edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0])
+    centres: list[Floats] = []
+    fans: list[tuple[int, int, int]] = []
+    for loop in _loops(edges[lone][:, ::-1]):
+        centre = n + len(centres)
+        centres.append(points[loop].mean(axis=0))
+        fans += [(a, b, centre) for a, b in zip(loop, loop[1:] + loop[:1], strict=True)]
+    if not centres:
+        return points, triangles
+    return np.vstack([points, centres]), np.vstack([triangles, np.array(fans, dtype=np.int64)])
+
+
+def _half_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The directed edges (3 t, 2): first those of all first corners."""
+    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+
+
+def _loops(edges: NDArray[np.int64]) -> list[list[int]]:
+    """Directed border edges as loops that pass each of their vertices once."""
+    onward: dict[int, list[int]] = {}
+    for a, b in edges.tolist():
+        onward.setdefault(a, []).append(b)
+    loops = []
+    for start in sorted(onward):
+        while onward[start]:
+            path, place = [start], {start: 0}
+            while onward.get(path[-1]):
+                after = onward[path[-1]].pop()
+                if after in place:
+                    # The part since the last visit is a loop by itself.
+                    cut = place[after]
+                    loops.append(path[cut:])
+                    for vertex in path[cut + 1 :]:
+                        del place[vertex]
+                    path = path[: cut + 1]
+                else:
+                    place[after] = len(path)
+                    path.append(after)
+    return loops
+
+
+def _outward(points: Floats, triangles: NDArray[np.int64]) -> Indices:
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    volume = float(np.einsum("na,na->", a, np.cross(b, c))) / 6.0
+    corners = triangles if volume > 0.0 else triangles[:, ::-1]
+    return cast("Indices", corners.astype(np.uint32))
