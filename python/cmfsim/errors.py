@@ -49,5 +49,3 @@ class LandmarkInputError(LandmarkError, ValueError):
 
 class ImageInputError(ImageError, ValueError):
     """An image that cannot be meant: not three axes, no CT, damaged, no head in it."""
-
-    """A landmark that is missing or cannot be meant."""
