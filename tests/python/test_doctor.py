@@ -280,6 +280,14 @@ DEFECTS = {
         "error",
         "cut-unknown-bone",
     ),
+    "depth behind landmarks that are missing": (
+        lambda h: (
+            h.skull.pop("supraglenoid_L"),
+            h.replace("[tissue]", "[region]\nposterior_depth = 5\n\n[tissue]"),
+        ),
+        "error",
+        "region-unplaced",
+    ),
     "unknown preset": (lambda h: h.replace("kim2010", "kim2011"), "error", "tissue-preset"),
     "missing skin": (lambda h: h.replace("skin.ply", "face.ply"), "error", "file-missing"),
     "missing landmarks": (
