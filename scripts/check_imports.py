@@ -130,7 +130,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "surface_checks": "checks crossings scene topology",
         "surface_repair": "capping case checks errors scene surface_checks topology _core",
         "doctor": (
-            "case checks errors io patient planning scene surface_checks surface_repair _core"
+            "case checks errors io osteotomy patient planning scene surface_checks surface_repair "
+            "_core"
         ),
         "cli": ("cmfsim build case checks doctor errors io pictures report scene simulation study"),
         "__init__": (

@@ -48,6 +48,10 @@ class MeshInputError(MeshError, ValueError):
     """Labels, levels or surfaces that cannot be meshed."""
 
 
+class LandmarkInputError(LandmarkError, ValueError):
+    """Landmarks, in memory or on disk, that cannot be meant."""
+
+
 class ImageInputError(ImageError, ValueError):
     """An image that cannot be meant: not three axes, no CT, damaged, no head in it."""
 

@@ -280,6 +280,14 @@ DEFECTS = {
         "error",
         "cut-unknown-bone",
     ),
+    "depth behind landmarks that are missing": (
+        lambda h: (
+            h.skull.pop("supraglenoid_L"),
+            h.replace("[tissue]", "[region]\nposterior_depth = 5\n\n[tissue]"),
+        ),
+        "error",
+        "region-unplaced",
+    ),
     "unknown preset": (lambda h: h.replace("kim2010", "kim2011"), "error", "tissue-preset"),
     "missing skin": (lambda h: h.replace("skin.ply", "face.ply"), "error", "file-missing"),
     "missing landmarks": (
@@ -360,10 +368,6 @@ def test_an_unstated_landmark_frame_is_said(tmp_path):
     assert notes(tmp_path, head) == ["landmark-frame-unstated"]
 
 
-def unreadable(path, content):
-    path.write_bytes(content)
-
-
 @pytest.mark.parametrize(
     "content",
     [
@@ -403,6 +407,81 @@ def test_nan_in_a_surface_is_named_with_its_row(tmp_path):
     (finding,) = cmfsim.diagnose(cmfsim.Case.load(path))
     assert finding.code == "surface-unreadable"
     assert "must be finite" in finding.what
+
+
+# Cuts, transforms, images.
+
+
+def with_cut(head, table):
+    head.replace("[tissue]", f"[[osteotomies]]\n{table}\n\n[tissue]")
+
+
+def test_a_procedure_without_its_landmarks_or_with_a_wrong_option_is_said(tmp_path):
+    """Le Fort I needs the second molars' points."""
+    head = HeadCase()
+    with_cut(head, 'procedure = "le_fort_1"')
+    assert serious(tmp_path, head) == []
+    del head.skull["supra_m2_L"]
+    (finding,) = (f for f in diagnosis(tmp_path, head) if f.severity == "error")
+    assert finding.code == "landmark-missing"
+    assert "supra_m2_L" in finding.what
+    head = HeadCase()
+    with_cut(head, 'procedure = "le_fort_1"\nheight = 400')
+    assert serious(tmp_path, head) == [("error", "cut-options")]
+
+
+def test_the_motion_of_a_cut_segment_is_measured_on_its_bone(tmp_path):
+    """A turn about the origin moves the front half of the mandible by more than 60 mm."""
+    head = HeadCase()
+    with_cut(
+        head,
+        "plane = {point = [0, -128, 1445], normal = [0, -1, 0]}\n"
+        'bone = "mandible"\nname = "half"\n[plan.half]\nangle = 3',
+    )
+    (finding,) = (f for f in diagnosis(tmp_path, head) if f.severity != "note")
+    assert (finding.severity, finding.code) == ("error", "plan-far")
+    # 2 sin(θ/2) times the distance from the axis, the L axis, at the front of the mandible.
+    far = 2 * np.sin(np.radians(1.5)) * np.hypot(1463, 158)
+    assert float(finding.what.split(" mm")[0].split()[-1]) == pytest.approx(far, rel=0.02)
+
+
+def test_a_transform_file_is_read_for_its_motion(tmp_path):
+    """A 4 × 4 text moves the bone too far; a broken one cannot be read."""
+    head = HeadCase()
+    motion = "translation = [0, -4, 1]\nangle = 2\naxis = [1, 0, 0]\ncentre = [3, -100, 1450]"
+    head.replace(motion, 'transform = "jaw.txt"')
+    np.savetxt(tmp_path / "jaw.txt", cmfsim.rigid_motion(translation=(0, 30, 0)))
+    assert serious(tmp_path, head) == [("warning", "plan-far")]
+    (tmp_path / "jaw.txt").write_text("1 2 3\n", encoding="utf-8")
+    assert serious(tmp_path, head) == [("error", "transform-unreadable")]
+
+
+def image_case(folder, spacing):
+    """The case with an empty image round the head in place of its surfaces."""
+    pytest.importorskip("SimpleITK")
+    head = HeadCase()
+    table = head.toml.split("[surfaces]")[1].split("[landmarks]")[0]
+    head.replace(f"[surfaces]{table}", '[image]\nfile = "ct.nrrd"\n\n')
+    low, high = np.array([-80, -210, 1370.0]), np.array([90, 10, 1630.0])
+    shape = tuple(int(n) for n in np.ceil((high - low) / spacing) + 1)
+    image = cmfsim.ImageData(np.full(shape, -1000, np.int16), (spacing,) * 3, low)
+    cmfsim.write_image(image, folder / "ct.nrrd")
+    return head
+
+
+def test_an_image_is_compared_with_its_landmarks_and_its_voxels_are_looked_at(tmp_path):
+    """Fine and fitting: nothing; coarse, in another frame, of another patient, damaged: said."""
+    head = image_case(tmp_path, 2.5)
+    assert serious(tmp_path, head) == []
+    assert serious(tmp_path, image_case(tmp_path, 3.0)) == [("warning", "ct-spacing-coarse")]
+    head = image_case(tmp_path, 2.5)
+    head.skull = {n: p * HALF_TURN for n, p in head.skull.items()}
+    assert serious(tmp_path, head) == [("error", "landmark-frame")]
+    head.skull = {n: p + [0, 0, 900.0] for n, p in HeadCase().skull.items()}
+    assert serious(tmp_path, head) == [("error", "landmark-outside-image")]
+    (tmp_path / "ct.nrrd").write_bytes(b"NRRD0004\n")
+    head.skull = HeadCase().skull
+    assert serious(tmp_path, head) == [("error", "image-unreadable")]
 
 
 # The command.
@@ -482,3 +561,23 @@ translation = [0, -4, 0]
     findings = cmfsim.diagnose(cmfsim.Case.load(path))
     assert not [f for f in findings if f.severity != "note"]
     assert any(f.code == "surface-open" for f in findings) == (skin == "skin_open.ply")
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no real data at {DATA}")
+def test_the_ct_of_the_phantom_has_no_error(tmp_path):
+    """Image and landmarks with three procedures, which may have a warning about the chin."""
+    pytest.importorskip("SimpleITK")
+    folder = DATA / "ct_phantom"
+    cuts = ("le_fort_1", "bsso", "genioplasty")
+    text = f"""format = "cmfsim-case"
+version = 1
+[image]
+file = "{folder / "ct.nii.gz"}"
+[landmarks]
+skull = "{folder / "skull_landmarks.mrk.json"}"
+skin = "{folder / "skin_landmarks.mrk.json"}"
+""" + "".join(f'[[osteotomies]]\nprocedure = "{cut}"\n' for cut in cuts)
+    path = tmp_path / "case.toml"
+    path.write_text(text, encoding="utf-8")
+    findings = cmfsim.diagnose(cmfsim.Case.load(path))
+    assert not [f for f in findings if f.severity == "error"]

@@ -10,7 +10,7 @@ from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.operation import check_cuts, check_plan
 from cmfsim.doctor.placement import check_placement
 from cmfsim.doctor.report import findings_text
-from cmfsim.doctor.surfaces import check_mesh_size, check_surfaces
+from cmfsim.doctor.surfaces import check_image, check_mesh_size, check_surfaces
 from cmfsim.io import Case
 
 __all__ = ["diagnose", "findings_text"]
@@ -43,7 +43,7 @@ def diagnose(case: Case) -> tuple[Finding, ...]:
     findings = [*evidence.findings, *check_cuts(evidence)]
     placement = check_placement(evidence)
     findings += placement
-    findings += check_surfaces(evidence)
+    findings += [*check_image(evidence), *check_surfaces(evidence)]
     # Distances between things in different frames say nothing.
     if not any(finding.severity == "error" for finding in placement):
         findings += check_mesh_size(evidence)

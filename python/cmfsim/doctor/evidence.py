@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import PRESETS, Surface
-from cmfsim.case import Finding
+from cmfsim.case import Finding, ImageData
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseError, CmfsimError
-from cmfsim.io import Case, read_landmark_file, read_surface
+from cmfsim.io import Case, read_landmark_file, read_surface, read_transform
+from cmfsim.io.images import read_image_file
 from cmfsim.patient import CaseMotion, CaseSurfaces
 from cmfsim.scene import SurfaceData
 from cmfsim.surface_checks import SurfaceReport, check_surface
@@ -71,6 +72,7 @@ class Evidence:
     Attributes
     ----------
     case : Case
+    image : ImageData or None
     skin : Body or None
     bones : mapping of str to Body
     skull_landmarks, skin_landmarks : mapping of str to (3,) float64, mm
@@ -81,6 +83,7 @@ class Evidence:
     """
 
     case: Case
+    image: ImageData | None = None
     skin: Body | None = None
     bones: Mapping[str, Body] = field(default_factory=dict)
     skull_landmarks: Mapping[str, Floats] = field(default_factory=dict)
@@ -131,8 +134,7 @@ def gather(case: Case) -> Evidence:
                 skin = body
             else:
                 bones[body.name] = body
-    if case.image is not None:
-        _check_file(case, "image.file", case.image.file, findings, folder=True)
+    image = _image(case, findings)
     skull = _landmarks(case, "landmarks.skull", case.landmarks.skull, findings)
     skin_points = _landmarks(case, "landmarks.skin", case.landmarks.skin, findings)
     if case.mesh.parting is not None:
@@ -142,8 +144,9 @@ def gather(case: Case) -> Evidence:
     motions: dict[str, Floats] = {}
     for name, motion in case.plan.items():
         _check_motion_files(case, name, motion, findings)
-        if motion.matrix is not None:
-            motions[name] = motion.matrix
+        matrix = _matrix(case, name, motion, findings)
+        if matrix is not None:
+            motions[name] = matrix
     try:
         case.region.plane(skull, 0.0, 0.0)
     except CaseError as error:
@@ -169,7 +172,7 @@ def gather(case: Case) -> Evidence:
             )
         )
     _check_output(case, findings)
-    return Evidence(case, skin, bones, skull, skin_points, motions, tuple(findings))
+    return Evidence(case, image, skin, bones, skull, skin_points, motions, tuple(findings))
 
 
 def _body(
@@ -196,6 +199,50 @@ def _body(
         )
         return None
     return body
+
+
+def _image(case: Case, findings: list[Finding]) -> ImageData | None:
+    if case.image is None:
+        return None
+    path = case.image.file
+    if not _check_file(case, "image.file", path, findings, folder=True):
+        return None
+    try:
+        found = read_image_file(path)
+    except (CmfsimError, MemoryError) as error:
+        findings.append(
+            Finding(
+                "error",
+                "image-unreadable",
+                str(error),
+                f"{case.where('image.file')} ({path.name})",
+                "nothing can be built from it",
+                "export the CT series again, as DICOM, NRRD or NIfTI",
+            )
+        )
+        return None
+    findings.extend(found.findings)
+    return found.image
+
+
+def _matrix(case: Case, name: str, motion: CaseMotion, findings: list[Finding]) -> Floats | None:
+    """The motion of a segment where it is a matrix, in the case or in a readable file."""
+    if motion.transform is None or not motion.transform.is_file():
+        return motion.matrix
+    try:
+        return read_transform(motion.transform)
+    except CmfsimError as error:
+        findings.append(
+            Finding(
+                "error",
+                "transform-unreadable",
+                str(error),
+                case.where(f"plan.{name}.transform"),
+                f"nobody knows how {name} moves",
+                "save it again as a rigid ITK transform (.tfm), or write a matrix",
+            )
+        )
+        return None
 
 
 def _landmarks(

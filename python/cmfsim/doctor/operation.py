@@ -8,6 +8,9 @@ from cmfsim.case import Finding
 from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Body, Evidence
 from cmfsim.doctor.places import place_text
+from cmfsim.errors import CaseError, LandmarkError
+from cmfsim.osteotomy import Procedure, place_procedure
+from cmfsim.patient import CaseOsteotomy
 from cmfsim.planning import decompose_motion
 
 __all__ = ["check_cuts", "check_plan"]
@@ -16,8 +19,9 @@ __all__ = ["check_cuts", "check_plan"]
 # The largest relocation in Table 2 of the paper is 12.6 mm; distraction reaches 30 mm.
 FAR, TOO_FAR = 20.0, 60.0
 TURNED, TOO_TURNED = 20.0, 60.0
-# Depth by which a moved bone may pass the skin at rest before it is said, mm: skin gives way.
-THROUGH_SKIN = 0.1
+# Depth by which a moved bone may pass the skin at rest before it is said, mm: skin goes with the
+# bone, and an ordinary advancement exceeds the thickness of tissue over the piriform rim.
+THROUGH_SKIN = 2.0
 # How far outside a bone its neighbourhood is asked for tissue, mm.
 BESIDE_BONE = 0.5
 
@@ -39,6 +43,7 @@ def check_cuts(evidence: Evidence) -> Iterator[Finding]:
                 f"use one of: {', '.join(sorted(available))}",
             )
         available |= set(cut.segments)
+        yield from _check_procedure(evidence, cut, where)
     for name in case.plan:
         if name not in available:
             yield Finding(
@@ -51,24 +56,92 @@ def check_cuts(evidence: Evidence) -> Iterator[Finding]:
             )
 
 
+def _check_procedure(evidence: Evidence, cut: CaseOsteotomy, where: str) -> Iterator[Finding]:
+    """Whether a standard procedure can be placed from the landmarks that are there."""
+    if cut.procedure is None:
+        return
+    try:
+        yield from place_procedure(cut.procedure, evidence.skull_landmarks, cut.options).findings
+    except LandmarkError as error:
+        yield Finding(
+            "error",
+            "landmark-missing",
+            str(error),
+            where,
+            "standard procedures are placed from skull landmarks",
+            "add it to the file under [landmarks] skull, or cut by planes",
+        )
+    except CaseError as error:
+        yield Finding(
+            "error",
+            "cut-options",
+            str(error),
+            where,
+            "the cut cannot be placed",
+            "correct the option, or leave it out",
+        )
+
+
+def _placed(evidence: Evidence, cut: CaseOsteotomy) -> Procedure | None:
+    if cut.procedure is None:
+        return None
+    try:
+        return place_procedure(cut.procedure, evidence.skull_landmarks, cut.options)
+    except (CaseError, LandmarkError):
+        return None
+
+
+def _piece(evidence: Evidence, name: str) -> Floats | None:
+    """Points on the surface of a bone or segment, (k, 3) mm, with the unit normals, (k, 6) in all.
+
+    Of a segment those of its bone that lie in the cut's region; None if nothing is known of it.
+    """
+    found: list[Floats] = []
+    if name in evidence.bones:
+        found.append(_with_normals(evidence.bones[name]))
+    for cut in evidence.case.osteotomies:
+        procedure = _placed(evidence, cut)
+        if procedure is not None:
+            for piece in procedure.cuts:
+                bodies = [evidence.bones[s] for s in piece.sources if s in evidence.bones]
+                if name not in {piece.segment, piece.rest} or not bodies:
+                    continue
+                rows = np.concatenate([_with_normals(body) for body in bodies])
+                inside = np.maximum.reduce(
+                    [np.minimum.reduce([p.distance(rows[:, :3]) for p in g]) for g in piece.groups]
+                )
+                found.append(rows[inside > 0.0] if name == piece.segment else rows[inside <= 0.0])
+        elif cut.plane is not None and name == cut.name and cut.bone is not None:
+            if cut.bone not in evidence.bones:
+                continue
+            rows = _with_normals(evidence.bones[cut.bone])
+            found.append(rows[cut.plane.distance(rows[:, :3]) > 0.0])
+    rows = np.concatenate(found) if found else np.zeros((0, 6))
+    return rows if len(rows) else None
+
+
+def _with_normals(body: Body) -> Floats:
+    return np.concatenate([body.samples, body.index.closest(body.samples)[1]], axis=1)
+
+
 def check_plan(evidence: Evidence) -> Iterator[Finding]:
     """Findings about what the plan does to each bone."""
     for name, matrix in evidence.motions.items():
-        body = evidence.bones.get(name)
-        wrong = list(_check_size(evidence, name, matrix, body))
+        piece = _piece(evidence, name)
+        points = None if piece is None else piece[:, :3]
+        wrong = list(_check_size(evidence, name, matrix, points))
         yield from wrong
         # A bone that flies off passes the skin as well: one reason is enough.
-        if body is not None and not any(f.severity == "error" for f in wrong):
-            yield from _check_through_skin(evidence, name, matrix, body)
-            yield from _check_tissue(evidence, name, body)
+        if piece is not None and not any(f.severity == "error" for f in wrong):
+            yield from _check_through_skin(evidence, name, matrix, piece[:, :3])
+            yield from _check_tissue(evidence, name, piece)
 
 
 def _check_size(
-    evidence: Evidence, name: str, matrix: Floats, body: Body | None
+    evidence: Evidence, name: str, matrix: Floats, points: Floats | None
 ) -> Iterator[Finding]:
     case = evidence.case
     centre = case.plan[name].centre
-    points = body.samples if body is not None else None
     if centre is None:
         centre = np.zeros(3) if points is None else points.mean(axis=0)
     motion = decompose_motion(matrix, centre)
@@ -99,12 +172,11 @@ def _check_size(
 
 
 def _check_through_skin(
-    evidence: Evidence, name: str, matrix: Floats, body: Body
+    evidence: Evidence, name: str, matrix: Floats, points: Floats
 ) -> Iterator[Finding]:
     skin = evidence.skin
     if skin is None:
         return
-    points = body.samples
     moved = _moved(matrix, points)
     inside_before = skin.index.winding_number(points) >= 0.5
     outside_after = skin.index.winding_number(moved) < 0.5
@@ -127,13 +199,12 @@ def _check_through_skin(
     )
 
 
-def _check_tissue(evidence: Evidence, name: str, body: Body) -> Iterator[Finding]:
+def _check_tissue(evidence: Evidence, name: str, piece: Floats) -> Iterator[Finding]:
     """A moving bone with no soft tissue beside it, in the region that is meshed."""
     skin = evidence.skin
     if skin is None:
         return
-    points = body.samples
-    beside = points + BESIDE_BONE * body.index.closest(points)[1]
+    beside = piece[:, :3] + BESIDE_BONE * piece[:, 3:]
     tissue = (skin.index.winding_number(beside) > 0.5) & evidence.in_region(beside)
     for other in evidence.bones.values():
         if tissue.any():
@@ -146,7 +217,7 @@ def _check_tissue(evidence: Evidence, name: str, body: Body) -> Iterator[Finding
         "error",
         "segment-no-tissue",
         f"{name} touches no soft tissue in the meshed region",
-        body.where,
+        evidence.case.where(f"plan.{name}"),
         "moving it moves nothing",
         "check region (posterior plane, lower, upper), and that the skin encloses it",
     )

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmfsim.case import Finding
 from cmfsim.checks import Floats
@@ -60,6 +61,8 @@ def check_placement(evidence: Evidence) -> list[Finding]:
     turned = False
     for key, landmarks in _landmark_sets(evidence).items():
         wrong = list(_check_landmark_fit(evidence, key, landmarks))
+        if not wrong:
+            wrong = list(_check_within_image(evidence, key, landmarks))
         if not wrong:
             wrong = list(_check_directions(evidence, key, landmarks))
             turned = turned or any(f.code == "frame-turned" for f in wrong)
@@ -197,6 +200,42 @@ def _check_landmark_fit(
         where,
         why,
         "check that landmarks and surfaces belong to one patient and one frame",
+    )
+
+
+def _check_within_image(
+    evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
+) -> Iterator[Finding]:
+    """Landmarks beyond the CT, or inside it only in another frame."""
+    image = evidence.image
+    if image is None:
+        return
+    points = np.stack(list(landmarks.values()))
+
+    def outside(places: Floats) -> NDArray[np.bool_]:
+        beyond = (places < image.lowest - LANDMARK_WARNING) | (
+            places > image.highest + LANDMARK_WARNING
+        )
+        return np.asarray(beyond.any(axis=1), dtype=np.bool_)
+
+    wrong = outside(points)
+    if not wrong.any():
+        return
+    turned = outside(points * HALF_TURN)
+    is_frame = int(turned.sum()) < 0.5 * int(wrong.sum())
+    names = [name for name, is_wrong in zip(landmarks, wrong, strict=True) if is_wrong]
+    more = ", …" if len(names) > 4 else ""
+    yield Finding(
+        "error" if is_frame or wrong.mean() > ELSEWHERE_SHARE else "warning",
+        "landmark-frame" if is_frame else "landmark-outside-image",
+        f"{len(names)} of {len(landmarks)} landmarks lie beyond the image"
+        + (f", turned from RAS to LPS {int(turned.sum())}" if is_frame else "")
+        + f": {', '.join(names[:4])}{more}",
+        evidence.case.where(f"landmarks.{key}"),
+        "cuts, muscles and the region are placed from landmarks",
+        "correct coordinateSystem in the file (LPS or RAS)"
+        if is_frame
+        else "check that landmarks and image belong to one patient, and that the scan is whole",
     )
 
 

@@ -9,8 +9,10 @@ from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Body, Evidence
 from cmfsim.doctor.places import place_text
 
-__all__ = ["check_mesh_size", "check_surfaces"]
+__all__ = ["check_image", "check_mesh_size", "check_surfaces"]
 
+# Spacing above which thin structures of a face are lost, mm: half the thickness of lips and lids.
+COARSE_SPACING = 2.5
 # A border longer than this many extents of the skin runs round the face, not the neck: a cap over
 # it replaces the back of the head.
 WIDE_BORDER = 2.0
@@ -20,6 +22,24 @@ SOME_SLIVERS, SLIVER_SHARE = 0.01, 0.05
 CROSSING_SHARE = 0.02
 # Share of the skin whose tissue is thinner than an edge, above which it is worth a word.
 THIN_SHARE = 0.02
+
+
+def check_image(evidence: Evidence) -> Iterator[Finding]:
+    """Findings about the voxels of the CT, before any of it is segmented."""
+    image = evidence.image
+    if image is None:
+        return
+    largest = float(np.max(np.asarray(image.spacing)))
+    if largest > COARSE_SPACING:
+        size = " × ".join(f"{s:.2f}" for s in np.asarray(image.spacing))
+        yield Finding(
+            "warning",
+            "ct-spacing-coarse",
+            f"voxels are {size} mm",
+            evidence.case.where("image.file"),
+            f"beyond {COARSE_SPACING:g} mm thin bone, lids and lips are lost between voxels",
+            "use the thin series of the scan (1 mm or below) where there is one",
+        )
 
 
 def check_surfaces(evidence: Evidence) -> Iterator[Finding]:
