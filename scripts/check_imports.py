@@ -135,9 +135,9 @@ PYTHON: Mapping[str, frozenset[str]] = {
         ),
         "cli": ("cmfsim build case checks doctor errors io pictures report scene simulation study"),
         "__init__": (
-            "_core build model case doctor errors evaluation imaging io meshing node_kinds osteotomy "
-            "patient phantom planning scene simulation study surface_checks surface_repair "
-            "template"
+            "_core build case doctor errors evaluation imaging io meshing model node_kinds "
+            "osteotomy patient phantom planning scene simulation study surface_checks "
+            "surface_repair template"
         ),
     }.items()
 }

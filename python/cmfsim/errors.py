@@ -54,7 +54,3 @@ class LandmarkInputError(LandmarkError, ValueError):
 
 class ImageInputError(ImageError, ValueError):
     """An image that cannot be meant: not three axes, no CT, damaged, no head in it."""
-
-
-class LandmarkInputError(LandmarkError, ValueError):
-    """Landmarks, in memory or on disk, that cannot be meant."""

@@ -28,10 +28,17 @@ from cmfsim.meshing import (
     tissue_level,
 )
 from cmfsim.model import PatientModel
-from cmfsim.node_kinds import ClassifiedNodes, KindOptions, classify_nodes
-from cmfsim.osteotomy import CuttingPlane, Procedure, cut_bones, free_cut, place_procedure
+from cmfsim.node_kinds import ClassifiedNodes, KindOptions, classify_nodes, segment_data
+from cmfsim.osteotomy import (
+    CuttingPlane,
+    Procedure,
+    contact_surface,
+    cut_bones,
+    free_cut,
+    place_procedure,
+)
 from cmfsim.pictures import picture_anatomy, picture_node_kinds
-from cmfsim.scene import MovedSurface, Scene, SegmentData
+from cmfsim.scene import MovedSurface, Scene
 
 __all__ = ["build_case", "build_model"]
 
@@ -255,13 +262,13 @@ def _region(case: Case, anatomy: Anatomy, landmarks: Mapping[str, Floats]) -> Ti
     plane = case.region.plane(landmarks, foremost, hindmost)
     areas = np.count_nonzero(inside, axis=(0, 1))
     slices = np.flatnonzero(areas)
-    bounds: dict[str, float | None] = {"lower": case.region.lower, "upper": case.region.upper}
-    for name, end, inwards in (("lower", slices[0], 1), ("upper", slices[-1], -1)):
+    bounds = [case.region.lower, case.region.upper]
+    for which, end, inwards in ((0, slices[0], 1), (1, slices[-1], -1)):
         # Two slices from the end: the very last may be a cap's rim.
-        if bounds[name] is None and areas[end + 2 * inwards] > CUT_SHARE * areas.max():
+        if bounds[which] is None and areas[end + 2 * inwards] > CUT_SHARE * areas.max():
             height = lowest[2] + spacing[2] * (end - 0.5 * inwards)
-            bounds[name] = float(height + inwards * CUT_MARGIN * spacing[2])
-    return TissueRegion(plane.point, plane.normal, **bounds)
+            bounds[which] = float(height + inwards * CUT_MARGIN * spacing[2])
+    return TissueRegion(plane.point, plane.normal, lower=bounds[0], upper=bounds[1])
 
 
 def _planes(region: TissueRegion) -> dict[str, tuple[ArrayLike, ArrayLike]]:
@@ -314,20 +321,13 @@ def _scene(
     segments: tuple[BoneSegment, ...],
     motions: Mapping[str, Floats | MovedSurface],
 ) -> Scene:
-    data: dict[str, SegmentData] = {}
-    plan: dict[str, ArrayLike | MovedSurface] = {}
-    for segment in segments:
-        joined = kinds.nodes("joined", segment.name)
-        sliding = kinds.nodes("sliding", segment.name)
-        if not len(joined) and not len(sliding):
-            continue
-        data[segment.name] = SegmentData(
-            joined=joined,
-            sliding=sliding,
-            contact=segment.surface if len(sliding) else None,
-            gap="rest" if len(sliding) else 0.0,
-        )
-        plan[segment.name] = motions.get(segment.name, np.eye(4))
+    contacts = {
+        segment.name: contact_surface(segment)
+        for segment in segments
+        if len(kinds.nodes("sliding", segment.name))
+    }
+    data = segment_data(kinds, segments, contacts=contacts)
+    plan = {name: motions.get(name, np.eye(4)) for name in data}
     return Scene(
         nodes=mesh.nodes,
         tets=mesh.tets,
