@@ -60,7 +60,7 @@ fn a_ball_has_its_volume_and_its_surface() {
     // A sphere of radius r is met to h²/8r by chords of length h.
     let level = ball(20.0);
     let Stuffed { mesh, boundary_error_mean, boundary_error_max, level_volume, .. } =
-        stuff(&level, &options(3.0, 1)).expect("a mesh");
+        stuff(&level, &options(3.0, 1), None).expect("a mesh");
     let exact = 4.0 / 3.0 * std::f64::consts::PI * 20.0_f64.powi(3);
     assert!((volume(&mesh) / exact - 1.0).abs() < 0.01, "volume {}", volume(&mesh));
     assert!((level_volume / exact - 1.0).abs() < 0.002, "level volume {level_volume}");
@@ -74,7 +74,7 @@ fn a_ball_has_its_volume_and_its_surface() {
 fn the_volume_error_falls_with_the_square_of_the_edge() {
     let level = ball(20.0);
     let error = |edge: f64| {
-        let mesh = stuff(&level, &options(edge, 0)).expect("a mesh").mesh;
+        let mesh = stuff(&level, &options(edge, 0), None).expect("a mesh").mesh;
         (volume(&mesh) / (4.0 / 3.0 * std::f64::consts::PI * 8000.0) - 1.0).abs()
     };
     let (coarse, fine) = (error(6.0), error(3.0));
@@ -90,7 +90,7 @@ fn a_lattice_of_one_size_keeps_the_bound_of_the_paper_on_noise() {
         s - s.floor() - 0.5
     });
     for refinements in 0..2 {
-        let mesh = stuff(&level, &options(3.0, refinements)).expect("a mesh").mesh;
+        let mesh = stuff(&level, &options(3.0, refinements), None).expect("a mesh").mesh;
         assert!(least_dihedral(&mesh) >= 10.7, "{}", least_dihedral(&mesh));
         assert_conforming(&mesh);
     }
@@ -100,7 +100,7 @@ fn a_lattice_of_one_size_keeps_the_bound_of_the_paper_on_noise() {
 fn a_sheet_thinner_than_the_edge_is_kept_by_refinement_and_lost_without() {
     let sheet = image(50, 1.0, |x| 1.0 - (radius(x, CENTRE) - 18.0).abs());
     let exact = 4.0 / 3.0 * std::f64::consts::PI * (19.0_f64.powi(3) - 17.0_f64.powi(3));
-    let share = |r| volume(&stuff(&sheet, &options(3.0, r)).expect("a mesh").mesh) / exact;
+    let share = |r| volume(&stuff(&sheet, &options(3.0, r), None).expect("a mesh").mesh) / exact;
     assert!(share(0) < 0.5);
     assert!((share(1) - 1.0).abs() < 0.02, "{}", share(1));
 }
@@ -109,7 +109,7 @@ fn a_sheet_thinner_than_the_edge_is_kept_by_refinement_and_lost_without() {
 fn a_gap_thinner_than_the_edge_parts_two_bodies() {
     // Two half balls, one voxel apart: the lips of a face.
     let lips = image(50, 1.0, |x| (18.0 - radius(x, CENTRE)).min((x[2] - CENTRE[2]).abs() - 0.7));
-    let made = stuff(&lips, &options(3.0, 2)).expect("a mesh");
+    let made = stuff(&lips, &options(3.0, 2), None).expect("a mesh");
     let upper = made.mesh.nodes().iter().map(|x| x[2] > CENTRE[2]).collect::<Vec<_>>();
     let bridging =
         made.mesh.tets().iter().filter(|t| {
@@ -150,7 +150,7 @@ fn every_voxel_of_a_label_image_keeps_its_side() {
 fn tissue_ends_where_its_image_ends() {
     let grid = Grid::new([10, 10, 10], [1.0; 3], [0.0; 3]).expect("a grid");
     let level = LevelImage::from_labels(grid, &[true; 1000]).expect("a level");
-    let mesh = stuff(&level, &options(2.0, 0)).expect("a mesh").mesh;
+    let mesh = stuff(&level, &options(2.0, 0), None).expect("a mesh").mesh;
     assert!((volume(&mesh) / 1000.0 - 1.0).abs() < 0.05, "{}", volume(&mesh));
     assert_conforming(&mesh);
 }
@@ -162,9 +162,9 @@ fn specks_go_and_bodies_stay() {
             [([20.0, 20.0, 20.0], 12.0), ([45.0, 45.0, 45.0], 8.0), ([45.0, 15.0, 45.0], 3.0)];
         balls.iter().map(|&(c, r)| r - radius(x, c)).fold(f64::NEG_INFINITY, f64::max)
     });
-    let all = stuff(&level, &options(3.0, 0)).expect("a mesh");
+    let all = stuff(&level, &options(3.0, 0), None).expect("a mesh");
     assert_eq!(all.dropped.parts, 0);
-    let kept = stuff(&level, &StuffingOptions { least_body: 500.0, ..options(3.0, 0) });
+    let kept = stuff(&level, &StuffingOptions { least_body: 500.0, ..options(3.0, 0) }, None);
     let kept = kept.expect("a mesh");
     assert_eq!(kept.dropped.parts, 1);
     assert!((volume(&all.mesh) - volume(&kept.mesh) - kept.dropped.volume).abs() < 1e-9);
@@ -177,7 +177,7 @@ fn the_mesh_has_the_same_bits_for_any_number_of_threads() {
     });
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
-        pool.install(|| stuff(&level, &options(3.0, 2)).expect("a mesh").mesh)
+        pool.install(|| stuff(&level, &options(3.0, 2), None).expect("a mesh").mesh)
     };
     let (one, three) = (run(1), run(3));
     assert_eq!(one.nodes(), three.nodes());
@@ -187,7 +187,7 @@ fn the_mesh_has_the_same_bits_for_any_number_of_threads() {
 #[test]
 fn the_signed_distance_of_a_surface_is_that_of_brute_force() {
     let surface = {
-        let mesh = stuff(&ball(15.0), &options(4.0, 0)).expect("a mesh").mesh;
+        let mesh = stuff(&ball(15.0), &options(4.0, 0), None).expect("a mesh").mesh;
         Surface::new(mesh.nodes().to_vec(), mesh.boundary_triangles()).expect("a surface")
     };
     let grid = Grid::new([25, 24, 26], [2.0, 2.1, 1.9], [0.0; 3]).expect("a grid");
@@ -206,7 +206,7 @@ fn the_signed_distance_of_a_surface_is_that_of_brute_force() {
 fn a_parting_surface_parts_the_mesh_and_leaves_its_rim_joined() {
     let grid = Grid::new([20, 20, 20], [1.0; 3], [0.0; 3]).expect("a grid");
     let level = LevelImage::from_labels(grid, &[true; 8000]).expect("a level");
-    let mesh = stuff(&level, &options(3.0, 0)).expect("a mesh").mesh;
+    let mesh = stuff(&level, &options(3.0, 0), None).expect("a mesh").mesh;
     let sheet = |to: f64| {
         let corners = vec![[-5.0, -5.0, 9.3], [to, -5.0, 9.3], [to, 25.0, 9.3], [-5.0, 25.0, 9.3]];
         Surface::new(corners, vec![[0, 1, 2], [0, 2, 3]]).expect("a sheet")
@@ -259,15 +259,15 @@ fn bad_input_is_named() {
     values[5] = f32::NAN;
     assert!(matches!(LevelImage::new(grid, values), Err(MtmError::NotFinite { index: 5, .. })));
     let empty = LevelImage::new(grid, vec![-1.0; 64]).expect("a level");
-    assert!(matches!(stuff(&empty, &options(3.0, 0)), Err(MtmError::Empty { .. })));
+    assert!(matches!(stuff(&empty, &options(3.0, 0), None), Err(MtmError::Empty { .. })));
     let level = LevelImage::new(grid, vec![1.0; 64]).expect("a level");
     for bad in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e-4] {
         assert!(
-            matches!(stuff(&level, &options(bad, 0)), Err(MtmError::OutOfRange { .. })),
+            matches!(stuff(&level, &options(bad, 0), None), Err(MtmError::OutOfRange { .. })),
             "{bad}"
         );
     }
-    assert!(matches!(stuff(&level, &options(3.0, 9)), Err(MtmError::OutOfRange { .. })));
+    assert!(matches!(stuff(&level, &options(3.0, 9), None), Err(MtmError::OutOfRange { .. })));
 }
 
 proptest! {
@@ -283,7 +283,7 @@ proptest! {
         let level = image(32, 1.0, |x| {
             centres.iter().zip(&radii).map(|(&c, r)| r - radius(x, c)).fold(f64::NEG_INFINITY, f64::max)
         });
-        if let Ok(Stuffed { mesh, .. }) = stuff(&level, &options(edge, refinements)) {
+        if let Ok(Stuffed { mesh, .. }) = stuff(&level, &options(edge, refinements), None) {
             prop_assert!(least_dihedral(&mesh) >= 10.0, "{}", least_dihedral(&mesh));
             assert_conforming(&mesh);
         }

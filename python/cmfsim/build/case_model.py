@@ -24,6 +24,7 @@ from cmfsim.meshing import (
     TissueRegion,
     mesh_from_level,
     mesh_report,
+    near_skin,
     part_mesh,
     tissue_level,
 )
@@ -48,6 +49,9 @@ Progress = Callable[[str], None]
 
 # Bodies of tissue below this volume are specks between bones, mm³.
 LEAST_BODY = 1000.0
+# Depth below the skin to which thin tissue is refined, mm: lips, nose and lids, not the walls of the
+# nasal cavity.
+THIN_DEPTH = 12.0
 # A cross-section at an end of the head above this share of the largest is a cut, not a crown.
 CUT_SHARE = 0.15
 # Voxels between the end of a head that was cut and the plane that closes its tissue there: the
@@ -147,7 +151,7 @@ def build_model(
     findings += noticed
 
     stages.begin("filling the tissue with tets")
-    mesh, report, noticed = _mesh(case, level)
+    mesh, report, noticed = _mesh(case, level, anatomy)
     findings += noticed
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
 
@@ -280,7 +284,9 @@ def _planes(region: TissueRegion) -> dict[str, tuple[ArrayLike, ArrayLike]]:
     return planes
 
 
-def _mesh(case: Case, level: ImageData) -> tuple[TetMesh, MeshReport, tuple[Finding, ...]]:
+def _mesh(
+    case: Case, level: ImageData, anatomy: Anatomy
+) -> tuple[TetMesh, MeshReport, tuple[Finding, ...]]:
     if case.mesh.file is not None:
         mesh = TetMesh(*read_tet_mesh(case.mesh.file))
         return mesh, mesh_report(mesh), ()
@@ -289,7 +295,7 @@ def _mesh(case: Case, level: ImageData) -> tuple[TetMesh, MeshReport, tuple[Find
         refinements=1 if case.mesh.refine else 0,
         least_body=LEAST_BODY,
     )
-    made = mesh_from_level(level, options)
+    made = mesh_from_level(level, options, refinable=near_skin(anatomy, THIN_DEPTH))
     if case.mesh.parting is None:
         return made.mesh, made.report, made.findings
     units, frame = ("mm", "LPS")

@@ -10,7 +10,7 @@ from cmfsim.meshing.stuffing import (
     part_mesh,
 )
 from cmfsim.meshing.tetwild import mesh_with_tetwild
-from cmfsim.meshing.tissue import TissueRegion, tissue_level
+from cmfsim.meshing.tissue import TissueRegion, near_skin, tissue_level
 
 __all__ = [
     "MeshOptions",
@@ -22,6 +22,7 @@ __all__ = [
     "mesh_from_level",
     "mesh_report",
     "mesh_with_tetwild",
+    "near_skin",
     "part_mesh",
     "signed_level",
     "tissue_level",

@@ -127,7 +127,9 @@ def mesh_from_labels(
     return _stuffed(array, spacing, origin, options)[0]
 
 
-def mesh_from_level(level: ImageData, options: MeshOptions | None = None) -> TissueMesh:
+def mesh_from_level(
+    level: ImageData, options: MeshOptions | None = None, *, refinable: ArrayLike | None = None
+) -> TissueMesh:
     """The tets inside a level image, with the report of their quality.
 
     Parameters
@@ -135,6 +137,8 @@ def mesh_from_level(level: ImageData, options: MeshOptions | None = None) -> Tis
     level : ImageData
         Positive in the tissue, zero on its surface.
     options : MeshOptions, optional
+    refinable : (nx, ny, nz) bool, optional
+        Where the edge may be halved; everywhere if left out.
 
     Returns
     -------
@@ -156,7 +160,7 @@ def mesh_from_level(level: ImageData, options: MeshOptions | None = None) -> Tis
     """
     options = options or MeshOptions()
     values = np.asarray(level.values, dtype=np.float32)
-    mesh, making = _stuffed(values, level.spacing, level.origin, options)
+    mesh, making = _stuffed(values, level.spacing, level.origin, options, refinable)
     report = mesh_report(mesh, making)
     return TissueMesh(mesh, report, tuple(_findings(report)))
 
@@ -194,7 +198,11 @@ def part_mesh(mesh: TetMesh, surface: SurfaceData) -> TetMesh:
 
 
 def _stuffed(
-    values: ArrayLike, spacing: ArrayLike, origin: ArrayLike, options: MeshOptions
+    values: ArrayLike,
+    spacing: ArrayLike,
+    origin: ArrayLike,
+    options: MeshOptions,
+    refinable: ArrayLike | None = None,
 ) -> tuple[TetMesh, dict[str, float]]:
     steps = np.asarray(spacing, dtype=np.float64)
     steps = np.full(3, steps) if steps.ndim == 0 else steps
@@ -207,6 +215,7 @@ def _stuffed(
         (float(o[0]), float(o[1]), float(o[2])),
         refinements=options.refinements,
         least_body=options.least_body,
+        refinable=refinable,
     )
 
 

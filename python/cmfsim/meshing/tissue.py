@@ -13,16 +13,16 @@ from cmfsim.case import Anatomy, Finding, ImageData
 from cmfsim.checks import as_number, as_positive, as_rows
 from cmfsim.errors import MeshInputError
 
-__all__ = ["TissueRegion", "tissue_level"]
+__all__ = ["TissueRegion", "near_skin", "tissue_level"]
 
 Levels = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 # A level is clipped two voxels from its surface, like those of given surfaces.
 BAND_IN_VOXELS = 2.0
-# Radius of the foramina and fissures through which the cranial cavity meets the face, mm: the
-# superior orbital fissure is 6 mm wide at most, the optic canal 5 mm.
-FORAMEN_RADIUS = 3.0
+# Radius of the openings through which the cranial cavity meets the face, mm: fissures of the orbit
+# are up to 10 mm wide in reduced surfaces; the piriform aperture, 24 mm, must stay open.
+FORAMEN_RADIUS = 6.0
 # Hollows smaller than this are gaps between surfaces, not worth a word, mm³.
 NOTEWORTHY_HOLLOW = 500.0
 
@@ -110,6 +110,13 @@ def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tup
         )
     findings = tuple(_without_hollows(level, bone, grid, region))
     return grid.with_values(level), findings
+
+
+def near_skin(anatomy: Anatomy, depth: float) -> Mask:
+    """Where the skin's surface is nearer than `depth` mm: (nx, ny, nz) bool on the anatomy's grid."""
+    sx, sy, sz = (float(s) for s in np.asarray(anatomy.skin.spacing))
+    outside = np.asarray(anatomy.skin.values) <= 0.0
+    return np.asarray(_core.distance_image(outside, (sx, sy, sz)) < depth)
 
 
 def _inward_distances(grid: ImageData, region: TissueRegion) -> Iterator[Levels]:

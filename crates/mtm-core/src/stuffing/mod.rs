@@ -74,13 +74,28 @@ pub struct Stuffed {
 
 /// The mesh of `level`, with dihedral angles of at least 10°.
 ///
+/// `refinable`: whether what is thin at each voxel may be refined; everywhere if none.
+///
 /// # Errors
 /// Options out of range, no tissue in the image, or none that the lattice catches, an edge length so small
 /// that the lattice has no end.
-pub fn stuff(level: &LevelImage, options: &StuffingOptions) -> Result<Stuffed> {
+pub fn stuff(
+    level: &LevelImage,
+    options: &StuffingOptions,
+    refinable: Option<&[bool]>,
+) -> Result<Stuffed> {
     check(options)?;
+    if let Some(refinable) = refinable.filter(|r| r.len() != level.values().len()) {
+        return Err(MtmError::Length {
+            what: "refinable".into(),
+            found: refinable.len(),
+            expected: level.values().len(),
+            why: "one per voxel of the level image",
+            kind: ErrorKind::Mesh,
+        });
+    }
     let cover = Cover::new(level, options)?;
-    let lattice = Lattice::new(&cover.tree(level, options));
+    let lattice = Lattice::new(&cover.tree(level, options, refinable));
     let mut stuffed = cut(&lattice, level, cover.origin, cover.unit);
     drop(lattice);
     if stuffed.tets.is_empty() {
@@ -199,7 +214,12 @@ impl Cover {
     }
 
     /// The octree over the cubes near tissue, refined where tissue or a gap in it is thin.
-    fn tree(&self, level: &LevelImage, options: &StuffingOptions) -> Octree {
+    fn tree(
+        &self,
+        level: &LevelImage,
+        options: &StuffingOptions,
+        refinable: Option<&[bool]>,
+    ) -> Octree {
         let active = self.active(level);
         let mut tree = Octree::new(self.counts, options.refinements, &active);
         if options.refinements == 0 {
@@ -219,7 +239,8 @@ impl Cover {
             let size = tree.coarse_size() >> (refinement + 1);
             for squared in [&to_outside, &to_inside] {
                 let thin = thin_parts(grid, squared, THIN_RADIUS * edge, THIN_SLACK);
-                for index in (0..grid.len()).filter(|&index| thin[index]) {
+                let may = |index: &usize| thin[*index] && refinable.is_none_or(|r| r[*index]);
+                for index in (0..grid.len()).filter(may) {
                     self.refine_round(&mut tree, grid.centre(index), 0.5 * edge, size);
                 }
             }
