@@ -118,7 +118,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "simulation": "scene errors _core",
         "evaluation": "case checks errors scene _core",
         "build": (
-            "case checks doctor errors imaging io meshing model node_kinds osteotomy patient "
+            "case checks doctor errors imaging io meshing model node_kinds osteotomy patient phantom "
             "pictures scene surface_repair _core"
         ),
         "study": "build case errors template simulation evaluation scene",
@@ -133,7 +133,9 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "case checks errors io osteotomy patient planning scene surface_checks surface_repair "
             "_core"
         ),
-        "cli": ("cmfsim build case checks doctor errors io pictures report scene simulation study"),
+        "cli": (
+            "cmfsim build case checks doctor errors io phantom pictures report scene simulation study"
+        ),
         "__init__": (
             "_core build case doctor errors evaluation imaging io meshing model node_kinds "
             "osteotomy patient phantom planning scene simulation study surface_checks "

@@ -20,7 +20,7 @@ from cmfsim._core import (
     Tissue,
     __version__,
 )
-from cmfsim.build import build_case, build_model
+from cmfsim.build import build_case, build_model, write_phantom_case
 from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.doctor import diagnose
 from cmfsim.errors import (
@@ -201,6 +201,7 @@ __all__ = [
     "write_image",
     "write_landmarks",
     "write_model",
+    "write_phantom_case",
     "write_result",
     "write_scene",
     "write_surface",

@@ -116,7 +116,7 @@ def test_what_a_case_file_leaves_out_has_its_default(tmp_path):
     assert case.name == tmp_path.name
     assert case.tissue.preset == "kim2010"
     assert case.tissue.fraction.tolist() == [0.0]
-    assert case.mesh == cmfsim.patient.CaseMesh(edge_length=3.0, refine=True)
+    assert case.mesh == cmfsim.patient.CaseMesh(edge_length=4.0, refine=True)
     assert case.output == tmp_path / "out"
     assert (case.osteotomies, dict(case.plan)) == ((), {})
 

@@ -49,8 +49,8 @@ Progress = Callable[[str], None]
 
 # Bodies of tissue below this volume are specks between bones, mm³.
 LEAST_BODY = 1000.0
-# Depth below the skin to which thin tissue is refined, mm: lips, nose and lids, not the walls of the
-# nasal cavity.
+# Depth below the skin to which thin tissue is refined, mm: lips, nose and lids, not the walls of
+# the nasal cavity.
 THIN_DEPTH = 12.0
 # A cross-section at an end of the head above this share of the largest is a cut, not a crown.
 CUT_SHARE = 0.15

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim import __version__
-from cmfsim.cli import case_commands, scene_commands
+from cmfsim.cli import case_commands, phantom_command, scene_commands
 from cmfsim.io import result_suffixes
 from cmfsim.scene import CONTACTS, METHODS
 
@@ -50,6 +50,18 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     )
     build.add_argument("--no-doctor", action="store_true", help="build without checks before")
     build.set_defaults(run=case_commands.build)
+
+    phantom = commands.add_parser(
+        "phantom", parents=[common], help="write the case of a head made by code"
+    )
+    phantom.add_argument("folder", metavar="FOLDER", type=Path, help="made if it is not there")
+    phantom.add_argument(
+        "--person", metavar="N", type=int, help="another person; the same N is the same person"
+    )
+    phantom.add_argument(
+        "--spacing", metavar="MM", type=float, default=1.0, help="of the CT (default 1)"
+    )
+    phantom.set_defaults(run=phantom_command.phantom)
 
 
 def _add_scene_commands(commands: Any, common: argparse.ArgumentParser) -> None:

@@ -11,7 +11,17 @@ from cmfsim.case import Finding
 from cmfsim.checks import Floats
 from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.guess import guessed_landmarks
-from cmfsim.imaging.morphology import Mask, Volume, depth, reached, smoothed, watershed
+from cmfsim.imaging.morphology import (
+    Mask,
+    Volume,
+    depth,
+    label,
+    largest,
+    ndimage,
+    reached,
+    smoothed,
+    watershed,
+)
 from cmfsim.imaging.working import Working
 
 __all__ = ["Jaws", "part_jaws"]
@@ -118,10 +128,31 @@ def part_jaws(work: Working, bone: Bone, landmarks: Mapping[str, Floats] | None)
     if reason:
         return Jaws(None, None, None, (_not_parted(reason),))
     rest = bone.mask & ~mandible
+    # Pieces that the flood left to the skull, but that only the mandible holds, are the mandible's.
+    cut_off = _touching(rest & ~_largest_piece(rest), mandible)
+    mandible |= cut_off
+    rest &= ~cut_off
     # Threefold, so that smoothing leaves thin parts their size.
     side = np.clip(3.0 * (smoothed(mandible, 1.0) - smoothed(rest, 1.0)), -1.0, 1.0)
     height = 0.5 * float(landmarks["supradentale"][2] + landmarks["infradentale"][2])
     return Jaws(side, mandible, height, tuple(findings))
+
+
+def _largest_piece(mask: Mask) -> Mask:
+    """The largest piece of a mask; nothing of an empty one."""
+    return largest(mask) if mask.any() else mask
+
+
+def _touching(mask: Mask, other: Mask) -> Mask:
+    """The pieces of a mask that a face joins to another mask."""
+    if not mask.any():
+        return mask
+    labels, count = label(mask)
+    near = ndimage().binary_dilation(other)
+    touches = np.zeros(count + 1, dtype=bool)
+    touches[np.unique(labels[near & mask])] = True
+    touches[0] = False
+    return np.asarray(touches[labels])
 
 
 def _not_parted(reason: str) -> Finding:

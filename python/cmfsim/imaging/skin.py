@@ -214,10 +214,12 @@ def _beyond_scalp(
     down = (layers[-1] - np.arange(bone.shape[2])) * spacing[2]
     beside = (down < ABOVE_EARS)[None, None, :] & (y > 0.0)[None, :, None]
     behind = (down < ABOVE_NAPE)[None, None, :] & (y > BEHIND)[None, :, None]
-    # The vault with what it encloses: the skull is a ring in each layer there.
+    # The vault with what it encloses: the skull is a ring in each layer there, which the front
+    # closes where the fissures of the orbits open it.
     vault = ndimage().binary_closing(bone, iterations=2) | bone
     for k in np.flatnonzero(down < ABOVE_NAPE):
-        vault[:, :, k] = ndimage().binary_fill_holes(vault[:, :, k])
+        ring = vault[:, :, k] | (y <= 0.0)[None, :]
+        vault[:, :, k] |= ndimage().binary_fill_holes(ring) & (y > 0.0)[None, :]
     away = -depth(np.asfortranarray(vault), spacing)
     # In front of the ears nothing lies on the scalp, so its thickness is known there.
     skin = tissue & ~ndimage().binary_erosion(tissue)

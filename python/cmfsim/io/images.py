@@ -114,6 +114,12 @@ def write_image(image: ImageData, path: str | os.PathLike[str]) -> None:
     ------
     ImageError
         (also `ValueError`) Another ending.
+
+    Examples
+    --------
+    >>> import cmfsim, numpy as np
+    >>> image = cmfsim.ImageData(np.zeros((4, 4, 4), dtype=np.int16), spacing=(1, 1, 1))
+    >>> cmfsim.write_image(image, "image.nrrd")  # doctest: +SKIP
     """
     path = Path(path)
     suffix = next((s for s in SUFFIXES if path.name.lower().endswith(s)), None)

@@ -69,6 +69,11 @@ def read_tet_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], ND
         The file does not exist.
     CaseError
         (also `ValueError`) No linear tets.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> nodes, tets = cmfsim.read_tet_mesh("mesh.vtu")  # doctest: +SKIP
     """
     path = Path(path)
     mesh = read_mesh(path)

@@ -18,7 +18,7 @@ from cmfsim.phantom.head import HEAD_BOX, skin_shape
 from cmfsim.phantom.landmarks import find_skin_landmarks, find_skull_landmarks
 from cmfsim.phantom.muscles import Muscle, make_muscles
 from cmfsim.phantom.parameters import HeadParameters
-from cmfsim.phantom.shapes import Shape
+from cmfsim.phantom.shapes import Shape, Within
 from cmfsim.phantom.skull import (
     airway_shape,
     brain_shape,
@@ -65,6 +65,8 @@ MOST_VOXELS = 60_000_000
 SKIN_THICKNESS, LEAN_DEPTH = 1.8, 16.0
 # Thickness of cortical bone, mm.
 CORTEX = 2.2
+# Least thickness of bone about the cavity of the vault, mm: at the temples and the orbits' roofs.
+LEAST_VAULT = 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +109,7 @@ class PhantomHead:
             "upper_teeth": teeth_shape(upper=True),
             "lower_teeth": teeth_shape(upper=False),
             "air": airway_shape(),
-            "brain": brain_shape(),
+            "brain": Within(brain_shape(), cranium_shape(), LEAST_VAULT),
             "drawn_skin": skin_shape(p),
         }
 

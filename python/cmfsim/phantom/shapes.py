@@ -29,6 +29,7 @@ __all__ = [
     "Shape",
     "Step",
     "Tube",
+    "Within",
 ]
 
 # Shapes further away than this are left out, mm: twice the widest melt, so that not even a melt of
@@ -387,6 +388,26 @@ class Step:
     how: str
     shape: Shape
     melt: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Within:
+    """What of a shape lies at least `depth` mm below the surface of another."""
+
+    shape: Shape
+    outer: Shape
+    depth: float
+
+    @property
+    def box(self) -> Box:
+        """Where the level can be above 0."""
+        return self.shape.box
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """The lesser of both levels."""
+        inside = self.outer.level(x, y, z) - self.depth
+        level: Level = np.minimum(self.shape.level(x, y, z), inside)
+        return level
 
 
 @dataclass(frozen=True, eq=False)
