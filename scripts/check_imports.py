@@ -118,8 +118,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "simulation": "scene errors _core",
         "evaluation": "case checks errors scene _core",
         "build": (
-            "case checks doctor errors imaging io meshing model node_kinds osteotomy patient phantom "
-            "pictures scene surface_repair _core"
+            "case checks doctor errors imaging io meshing model node_kinds osteotomy patient "
+            "phantom pictures scene surface_repair _core"
         ),
         "study": "build case errors template simulation evaluation scene",
         "pictures": "case checks errors scene",
@@ -134,7 +134,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "_core"
         ),
         "cli": (
-            "cmfsim build case checks doctor errors io phantom pictures report scene simulation study"
+            "cmfsim build case checks doctor errors io phantom pictures report scene simulation "
+            "study"
         ),
         "__init__": (
             "_core build case doctor errors evaluation imaging io meshing model node_kinds "

@@ -52,8 +52,8 @@ POSTERIOR_DEPTH = 10.0
 POSTERIOR_SHARE = 0.6
 # Landmarks that the posterior plane is placed from: the roots of the arches, in front of the ears.
 POSTERIOR_LANDMARKS = ("supraglenoid_L", "supraglenoid_R")
-# Edge length of the mesh where a case states none, mm: some 250 000 tets of a face, whose edges are
-# 3.2 mm long on average, and half of that where tissue is thin.
+# Edge length of the mesh where a case states none, mm: some 400 000 tets of a face with its neck,
+# whose edges are 2.9 mm long on average, half of an edge where tissue is thin.
 EDGE_LENGTH = 4.0
 
 
