@@ -272,7 +272,7 @@ def stuff_image(
     *,
     refinements: int,
     least_body: float,
-    refinable: ArrayLike | None = None,
+    allowed: ArrayLike | None = None,
 ) -> tuple[TetMesh, dict[str, float]]: ...
 def distance_image(
     targets: ArrayLike, spacing: tuple[float, float, float]

@@ -121,6 +121,25 @@ fn a_gap_thinner_than_the_edge_parts_two_bodies() {
 }
 
 #[test]
+fn only_what_is_allowed_is_refined() {
+    let sheets = image(60, 1.0, |x| {
+        let sheet = |z: f64| (1.0 - (x[2] - z).abs()).min(24.0 - radius(x, [30.0, 30.0, z]));
+        sheet(15.2).max(sheet(44.7))
+    });
+    let allowed: Vec<u8> = (0..216_000).map(|i| u8::from(i % 60 < 30)).collect();
+    let mesh = stuff(&sheets, &options(3.0, 1), Some(&allowed)).expect("a mesh").mesh;
+    let volume_of = |low: bool| -> f64 {
+        let at = |t: &[u32; 4]| (mesh.nodes()[t[0] as usize][2] < 30.0) == low;
+        mesh.tets().iter().zip(mesh.volumes()).filter(|(t, _)| at(t)).map(|(_, v)| v).sum()
+    };
+    let exact = std::f64::consts::PI * 24.0_f64.powi(2) * 2.0;
+    assert!(volume_of(true) > 0.95 * exact, "{}", volume_of(true));
+    assert!(volume_of(false) < 0.6 * exact, "{}", volume_of(false));
+    let short = stuff(&sheets, &options(3.0, 1), Some(&allowed[1..]));
+    assert!(matches!(short, Err(MtmError::Length { .. })));
+}
+
+#[test]
 fn labels_keep_flat_faces_half_way_between_voxels() {
     let grid = Grid::new([14, 15, 16], [1.0, 2.0, 0.5], [5.0, 6.0, 7.0]).expect("a grid");
     let inside: Vec<bool> = (0..grid.len())

@@ -143,6 +143,20 @@ pub fn labels(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<([usize; 3]
     Ok((shape, non_zero(&array, name)?))
 }
 
+/// Small whole numbers of the voxels of an image.
+pub fn counts(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<u8>> {
+    let (array, _, kind) = three_axes(value, name)?;
+    if !"biu".contains(&kind) {
+        return Err(name.fail("has real numbers where whole numbers are needed".into()));
+    }
+    let numpy = array.py().import("numpy")?;
+    let bounded = numpy.call_method1("clip", (array, 0, u8::MAX))?;
+    let array = converted(&bounded.call_method1("astype", ("uint8",))?, name, "u", "uint8", "")?;
+    let array: PyReadonlyArrayDyn<'_, u8> = array.extract()?;
+    let values = array.as_slice().map_err(|e| name.fail(format!("is not contiguous: {e}")))?;
+    Ok(values.to_vec())
+}
+
 fn three_axes<'py>(
     value: &Bound<'py, PyAny>,
     name: Named<'_>,

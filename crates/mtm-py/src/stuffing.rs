@@ -22,12 +22,12 @@ const MESH: ErrorKind = ErrorKind::Mesh;
 /// Mesh of the tissue in a label image or inside a level image, and a dict of what its making says.
 ///
 /// `values`: (nx, ny, nz); bool or whole numbers are labels (non-zero is tissue), real numbers a level
-/// (positive inside). `spacing`, `origin`: (3,) mm. `refinable`: (nx, ny, nz) mask of where the edge may be
-/// halved, everywhere if none. The dict has `dropped_parts`, `dropped_volume` (mm³),
+/// (positive inside). `spacing`, `origin`: (3,) mm. `allowed`: (nx, ny, nz), how often the edge may be
+/// halved there; `refinements` times if none. The dict has `dropped_parts`, `dropped_volume` (mm³),
 /// `dropped_tets`, `level_volume` (mm³), `boundary_error_mean` and `boundary_error_max` (mm).
 #[pyfunction]
 #[pyo3(signature = (
-    values, spacing, edge_length, origin, *, refinements, least_body, refinable = None
+    values, spacing, edge_length, origin, *, refinements, least_body, allowed = None
 ))]
 #[allow(clippy::too_many_arguments)] // as many as its Python caller names
 pub fn stuff_image<'py>(
@@ -38,11 +38,11 @@ pub fn stuff_image<'py>(
     origin: [f64; 3],
     refinements: u32,
     least_body: f64,
-    refinable: Option<&Bound<'py, PyAny>>,
+    allowed: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<(PyTetMesh, Bound<'py, PyDict>)> {
     let image = arrays::image(values, Named("image", MESH))?;
-    let refinable = match refinable {
-        Some(mask) => Some(arrays::labels(mask, Named("refinable", MESH))?.1),
+    let allowed = match allowed {
+        Some(counts) => Some(arrays::counts(counts, Named("allowed", MESH))?),
         None => None,
     };
     let options = StuffingOptions { edge_length, refinements, least_body };
@@ -55,7 +55,7 @@ pub fn stuff_image<'py>(
                 LevelImage::new(Grid::new(shape, spacing, origin)?, values)?
             }
         };
-        stuff(&level, &options, refinable.as_deref())
+        stuff(&level, &options, allowed.as_deref())
     })?;
     let report = PyDict::new(py);
     report.set_item("dropped_parts", made.dropped.parts)?;

@@ -52,6 +52,8 @@ LEAST_BODY = 1000.0
 # Depth below the skin to which thin tissue is refined, mm: lips, nose and lids, not the walls of
 # the nasal cavity.
 THIN_DEPTH = 12.0
+# Halvings of the edge at gaps between skin and skin: lips a millimetre apart stay two.
+GAP_REFINEMENTS = 2
 # A cross-section at an end of the head above this share of the largest is a cut, not a crown.
 CUT_SHARE = 0.15
 # Voxels between the end of a head that was cut and the plane that closes its tissue there: the
@@ -292,10 +294,12 @@ def _mesh(
         return mesh, mesh_report(mesh), ()
     options = MeshOptions(
         edge_length=case.mesh.edge_length,
-        refinements=1 if case.mesh.refine else 0,
+        refinements=GAP_REFINEMENTS if case.mesh.refine else 0,
         least_body=LEAST_BODY,
     )
-    made = mesh_from_level(level, options, refinable=near_skin(anatomy, THIN_DEPTH))
+    allowed = near_skin(anatomy, THIN_DEPTH).astype(np.uint8)
+    allowed[anatomy.skin.values <= 0.0] = GAP_REFINEMENTS
+    made = mesh_from_level(level, options, allowed=allowed)
     if case.mesh.parting is None:
         return made.mesh, made.report, made.findings
     units, frame = ("mm", "LPS")

@@ -128,7 +128,7 @@ def mesh_from_labels(
 
 
 def mesh_from_level(
-    level: ImageData, options: MeshOptions | None = None, *, refinable: ArrayLike | None = None
+    level: ImageData, options: MeshOptions | None = None, *, allowed: ArrayLike | None = None
 ) -> TissueMesh:
     """The tets inside a level image, with the report of their quality.
 
@@ -137,8 +137,9 @@ def mesh_from_level(
     level : ImageData
         Positive in the tissue, zero on its surface.
     options : MeshOptions, optional
-    refinable : (nx, ny, nz) bool, optional
-        Where the edge may be halved; everywhere if left out.
+    allowed : (nx, ny, nz) array of whole numbers, optional
+        How often the edge may be halved for what is thin at each voxel; as often as the options
+        say if left out.
 
     Returns
     -------
@@ -160,7 +161,7 @@ def mesh_from_level(
     """
     options = options or MeshOptions()
     values = np.asarray(level.values, dtype=np.float32)
-    mesh, making = _stuffed(values, level.spacing, level.origin, options, refinable)
+    mesh, making = _stuffed(values, level.spacing, level.origin, options, allowed)
     report = mesh_report(mesh, making)
     return TissueMesh(mesh, report, tuple(_findings(report)))
 
@@ -202,7 +203,7 @@ def _stuffed(
     spacing: ArrayLike,
     origin: ArrayLike,
     options: MeshOptions,
-    refinable: ArrayLike | None = None,
+    allowed: ArrayLike | None = None,
 ) -> tuple[TetMesh, dict[str, float]]:
     steps = np.asarray(spacing, dtype=np.float64)
     steps = np.full(3, steps) if steps.ndim == 0 else steps
@@ -215,7 +216,7 @@ def _stuffed(
         (float(o[0]), float(o[1]), float(o[2])),
         refinements=options.refinements,
         least_body=options.least_body,
-        refinable=refinable,
+        allowed=allowed,
     )
 
 

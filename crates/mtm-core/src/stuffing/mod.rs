@@ -74,7 +74,7 @@ pub struct Stuffed {
 
 /// The mesh of `level`, with dihedral angles of at least 10°.
 ///
-/// `refinable`: whether what is thin at each voxel may be refined; everywhere if none.
+/// `allowed`: how often the edge may be halved for what is thin at each voxel; as the options say if none.
 ///
 /// # Errors
 /// Options out of range, no tissue in the image, or none that the lattice catches, an edge length so small
@@ -82,20 +82,20 @@ pub struct Stuffed {
 pub fn stuff(
     level: &LevelImage,
     options: &StuffingOptions,
-    refinable: Option<&[bool]>,
+    allowed: Option<&[u8]>,
 ) -> Result<Stuffed> {
     check(options)?;
-    if let Some(refinable) = refinable.filter(|r| r.len() != level.values().len()) {
+    if let Some(allowed) = allowed.filter(|a| a.len() != level.values().len()) {
         return Err(MtmError::Length {
-            what: "refinable".into(),
-            found: refinable.len(),
+            what: "allowed refinements".into(),
+            found: allowed.len(),
             expected: level.values().len(),
             why: "one per voxel of the level image",
             kind: ErrorKind::Mesh,
         });
     }
     let cover = Cover::new(level, options)?;
-    let lattice = Lattice::new(&cover.tree(level, options, refinable));
+    let lattice = Lattice::new(&cover.tree(level, options, allowed));
     let mut stuffed = cut(&lattice, level, cover.origin, cover.unit);
     drop(lattice);
     if stuffed.tets.is_empty() {
@@ -218,7 +218,7 @@ impl Cover {
         &self,
         level: &LevelImage,
         options: &StuffingOptions,
-        refinable: Option<&[bool]>,
+        allowed: Option<&[u8]>,
     ) -> Octree {
         let active = self.active(level);
         let mut tree = Octree::new(self.counts, options.refinements, &active);
@@ -239,7 +239,9 @@ impl Cover {
             let size = tree.coarse_size() >> (refinement + 1);
             for squared in [&to_outside, &to_inside] {
                 let thin = thin_parts(grid, squared, THIN_RADIUS * edge, THIN_SLACK);
-                let may = |index: &usize| thin[*index] && refinable.is_none_or(|r| r[*index]);
+                let may = |index: &usize| {
+                    thin[*index] && allowed.is_none_or(|a| u32::from(a[*index]) > refinement)
+                };
                 for index in (0..grid.len()).filter(may) {
                     self.refine_round(&mut tree, grid.centre(index), 0.5 * edge, size);
                 }
