@@ -119,16 +119,15 @@ impl Octree {
     pub fn balance(&mut self) {
         let mut pending = self.leaves();
         while !pending.is_empty() {
-            let too_large: Vec<Place> = pending
+            let too_large: Vec<(Place, i32)> = pending
                 .par_iter()
                 .flat_map_iter(|leaf| neighbours(leaf).map(move |place| (place, leaf.size)))
                 .filter(|&(place, size)| self.leaf_at(place).is_some_and(|l| l.size > 2 * size))
-                .map(|(place, _)| place)
                 .collect();
             let mut split = Vec::new();
-            for place in too_large {
-                // Another finding may have split it already: then it is checked again as a new leaf.
-                if let Some(leaf) = self.leaf_at(place).filter(|leaf| leaf.size > 2) {
+            for (place, size) in too_large {
+                // Another of these may have split it far enough already.
+                if let Some(leaf) = self.leaf_at(place).filter(|leaf| leaf.size > 2 * size) {
                     self.split(leaf.index);
                     split.push(leaf);
                 }
@@ -317,5 +316,29 @@ impl Hasher for KeyHasher {
         // Knuth's multiplicative hash with the golden ratio; the table takes its index from both ends.
         let product = (self.0 ^ key).wrapping_mul(0x9E37_79B9_7F4A_7C15);
         self.0 = product ^ product >> 32;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn balancing_splits_no_more_than_it_must() {
+        let mut tree = Octree::new([8, 8, 8], 2, &[true; 512]);
+        tree.refine([33, 33, 33], 2);
+        tree.balance();
+        let leaves = tree.leaves();
+        let count = |size| leaves.iter().filter(|leaf| leaf.size == size).count();
+        // One coarse cube becomes 7 cubes of half its size and 8 of a quarter; the cubes that touch the
+        // small ones across three of its faces, their edges and their corner are halved.
+        assert_eq!(count(2), 8);
+        assert_eq!(count(4), 7 + 7 * 8);
+        assert_eq!(count(8), 512 - 8);
+        for leaf in &leaves {
+            for place in neighbours(leaf) {
+                assert!(tree.leaf_at(place).is_none_or(|other| other.size <= 2 * leaf.size));
+            }
+        }
     }
 }
