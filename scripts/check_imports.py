@@ -108,7 +108,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "patient": "checks errors",
         "model": "case checks scene",
         "io": "case checks errors model patient planning scene",
-        "imaging": "case checks errors scene",
+        "imaging": "case checks errors scene _core",
         "meshing": "case checks errors scene _core",
         "template": "case checks errors scene _core",
         "phantom": "case checks errors scene",

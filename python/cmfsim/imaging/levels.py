@@ -29,8 +29,8 @@ def level_of(values: Volume, threshold: float, scale: float, mask: Mask) -> Volu
     inside, outside = shrunk(mask), shrunk(~mask)
     np.maximum(level, NEAR, out=level, where=inside)
     np.minimum(level, -NEAR, out=level, where=outside)
-    level[shrunk(inside)] = 1.0
-    level[shrunk(outside)] = -1.0
+    np.copyto(level, np.float32(1.0), where=shrunk(inside))
+    np.copyto(level, np.float32(-1.0), where=shrunk(outside))
     return level
 
 
