@@ -251,7 +251,7 @@ def coarse_phantom(phantom):
 
 @pytest.fixture(scope="session")
 def reference():
-    from cmfsim.io.meshes import read_surface  # noqa: PLC0415
+    from cmfsim.io import read_surface  # noqa: PLC0415
 
     surfaces = {n: read_surface(PHANTOM / f"{n}.ply") for n in ("skin", "bone", "mandible")}
     return {n: cmfsim.Surface(s.vertices, s.triangles) for n, s in surfaces.items()}

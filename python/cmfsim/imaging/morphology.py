@@ -14,6 +14,7 @@ from cmfsim import _core
 from cmfsim.errors import ImageError
 
 __all__ = [
+    "Block",
     "Mask",
     "Volume",
     "as_array",
@@ -24,6 +25,7 @@ __all__ = [
     "closed",
     "depth",
     "distance",
+    "grown",
     "label",
     "largest",
     "ndimage",
@@ -39,6 +41,7 @@ __all__ = [
 
 Mask = NDArray[np.bool_]
 Volume = NDArray[np.float32]
+Block = tuple[slice, ...]
 
 
 def simpleitk() -> Any:
@@ -104,11 +107,13 @@ def depth(mask: Mask, spacing: NDArray[np.float64]) -> Volume:
     return to_rim
 
 
-def box_of(mask: Mask, margin: int = 0) -> tuple[slice, ...]:
+def box_of(mask: Mask, margin: int = 0) -> Block:
     """The smallest block that holds the mask, and a margin of voxels where the array has them."""
     box = []
-    for axis in range(3):
-        found = np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis)))
+    columns, sheet = mask.any(axis=0), mask.any(axis=2)
+    lines = (sheet.any(axis=1), columns.any(axis=1), columns.any(axis=0))
+    for axis, line in enumerate(lines):
+        found = np.flatnonzero(line)
         if not len(found):
             return (slice(0, 0),) * 3
         low, high = int(found[0]) - margin, int(found[-1]) + 1 + margin
@@ -147,8 +152,8 @@ def closed(mask: Mask, radius: float, spacing: NDArray[np.float64]) -> Mask:
     if not part.size:
         return filled
     wide, inner = _padded(part, radius, spacing)
-    grown = distance(wide, spacing) < radius + 0.5 * float(spacing.min())
-    filled[box] |= (depth(grown, spacing) > radius)[inner]
+    swollen = distance(wide, spacing) < radius + 0.5 * float(spacing.min())
+    filled[box] |= (depth(swollen, spacing) > radius)[inner]
     return filled
 
 
@@ -162,6 +167,16 @@ def shrunk(mask: Mask) -> Mask:
         out[1:] &= along[:-1]
         out[:-1] &= along[1:]
     return kept
+
+
+def grown(mask: Mask) -> Mask:
+    """The mask and the voxels that share a face with it."""
+    wide = mask.copy(order="K")
+    for axis in range(3):
+        along, out = np.moveaxis(mask, axis, 0), np.moveaxis(wide, axis, 0)
+        out[1:] |= along[:-1]
+        out[:-1] |= along[1:]
+    return wide
 
 
 def label(mask: Mask, *, corners: bool = False) -> tuple[NDArray[np.int32], int]:
