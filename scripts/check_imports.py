@@ -113,7 +113,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "template": "case checks errors scene _core",
         "phantom": "case checks errors scene",
         "planning": "errors",
-        "osteotomy": "case checks errors planning scene",
+        "osteotomy": "case checks errors planning scene _core",
         "node_kinds": "case checks errors scene _core",
         "simulation": "scene errors _core",
         "evaluation": "case checks errors scene _core",
