@@ -110,7 +110,8 @@ def depth(mask: Mask, spacing: NDArray[np.float64]) -> Volume:
 def box_of(mask: Mask, margin: int = 0) -> Block:
     """The smallest block that holds the mask, and a margin of voxels where the array has them."""
     box = []
-    columns, sheet = mask.any(axis=0), mask.any(axis=2)
+    columns = np.asarray(mask.any(axis=0))
+    sheet = np.asarray(mask.any(axis=2))
     lines = (sheet.any(axis=1), columns.any(axis=1), columns.any(axis=0))
     for axis, line in enumerate(lines):
         found = np.flatnonzero(line)

@@ -273,8 +273,10 @@ def _standing_out(
     if not count:
         return rest
     large = sizes_of(labels, count) * float(np.prod(spacing)) > volume
-    farthest = -ndimage().minimum(around.T, labels.T, np.arange(1, count + 1))
-    large[1:] |= np.asarray(farthest) > reach
+    numbers = labels.T[rest.T]
+    farthest = np.full(count + 1, -np.inf)
+    np.maximum.at(farthest, numbers, -around.T[rest.T])
+    large |= farthest > reach
     large[0] = False
     gone: Mask = large[labels]
     return gone

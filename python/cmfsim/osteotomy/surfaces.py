@@ -154,7 +154,7 @@ def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> 
     )
     depth = ndimage.gaussian_filter(depth, sigma, mode="nearest", truncate=BLUR_REACH)
     origin = segment.level.lowest + low * np.asarray(spacing)
-    level = ImageData(depth.astype(np.float32), spacing, origin)
+    level = ImageData(depth.astype(np.float32, copy=False), spacing, origin)
     return surface_of_level(f"contact of {segment.name}", level)
 
 
@@ -168,7 +168,7 @@ def _module(name: str, extra: str, purpose: str) -> Any:
 def block_of(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The first and the past-the-last voxel of the mask along each axis; equal if it is empty."""
     low, high = np.zeros(3, dtype=np.intp), np.zeros(3, dtype=np.intp)
-    columns, sheet = mask.any(axis=2), mask.any(axis=0)
+    columns, sheet = np.asarray(mask.any(axis=2)), np.asarray(mask.any(axis=0))
     for axis, line in enumerate((columns.any(axis=1), columns.any(axis=0), sheet.any(axis=0))):
         found = np.flatnonzero(line)
         if len(found):
