@@ -13,11 +13,12 @@ from cmfsim.imaging.air import air_level
 from cmfsim.imaging.bone import bone_level, find_bone, teeth_level
 from cmfsim.imaging.intensity import weak_bone
 from cmfsim.imaging.jaw import part_jaws
-from cmfsim.imaging.metal import find_metal
+from cmfsim.imaging.metal import find_metal, metal_within
+from cmfsim.imaging.morphology import Block, Volume
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import find_skin
 from cmfsim.imaging.view import view_findings
-from cmfsim.imaging.working import without_noise, working_grid
+from cmfsim.imaging.working import Working, without_noise, working_grid
 
 __all__ = ["segment_head"]
 
@@ -77,6 +78,8 @@ def segment_head(
     say("skin")
     skin = find_skin(work, metal, options)
     say("bone")
+    # The couch and the air around the head need no more work.
+    whole, work, metal = work, work.part(skin.box), metal_within(metal, skin.box)
     metal = replace(metal, hu=without_noise(metal.hu))
     bone = find_bone(work, metal, skin, options)
     all_findings += [
@@ -88,7 +91,7 @@ def segment_head(
     ]
     # A smoothed rim may not carry bone past the skin.
     level = np.minimum(bone_level(bone, options), skin.level)
-    bones = {"skull": work.image(level)}
+    bones = {"skull": _image(whole, level, skin.box)}
     teeth = None
     if options.part_jaws:
         say("jaw")
@@ -96,15 +99,23 @@ def segment_head(
         all_findings += jaws.findings
         if jaws.side is not None:
             bones = {
-                "cranium": work.image(np.minimum(level, -jaws.side)),
-                "mandible": work.image(np.minimum(level, jaws.side)),
+                "cranium": _image(whole, np.minimum(level, -jaws.side), skin.box),
+                "mandible": _image(whole, np.minimum(level, jaws.side), skin.box),
             }
         dense = teeth_level(bone, work, jaws.occlusal_height)
-        teeth = None if dense is None else work.image(dense)
+        teeth = None if dense is None else _image(whole, dense, skin.box)
     say("air")
     hollow = air_level(work, skin, bone, options)
-    air = None if hollow is None else work.image(hollow)
-    return Anatomy(work.image(skin.level), bones, air, teeth, tuple(all_findings))
+    air = None if hollow is None else _image(whole, hollow, skin.box)
+    outer = _image(whole, skin.level, skin.box)
+    return Anatomy(outer, bones, air, teeth, tuple(all_findings))
+
+
+def _image(whole: Working, level: Volume, box: Block) -> ImageData:
+    """A level on the working grid, of which it was made on a block: outside elsewhere."""
+    values = np.full(whole.hu.shape, np.float32(-1.0))
+    values[box] = level
+    return whole.image(values)
 
 
 def _checked(landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:

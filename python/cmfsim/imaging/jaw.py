@@ -12,8 +12,10 @@ from cmfsim.checks import Floats
 from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.guess import guessed_landmarks
 from cmfsim.imaging.morphology import (
+    Block,
     Mask,
     Volume,
+    box_of,
     depth,
     label,
     largest,
@@ -75,6 +77,8 @@ CONDYLE = (15.0, 0.5, -12.0)
 FLOOD_DEPTH = 3.0
 # A joint space is dark before it is open, HU.
 FLOOD_HU = 700.0
+# A Gaussian of one voxel ends within this many voxels.
+SMOOTH_REACH = 6
 # Mandibles have volumes (with marrow, mm³) and widths (mm) in these ranges, children's included.
 VOLUMES = (8_000.0, 250_000.0)
 WIDTHS = (45.0, 150.0)
@@ -110,9 +114,9 @@ def part_jaws(work: Working, bone: Bone, landmarks: Mapping[str, Floats] | None)
         landmarks = guess | dict(landmarks or {})
         findings.append(_guessed())
     landmarks = dict(landmarks)
-    box = _box(work, landmarks)
+    box = _box(work, bone, landmarks)
     domain = np.asfortranarray(bone.mask[box])
-    seeds = _seeds(work, bone, landmarks, box)
+    seeds = _seeds(work.part(box), bone, landmarks, box)
     if not ((seeds == 1).any() and (seeds == 2).any()):
         return Jaws(None, None, None, (_not_parted("the landmarks lie far from bone"),))
     deep = depth(domain, work.spacing) / np.float32(FLOOD_DEPTH)
@@ -127,13 +131,10 @@ def part_jaws(work: Working, bone: Bone, landmarks: Mapping[str, Floats] | None)
     reason = _implausible(mandible, work)
     if reason:
         return Jaws(None, None, None, (_not_parted(reason),))
-    rest = bone.mask & ~mandible
     # Pieces that the flood left to the skull, but that only the mandible holds, are the mandible's.
-    cut_off = _touching(rest & ~_largest_piece(rest), mandible)
-    mandible |= cut_off
-    rest &= ~cut_off
-    # Threefold, so that smoothing leaves thin parts their size.
-    side = np.clip(3.0 * (smoothed(mandible, 1.0) - smoothed(rest, 1.0)), -1.0, 1.0)
+    rest = bone.mask[box] & ~mandible[box]
+    mandible[box] |= _touching(rest & ~_largest_piece(rest), mandible[box])
+    side = _side(mandible, bone.mask)
     height = 0.5 * float(landmarks["supradentale"][2] + landmarks["infradentale"][2])
     return Jaws(side, mandible, height, tuple(findings))
 
@@ -153,6 +154,17 @@ def _touching(mask: Mask, other: Mask) -> Mask:
     touches[np.unique(labels[near & mask])] = True
     touches[0] = False
     return np.asarray(touches[labels])
+
+
+def _side(mandible: Mask, bone: Mask) -> Volume:
+    """1 in the mandible and −1 elsewhere, smooth where they meet."""
+    side = np.full(mandible.shape, np.float32(-1.0), order="F")
+    box = box_of(mandible, SMOOTH_REACH)
+    part = np.asfortranarray(mandible[box])
+    rest = bone[box] & ~part
+    # Threefold, so that smoothing leaves thin parts their size.
+    side[box] = np.clip(3.0 * (smoothed(part, 1.0) - smoothed(rest, 1.0)), -1.0, 1.0)
+    return side
 
 
 def _not_parted(reason: str) -> Finding:
@@ -194,11 +206,13 @@ def _implausible(mandible: Mask, work: Working) -> str | None:
     return None
 
 
-def _box(work: Working, landmarks: Mapping[str, Floats]) -> tuple[slice, ...]:
-    """The layers from below the chin to above the joints."""
+def _box(work: Working, bone: Bone, landmarks: Mapping[str, Floats]) -> Block:
+    """The bone from below the chin to above the joints."""
     top = _joint_height(landmarks) + ABOVE_JOINT + 10.0
     end = int((top - work.origin[2]) / work.spacing[2])
-    return slice(None), slice(None), slice(0, min(max(end, 2), work.hu.shape[2]))
+    layers = slice(0, min(max(end, 2), work.hu.shape[2]))
+    x, y, _ = box_of(bone.mask[:, :, layers], SMOOTH_REACH)
+    return x, y, layers
 
 
 def _joint_height(landmarks: Mapping[str, Floats]) -> float:
@@ -211,7 +225,7 @@ def _joint_height(landmarks: Mapping[str, Floats]) -> float:
 
 
 def _seeds(
-    work: Working, bone: Bone, landmarks: dict[str, Floats], box: tuple[slice, ...]
+    work: Working, bone: Bone, landmarks: dict[str, Floats], box: Block
 ) -> NDArray[np.int32]:
     """1 mandible, 2 the rest, 0 to be flooded."""
     domain = bone.mask[box]

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from cmfsim.case import Finding
 from cmfsim.imaging.morphology import (
+    Block,
     Mask,
     Volume,
     as_array,
@@ -21,7 +22,7 @@ from cmfsim.imaging.morphology import (
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.working import Working
 
-__all__ = ["Metal", "find_metal", "without_streaks"]
+__all__ = ["Metal", "find_metal", "metal_within", "without_streaks"]
 
 # Metal of less than this is a point of noise or dense enamel, mm³.
 LEAST_METAL = 15.0
@@ -57,6 +58,17 @@ class Metal:
     layers: slice
     hu: Volume
     findings: tuple[Finding, ...]
+
+
+def metal_within(metal: Metal, box: Block) -> Metal:
+    """The metal in a block of the grid."""
+    layers = box[2]
+    low, high = (
+        min(max(place - layers.start, 0), layers.stop - layers.start)
+        for place in (metal.layers.start, metal.layers.stop)
+    )
+    mask = None if metal.mask is None or low == high else np.asfortranarray(metal.mask[box])
+    return Metal(mask, slice(low, high), np.asfortranarray(metal.hu[box]), metal.findings)
 
 
 def find_metal(work: Working, options: SegmentOptions) -> Metal:

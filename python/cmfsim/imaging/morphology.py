@@ -1,4 +1,4 @@
-"""Distances, growing and shrinking of masks in mm, over SimpleITK and scipy.
+"""Distances, growing and shrinking of masks in mm, over the core, SimpleITK and scipy.
 
 Arrays have axes x, y, z and Fortran order, which is the order of ITK's memory: both sides then see
 the same bytes, and element-wise work runs straight through memory.
@@ -10,16 +10,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cmfsim import _core
 from cmfsim.errors import ImageError
 
 __all__ = [
+    "Block",
     "Mask",
     "Volume",
     "as_array",
     "as_itk",
     "binned",
+    "box_of",
+    "chosen",
     "closed",
     "depth",
+    "distance",
+    "grown",
     "label",
     "largest",
     "ndimage",
@@ -35,6 +41,7 @@ __all__ = [
 
 Mask = NDArray[np.bool_]
 Volume = NDArray[np.float32]
+Block = tuple[slice, ...]
 
 
 def simpleitk() -> Any:
@@ -77,6 +84,14 @@ def as_array(image: Any) -> NDArray[Any]:
     return voxels.T
 
 
+def distance(targets: Mask, spacing: NDArray[np.float64]) -> Volume:
+    """The distance of each voxel's centre to the nearest target's, mm; infinite without targets."""
+    # The core walks C order: the transposed view has it.
+    x, y, z = (float(s) for s in spacing)
+    apart: Volume = _core.distance_image(targets.T, (z, y, x)).T
+    return apart
+
+
 def depth(mask: Mask, spacing: NDArray[np.float64]) -> Volume:
     """The distance to the surface, mm: positive inside the mask, negative outside.
 
@@ -85,14 +100,26 @@ def depth(mask: Mask, spacing: NDArray[np.float64]) -> Volume:
     if mask.all() or not mask.any():
         far = np.float32(np.linalg.norm(np.array(mask.shape) * spacing))
         return np.full(mask.shape, far if mask.any() else -far, dtype=np.float32, order="F")
-    itk = simpleitk()
-    image = itk.SignedMaurerDistanceMap(
-        as_itk(mask, spacing), insideIsPositive=True, squaredDistance=False, useImageSpacing=True
-    )
-    distance = as_array(image)
-    # ITK measures from the voxels of the mask's rim, which lie half a voxel inside.
-    distance += np.float32(0.5 * spacing.min())
-    return distance
+    # Both sides are measured from the voxels of the mask's rim, which lie half a voxel inside.
+    to_rim = distance(mask & ~shrunk(mask), spacing)
+    np.negative(to_rim, out=to_rim, where=~mask)
+    to_rim += np.float32(0.5 * spacing.min())
+    return to_rim
+
+
+def box_of(mask: Mask, margin: int = 0) -> Block:
+    """The smallest block that holds the mask, and a margin of voxels where the array has them."""
+    box = []
+    columns = np.asarray(mask.any(axis=0))
+    sheet = np.asarray(mask.any(axis=2))
+    lines = (sheet.any(axis=1), columns.any(axis=1), columns.any(axis=0))
+    for axis, line in enumerate(lines):
+        found = np.flatnonzero(line)
+        if not len(found):
+            return (slice(0, 0),) * 3
+        low, high = int(found[0]) - margin, int(found[-1]) + 1 + margin
+        box.append(slice(max(low, 0), min(high, mask.shape[axis])))
+    return tuple(box)
 
 
 def _padded(mask: Mask, radius: float, spacing: NDArray[np.float64]) -> tuple[Mask, Any]:
@@ -104,25 +131,53 @@ def _padded(mask: Mask, radius: float, spacing: NDArray[np.float64]) -> tuple[Ma
 
 def opened(mask: Mask, radius: float, spacing: NDArray[np.float64]) -> Mask:
     """What balls of a radius (mm) can sweep inside the mask, as if it went on past the border."""
-    wide, inner = _padded(mask, radius, spacing)
+    swept = np.zeros_like(mask)
+    box = box_of(mask, 1)
+    part = mask[box]
+    if not part.size:
+        return swept
+    wide, inner = _padded(part, radius, spacing)
     core = depth(wide, spacing) > radius
-    if not core.any():
-        return np.zeros_like(mask)
-    return np.asfortranarray((depth(core, spacing) > -radius)[inner]) & mask
+    if core.any():
+        near = distance(core, spacing) < radius + 0.5 * float(spacing.min())
+        swept[box] = near[inner] & part
+    return swept
 
 
 def closed(mask: Mask, radius: float, spacing: NDArray[np.float64]) -> Mask:
     """The mask with what balls of a radius (mm) cannot reach from outside."""
-    wide, inner = _padded(mask, radius, spacing)
-    grown = depth(wide, spacing) > -radius
-    return np.asfortranarray((depth(grown, spacing) > radius)[inner]) | mask
+    filled = mask.copy(order="F")
+    # Nothing that a ball cannot reach lies outside the box.
+    box = box_of(mask, 1)
+    part = mask[box]
+    if not part.size:
+        return filled
+    wide, inner = _padded(part, radius, spacing)
+    swollen = distance(wide, spacing) < radius + 0.5 * float(spacing.min())
+    filled[box] |= (depth(swollen, spacing) > radius)[inner]
+    return filled
 
 
 def shrunk(mask: Mask) -> Mask:
     """The voxels all of whose 26 neighbours are in the mask; beyond the border it goes on."""
-    itk = simpleitk()
-    image = itk.BinaryErode(as_itk(mask, np.ones(3)), [1, 1, 1], itk.sitkBox, 0.0, 1.0, True)  # noqa: FBT003
-    return as_array(image).view(np.bool_)
+    kept = mask
+    for axis in range(3):
+        along = np.moveaxis(kept, axis, 0)
+        kept = kept.copy(order="K")
+        out = np.moveaxis(kept, axis, 0)
+        out[1:] &= along[:-1]
+        out[:-1] &= along[1:]
+    return kept
+
+
+def grown(mask: Mask) -> Mask:
+    """The mask and the voxels that share a face with it."""
+    wide = mask.copy(order="K")
+    for axis in range(3):
+        along, out = np.moveaxis(mask, axis, 0), np.moveaxis(wide, axis, 0)
+        out[1:] |= along[:-1]
+        out[:-1] |= along[1:]
+    return wide
 
 
 def label(mask: Mask, *, corners: bool = False) -> tuple[NDArray[np.int32], int]:
@@ -137,9 +192,14 @@ def label(mask: Mask, *, corners: bool = False) -> tuple[NDArray[np.int32], int]
 
 def sizes_of(labels: NDArray[np.int32], count: int) -> NDArray[np.intp]:
     """How many voxels each label has; that of 0 is given as 0."""
-    sizes = np.bincount(labels.ravel(order="K"), minlength=count + 1)
-    sizes[0] = 0
-    return sizes
+    flat = labels.ravel(order="K")
+    return np.bincount(flat[flat > 0], minlength=count + 1)
+
+
+def chosen(wanted: Mask, labels: NDArray[np.int32]) -> Mask:
+    """The voxels whose label is wanted; `wanted` has an entry for each label."""
+    voxels: Mask = wanted.take(labels.T).T
+    return voxels
 
 
 def largest(mask: Mask) -> Mask:
@@ -155,10 +215,9 @@ def reached(mask: Mask, seeds: Mask) -> Mask:
     """The connected pieces of the mask that hold a seed."""
     labels, count = label(mask)
     hit = np.zeros(count + 1, dtype=bool)
-    hit[labels[seeds & mask]] = True
+    hit[labels.T[(seeds & mask).T]] = True
     hit[0] = False
-    pieces: Mask = hit[labels]
-    return pieces
+    return chosen(hit, labels)
 
 
 def smoothed(

@@ -8,10 +8,12 @@ from numpy.typing import NDArray
 from cmfsim.case import Finding
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.levels import level_of
-from cmfsim.imaging.metal import Metal, without_streaks
+from cmfsim.imaging.metal import Metal, metal_within, without_streaks
 from cmfsim.imaging.morphology import (
+    Block,
     Mask,
     Volume,
+    box_of,
     closed,
     depth,
     label,
@@ -59,18 +61,26 @@ OPENING = 7.0
 # surface is drawn in by the second, so that lips and nostrils keep their edge; mm.
 DEEP = 9.0
 DRAWN_IN = 3.0
+# Hollows behind narrow openings are found on voxels of about this size, mm.
+HOLLOW_STEP = 1.6
 # Skin beyond these in a straight cut is said to be cut off, mm².
 CUT_AREA = 150.0
+# Layers of air left round the head, and the multiple of voxels at which its block begins, so that
+# coarser voxels made of it are those of the whole grid; voxels.
+RIM = 4
+ALIGNED = 12
 # Heads are this large from vertex to chin at least, mm; lower parts do not count for the middle.
 HEAD_HEIGHT = 220.0
 
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """The head's inside, hollows included.
+    """The head's inside, hollows included, on the block of the working grid that holds it.
 
     Attributes
     ----------
+    box : tuple of slice
+        The block; outside it nothing is head.
     level : (nx, ny, nz) float32
     mask : (nx, ny, nz) bool
     hollow : (nx, ny, nz) bool
@@ -78,6 +88,7 @@ class Skin:
     findings : tuple of Finding
     """
 
+    box: Block
     level: Volume
     mask: Mask
     hollow: Mask
@@ -103,7 +114,11 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
     head, more = _without_rests(free, bone, steps)
     # Off the coarse grid the head is known to a voxel: the threshold places its surface.
     margin = 1.2 * float(steps.max())
-    near = resampled_to(depth(head, steps), steps, shift, work.hu.shape, work.spacing)
+    around = depth(head, steps)
+    box = _box(around > -margin - float(steps.max()), steps, shift, work)
+    work, metal = work.part(box), metal_within(metal, box)
+    shift = shift - work.spacing * np.array([b.start for b in box])
+    near = resampled_to(around, steps, shift, work.hu.shape, work.spacing)
     near += np.float32(margin)
     above = without_streaks(metal.hu > options.skin_threshold, metal, work.spacing)
     solid = largest(above & (near > 0.0))
@@ -118,7 +133,20 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
     table = np.count_nonzero(removed | more) * float(np.prod(steps))
     if table > LARGEST_EAR / 5.0:
         findings.append(_rest_removed(table))
-    return Skin(level, mask, hollow, tuple(findings))
+    return Skin(box, level, mask, hollow, tuple(findings))
+
+
+def _box(
+    head: Mask, steps: NDArray[np.float64], shift: NDArray[np.float64], work: Working
+) -> Block:
+    """The block of the working grid that holds the voxels of a coarser one."""
+    box = []
+    for axis, coarse in enumerate(box_of(head)):
+        low, high = shift[axis] + steps[axis] * (np.array([coarse.start, coarse.stop]) - 0.5)
+        start = max(int(low / work.spacing[axis]) - RIM, 0) // ALIGNED * ALIGNED
+        stop = min(int(high / work.spacing[axis]) + 1 + RIM, work.hu.shape[axis])
+        box.append(slice(start, stop))
+    return tuple(box)
 
 
 def _rest_removed(volume: float) -> Finding:
@@ -247,8 +275,10 @@ def _standing_out(
     if not count:
         return rest
     large = sizes_of(labels, count) * float(np.prod(spacing)) > volume
-    farthest = -ndimage().minimum(around.T, labels.T, np.arange(1, count + 1))
-    large[1:] |= np.asarray(farthest) > reach
+    numbers = labels.T[rest.T]
+    farthest = np.full(count + 1, -np.inf)
+    np.maximum.at(farthest, numbers, -around.T[rest.T])
+    large |= farthest > reach
     large[0] = False
     gone: Mask = large[labels]
     return gone
@@ -256,8 +286,8 @@ def _standing_out(
 
 def _with_hollows(solid: Mask, work: Working) -> tuple[Mask, Mask]:
     """The head with airway and other hollows, and these."""
-    # Hollows behind narrow openings, judged on voxels of about 1.6 mm.
-    factors = tuple(max(1, int(1.6 / s)) for s in work.spacing)
+    # Hollows behind narrow openings, judged on coarser voxels.
+    factors = tuple(max(1, round(HOLLOW_STEP / s)) for s in work.spacing)
     blocks = tuple(slice(f // 2, None, f) for f in factors)
     small = np.asfortranarray(solid[blocks])
     steps = work.spacing * np.array(factors)

@@ -10,6 +10,7 @@ from cmfsim.case import Finding, ImageData
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.intensity import Calibration, calibration, noise_of
 from cmfsim.imaging.morphology import (
+    Block,
     Mask,
     Volume,
     binned,
@@ -65,6 +66,18 @@ class Working:
     origin: NDArray[np.float64]
     border: NDArray[np.bool_]
     native: NDArray[np.float64]
+
+    def part(self, box: Block) -> "Working":
+        """A block of this grid."""
+        starts = np.array([b.start for b in box])
+        ends = np.array([b.stop == n for b, n in zip(box, self.hu.shape, strict=True)])
+        return Working(
+            np.asfortranarray(self.hu[box]),
+            self.spacing,
+            self.origin + self.spacing * starts,
+            self.border & np.array([starts == 0, ends]),
+            self.native,
+        )
 
     def image(self, values: NDArray[np.float32]) -> ImageData:
         """Values on this grid."""

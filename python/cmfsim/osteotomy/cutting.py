@@ -1,6 +1,7 @@
 """Bones cut into segments: the levels of the pieces, and what became of crumbs."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, cast
@@ -13,7 +14,7 @@ from cmfsim.checks import as_number, check_instance
 from cmfsim.errors import CaseInputError
 from cmfsim.osteotomy.planes import Cut, Procedure
 from cmfsim.osteotomy.procedures import PROCEDURES, place_procedure
-from cmfsim.osteotomy.surfaces import SurfaceOptions, surface_of_level
+from cmfsim.osteotomy.surfaces import SurfaceOptions, block_of, surface_of_level
 from cmfsim.scene import SurfaceData
 
 __all__ = ["CutBones", "CutOptions", "cut_bones", "segments_from_surfaces"]
@@ -23,6 +24,8 @@ Levels = NDArray[np.float32]
 ORDER = {"le_fort_3": 0, "le_fort_1": 1, "bsso": 2, "genioplasty": 3}
 # Half-width of the block of voxels that goes over with a crumb.
 CRUMB_RIM = 2
+# Surfaces that are made at the same time.
+SURFACES_AT_ONCE = 2
 
 
 @dataclass(frozen=True)
@@ -145,11 +148,17 @@ def cut_bones(
     for procedure in placed:
         for cut in procedure.cuts:
             _make_cut(procedure, cut, grid, pieces, findings, options)
-    segments = []
-    for name, values in pieces.items():
-        level = grid.with_values(values)
-        segments.append(BoneSegment(name, level, surface_of_level(name, level, options.surface)))
-    return CutBones(tuple(segments), placed, tuple(findings))
+    levels = {name: grid.with_values(values) for name, values in pieces.items()}
+    # Decimation uses one thread and leaves Python's lock alone, so that two pieces go side by side.
+    with ThreadPoolExecutor(SURFACES_AT_ONCE) as pool:
+        surfaces = pool.map(
+            lambda name: surface_of_level(name, levels[name], options.surface), levels
+        )
+        segments = tuple(
+            BoneSegment(name, levels[name], surface)
+            for name, surface in zip(levels, surfaces, strict=True)
+        )
+    return CutBones(segments, placed, tuple(findings))
 
 
 def segments_from_surfaces(
@@ -225,7 +234,13 @@ def _make_cut(
     if cut.segment in pieces or (rest_name != source and rest_name in pieces):
         raise CaseInputError(f"{procedure.kind} makes {cut.segment!r}, which there is already")
     bone = pieces[source]
-    region = _scaled(cut, grid, float(np.abs(bone).max()))
+    limit = max(float(bone.max()), -float(bone.min()))
+    # Where the bone's level is at its limit, so are those of both pieces.
+    low, high = block_of(bone > -limit)
+    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    whole, bone = bone, bone[box]
+    part_grid = ImageData(bone, grid.spacing, grid.lowest + low * np.asarray(grid.spacing))
+    region = _scaled(cut, part_grid, limit)
     piece, rest = np.minimum(bone, region), np.minimum(bone, -region)
     voxel = float(np.prod(np.asarray(grid.spacing)))
     names = (cut.segment, rest_name)
@@ -238,7 +253,7 @@ def _make_cut(
                 f"(planes: {planes}): check the landmarks, or move the planes"
             )
     for one, other, both in ((piece, rest, names), (rest, piece, names[::-1])):
-        moved, kept = _join_crumbs(one, other, bone, int(options.crumb_volume / voxel))
+        moved, kept = _join_crumbs(one, other, bone, limit, int(options.crumb_volume / voxel))
         if moved:
             findings.append(
                 Finding(
@@ -266,8 +281,17 @@ def _make_cut(
     names_now = list(pieces.items())
     pieces.clear()
     for name, values in names_now:
-        pieces[rest_name if name == source else name] = rest if name == source else values
-    pieces[cut.segment] = piece
+        pieces[rest_name if name == source else name] = (
+            _within(whole, box, rest, limit) if name == source else values
+        )
+    pieces[cut.segment] = _within(whole, box, piece, limit)
+
+
+def _within(whole: Levels, box: tuple[slice, ...], part: Levels, limit: float) -> Levels:
+    """A part on the whole grid, at its limit elsewhere."""
+    values = np.full(whole.shape, np.float32(-limit))
+    values[box] = part
+    return values
 
 
 def _scaled(cut: Cut, grid: ImageData, limit: float) -> Levels:
@@ -280,10 +304,11 @@ def _scaled(cut: Cut, grid: ImageData, limit: float) -> Levels:
 
 
 def _join_crumbs(
-    piece: Levels, rest: Levels, bone: Levels, limit: int
+    piece: Levels, rest: Levels, bone: Levels, bound: float, most: int
 ) -> tuple[list[int], list[int]]:
     """Gives small parts of a piece to the rest, in place; voxels of those given and of those left.
 
+    `bound` is the greatest size of a level, `most` the voxels of a small part.
     Only parts that hang on the rest are given: what lay apart in the bone already stays.
     """
     ndimage = _ndimage()
@@ -313,12 +338,12 @@ def _join_crumbs(
         touching = ndimage.binary_dilation(crumb, block, CRUMB_RIM) & (rest[around] > 0.0)
         if not touching.any():
             continue
-        if sizes[label] > limit:
+        if sizes[label] > most:
             kept.append(int(sizes[label]))
             continue
         moved.append(int(sizes[label]))
         rest[around] = np.where(rim, bone[around], rest[around])
-        outside = -np.abs(bone[around]).clip(min=np.abs(bone).max() * 1e-3)
+        outside = -np.abs(bone[around]).clip(min=np.float32(bound * 1e-3))
         piece[around] = np.where(rim, np.minimum(piece[around], outside), piece[around])
     return moved, kept
 

@@ -7,12 +7,13 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from cmfsim import _core
 from cmfsim.case import BoneSegment, ImageData
 from cmfsim.checks import Floats, Indices, as_number, as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.scene import SurfaceData
 
-__all__ = ["SurfaceOptions", "contact_surface", "surface_of_level"]
+__all__ = ["SurfaceOptions", "block_of", "contact_surface", "surface_of_level"]
 
 # Taubin (1995): a shrinking step and a slightly larger growing one, which keep the volume.
 SHRINK, GROW = 0.5, -0.53
@@ -79,15 +80,15 @@ def surface_of_level(
     """
     options = options or SurfaceOptions()
     values = np.asarray(level.values, dtype=np.float32)
-    index = np.argwhere(values > 0.0)
-    if not len(index):
+    low, high = block_of(values > 0.0)
+    if not (high > low).all():
         raise CaseInputError(f"{name!r} has no voxel inside: its surface would be empty")
     measure = _module("skimage.measure", "imaging", "surfaces of levels are made with scikit-image")
     # Only the block that holds the piece, with a border of outside, so that the surface closes.
-    low = np.maximum(index.min(0) - 1, 0)
-    high = np.minimum(index.max(0) + 2, values.shape)
+    low = np.maximum(low - 1, 0)
+    high = np.minimum(high + 1, values.shape)
     block = values[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
-    outside = float(min(values.min(), -np.abs(values).max()))
+    outside = -max(float(values.max()), -float(values.min()))
     block = np.pad(block, 1, constant_values=outside)
     spacing = np.asarray(level.spacing)
     vertices, triangles, _, _ = measure.marching_cubes(block, 0.0, gradient_direction="descent")
@@ -132,27 +133,28 @@ def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> 
     sigma = as_positive("relief", relief) / np.asarray(segment.level.spacing)
     ndimage = _module("scipy.ndimage", "imaging", "contact surfaces are smoothed with scipy")
     inside = np.asarray(segment.level.values) > 0.0
-    index = np.argwhere(inside)
-    if not len(index):
+    first, past = block_of(inside)
+    if not (past > first).all():
         raise CaseInputError(f"{segment.name!r} has no voxel inside: its surface would be empty")
     # A border that the blur cannot reach across, so that the surface closes within the block.
     rim = np.ceil(BLUR_REACH * sigma).astype(int) + 2
-    low, high = index.min(0) - rim, index.max(0) + rim + 1
+    low, high = first - rim, past + rim
     block = np.zeros(high - low, dtype=bool)
     within = tuple(slice(r, -r) for r in rim)
-    bounds = tuple(slice(a, b) for a, b in zip(index.min(0), index.max(0) + 1, strict=True))
+    bounds = tuple(slice(a, b) for a, b in zip(first, past, strict=True))
     block[within] = inside[bounds]
     spacing = np.asarray(segment.level.spacing).tolist()
+    x, y, z = spacing
     # Distances between voxel centres: the surface lies half a voxel from either.
-    half = 0.5 * float(np.min(spacing))
+    half = np.float32(0.5 * min(spacing))
     depth = np.where(
         block,
-        ndimage.distance_transform_edt(block, sampling=spacing) - half,
-        half - ndimage.distance_transform_edt(~block, sampling=spacing),
+        _core.distance_image(~block, (x, y, z)) - half,
+        half - _core.distance_image(block, (x, y, z)),
     )
     depth = ndimage.gaussian_filter(depth, sigma, mode="nearest", truncate=BLUR_REACH)
     origin = segment.level.lowest + low * np.asarray(spacing)
-    level = ImageData(depth.astype(np.float32), spacing, origin)
+    level = ImageData(depth.astype(np.float32, copy=False), spacing, origin)
     return surface_of_level(f"contact of {segment.name}", level)
 
 
@@ -163,21 +165,34 @@ def _module(name: str, extra: str, purpose: str) -> Any:
         raise CaseInputError(f"{purpose}: pip install 'cmfsim[{extra}]'") from error
 
 
+def block_of(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The first and the past-the-last voxel of the mask along each axis; equal if it is empty."""
+    low, high = np.zeros(3, dtype=np.intp), np.zeros(3, dtype=np.intp)
+    columns, sheet = np.asarray(mask.any(axis=2)), np.asarray(mask.any(axis=0))
+    for axis, line in enumerate((columns.any(axis=1), columns.any(axis=0), sheet.any(axis=0))):
+        found = np.flatnonzero(line)
+        if len(found):
+            low[axis], high[axis] = found[0], found[-1] + 1
+    return low, high
+
+
 def _without_slits(
     triangles: NDArray[np.int64], points: Floats
 ) -> tuple[NDArray[np.int64], Floats]:
     """Vertices in the same place made one, triangles that thereby lose a corner dropped."""
-    _, first, back = np.unique(points, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    number = np.empty(len(first), dtype=np.int64)
-    number[order] = np.arange(len(first))
-    joined = number[back.reshape(-1)][triangles]
+    # Vertices lie on the edges of voxels' cells: those of two edges meet at a voxel's centre only.
+    centred = np.flatnonzero((points == np.rint(points)).all(axis=1))
+    _, first, back = np.unique(points[centred], axis=0, return_index=True, return_inverse=True)
+    same = np.arange(len(points))
+    same[centred] = centred[first[back.reshape(-1)]]
+    own = same == np.arange(len(points))
+    joined = (np.cumsum(own) - 1)[same][triangles]
     kept = (
         (joined[:, 0] != joined[:, 1])
         & (joined[:, 1] != joined[:, 2])
         & (joined[:, 2] != joined[:, 0])
     )
-    return joined[kept], points[first[order]]
+    return joined[kept], points[own]
 
 
 def _smoothed(points: Floats, triangles: NDArray[np.int64], rounds: int) -> Floats:
