@@ -87,6 +87,12 @@ class MeshReport:
             if count:
                 bar = "█" * max(1, round(30 * count / most))
                 lines.append(f"  {low:3.0f}–{low + 5:2.0f}°  {count:9d} {bar}")
+        lines.append("worst tets    smallest dihedral angle, and where")
+        for tet in self.worst:
+            x, y, z = tet["centroid"]
+            lines.append(
+                f"  {tet['min_dihedral']:5.1f}°  {tet['tet']:9d} at ({x:.1f}, {y:.1f}, {z:.1f}) mm"
+            )
         if self.dropped_parts:
             lines.append(
                 f"left out      {self.dropped_parts} parts of {self.dropped_volume:.1f} mm³ in all"

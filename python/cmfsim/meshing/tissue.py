@@ -113,7 +113,7 @@ def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tup
 
 
 def near_skin(anatomy: Anatomy, depth: float) -> Mask:
-    """Where the skin's surface is nearer than `depth` mm: (nx, ny, nz) bool on the anatomy's grid."""
+    """Where the skin is nearer than `depth` mm: (nx, ny, nz) bool on the anatomy's grid."""
     sx, sy, sz = (float(s) for s in np.asarray(anatomy.skin.spacing))
     outside = np.asarray(anatomy.skin.values) <= 0.0
     return np.asarray(_core.distance_image(outside, (sx, sy, sz)) < depth)
