@@ -133,7 +133,10 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "case checks errors io osteotomy patient planning scene surface_checks surface_repair "
             "_core"
         ),
-        "cli": ("cmfsim build case checks doctor errors io pictures report scene simulation study"),
+        "cli": (
+            "cmfsim build case checks doctor errors io meshing pictures report scene simulation "
+            "study"
+        ),
         "__init__": (
             "_core build case doctor errors evaluation imaging io meshing model node_kinds "
             "osteotomy patient phantom planning scene simulation study surface_checks "
