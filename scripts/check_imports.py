@@ -134,8 +134,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "_core"
         ),
         "cli": (
-            "cmfsim build case checks doctor errors io phantom pictures report scene simulation "
-            "study"
+            "cmfsim build case checks doctor errors io meshing phantom pictures report scene "
+            "simulation study"
         ),
         "__init__": (
             "_core build case doctor errors evaluation imaging io meshing model node_kinds "

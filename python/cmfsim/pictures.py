@@ -4,12 +4,16 @@ Cameras look along the patient's axes (LPS) and depend on the bounds alone, so t
 plans lie on top of each other.
 """
 
+import contextlib
 import os
 import struct
+import subprocess
+import sys
 import warnings
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
@@ -60,6 +64,22 @@ DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
 MARGIN = 1.04
 TEXT_SIZE = 9
 LEGEND_ROW = 26  # pixels
+# What draws nothing into a small window. Where OpenGL is missing VTK ends the process instead of
+# raising, so this is tried in a process of its own, once.
+PROBE = """
+import vtkmodules.vtkRenderingOpenGL2
+from vtkmodules.vtkRenderingCore import vtkRenderWindow
+window = vtkRenderWindow()
+window.SetOffScreenRendering(True)
+window.SetSize(8, 8)
+window.Render()
+"""
+# Time after which the probe counts as failed, s; it takes half a second.
+PROBE_TIME = 60.0
+NO_OPENGL = (
+    "on a machine without a screen install OpenGL for software rendering "
+    "(Debian: libgl1, libegl1, libosmesa6)"
+)
 
 
 def picture_segments(
@@ -256,11 +276,15 @@ def _draw(
         raise CaseInputError(f"{path.name}: a picture is written as .png, not {path.suffix!r}")
     width, height = (int(as_positive("picture size", n)) for n in size)
     pv = _pyvista()
+    if not _can_draw():
+        raise CaseInputError(
+            f"{path.name}: the picture cannot be drawn (OpenGL does not work); {NO_OPENGL}"
+        )
     # One scale for all views.
     half = max(_half_height(view, corners, width / len(views), height) for view in views)
     try:
         # PyVista and VTK warn of missing screens; whether the picture was made decides here.
-        with warnings.catch_warnings():
+        with _silent_vtk(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             plotter = pv.Plotter(
                 off_screen=True, shape=(1, len(views)), window_size=[width, height], border=False
@@ -287,8 +311,7 @@ def _draw(
                 plotter.close()
     except (RuntimeError, OSError, AttributeError) as error:
         raise CaseInputError(
-            f"{path.name}: the picture cannot be drawn ({error}); on a machine without a screen "
-            "install OpenGL for software rendering (Debian: libgl1, libegl1, libosmesa6)"
+            f"{path.name}: the picture cannot be drawn ({error}); {NO_OPENGL}"
         ) from error
     for top, colour in swatches:
         image[top - 1 : top + 19, 11:31] = 90
@@ -383,6 +406,38 @@ def _polydata(vertices: ArrayLike, triangles: ArrayLike) -> Any:
     return _pyvista().PolyData.from_regular_faces(
         np.asarray(vertices, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
     )
+
+
+@cache
+def _can_draw() -> bool:
+    """Whether VTK can draw here, asked of another process: it may crash."""
+    if not sys.executable:
+        return True
+    try:
+        probe = subprocess.run(  # noqa: S603 (this interpreter, and a text of this file)
+            [sys.executable, "-c", PROBE],
+            env={**os.environ, "PYTHONSAFEPATH": "1"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            timeout=PROBE_TIME,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return probe.returncode == 0
+
+
+@contextlib.contextmanager
+def _silent_vtk() -> Iterator[None]:
+    """Keeps VTK's warnings, as of a screen that is not there, off the standard error."""
+    logger = import_module("vtkmodules.vtkCommonCore").vtkLogger
+    before = logger.GetCurrentVerbosityCutoff()
+    logger.SetStderrVerbosity(logger.VERBOSITY_ERROR)
+    try:
+        yield
+    finally:
+        logger.SetStderrVerbosity(before)
 
 
 def _pyvista() -> Any:

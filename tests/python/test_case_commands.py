@@ -1,10 +1,12 @@
 """`cmfsim build` reads the case, asks the doctor first, and names its stages."""
 
+import dataclasses
 import io
 import json
 import sys
 import types
 
+import numpy as np
 import pytest
 
 import cmfsim
@@ -18,11 +20,24 @@ def built(monkeypatch):
     """The cases that a stand-in for the build stage was given."""
     cases = []
 
-    def build_case(case, progress):
+    def build_case(case, *, progress, check, findings):
+        # The command has asked the doctor itself, and shows all that he finds.
+        assert not check
         cases.append(case)
         progress("segmenting")
         progress("meshing")
-        return types.SimpleNamespace(summary={"n_tets": 7, "name\x1b[2J": case.name})
+        mesh = cmfsim.mesh_report(cmfsim.TetMesh(np.eye(4, 3, -1), [[0, 1, 2, 3]]))
+        summary = {
+            "case": case.name + "\x1b[2J",
+            "nodes": {"free": 1, "fixed": 2, "joined": 3, "sliding": 4},
+            "segments": {"maxilla\x1b[2J": {"joined": 3, "sliding": 4}},
+            "mesh": mesh.as_dict(),
+            "findings": [dataclasses.asdict(finding) for finding in findings],
+            "timings": {"segmenting": 1.25, "meshing": 0.5},
+            "output": str(case.output),
+            "files": ["scene.npz", "build.json"],
+        }
+        return types.SimpleNamespace(summary=summary)
 
     monkeypatch.setitem(sys.modules, "cmfsim.build", types.SimpleNamespace(build_case=build_case))
     return cases
@@ -38,12 +53,17 @@ def test_build_passes_the_case_and_names_its_stages(built, tmp_path, capsys):
         f"cmfsim: {s}" for s in ("checking the case", "segmenting", "meshing")
     ]
     assert "\x1b" not in out + err
-    assert "n_tets               7" in out
+    assert "nodes         1 free, 2 fixed, 3 joined, 4 sliding" in out
+    assert "mesh          4 nodes, 1 tets" in out
+    assert f"written       {tmp_path / 'there'}" in out
+    assert max(len(line) for line in out.splitlines() if "written" not in line) <= 100
     assert (built[0].output, built[0].mesh.edge_length) == (tmp_path / "there", 2.5)
     assert main([*words, "--json", "-q"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
-    assert json.loads(out)["n_tets"] == 7
+    summary = json.loads(out)
+    assert summary["mesh"]["n_tets"] == 1
+    assert list(summary["timings"]) == ["checking the case", "segmenting", "meshing"]
 
 
 def test_build_stops_at_an_error_of_the_doctor(built, tmp_path, capsys):

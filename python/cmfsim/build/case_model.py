@@ -3,8 +3,10 @@
 import logging
 import platform
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import TetMesh, __version__
 from cmfsim.build.held import held_part
-from cmfsim.build.inputs import input_hashes, read_anatomy, read_case_landmarks, read_motion
+from cmfsim.build.inputs import (
+    check_output,
+    input_hashes,
+    read_anatomy,
+    read_case_landmarks,
+    read_motion,
+)
 from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.checks import Floats
 from cmfsim.doctor import diagnose
@@ -22,6 +30,7 @@ from cmfsim.meshing import (
     MeshOptions,
     MeshReport,
     TissueRegion,
+    mesh_findings,
     mesh_from_level,
     mesh_report,
     near_skin,
@@ -29,7 +38,7 @@ from cmfsim.meshing import (
     tissue_level,
 )
 from cmfsim.model import PatientModel
-from cmfsim.node_kinds import ClassifiedNodes, KindOptions, classify_nodes, segment_data
+from cmfsim.node_kinds import KindOptions, classify_nodes, segment_data
 from cmfsim.osteotomy import (
     CuttingPlane,
     Procedure,
@@ -54,14 +63,26 @@ LEAST_BODY = 1000.0
 THIN_DEPTH = 12.0
 # Halvings of the edge at gaps between skin and skin: lips a millimetre apart stay two.
 GAP_REFINEMENTS = 2
-# A cross-section at an end of the head above this share of the largest is a cut, not a crown.
+# A head ends in a cut, not a crown, where its cross-section near the end is above this share of the
+# largest, and above the other share of that twice as far in: under a crown they grow with depth.
 CUT_SHARE = 0.15
+CUT_GROWTH = 0.75
+# How far from the end the cross-section is taken, mm, and in voxels at least: the very last layer
+# may be the rim of a cap.
+CUT_DEPTH = 5.0
+CUT_LAYERS = 2
 # Voxels between the end of a head that was cut and the plane that closes its tissue there: the
 # image's own end is ragged where the neck is tilted or a cap was sewn in.
 CUT_MARGIN = 1.5
 
 
-def build_case(case: Case, *, progress: Progress | None = None, check: bool = True) -> PatientModel:
+def build_case(
+    case: Case,
+    *,
+    progress: Progress | None = None,
+    check: bool = True,
+    findings: Iterable[Finding] = (),
+) -> PatientModel:
     """The model of a case, written to its output folder.
 
     Parameters
@@ -71,6 +92,8 @@ def build_case(case: Case, *, progress: Progress | None = None, check: bool = Tr
         Called with the name of each stage as it begins.
     check : bool
         Whether the doctor looks at the case first; an error that it finds ends the work.
+    findings : iterable of Finding
+        What is known of the case already; the model keeps it.
 
     Returns
     -------
@@ -90,17 +113,23 @@ def build_case(case: Case, *, progress: Progress | None = None, check: bool = Tr
     >>> model = cmfsim.build_case(cmfsim.Case.load("case.toml"))  # doctest: +SKIP
     >>> result = cmfsim.solve_scene(model.scene)  # doctest: +SKIP
     """
-    model = build_model(case, progress=progress, check=check)
+    check_output(case)
+    model = build_model(case, progress=progress, check=check, findings=findings)
     stage = progress or _quiet
     stage("writing the model")
-    write_model(case.output, model)
-    stage("drawing")
-    _draw(case, model)
-    return model
+    begun = time.perf_counter()
+    names = write_model(case.output, model, partial(_draw, model))
+    timings = {**model.summary["timings"], "writing the model": time.perf_counter() - begun}
+    more = {"timings": timings, "output": str(case.output), "files": names}
+    return replace(model, summary={**model.summary, **more})
 
 
 def build_model(
-    case: Case, *, progress: Progress | None = None, check: bool = True
+    case: Case,
+    *,
+    progress: Progress | None = None,
+    check: bool = True,
+    findings: Iterable[Finding] = (),
 ) -> PatientModel:
     """The model of a case: read, segmented, cut, meshed and classified; nothing is written.
 
@@ -109,6 +138,8 @@ def build_model(
     case : Case
     progress : callable, optional
     check : bool
+    findings : iterable of Finding
+        As for `build_case`.
 
     Returns
     -------
@@ -125,12 +156,12 @@ def build_model(
     >>> model = cmfsim.build_model(cmfsim.Case.load("case.toml"))  # doctest: +SKIP
     """
     stages = _Stages(progress or _quiet)
-    findings: list[Finding] = []
+    findings = [*findings]
     if check:
         stages.begin("checking the case")
         findings += _checked(case)
     landmarks, noticed = read_case_landmarks(case)
-    findings += [f for f in noticed if f not in findings]
+    findings += noticed
     skull = landmarks.get("skull", {})
     anatomy, noticed = read_anatomy(case, skull, stages.begin)
     findings += noticed
@@ -174,6 +205,7 @@ def build_model(
         report = mesh_report(mesh)
     findings += noticed
     findings += _untouched(case, kinds)
+    findings = [*dict.fromkeys(findings)]
 
     stages.begin("assembling the scene")
     motions = {name: read_motion(case, motion) for name, motion in case.plan.items()}
@@ -191,22 +223,19 @@ def build_model(
         anatomy=anatomy,
         landmarks=landmarks,
         findings=tuple(findings),
-        summary=_summary(
-            case, classified, report, anatomy, findings, stages.seconds, cut.procedures
-        ),
+        summary=_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
     )
 
 
-def _draw(case: Case, model: PatientModel) -> None:
-    """The pictures beside the model; without PyVista or OpenGL the model stands without them."""
-    nodes = model.scene.nodes
+def _draw(model: PatientModel, folder: Path) -> list[str]:
+    """The names of the pictures drawn into a folder: none without PyVista or OpenGL."""
+    anatomy, kinds = folder / "anatomy.png", folder / "node_kinds.png"
     try:
-        picture_anatomy(case.output / "anatomy.png", model.skin, model.segments)
-        picture_node_kinds(
-            case.output / "node_kinds.png", nodes, model.boundary_triangles, model.kinds
-        )
+        picture_anatomy(anatomy, model.skin, model.segments)
+        picture_node_kinds(kinds, model.scene.nodes, model.boundary_triangles, model.kinds)
     except CmfsimError as error:
         _log.warning("no pictures: %s", error)
+    return [path.name for path in (anatomy, kinds) if path.exists()]
 
 
 class _Stages:
@@ -270,11 +299,19 @@ def _region(case: Case, anatomy: Anatomy, landmarks: Mapping[str, Floats]) -> Ti
     slices = np.flatnonzero(areas)
     bounds = [case.region.lower, case.region.upper]
     for which, end, inwards in ((0, slices[0], 1), (1, slices[-1], -1)):
-        # Two slices from the end: the very last may be a cap's rim.
-        if bounds[which] is None and areas[end + 2 * inwards] > CUT_SHARE * areas.max():
+        if bounds[which] is None and _is_cut(areas[slices][::inwards], float(spacing[2])):
             height = lowest[2] + spacing[2] * (end - 0.5 * inwards)
             bounds[which] = float(height + inwards * CUT_MARGIN * spacing[2])
     return TissueRegion(plane.point, plane.normal, lower=bounds[0], upper=bounds[1])
+
+
+def _is_cut(areas: NDArray[np.intp], step: float) -> bool:
+    """Whether a head whose cross-sections, from one end on, have these areas was cut off there."""
+    layers = max(CUT_LAYERS, round(CUT_DEPTH / step))
+    if len(areas) <= 2 * layers:
+        return True
+    near, farther = int(areas[layers]), int(areas[2 * layers])
+    return near > CUT_SHARE * int(areas.max()) and near > CUT_GROWTH * farther
 
 
 def _planes(region: TissueRegion) -> dict[str, tuple[ArrayLike, ArrayLike]]:
@@ -291,7 +328,8 @@ def _mesh(
 ) -> tuple[TetMesh, MeshReport, tuple[Finding, ...]]:
     if case.mesh.file is not None:
         mesh = TetMesh(*read_tet_mesh(case.mesh.file))
-        return mesh, mesh_report(mesh), ()
+        report = mesh_report(mesh)
+        return mesh, report, mesh_findings(report)
     options = MeshOptions(
         edge_length=case.mesh.edge_length,
         refinements=GAP_REFINEMENTS if case.mesh.refine else 0,
@@ -306,7 +344,8 @@ def _mesh(
     if case.surfaces is not None:
         units, frame = case.surfaces.units, case.surfaces.frame
     parted = part_mesh(made.mesh, read_surface(case.mesh.parting, units=units, frame=frame))
-    return parted, mesh_report(parted), made.findings
+    # A crack parts tets and changes none: what was said of the whole holds.
+    return parted, replace(made.report, n_nodes=parted.n_nodes), made.findings
 
 
 def _untouched(case: Case, kinds: NodeKinds) -> list[Finding]:
@@ -365,7 +404,7 @@ def _on_skin(
 
 def _summary(
     case: Case,
-    classified: ClassifiedNodes,
+    kinds: NodeKinds,
     report: MeshReport,
     anatomy: Anatomy,
     findings: list[Finding],
@@ -375,7 +414,11 @@ def _summary(
     grid = anatomy.skin
     return {
         "case": case.name,
-        "nodes": dict(classified.counts),
+        "nodes": {name: len(kinds.nodes(name)) for name in ("free", "fixed", "joined", "sliding")},
+        "segments": {
+            name: {kind: len(kinds.nodes(kind, name)) for kind in ("joined", "sliding")}
+            for name in kinds.segments
+        },
         "mesh": report.as_dict(),
         "grid": {
             "shape": list(grid.values.shape),

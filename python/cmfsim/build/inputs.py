@@ -1,6 +1,7 @@
 """What the files of a case hold: anatomy, landmarks, motions, and the hashes of them all."""
 
 import hashlib
+import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from cmfsim.case import Anatomy, Finding
 from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError
 from cmfsim.imaging import SegmentOptions, segment_head
 from cmfsim.io import (
     Case,
@@ -17,12 +19,13 @@ from cmfsim.io import (
     read_transform,
 )
 from cmfsim.io.images import read_image_file
+from cmfsim.io.models import is_model_file
 from cmfsim.meshing import anatomy_from_surfaces
 from cmfsim.patient import CaseMotion
 from cmfsim.scene import MovedSurface
 from cmfsim.surface_repair import repair_surface
 
-__all__ = ["input_hashes", "read_anatomy", "read_case_landmarks", "read_motion"]
+__all__ = ["check_output", "input_hashes", "read_anatomy", "read_case_landmarks", "read_motion"]
 
 Progress = Callable[[str], None]
 
@@ -98,8 +101,43 @@ def read_motion(case: Case, motion: CaseMotion) -> Floats | MovedSurface:
 
 
 def input_hashes(case: Case) -> dict[str, str]:
-    """The SHA-256 of every file that a case names, by name; that of a folder is of its files."""
-    return {path.name: _sha256(path) for path in sorted(_files(case))}
+    """The SHA-256 of every file that a case names, by its path from the case's folder.
+
+    That of a folder is of the files in it.
+    """
+    folder = case.file.parent
+    return {_path_from(path, folder): _sha256(path) for path in sorted(set(_files(case)))}
+
+
+def _path_from(path: Path, folder: Path) -> str:
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
+
+
+def check_output(case: Case) -> None:
+    """Finds before the work what would keep the model from being written, or spoil an input.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) The output folder is a file, or holds an input of a name that is written
+        there.
+    OSError
+        It cannot be written to.
+    """
+    folder = case.output
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise CaseInputError(f"{there}: is a file; the output folder cannot be made there")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise PermissionError(f"{there}: the output cannot be written there")
+    for path in _files(case):
+        written = folder / path.name
+        if not is_model_file(path.name) or not path.exists() or not written.exists():
+            continue
+        if path.samefile(written):
+            raise CaseInputError(
+                f"{path}: the model would replace this input; give another output folder"
+            )
 
 
 def _files(case: Case) -> Iterator[Path]:

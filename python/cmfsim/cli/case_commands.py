@@ -4,12 +4,14 @@ import argparse
 import dataclasses
 import json
 import sys
+import time
 from collections.abc import Sequence
 from importlib import import_module
 from typing import TextIO
 
 from cmfsim.case import SEVERITIES, Finding
 from cmfsim.checks import as_positive
+from cmfsim.cli.build_report import WIDTH, build_text
 from cmfsim.cli.exit_codes import BAD_INPUT, DONE
 from cmfsim.cli.terminal import StageProgress, columns, escaped, in_colour
 from cmfsim.doctor import diagnose, findings_text
@@ -44,19 +46,27 @@ def build(options: argparse.Namespace) -> int:
         )
     if options.output is not None:
         case = dataclasses.replace(case, output=options.output)
+    findings: tuple[Finding, ...] = ()
+    begun = time.perf_counter()
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         if not options.no_doctor:
             progress.stage("checking the case")
             findings = diagnose(case)
-            if _has_errors(findings):
-                _print_findings(findings, sys.stderr)
-                return BAD_INPUT
-        built = import_module("cmfsim.build").build_case(case, progress=progress.stage)
+        checked = time.perf_counter() - begun
+        if not _has_errors(findings):
+            build_case = import_module("cmfsim.build").build_case
+            built = build_case(case, progress=progress.stage, check=False, findings=findings)
+    if _has_errors(findings):
+        _print_findings(findings, sys.stderr)
+        return BAD_INPUT
+    summary = dict(built.summary)
+    if not options.no_doctor:
+        summary["timings"] = {"checking the case": checked, **summary["timings"]}
     if options.json:
-        print(json.dumps(dict(built.summary), allow_nan=False))
-    else:
-        for name, value in built.summary.items():
-            print(f"{escaped(str(name)):<20} {escaped(str(value))}")
+        print(json.dumps(summary, allow_nan=False))
+        return DONE
+    width = min(columns(), WIDTH) if sys.stdout.isatty() else WIDTH
+    print(build_text(summary, colour=in_colour(sys.stdout), width=width))
     return DONE
 
 

@@ -1,7 +1,7 @@
 """From labels, levels or surfaces to tets, with a report of their quality."""
 
 from cmfsim.meshing.levels import anatomy_from_surfaces, signed_level
-from cmfsim.meshing.quality import MeshReport, mesh_report
+from cmfsim.meshing.quality import MeshReport, mesh_findings, mesh_report
 from cmfsim.meshing.stuffing import (
     MeshOptions,
     TissueMesh,
@@ -18,6 +18,7 @@ __all__ = [
     "TissueMesh",
     "TissueRegion",
     "anatomy_from_surfaces",
+    "mesh_findings",
     "mesh_from_labels",
     "mesh_from_level",
     "mesh_report",

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from cmfsim._core import TetMesh
+from cmfsim.case import Finding
 
-__all__ = ["LEAST_DIHEDRAL", "MeshReport", "mesh_report"]
+__all__ = ["LEAST_DIHEDRAL", "MeshReport", "mesh_findings", "mesh_report"]
 
 # Smallest dihedral angle that a tet of a good mesh has, degrees; below, the stiffness matrix loses
 # digits and the deformation of the tet its meaning.
@@ -87,6 +88,12 @@ class MeshReport:
             if count:
                 bar = "█" * max(1, round(30 * count / most))
                 lines.append(f"  {low:3.0f}–{low + 5:2.0f}°  {count:9d} {bar}")
+        lines.append("worst tets    smallest dihedral angle, and where")
+        for tet in self.worst:
+            x, y, z = tet["centroid"]
+            lines.append(
+                f"  {tet['min_dihedral']:5.1f}°  {tet['tet']:9d} at ({x:.1f}, {y:.1f}, {z:.1f}) mm"
+            )
         if self.dropped_parts:
             lines.append(
                 f"left out      {self.dropped_parts} parts of {self.dropped_volume:.1f} mm³ in all"
@@ -149,6 +156,37 @@ def mesh_report(mesh: TetMesh, making: Mapping[str, Any] | None = None) -> MeshR
         dropped_volume=float(making.get("dropped_volume", 0.0)),
         dropped_tets=int(making.get("dropped_tets", 0)),
     )
+
+
+def mesh_findings(report: MeshReport) -> tuple[Finding, ...]:
+    """What a person should know of a mesh: poor tets, and specks that were left out."""
+    findings = []
+    if report.min_dihedral < LEAST_DIHEDRAL:
+        worst = report.worst[0]
+        x, y, z = worst["centroid"]
+        findings.append(
+            Finding(
+                "warning",
+                "mesh-poor-tet",
+                f"tet {worst['tet']} has a dihedral angle of {report.min_dihedral:.1f}°",
+                f"mesh, at ({x:.1f}, {y:.1f}, {z:.1f}) mm",
+                "its deformation is inaccurate and the system worse conditioned",
+                "change edge_length a little, or set refinements = 0",
+            )
+        )
+    if report.dropped_parts:
+        findings.append(
+            Finding(
+                "note",
+                "mesh-specks-dropped",
+                f"{report.dropped_parts} specks of tissue with {report.dropped_volume:.1f} mm³ "
+                "in all were left out",
+                "mesh",
+                "they hang on nothing",
+                "none is needed; check the thresholds if a part of the face is missing",
+            )
+        )
+    return tuple(findings)
 
 
 def _percent(error: float | None) -> str:

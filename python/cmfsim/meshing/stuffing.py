@@ -10,7 +10,7 @@ from cmfsim._core import Surface, TetMesh
 from cmfsim.case import Finding, ImageData
 from cmfsim.checks import as_number, as_positive, as_rows
 from cmfsim.errors import MeshInputError
-from cmfsim.meshing.quality import LEAST_DIHEDRAL, MeshReport, mesh_report
+from cmfsim.meshing.quality import MeshReport, mesh_findings, mesh_report
 from cmfsim.scene import SurfaceData
 
 __all__ = ["MeshOptions", "TissueMesh", "mesh_from_labels", "mesh_from_level", "part_mesh"]
@@ -163,7 +163,7 @@ def mesh_from_level(
     values = np.asarray(level.values, dtype=np.float32)
     mesh, making = _stuffed(values, level.spacing, level.origin, options, allowed)
     report = mesh_report(mesh, making)
-    return TissueMesh(mesh, report, tuple(_findings(report)))
+    return TissueMesh(mesh, report, mesh_findings(report))
 
 
 def part_mesh(mesh: TetMesh, surface: SurfaceData) -> TetMesh:
@@ -218,33 +218,3 @@ def _stuffed(
         least_body=options.least_body,
         allowed=allowed,
     )
-
-
-def _findings(report: MeshReport) -> list[Finding]:
-    findings = []
-    if report.min_dihedral < LEAST_DIHEDRAL:
-        worst = report.worst[0]
-        x, y, z = worst["centroid"]
-        findings.append(
-            Finding(
-                "warning",
-                "mesh-poor-tet",
-                f"tet {worst['tet']} has a dihedral angle of {report.min_dihedral:.1f}°",
-                f"mesh, at ({x:.1f}, {y:.1f}, {z:.1f}) mm",
-                "its deformation is inaccurate and the system worse conditioned",
-                "change edge_length a little, or set refinements = 0",
-            )
-        )
-    if report.dropped_parts:
-        findings.append(
-            Finding(
-                "note",
-                "mesh-specks-dropped",
-                f"{report.dropped_parts} specks of tissue with {report.dropped_volume:.1f} mm³ "
-                "in all were left out",
-                "mesh",
-                "they hang on nothing",
-                "none is needed; check the thresholds if a part of the face is missing",
-            )
-        )
-    return findings

@@ -43,8 +43,8 @@ def mesh_with_tetwild(surface: SurfaceData, edge_length: float = 3.0) -> TetMesh
             "mesh_from_labels and mesh_from_level need nothing"
         ) from error
     nodes, tets = tetwild.tetrahedralize(
-        np.asarray(surface.vertices, dtype=np.float64),
-        np.asarray(surface.triangles, dtype=np.int32),
+        np.array(surface.vertices, dtype=np.float64),
+        np.array(surface.triangles, dtype=np.int32),
         edge_length_abs=edge_length,
     )[:2]
     if not len(tets):

@@ -1,0 +1,72 @@
+"""What `cmfsim build` says at its end, as text."""
+
+import textwrap
+from collections.abc import Mapping
+from typing import Any
+
+from cmfsim.case import Finding
+from cmfsim.cli.terminal import escaped
+from cmfsim.doctor import findings_text
+from cmfsim.meshing import MeshReport
+
+__all__ = ["WIDTH", "build_text"]
+
+# Columns of the text in a pipe, and at most on a terminal.
+WIDTH = 100
+# Columns before the values, as in the lines of `MeshReport.as_text`.
+INDENT = 14
+
+
+def build_text(summary: Mapping[str, Any], *, colour: bool = False, width: int = WIDTH) -> str:
+    """The summary of a model as lines: nodes, mesh, findings, time per stage, files.
+
+    Parameters
+    ----------
+    summary : mapping
+        Of a `PatientModel` that was written.
+    colour : bool
+    width : int
+        Columns at which findings and names of files wrap.
+
+    Returns
+    -------
+    str
+    """
+    findings = [Finding(**entry) for entry in summary["findings"]]
+    parts = [
+        [f"case          {escaped(summary['case'])}", *_nodes(summary)],
+        MeshReport(**summary["mesh"]).as_text().splitlines(),
+        findings_text(findings, colour=colour, width=width, escape=escaped).splitlines(),
+        _times(summary["timings"]),
+        _files(summary, width),
+    ]
+    return "\n\n".join("\n".join(part) for part in parts)
+
+
+def _nodes(summary: Mapping[str, Any]) -> list[str]:
+    counts = summary["nodes"]
+    kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    names = [escaped(name) for name in summary["segments"]]
+    wide = max([len("segment"), *map(len, names)])
+    lines = [f"nodes         {kinds}", f"  {'segment':<{wide}}    joined   sliding"]
+    for name, held in zip(names, summary["segments"].values(), strict=True):
+        lines.append(f"  {name:<{wide}} {held['joined']:9d} {held['sliding']:9d}")
+    return lines
+
+
+def _times(timings: Mapping[str, float]) -> list[str]:
+    lines = [f"time          {sum(timings.values()):.1f} s"]
+    return lines + [f"  {seconds:8.2f} s  {escaped(name)}" for name, seconds in timings.items()]
+
+
+def _files(summary: Mapping[str, Any], width: int) -> list[str]:
+    names = ", ".join(escaped(name) for name in summary["files"])
+    wrapped = textwrap.wrap(
+        names,
+        max(width, 40),
+        initial_indent=" " * INDENT,
+        subsequent_indent=" " * INDENT,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return [f"written       {escaped(summary['output'])}", *wrapped]
