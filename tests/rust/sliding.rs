@@ -540,3 +540,180 @@ fn spiky_contact_surface_settles_or_is_refused() {
         }
     }
 }
+
+/// A node amid six joined ones: with cubic symmetry its stiffness is k I, so that it ends at the point
+/// of the contact surface that is closest to where it would float. The mesh and k.
+fn star(
+    centre: Vec3,
+    tensors_of: impl Fn(&Arc<TetMesh>) -> Arc<MassTensors>,
+) -> (Arc<MassTensors>, f64) {
+    let mut nodes: Vec<[f64; 3]> = vec![centre.into()];
+    for axis in 0..3 {
+        for side in [-1.0, 1.0] {
+            let mut x = centre;
+            x[axis] += side;
+            nodes.push(x.into());
+        }
+    }
+    let mut tets = Vec::new();
+    for (x, y, z) in (0..8).map(|i| (1 + (i & 1), 3 + (i >> 1 & 1), 5 + (i >> 2 & 1))) {
+        tets.push(meshes::oriented(&nodes, [0, x, y, z]));
+    }
+    let tensors = tensors_of(&meshes::checked((nodes, tets)));
+    let (columns, blocks) = tensors.matrix().row(0);
+    let own = blocks[columns.iter().position(|&c| c == 0).unwrap()];
+    assert!((own[0] - own[8]).abs() <= 1e-15 && own[1].abs() <= 1e-15, "{own:?}");
+    (tensors, own[0])
+}
+
+/// Where the star's node ends, its contact force vector, and the walls that hold it.
+fn drawn_to(
+    goal: Vec3,
+    wall: &Arc<Surface>,
+    gap: f64,
+    options: StaticOptions,
+) -> (Vec3, Vec3, u8, f64) {
+    let centre = Vec3::new(0.3, 0.1, 1.5);
+    let (tensors, k) = star(centre, |mesh| tensors(mesh, &isotropic(0.01, POISSON)));
+    let slide = sliding("bone", vec![0], wall, Gap::Uniform(gap));
+    let bounds = boundary(vec![], vec![joined("body", (1..7).collect()), slide]);
+    let shift = rigid([0.0, 0.0, 1.0], 0.0, [0.0; 3], (goal - centre).into());
+    let motion = plan([("body", Motion::Rigid(shift)), ("bone", stays())]);
+    let found = solve(&tensors, &bounds, options, &motion, None).unwrap();
+    let c = &found.contact;
+    assert!(found.contact_gap() <= 1e-9, "{:e} mm", found.contact_gap());
+    assert!(found.residual <= 1e-7, "{:e}", found.residual);
+    let end = centre + Vec3::from(found.displacements[0]);
+    (end, Vec3::from(c.normals[0]) * c.forces[0], c.walls[0], k)
+}
+
+/// Two planes that meet in a valley along y.
+fn groove(slope: f64) -> Arc<Surface> {
+    let (vertices, triangles) = plane(4, 12.0, 0.0);
+    surface((vertices.iter().map(|v| [v[0], v[1], v[0].abs() * slope]).collect(), triangles))
+}
+
+/// A node drawn into a groove rests on both walls and slides along it: x = 0, z = g / cos α, y and the
+/// force k (u − t) as if y were free; drawn onto one wall it is held by that wall alone.
+#[test]
+fn node_in_a_groove_rests_on_both_walls() {
+    let angle = 40.0_f64.to_radians();
+    let wall = groove(angle.tan());
+    for gap in [0.0, 0.4] {
+        let z = gap / angle.cos();
+        for method in METHODS {
+            for options in [with_method(method), unilateral(method)] {
+                let goal = Vec3::new(0.1, 0.7, z - 1.0);
+                let (end, force, walls, k) = drawn_to(goal, &wall, gap, options);
+                let exact = Vec3::new(0.0, 0.7, z);
+                assert_eq!(walls, 2, "{options:?}");
+                assert!((end - exact).norm() <= 1e-7, "{options:?}: {end}");
+                assert!((force - (exact - goal) * k).norm() <= 1e-7 * k, "{options:?}: {force}");
+
+                // Outside the cone of the two normals the nearest point lies on one wall.
+                let goal = Vec3::new(2.0, 0.7, z - 1.0);
+                let n = Vec3::new(-angle.sin(), 0.0, angle.cos());
+                let exact = goal - n * (n.dot(&goal) - gap);
+                let (end, force, walls, k) = drawn_to(goal, &wall, gap, options);
+                assert_eq!(walls, 1, "{options:?}");
+                assert!((end - exact).norm() <= 1e-7, "{options:?}: {end}");
+                assert!((force - (exact - goal) * k).norm() <= 1e-7 * k, "{options:?}: {force}");
+            }
+            // A node that may lift off is held by no wall where it floats above both.
+            let goal = Vec3::new(0.1, 0.7, z + 0.5);
+            let (end, force, walls, _) = drawn_to(goal, &wall, gap, unilateral(method));
+            assert!(walls == 0 && force.norm() == 0.0 && (end - goal).norm() <= 1e-7, "{end}");
+        }
+    }
+}
+
+/// Three walls that meet in a pit: a node drawn into it rests in the corner, whatever the direction.
+#[test]
+fn node_in_a_corner_rests_on_three_walls() {
+    let angle = 45.0_f64.to_radians();
+    let mut vertices = vec![[0.0; 3]];
+    for k in 0..3 {
+        let turn = f64::from(k) * 120.0_f64.to_radians();
+        vertices.push([12.0 * turn.cos(), 12.0 * turn.sin(), 6.0 * angle.tan()]);
+    }
+    let pit = surface((vertices, vec![[0, 1, 2], [0, 2, 3], [0, 3, 1]]));
+    for gap in [0.0, 0.3] {
+        let exact = Vec3::new(0.0, 0.0, gap / angle.cos());
+        for method in METHODS {
+            for options in [with_method(method), unilateral(method)] {
+                let goal = Vec3::new(0.05, -0.08, exact.z - 1.0);
+                let (end, force, walls, k) = drawn_to(goal, &pit, gap, options);
+                assert_eq!(walls, 3, "{options:?}");
+                assert!((end - exact).norm() <= 1e-7, "{options:?}: {end}");
+                assert!((force - (exact - goal) * k).norm() <= 1e-7 * k, "{options:?}: {force}");
+            }
+        }
+    }
+}
+
+/// A block pressed on a row of sharp teeth and pushed across them.
+fn on_teeth() -> (Arc<TetMesh>, Arc<Boundary>, Arc<Surface>, Plan) {
+    let (mesh, base, lid) = block(&RigidMotion::identity());
+    let (vertices, triangles) = plane(12, 12.0, 0.0);
+    let height = |x: f64| if (x / 2.0).round() as i64 % 2 == 0 { -1.5 } else { 0.0 };
+    let teeth: Vec<[f64; 3]> = vertices.iter().map(|v| [v[0], v[1], height(v[0])]).collect();
+    let row = surface((teeth, triangles));
+    let slide = sliding("teeth", base, &row, Gap::Rest);
+    let bounds = boundary(vec![], vec![joined("lid", lid), slide]);
+    let shift = rigid([0.0, 0.0, 1.0], 2.0, [2.0, 2.0, 0.0], [0.4, 0.2, -0.6]);
+    (mesh, bounds, row, plan([("lid", Motion::Rigid(shift)), ("teeth", stays())]))
+}
+
+/// Tissue on a row of teeth settles, with nodes in the valleys: each ends on the surface, its force lies
+/// between the normals of its walls, and all ways of solving agree.
+#[test]
+fn tissue_on_a_row_of_teeth_settles_with_nodes_in_the_valleys() {
+    let (mesh, bounds, _, motion) = on_teeth();
+    let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
+    let mut answers: Vec<Solution> = Vec::new();
+    for method in [Method::Cholesky, Method::Pcg] {
+        let found = solve(&tensors, &bounds, with_method(method), &motion, None).unwrap();
+        assert!(found.contact_gap() <= 1e-6, "{method:?}: {:e} mm", found.contact_gap());
+        assert!(found.residual <= 1e-6 && tangential_share(&found) <= 1e-6);
+        assert!(found.contact.walls.iter().any(|&w| w > 1), "{:?}", found.contact.walls);
+        answers.push(found);
+    }
+    let e = largest_difference(&answers[0].displacements, &answers[1].displacements);
+    assert!(e <= 1e-6, "{e:e} mm");
+    assert_eq!(answers[0].contact.walls, answers[1].contact.walls);
+    let found = solve(&tensors, &bounds, unilateral(Method::Cholesky), &motion, None).unwrap();
+    assert_signorini("teeth", &found);
+}
+
+/// The same bits for any number of threads, with nodes in creases.
+#[test]
+fn creases_do_not_depend_on_the_number_of_threads() {
+    let (mesh, bounds, _, motion) = on_teeth();
+    let answers: Vec<Vec<u64>> = [1, 2, 3]
+        .map(|threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
+                let options = with_method(Method::Cholesky);
+                let found = solve(&tensors, &bounds, options, &motion, None).unwrap();
+                meshes::bits(&found.displacements)
+            })
+        })
+        .into();
+    assert!(answers[0] == answers[1] && answers[0] == answers[2]);
+}
+
+/// The plan operator keeps the walls of its reference: there it equals the solution.
+#[test]
+fn plan_operator_equals_the_solution_in_creases() {
+    let (mesh, bounds, _, motion) = on_teeth();
+    let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
+    for method in [Method::Cholesky, Method::Pcg] {
+        let solver = solver(&tensors, &bounds, with_method(method)).unwrap();
+        let found = solver.solve(&motion, None, GO_ON).unwrap();
+        assert!(found.contact.walls.iter().any(|&w| w > 1));
+        let operator = solver.plan_operator(None, Some(&motion), GO_ON).unwrap();
+        let e = largest_difference(&operator.apply(&motion).unwrap(), &found.displacements);
+        assert!(e <= 1e-6, "{method:?}: {e:e} mm");
+    }
+}

@@ -1,8 +1,8 @@
-//! Normal constraints n·u = g on rows of the system, by projection: the pattern stays, and the
-//! constraint holds to rounding.
+//! Normal constraints n·u = g on rows of the system, one to three a row, by projection: the pattern
+//! stays, and the constraints hold to rounding.
 
 use crate::blocks::BlockMatrix;
-use crate::mesh::{dot, scaled, sub};
+use crate::mesh::{dot, norm, scaled, sub};
 
 /// n·u = offset on one row.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -15,11 +15,58 @@ pub struct Constraint {
     pub offset: f64,
 }
 
-/// P A P + k (I − P) with P = I − n⊗n on the constrained rows, k the mean diagonal of each.
+/// The same constraints with normals orthonormal on each row, which the projection needs.
+///
+/// Constraints of one row follow each other and have independent normals (a row with one constraint
+/// keeps its bits). Gram and Schmidt: q = (n − Σ r q_k) / s, and the offset alike.
+pub fn orthonormal(constraints: &[Constraint]) -> Vec<Constraint> {
+    let mut out: Vec<Constraint> = Vec::with_capacity(constraints.len());
+    for chunk in constraints.chunk_by(|a, b| a.row == b.row) {
+        let first = out.len();
+        for (k, c) in chunk.iter().enumerate() {
+            let mut q = *c;
+            if k > 0 {
+                for earlier in &out[first..] {
+                    let share = dot(earlier.normal, q.normal);
+                    q.normal = sub(q.normal, scaled(earlier.normal, share));
+                    q.offset -= share * earlier.offset;
+                }
+                let length = norm(q.normal);
+                q.normal = scaled(q.normal, 1.0 / length);
+                q.offset /= length;
+            }
+            out.push(q);
+        }
+    }
+    out
+}
+
+/// Forces along the normals of `constraints` (as given to [`orthonormal`]) that make up the reaction
+/// of each row, which lies in the span of the row's normals.
+pub fn along_normals(constraints: &[Constraint], reaction: impl Fn(usize) -> [f64; 3]) -> Vec<f64> {
+    let mut out = Vec::with_capacity(constraints.len());
+    for chunk in constraints.chunk_by(|a, b| a.row == b.row) {
+        let axes = orthonormal(chunk);
+        let mut rest = reaction(chunk[0].row);
+        let mut forces = vec![0.0; chunk.len()];
+        // The last axis is the part of the last normal that no earlier one has: from there back.
+        for k in (0..chunk.len()).rev() {
+            let share = if k == 0 { 1.0 } else { dot(axes[k].normal, chunk[k].normal) };
+            forces[k] = dot(axes[k].normal, rest) / share;
+            rest = sub(rest, scaled(chunk[k].normal, forces[k]));
+        }
+        out.extend(forces);
+    }
+    out
+}
+
+/// P A P + k (I − P) with P = I − Σ n⊗n on the constrained rows, k the mean diagonal of each.
+///
+/// The normals of one row are orthonormal.
 pub fn projected(matrix: &BlockMatrix, constraints: &[Constraint]) -> BlockMatrix {
-    let mut normal: Vec<Option<[f64; 3]>> = vec![None; matrix.n_rows()];
-    for &Constraint { row, normal: n, .. } in constraints {
-        normal[row] = Some(n);
+    let mut normals: Vec<&[Constraint]> = vec![&[]; matrix.n_rows()];
+    for chunk in constraints.chunk_by(|a, b| a.row == b.row) {
+        normals[chunk[0].row] = chunk;
     }
     let mut out = matrix.clone();
     for j in 0..out.n_rows() {
@@ -27,7 +74,7 @@ pub fn projected(matrix: &BlockMatrix, constraints: &[Constraint]) -> BlockMatri
             let k = out.columns[at] as usize;
             let block = &mut out.blocks[at];
             let stiffness = (block[0] + block[4] + block[8]) / 3.0;
-            if let Some(n) = normal[j] {
+            for &Constraint { normal: n, .. } in normals[j] {
                 for c in 0..3 {
                     let along = n[0] * block[c] + n[1] * block[3 + c] + n[2] * block[6 + c];
                     for r in 0..3 {
@@ -35,7 +82,7 @@ pub fn projected(matrix: &BlockMatrix, constraints: &[Constraint]) -> BlockMatri
                     }
                 }
             }
-            if let Some(n) = normal[k] {
+            for &Constraint { normal: n, .. } in normals[k] {
                 for r in 0..3 {
                     let along = dot([block[3 * r], block[3 * r + 1], block[3 * r + 2]], n);
                     for c in 0..3 {
@@ -43,7 +90,8 @@ pub fn projected(matrix: &BlockMatrix, constraints: &[Constraint]) -> BlockMatri
                     }
                 }
             }
-            if let (true, Some(n)) = (k == j, normal[j]) {
+            let own = if k == j { normals[j] } else { &[] };
+            for &Constraint { normal: n, .. } in own {
                 for r in 0..3 {
                     for c in 0..3 {
                         block[3 * r + c] += stiffness * n[r] * n[c];

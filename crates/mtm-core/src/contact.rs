@@ -9,9 +9,9 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use crate::boundary::{Boundary, Gap, Motion};
+use crate::crease::{ContactRow, Foot, MovedSurface, Push, Walls};
 use crate::error::{MtmError, Result};
 use crate::mesh::{TetMesh, add, dot, norm, scaled, sub};
-use crate::motion::RigidMotion;
 use crate::surface::Surface;
 
 /// Smallest step of a damped node towards its new position.
@@ -82,25 +82,6 @@ pub struct Sliding {
     diagonal: f64,
 }
 
-/// A contact surface under a plan.
-enum MovedSurface {
-    /// Queries are carried back to the surface at rest, whose index serves every plan.
-    Rigid(Arc<Surface>, RigidMotion),
-    /// A surface with new vertices.
-    Moved(Surface),
-    /// The segment has no sliding nodes.
-    Unused,
-}
-
-/// Closest point of one node.
-#[derive(Debug, Clone, Copy)]
-struct Foot {
-    point: [f64; 3],
-    normal: [f64; 3],
-    triangle: u32,
-    on_border: bool,
-}
-
 /// Where the sliding nodes ended.
 #[derive(Debug, Clone)]
 pub struct ContactState {
@@ -112,6 +93,11 @@ pub struct ContactState {
     pub normals: Vec<[f64; 3]>,
     /// Contact force along the normal, N; positive pushes the tissue away from the bone.
     pub forces: Vec<f64>,
+    /// Walls that hold each node: one on a smooth part, two in a crease, three in a corner, none where it
+    /// has lifted off.
+    pub walls: Vec<u8>,
+    /// Normal and closest point of each of these walls, node by node.
+    pub rows: Vec<ContactRow>,
     /// n·(x + u − c) − g at the end, mm.
     pub gaps: Vec<f64>,
     /// Whether the node is held to the surface.
@@ -120,21 +106,19 @@ pub struct ContactState {
     pub iterations: usize,
 }
 
-/// Constraints n_i·u_i = offset_i on the sliding nodes that are held.
+/// Constraints n_r·u_i = offset_r on the sliding nodes that are held.
 pub struct Constraints<'a> {
-    /// Indices into the sliding nodes, ascending.
-    pub active: &'a [usize],
-    /// Unit normal of every sliding node.
-    pub normals: &'a [[f64; 3]],
-    /// Offset of every sliding node, mm.
+    /// Node and normal of each constraint, nodes ascending.
+    pub rows: &'a [ContactRow],
+    /// Offset of every row, mm.
     pub offsets: &'a [f64],
 }
 
-/// Displacements (mm) of all sliding nodes and contact forces (N) of the held ones.
+/// Displacements (mm) of all sliding nodes and contact forces (N) along the rows.
 pub struct Response {
     /// Displacement of every sliding node.
     pub displacements: Vec<[f64; 3]>,
-    /// Contact force of each held node, in the order of `Constraints::active`.
+    /// Contact force of each of `Constraints::rows`.
     pub forces: Vec<f64>,
 }
 
@@ -215,7 +199,7 @@ impl Sliding {
         let n = self.nodes.len();
         let gap_limit = options.tolerance * self.diagonal;
         let mut at: Vec<[f64; 3]> = self.carried(motions);
-        let mut feet = self.feet(&surfaces, &at);
+        let mut walls: Vec<Walls> = self.feet(&surfaces, &at).into_iter().map(Walls::new).collect();
         let mut held = Held::new(n, options.mode);
         let (mut step, mut damping) = (vec![[0.0; 3]; n], vec![1.0_f64; n]);
         let mut state = None;
@@ -223,51 +207,76 @@ impl Sliding {
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
-            let normals: Vec<[f64; 3]> = feet.iter().map(|f| f.normal).collect();
-            let offsets: Vec<f64> = (0..n)
-                .map(|i| {
-                    dot(feet[i].normal, sub(feet[i].point, self.positions[i])) + self.nodes[i].gap
+            let mut rows: Vec<ContactRow> = (0..n)
+                .filter(|&i| held.active[i])
+                .flat_map(|i| {
+                    let row = |f: &Foot| ContactRow { node: i, normal: f.normal, point: f.point };
+                    walls[i].feet.iter().map(row).collect::<Vec<_>>()
                 })
                 .collect();
-            let active = held.indices();
-            let response =
-                solve(&Constraints { active: &active, normals: &normals, offsets: &offsets })?;
-            let mut forces = vec![0.0; n];
-            for (&i, &force) in active.iter().zip(&response.forces) {
-                forces[i] = force;
-            }
+            let offsets: Vec<f64> = rows
+                .iter()
+                .map(|r| {
+                    dot(r.normal, sub(r.point, self.positions[r.node])) + self.nodes[r.node].gap
+                })
+                .collect();
+            let response = solve(&Constraints { rows: &rows, offsets: &offsets })?;
 
             let reached: Vec<[f64; 3]> =
                 (0..n).map(|i| add(self.positions[i], response.displacements[i])).collect();
-            let new_feet = self.feet(&surfaces, &reached);
-            let gaps: Vec<f64> = (0..n)
-                .map(|i| {
-                    dot(new_feet[i].normal, sub(reached[i], new_feet[i].point)) - self.nodes[i].gap
-                })
-                .collect();
-            let largest_force = forces.iter().fold(0.0_f64, |m, f| m.max(f.abs()));
-            let gap = (0..n).filter(|&i| held.active[i]).fold(0.0_f64, |m, i| m.max(gaps[i].abs()));
-            let turned = (0..n).fold(0.0_f64, |m, i| {
-                m.max(forces[i].abs() * norm(sub(new_feet[i].normal, normals[i])))
-            });
-            let changed = held.update(&forces, &gaps, gap_limit);
+            let nearest = self.feet(&surfaces, &reached);
+            let gaps: Vec<f64> =
+                (0..n).map(|i| nearest[i].height(reached[i]) - self.nodes[i].gap).collect();
+            let surface = |i: usize| &surfaces[self.nodes[i].segment];
+            let new_feet: Vec<Vec<Foot>> =
+                (0..n).map(|i| walls[i].feet_at(surface(i), reached[i], nearest[i])).collect();
+            let largest_force = response.forces.iter().fold(0.0_f64, |m, f| m.max(f.abs()));
+            let mut gap =
+                (0..n).filter(|&i| held.active[i]).fold(0.0_f64, |m, i| m.max(gaps[i].abs()));
+            let mut turned = 0.0_f64;
+            let mut pushes = vec![Push::default(); n];
+            for (row, &force) in rows.iter_mut().zip(&response.forces) {
+                let i = row.node;
+                let foot = &new_feet[i][pushes[i].forces.len()];
+                gap = gap.max((foot.height(reached[i]) - self.nodes[i].gap).abs());
+                turned = turned.max(force.abs() * norm(sub(foot.normal, row.normal)));
+                row.point = foot.point;
+                pushes[i].add(row.normal, force);
+            }
+            let (normals, forces): (Vec<[f64; 3]>, Vec<f64>) =
+                pushes.iter().zip(&walls).map(|(p, w)| p.along(w.feet[0].normal)).unzip();
+            let mut rebuilt = false;
+            for i in (0..n).filter(|&i| held.active[i]) {
+                let let_go = held.unilateral && walls[i].let_go(&pushes[i].forces);
+                let left = !let_go
+                    && gaps[i].abs() > gap_limit
+                    && nearest[i].triangle != walls[i].feet[0].triangle
+                    && walls[i].leave(surface(i), reached[i], nearest[i]);
+                if left || let_go {
+                    (damping[i], rebuilt) = (1.0, true);
+                }
+            }
+            let active = held.active.clone();
+            let changed = held.update(&forces, &gaps, gap_limit) || rebuilt;
             let settled =
                 !changed && gap <= gap_limit && turned <= options.tolerance * largest_force;
             let last = ContactState {
                 displacements: response.displacements,
-                points: new_feet.iter().map(|f| f.point).collect(),
+                points: nearest.iter().map(|f| f.point).collect(),
                 normals,
                 forces,
+                walls: pushes.iter().map(|p| p.forces.len() as u8).collect(),
+                rows,
                 gaps,
-                active: held.active.clone(),
+                active,
                 iterations: iteration,
             };
             if settled {
-                self.check_border(&new_feet, &reached, &surfaces, options)?;
+                self.check_border(&nearest, &reached, &surfaces, options)?;
                 return Ok(last);
             }
             if held.cycled {
-                return Err(self.cycle(&last, &new_feet, &feet, iteration));
+                return Err(self.cycle(&last, &nearest, &walls, iteration));
             }
             // Nodes that swing back and forth between triangles approach their new place in part.
             let mut moved = at.clone();
@@ -284,18 +293,25 @@ impl Sliding {
                 step[i] = new_step;
                 moved[i] = add(at[i], scaled(new_step, damping[i]));
             }
+            for i in (0..n).filter(|&i| !held.active[i]) {
+                walls[i] = Walls::new(nearest[i]);
+            }
             let next = if damping.iter().all(|&d| d == 1.0) {
-                new_feet
+                nearest
             } else {
                 self.feet(&surfaces, &moved)
             };
             at = moved;
-            let previous = std::mem::replace(&mut feet, next);
-            state = Some((last, previous));
+            let previous = walls.clone();
+            for i in 0..n {
+                let feet = walls[i].feet_at(surface(i), at[i], next[i]);
+                walls[i].follow(&feet);
+            }
+            state = Some((last, next, previous));
         }
         match state {
-            Some((last, previous)) => {
-                Err(self.cycle(&last, &feet, &previous, options.max_iterations))
+            Some((last, new, previous)) => {
+                Err(self.cycle(&last, &new, &previous, options.max_iterations))
             }
             None => Err(MtmError::OutOfRange {
                 what: "contact_iterations".into(),
@@ -392,13 +408,14 @@ impl Sliding {
         &self,
         last: &ContactState,
         new: &[Foot],
-        old: &[Foot],
+        old: &[Walls],
         iterations: usize,
     ) -> MtmError {
         let mut order: Vec<usize> = (0..self.nodes.len()).collect();
         let badness = |i: usize| {
-            let turned = last.forces[i].abs() * norm(sub(new[i].normal, old[i].normal));
-            let jumped = if new[i].triangle == old[i].triangle { 0.0 } else { f64::MIN_POSITIVE };
+            let old = &old[i].feet[0];
+            let turned = last.forces[i].abs() * norm(sub(new[i].normal, old.normal));
+            let jumped = if new[i].triangle == old.triangle { 0.0 } else { f64::MIN_POSITIVE };
             let gap = if last.active[i] { last.gaps[i].abs() } else { 0.0 };
             gap / self.diagonal + turned + jumped
         };
@@ -408,40 +425,6 @@ impl Sliding {
             .fold(0.0_f64, |m, i| m.max(last.gaps[i].abs()));
         let nodes = order.iter().take(NAMED_NODES).map(|&i| self.nodes[i].node as usize).collect();
         MtmError::ContactCycle { iterations, nodes, gap }
-    }
-}
-
-impl MovedSurface {
-    fn foot(&self, at: [f64; 3]) -> Foot {
-        match self {
-            Self::Rigid(rest, rigid) => {
-                let c = rest.closest_one(rigid.apply_inverse(at));
-                Foot {
-                    point: rigid.apply(c.point),
-                    normal: rigid.rotate(c.normal),
-                    triangle: c.triangle,
-                    on_border: c.on_border,
-                }
-            }
-            Self::Moved(surface) => {
-                let c = surface.closest_one(at);
-                Foot {
-                    point: c.point,
-                    normal: c.normal,
-                    triangle: c.triangle,
-                    on_border: c.on_border,
-                }
-            }
-            Self::Unused => Foot { point: at, normal: [0.0; 3], triangle: 0, on_border: false },
-        }
-    }
-
-    fn mean_edge(&self) -> f64 {
-        match self {
-            Self::Rigid(surface, _) => surface.mean_edge_length(),
-            Self::Moved(surface) => surface.mean_edge_length(),
-            Self::Unused => 0.0,
-        }
     }
 }
 
@@ -464,10 +447,6 @@ impl Held {
             one_at_a_time: false,
             cycled: false,
         }
-    }
-
-    fn indices(&self) -> Vec<usize> {
-        (0..self.active.len()).filter(|&i| self.active[i]).collect()
     }
 
     /// Lets go of nodes that are pulled and holds those that penetrate; whether any changed.

@@ -55,6 +55,7 @@ pub mod boundary;
 pub mod cholesky;
 pub mod constraints;
 pub mod contact;
+pub mod crease;
 pub mod error;
 mod error_bound;
 pub mod krylov;

@@ -7,6 +7,7 @@
 use rayon::prelude::*;
 
 use crate::boundary::{Motion, NodeKind, Plan, matched};
+use crate::crease::ContactRow;
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::mesh::{dot, sub};
 use crate::method::Interrupt;
@@ -85,17 +86,14 @@ impl StaticSolver {
         // Prescribed fields of every column, and the constant column last if there is contact.
         let (mut fields, mut offsets, mut scales) = (Vec::new(), Vec::new(), Vec::new());
         let sliding = self.sliding.as_ref().map_or(&[][..], |s| s.nodes());
-        let feet: Vec<[f64; 3]> = match &contact {
-            None => Vec::new(),
-            Some(state) => sliding
-                .iter()
-                .zip(&state.points)
-                .map(|(node, &point)| match &find(reference, &segments[node.segment].name) {
-                    Some(rigid) => rigid.apply_inverse(point),
-                    None => point,
-                })
-                .collect(),
-        };
+        let rows = contact.as_ref().map_or(&[][..], |c| c.rows.as_slice());
+        let feet: Vec<[f64; 3]> = rows
+            .iter()
+            .map(|row| match find(reference, &segments[sliding[row.node].segment].name) {
+                Some(rigid) => rigid.apply_inverse(row.point),
+                None => row.point,
+            })
+            .collect();
         for (s, segment) in segments.iter().enumerate() {
             for column in 0..COLUMNS {
                 let mut u = vec![[0.0; 3]; n];
@@ -104,38 +102,29 @@ impl StaticSolver {
                 }
                 scales.push(if column < 9 { mesh.diagonal() } else { 1.0 });
                 fields.push(self.coupled(&u));
-                let Some(state) = &contact else { continue };
-                offsets.push(
-                    (0..sliding.len())
-                        .map(|i| {
-                            if sliding[i].segment != s {
-                                return 0.0;
-                            }
-                            dot(state.normals[i], unit_field(column, feet[i], centres[s]))
-                        })
-                        .collect::<Vec<f64>>(),
-                );
+                if contact.is_none() {
+                    continue;
+                }
+                let along = |(row, &foot): (&ContactRow, &[f64; 3])| {
+                    if sliding[row.node].segment == s {
+                        dot(row.normal, unit_field(column, foot, centres[s]))
+                    } else {
+                        0.0
+                    }
+                };
+                offsets.push(rows.iter().zip(&feet).map(along).collect::<Vec<f64>>());
             }
         }
-        if let Some(state) = &contact {
+        if contact.is_some() {
             scales.push(1.0);
             fields.push(vec![[0.0; 3]; self.unknowns.len()]);
-            offsets.push(
-                (0..sliding.len())
-                    .map(|i| {
-                        let x = mesh.nodes()[sliding[i].node as usize];
-                        dot(state.normals[i], sub(feet[i], x)) + sliding[i].gap
-                    })
-                    .collect(),
-            );
+            let rest = |(row, &foot): (&ContactRow, &[f64; 3])| {
+                let node = &sliding[row.node];
+                dot(row.normal, sub(foot, mesh.nodes()[node.node as usize])) + node.gap
+            };
+            offsets.push(rows.iter().zip(&feet).map(rest).collect());
         }
-        let active: Vec<usize> =
-            contact.iter().flat_map(|c| (0..c.active.len()).filter(|&i| c.active[i])).collect();
-        let frozen = contact.as_ref().map(|c| Frozen {
-            active: &active,
-            normals: &c.normals,
-            offsets: &offsets,
-        });
+        let frozen = contact.as_ref().map(|_| Frozen { rows, offsets: &offsets });
         let solved = self.solve_columns(fields, &scales, frozen, interrupted)?;
 
         let kinds = self.boundary.kinds(n)?;

@@ -20,6 +20,8 @@ pub struct ContactResult {
     pub gaps: Vec<f64>,
     /// Whether the node is held to the surface.
     pub active: Vec<bool>,
+    /// Walls that hold the node: one as a rule, two in a crease, three in a corner, none if lifted off.
+    pub walls: Vec<u8>,
 }
 
 /// Displacements under one plan.

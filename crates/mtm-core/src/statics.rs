@@ -289,6 +289,7 @@ impl StaticSolver {
             normals: state.normals,
             forces: state.forces,
             gaps: state.gaps,
+            walls: state.walls,
             active: state.active,
         }
     }

@@ -239,6 +239,31 @@ impl Surface {
         self.describe(&p, t, &found)
     }
 
+    /// Closest point to `point` (mm, finite) of the part of the surface that goes down to it from
+    /// `triangle`: the nearest point of one wall where another wall may be nearer.
+    ///
+    /// `triangle`: its index, below the number of triangles. A local minimum of the distance, found
+    /// across edges and round corners where normals are continuous; creases end a wall.
+    pub fn closest_from(&self, point: [f64; 3], triangle: u32) -> Closest {
+        let p = Vec3::from(point);
+        let squared = |found: &TrianglePoint| (p - found.point).norm_squared();
+        let (mut at, mut found) = (triangle, self.closest_on(&p, triangle));
+        loop {
+            let nearer = self
+                .topology
+                .round(at, found.feature)
+                .into_iter()
+                .map(|t| (t, self.closest_on(&p, t)))
+                .min_by(|a, b| squared(&a.1).total_cmp(&squared(&b.1)).then(a.0.cmp(&b.0)))
+                .filter(|(_, candidate)| squared(candidate) < squared(&found));
+            // Each step is strictly nearer: no triangle comes twice.
+            let Some((t, candidate)) = nearer else {
+                return self.describe(&p, at, &found);
+            };
+            (at, found) = (t, candidate);
+        }
+    }
+
     /// Unit normal at a point of a triangle, continuous across all edges but creases.
     ///
     /// `triangle`: its index, below the number of triangles. `barycentric`: weights of its corners.

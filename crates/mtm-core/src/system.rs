@@ -4,11 +4,14 @@
 use crate::blocks::BlockMatrix;
 use crate::boundary::Motion;
 use crate::cholesky::{Factor, Symbolic, TailFactor};
-use crate::constraints::{Constraint, add_offsets, projected, projected_rhs};
+use crate::constraints::{
+    Constraint, add_offsets, along_normals, orthonormal, projected, projected_rhs,
+};
 use crate::contact::{Constraints, ContactState, Response, Sliding};
+use crate::crease::ContactRow;
 use crate::error::{MtmError, Result};
 use crate::krylov::{PcgOptions, Preconditioner, pcg};
-use crate::mesh::{dot, norm, scaled, sub};
+use crate::mesh::{add, dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
 use crate::multigrid::{Multigrid, MultigridOptions};
 use crate::relaxation::{RelaxationOptions, relax};
@@ -63,11 +66,9 @@ pub(crate) struct System {
 
 /// Contact constraints that do not change, for several right-hand sides.
 pub(crate) struct Frozen<'a> {
-    /// Indices of the held sliding nodes.
-    pub active: &'a [usize],
-    /// Unit normal of every sliding node.
-    pub normals: &'a [[f64; 3]],
-    /// Offset of every sliding node, for each right-hand side.
+    /// Sliding node and normal of each constraint.
+    pub rows: &'a [ContactRow],
+    /// Offset of every row, for each right-hand side.
     pub offsets: &'a [Vec<f64>],
 }
 
@@ -244,7 +245,7 @@ impl System {
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
-            let c = Constraints { active: frozen.active, normals: frozen.normals, offsets };
+            let c = Constraints { rows: frozen.rows, offsets };
             let Kept::Direct { symbolic, factor, tail: Some(tail) } = &self.kept else {
                 let solved = self.solve_projected(b, sliding, &c, scale, &mut effort, interrupted);
                 return Ok(solved?.0);
@@ -253,7 +254,7 @@ impl System {
             symbolic.forward(factor, &mut x, 1);
             let free = tail.free_displacements(&x);
             let response = respond(tail, &free, &c)?;
-            tail.add_forces(&mut x, &active_pushes(&c, &response.forces));
+            tail.add_forces(&mut x, &row_pushes(sliding.nodes().len(), c.rows, &response.forces));
             symbolic.backward(factor, &mut x, 1);
             Ok(symbolic.unpermuted(&x))
         };
@@ -270,15 +271,17 @@ impl System {
         effort: &mut Effort,
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, Response)> {
-        let constraints: Vec<Constraint> = c
-            .active
+        let asked: Vec<Constraint> = c
+            .rows
             .iter()
-            .map(|&i| Constraint {
-                row: sliding.nodes()[i].row as usize,
-                normal: c.normals[i],
-                offset: c.offsets[i],
+            .zip(c.offsets)
+            .map(|(r, &offset)| Constraint {
+                row: sliding.nodes()[r.node].row as usize,
+                normal: r.normal,
+                offset,
             })
             .collect();
+        let constraints = orthonormal(&asked);
         let matrix = match &self.kept {
             Kept::Refactored { matrix, .. }
             | Kept::Pcg { matrix, .. }
@@ -300,10 +303,7 @@ impl System {
             }
         };
         add_offsets(&mut x, &constraints);
-        let forces = constraints
-            .iter()
-            .map(|c| dot(c.normal, sub(matrix.row_product(c.row, &x), b[c.row])))
-            .collect();
+        let forces = along_normals(&asked, |row| sub(matrix.row_product(row, &x), b[row]));
         let displacements = sliding.nodes().iter().map(|n| x[n.row as usize]).collect();
         Ok((x, Response { displacements, forces }))
     }
@@ -431,14 +431,16 @@ fn gave_up(error: MtmError, sweeps: usize, tolerance: f64) -> MtmError {
 /// Contact forces λ from (Nᵀ S⁻¹ N) λ = g − Nᵀ u_free, and the displacements of the sliding nodes.
 fn respond(tail: &TailFactor, free: &[[f64; 3]], c: &Constraints<'_>) -> Result<Response> {
     let mut forces: Vec<f64> =
-        c.active.iter().map(|&i| c.offsets[i] - dot(c.normals[i], free[i])).collect();
-    let dense = tail.normal_flexibility(c.active, c.normals);
+        c.rows.iter().zip(c.offsets).map(|(r, g)| g - dot(r.normal, free[r.node])).collect();
+    let nodes: Vec<usize> = c.rows.iter().map(|r| r.node).collect();
+    let normals: Vec<[f64; 3]> = c.rows.iter().map(|r| r.normal).collect();
+    let dense = tail.normal_flexibility(&nodes, &normals);
     dense.solve(&mut forces).map_err(|at| MtmError::NotPositiveDefinite {
-        node: tail.row(c.active[at]),
+        node: tail.row(nodes[at]),
         detail: "the flexibility of the sliding nodes is singular".into(),
     })?;
     let displacements = tail
-        .respond(&active_pushes(c, &forces))
+        .respond(&row_pushes(free.len(), c.rows, &forces))
         .iter()
         .zip(free)
         .map(|(r, f)| [0, 1, 2].map(|i| r[i] + f[i]))
@@ -456,11 +458,11 @@ fn pushes(normals: &[[f64; 3]], forces: &[f64]) -> Vec<[f64; 3]> {
     normals.iter().zip(forces).map(|(&n, &f)| scaled(n, f)).collect()
 }
 
-/// Force vector of every sliding node from the forces of the held ones.
-fn active_pushes(c: &Constraints<'_>, forces: &[f64]) -> Vec<[f64; 3]> {
-    let mut out = vec![[0.0; 3]; c.normals.len()];
-    for (&i, &force) in c.active.iter().zip(forces) {
-        out[i] = scaled(c.normals[i], force);
+/// Force vector of each of `n` sliding nodes from the forces along the rows.
+fn row_pushes(n: usize, rows: &[ContactRow], forces: &[f64]) -> Vec<[f64; 3]> {
+    let mut out = vec![[0.0; 3]; n];
+    for (r, &force) in rows.iter().zip(forces) {
+        out[r.node] = add(out[r.node], scaled(r.normal, force));
     }
     out
 }

@@ -535,6 +535,13 @@ impl PySolution {
         self.core.contact.gaps.clone().into_pyarray(py)
     }
 
+    /// Walls of the contact surface that hold each sliding node, (s,) uint8: one as a rule, two in a
+    /// crease, three in a corner, none where it has lifted off.
+    #[getter]
+    fn contact_walls<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u8>> {
+        self.core.contact.walls.clone().into_pyarray(py)
+    }
+
     /// Seconds of each stage, set-up included; exactly 0 for what the scene does not need.
     #[getter]
     fn timings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {

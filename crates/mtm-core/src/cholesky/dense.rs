@@ -110,17 +110,18 @@ impl TailFactor {
         rows
     }
 
-    /// Normal flexibility n_iᵀ S⁻¹_ij n_j of the tail nodes `active` with unit normals `normals`.
-    pub fn normal_flexibility(&self, active: &[usize], normals: &[[f64; 3]]) -> DenseSymmetric {
-        let k = active.len();
+    /// Normal flexibility n_rᵀ S⁻¹_ij n_s of constraint rows: row r holds tail node i = `nodes[r]` along
+    /// the unit normal `normals[r]`; a node may have several rows.
+    pub fn normal_flexibility(&self, nodes: &[usize], normals: &[[f64; 3]]) -> DenseSymmetric {
+        let k = nodes.len();
         let mut values = vec![0.0; k * k];
         values.par_chunks_mut(k.max(1)).enumerate().for_each(|(c, column)| {
-            let j = active[c];
-            let n_j = normals[j];
+            let j = nodes[c];
+            let n_j = normals[c];
             let [c0, c1, c2] = [0, 1, 2].map(|b| self.flexibility.col(3 * j + b));
             for (r, out) in column.iter_mut().enumerate().skip(c) {
-                let i = active[r];
-                let n_i = normals[i];
+                let i = nodes[r];
+                let n_i = normals[r];
                 *out = (0..3)
                     .map(|a| {
                         let row = 3 * i + a;
