@@ -443,6 +443,19 @@ def test_a_later_build_takes_its_own_old_files_away_and_no_others(ready, ellipso
     assert "segment-old.ply" in before
 
 
+def test_segments_of_any_name_have_files_of_their_own(tmp_path, small_model):
+    """Letters of other scripts, capitals alone, digits: names that a case file allows."""
+    segments = [
+        dataclasses.replace(small_model.segments[0], name=name)
+        for name in ("1", "kiefer_größe", "Chin", "chin", "0")
+    ]
+    model = dataclasses.replace(small_model, segments=tuple(segments))
+    names = cmfsim.write_model(tmp_path / "out", model)
+    drawn = [name for name in names if name.startswith("segment-")]
+    assert drawn == [f"segment-{n}.ply" for n in ("1", "+1", "Chin", "+3", "0")]
+    assert set(contents(tmp_path / "out")) == set(names)
+
+
 def test_a_folder_made_for_nothing_goes_again(ready, ellipsoids, monkeypatch):
     del ready
 

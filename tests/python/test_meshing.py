@@ -420,13 +420,15 @@ def test_near_skin_is_a_shell():
     assert not near[r < 46.0].any()
 
 
-def test_tets_of_tetwild_fill_a_surface():
+def test_tets_of_tetwild_fill_a_surface(tmp_path, monkeypatch):
     """The optional mesher: volume, orientation, edge."""
     if importlib.util.find_spec("pytetwild") is None:
         pytest.skip("needs pytetwild: pip install 'cmfsim[tetwild]'")
     vertices, triangles = head_case.icosphere(2)
     surface = cmfsim.SurfaceData(10.0 * vertices, triangles)
+    monkeypatch.chdir(tmp_path)
     mesh = cmfsim.mesh_with_tetwild(surface, 4.0)
+    assert list(tmp_path.iterdir()) == []
     assert float(np.sum(mesh.volumes)) == pytest.approx(4.0 / 3.0 * np.pi * 1000.0, rel=0.06)
     assert np.asarray(mesh.volumes).min() > 0.0
     assert 1.5 < cmfsim.mesh_report(mesh).mean_edge < 6.0

@@ -25,7 +25,7 @@ __all__ = ["is_model_file", "write_model"]
 
 # What models are written as: an earlier build's files of these names go when a later lacks them.
 MODEL_FILES = re.compile(
-    r"scene\.npz|tissue\.vtu|skin\.ply|segment-[A-Za-z0-9_-]+\.ply|anatomy\.png|node_kinds\.png|"
+    r"scene\.npz|tissue\.vtu|skin\.ply|segment-[A-Za-z0-9_+-]+\.ply|anatomy\.png|node_kinds\.png|"
     r"build\.json"
 )
 
@@ -93,7 +93,7 @@ def _write_into(
             _write_tissue(file, model.scene, model.kinds)
         write_surface(fresh / names[2], model.skin)
         for number, segment in enumerate(model.segments):
-            names.append(_segment_file(segment.name, number))
+            names.append(_segment_file(segment.name, number, names))
             write_surface(fresh / names[-1], segment.surface)
         if draw is not None:
             names.extend(draw(fresh))
@@ -147,10 +147,17 @@ def _listed(summary: Path) -> list[str]:
     return [n for n in listed if isinstance(n, str) and is_model_file(n)]
 
 
-def _segment_file(name: str, number: int) -> str:
-    """A file name that any system takes and no stranger's name can lead elsewhere."""
-    plain = re.fullmatch(r"[A-Za-z0-9_-]{1,60}", name)
-    return f"segment-{name if plain else number}.ply"
+def _segment_file(name: str, number: int, taken: Sequence[str]) -> str:
+    """A file name that any system takes and no stranger's name can lead elsewhere.
+
+    Other names than plain ones give way to their number, as do those that differ from an earlier
+    one in capitals alone; "+" keeps the number apart from a segment that is called so.
+    """
+    file = f"segment-{name}.ply"
+    plain = re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name) is not None
+    if plain and file.lower() not in {other.lower() for other in taken}:
+        return file
+    return f"segment-+{number}.ply"
 
 
 def _write_tissue(file: BinaryIO, scene: Scene, kinds: NodeKinds) -> None:

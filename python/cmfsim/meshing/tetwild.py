@@ -1,6 +1,11 @@
 """Tets by fTetWild (Hu et al. 2020), the optional other way, from a closed surface."""
 
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
 from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 
@@ -42,11 +47,12 @@ def mesh_with_tetwild(surface: SurfaceData, edge_length: float = 3.0) -> TetMesh
             "meshing with fTetWild needs pytetwild: pip install 'cmfsim[tetwild]'; "
             "mesh_from_labels and mesh_from_level need nothing"
         ) from error
-    nodes, tets = tetwild.tetrahedralize(
-        np.array(surface.vertices, dtype=np.float64),
-        np.array(surface.triangles, dtype=np.int32),
-        edge_length_abs=edge_length,
-    )[:2]
+    with _elsewhere():
+        nodes, tets = tetwild.tetrahedralize(
+            np.array(surface.vertices, dtype=np.float64),
+            np.array(surface.triangles, dtype=np.int32),
+            edge_length_abs=edge_length,
+        )[:2]
     if not len(tets):
         raise MeshInputError("fTetWild found no tets: is the surface closed and outward?")
     corners = nodes[tets]
@@ -54,3 +60,15 @@ def mesh_with_tetwild(surface: SurfaceData, edge_length: float = 3.0) -> TetMesh
     inverted = np.linalg.det(edges) < 0.0
     tets[inverted] = tets[inverted][:, [0, 1, 3, 2]]
     return TetMesh(nodes, tets)
+
+
+@contextlib.contextmanager
+def _elsewhere() -> Iterator[None]:
+    """Another current folder for a while: fTetWild leaves a file in it."""
+    before = Path.cwd()
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        try:
+            yield
+        finally:
+            os.chdir(before)
