@@ -41,7 +41,8 @@ CORE: Mapping[str, frozenset[str]] = {
         "registration": "surface motion mesh",
         "boundary": "surface motion mesh",
         "restraint": "mesh",
-        "contact": "boundary mesh motion surface",
+        "crease": "mesh motion surface",
+        "contact": "boundary crease mesh motion surface",
         "constraints": "blocks mesh",
         "cholesky/workspace": "",
         "cholesky/structure": "blocks ordering cholesky/workspace",
@@ -81,11 +82,11 @@ CORE: Mapping[str, frozenset[str]] = {
         "method": "contact",
         "solution": "",
         "system": (
-            "blocks boundary cholesky constraints contact krylov mesh method multigrid relaxation "
-            "restraint solution"
+            "blocks boundary cholesky constraints contact crease krylov mesh method multigrid "
+            "relaxation restraint solution"
         ),
         "statics": ("blocks boundary contact mesh method restraint solution system tensors"),
-        "replan": "boundary mesh method motion statics system",
+        "replan": "boundary crease mesh method motion statics system",
     }.items()
 }
 # The one place, below crates/, that may name each outside crate.
