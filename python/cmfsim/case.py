@@ -17,9 +17,19 @@ from cmfsim.checks import Floats, as_rows, as_text, check_instance, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.scene import SurfaceData
 
-__all__ = ["SEVERITIES", "Anatomy", "BoneSegment", "Finding", "ImageData", "NodeKinds"]
+__all__ = [
+    "NODE_KINDS",
+    "SEVERITIES",
+    "Anatomy",
+    "BoneSegment",
+    "Finding",
+    "ImageData",
+    "NodeKinds",
+]
 
 SEVERITIES = ("error", "warning", "note")
+# Kinds of node (paper 2.5), by the number that files hold.
+NODE_KINDS = ("free", "fixed", "joined", "sliding")
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,9 +264,8 @@ class NodeKinds:
 
     def nodes(self, kind: str, segment: str | None = None) -> NDArray[np.uint32]:
         """The indices of the nodes of a kind ("free", "fixed", "joined", "sliding")."""
-        names = ("free", "fixed", "joined", "sliding")
-        check_one_of("kind", kind, names)
-        chosen = self.kind == names.index(kind)
+        check_one_of("kind", kind, NODE_KINDS)
+        chosen = self.kind == NODE_KINDS.index(kind)
         if segment is not None:
             check_one_of("segment", segment, self.segments)
             chosen &= self.segment == self.segments.index(segment)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.case import BoneSegment, NodeKinds
+from cmfsim.case import NODE_KINDS, BoneSegment, NodeKinds
 from cmfsim.checks import Floats, as_index_rows, as_positive, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.scene import SurfaceData
@@ -35,7 +35,6 @@ SKIN_COLOUR = "#e3b7a0"
 KIND_COLOURS: Mapping[str, str] = MappingProxyType(
     {"fixed": "#f08cb4", "joined": "#f28500", "sliding": "#2f6fd0", "free": "#ffffff"}
 )
-KIND_NAMES = ("free", "fixed", "joined", "sliding")
 SEGMENT_COLOURS: Mapping[str, str] = MappingProxyType(
     {
         "cranium": "#e6dcc3",
@@ -218,7 +217,7 @@ def picture_node_kinds(
         shown = triangles
         if view.bare:
             shown = triangles[held & ~closing]
-        for number, name in enumerate(KIND_NAMES):
+        for number, name in enumerate(NODE_KINDS):
             corner = _corners_of_kind(points, shown, kinds.kind == number)
             if len(corner):
                 count = np.arange(3 * len(corner)).reshape(-1, 3)

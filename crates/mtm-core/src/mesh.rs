@@ -25,7 +25,7 @@ pub struct TetMesh {
 
 /// Tets round each node, ascending.
 #[derive(Debug, Clone)]
-struct Incidence {
+pub(crate) struct Incidence {
     start: Vec<u32>,
     tets: Vec<u32>,
 }
@@ -207,7 +207,8 @@ impl TetMesh {
 }
 
 impl Incidence {
-    fn new(n_nodes: usize, tets: &[[u32; 4]]) -> Self {
+    /// Of tets on `n_nodes` nodes.
+    pub(crate) fn new(n_nodes: usize, tets: &[[u32; 4]]) -> Self {
         let mut start = vec![0_u32; n_nodes + 1];
         for &v in tets.iter().flatten() {
             start[v as usize + 1] += 1;
@@ -226,7 +227,8 @@ impl Incidence {
         Self { start, tets: list }
     }
 
-    fn of(&self, j: usize) -> &[u32] {
+    /// Tets round node `j`.
+    pub(crate) fn of(&self, j: usize) -> &[u32] {
         &self.tets[self.start[j] as usize..self.start[j + 1] as usize]
     }
 }

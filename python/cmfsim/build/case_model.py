@@ -21,7 +21,7 @@ from cmfsim.build.inputs import (
     read_case_landmarks,
     read_motion,
 )
-from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
+from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.checks import Floats
 from cmfsim.doctor import diagnose
 from cmfsim.errors import CaseInputError, CmfsimError
@@ -414,7 +414,7 @@ def _summary(
     grid = anatomy.skin
     return {
         "case": case.name,
-        "nodes": {name: len(kinds.nodes(name)) for name in ("free", "fixed", "joined", "sliding")},
+        "nodes": {name: len(kinds.nodes(name)) for name in NODE_KINDS},
         "segments": {
             name: {kind: len(kinds.nodes(kind, name)) for kind in ("joined", "sliding")}
             for name in kinds.segments

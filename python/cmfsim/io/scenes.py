@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cmfsim.case import NODE_KINDS
 from cmfsim.errors import CaseInputError
 from cmfsim.io.archives import member_of, read_archive, write_archive
 from cmfsim.io.files import beside, check_version, known_keys, named, read_document, table_of
@@ -27,8 +28,6 @@ from cmfsim.scene import (
 __all__ = ["read_plan", "read_scene", "write_scene"]
 
 SCENE_FORMAT = "cmfsim-scene"
-# Kinds of node in the point data of a VTU scene.
-NODE_KINDS = ("free", "fixed", "joined", "sliding")
 # Texts of a tissue, beside its arrays.
 TISSUE_TEXTS = ("kind", "law", "preset", "mixing")
 

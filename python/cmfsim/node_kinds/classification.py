@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
-from cmfsim.case import Anatomy, BoneSegment, Finding, NodeKinds
+from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, NodeKinds
 from cmfsim.checks import Floats, Indices, as_index_rows, as_rows, check_instance
 from cmfsim.errors import CaseInputError
 from cmfsim.node_kinds.options import BORDERS, KindOptions
@@ -138,7 +138,7 @@ def classify_nodes(
     held = np.isin(part, (JOINED, SLIDING))
     owner[border.ids[held]] = nearest[held]
     kinds = NodeKinds(kind, owner, names)
-    counts = {n: len(kinds.nodes(n)) for n in ("free", "fixed", "joined", "sliding")}
+    counts = {n: len(kinds.nodes(n)) for n in NODE_KINDS}
     for name in names:
         counts |= {f"{k} on {name}": len(kinds.nodes(k, name)) for k in ("joined", "sliding")}
     counts["fixed on planes"] = int(on_plane.sum())

@@ -4,7 +4,7 @@
 //! it. What is still poor lies at the surface, where a tet can be dropped: the mesh stays conforming and the
 //! surface moves by less than the height of that tet.
 
-use crate::mesh::{add, dot, norm, scaled, sub};
+use crate::mesh::{Incidence, add, dot, norm, scaled, sub};
 
 use super::cut::{Cut, shape};
 use super::level::LevelImage;
@@ -24,12 +24,6 @@ const PROJECTIONS: usize = 8;
 /// Distance from the surface, in the node's shortest edge, at which it counts as reached.
 const ON_SURFACE: f64 = 1e-3;
 
-/// Tets round each node.
-struct Stars {
-    start: Vec<u32>,
-    tets: Vec<u32>,
-}
-
 /// Improves `cut` in place until no tet is below `LEAST_DIHEDRAL`; the number of tets dropped.
 pub fn improve(cut: &mut Cut, level: &LevelImage) -> usize {
     let before = cut.tets.len();
@@ -39,7 +33,7 @@ pub fn improve(cut: &mut Cut, level: &LevelImage) -> usize {
 
 /// Moves the nodes of poor tets; the worst shape that is left.
 fn smooth(cut: &mut Cut, level: &LevelImage) -> f64 {
-    let stars = Stars::new(cut);
+    let stars = Incidence::new(cut.nodes.len(), &cut.tets);
     let shape_of = |cut: &Cut, t: u32| shape(cut.tets[t as usize].map(|v| cut.nodes[v as usize]));
     let mut poor: Vec<u32> =
         (0..cut.tets.len() as u32).filter(|&t| shape_of(cut, t) < GOAL).collect();
@@ -49,10 +43,10 @@ fn smooth(cut: &mut Cut, level: &LevelImage) -> f64 {
         nodes.dedup();
         let mut moved = false;
         for &node in &nodes {
-            moved |= move_node(cut, level, stars.of(node), node);
+            moved |= move_node(cut, level, stars.of(node as usize), node);
         }
         // Moving may have made others poor, never poorer than the worst beside them was.
-        poor = nodes.iter().flat_map(|&v| stars.of(v).iter().copied()).collect();
+        poor = nodes.iter().flat_map(|&v| stars.of(v as usize).iter().copied()).collect();
         poor.sort_unstable();
         poor.dedup();
         poor.retain(|&t| shape_of(cut, t) < GOAL);
@@ -141,13 +135,13 @@ fn projected(level: &LevelImage, point: [f64; 3], reach: f64) -> Option<[f64; 3]
 
 /// Drops tets below the limit that have a face on the boundary; whether there was one.
 fn drop_poor(cut: &mut Cut) -> bool {
-    let stars = Stars::new(cut);
+    let stars = Incidence::new(cut.nodes.len(), &cut.tets);
     let tets = &cut.tets;
     let is_poor = |tet: &[u32; 4]| shape(tet.map(|v| cut.nodes[v as usize])) < LEAST_DIHEDRAL;
     let on_boundary = |t: usize| {
         (0..4).any(|opposite| {
             let face: Vec<u32> = (0..4).filter(|&v| v != opposite).map(|v| tets[t][v]).collect();
-            !stars.of(face[0]).iter().any(|&other| {
+            !stars.of(face[0] as usize).iter().any(|&other| {
                 other as usize != t && face.iter().all(|v| tets[other as usize].contains(v))
             })
         })
@@ -162,30 +156,4 @@ fn drop_poor(cut: &mut Cut) -> bool {
     // What lay behind a dropped tet is boundary now, but not on the zero set: it may move freely.
     cut.compress();
     true
-}
-
-impl Stars {
-    fn new(cut: &Cut) -> Self {
-        let n = cut.nodes.len();
-        let mut start = vec![0_u32; n + 1];
-        for &v in cut.tets.iter().flatten() {
-            start[v as usize + 1] += 1;
-        }
-        for v in 0..n {
-            start[v + 1] += start[v];
-        }
-        let mut next = start.clone();
-        let mut tets = vec![0_u32; 4 * cut.tets.len()];
-        for (t, tet) in cut.tets.iter().enumerate() {
-            for &v in tet {
-                tets[next[v as usize] as usize] = t as u32;
-                next[v as usize] += 1;
-            }
-        }
-        Self { start, tets }
-    }
-
-    fn of(&self, v: u32) -> &[u32] {
-        &self.tets[self.start[v as usize] as usize..self.start[v as usize + 1] as usize]
-    }
 }
