@@ -35,7 +35,7 @@ CORE: Mapping[str, frozenset[str]] = {
         "signed_distance": "mesh stuffing/level surface winding",
         "material": "mesh",
         "fibre": "surface mesh",
-        "equivalent": "mesh surface winding material",
+        "equivalent": "fibre mesh surface winding material",
         "tensors": "blocks mesh material",
         "motion": "surface mesh triangle",
         "registration": "surface motion mesh",
@@ -111,7 +111,10 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "io": "case checks errors model patient planning scene",
         "imaging": "case checks errors scene _core",
         "meshing": "case checks errors scene _core",
-        "template": "case checks errors scene _core",
+        "musculature": "case checks errors scene",
+        "registration": "case checks errors scene _core",
+        "equivalent": "case checks errors musculature scene _core",
+        "template": "case checks errors io musculature registration scene _core",
         "phantom": "case checks errors scene",
         "planning": "errors",
         "osteotomy": "case checks errors planning scene _core",
@@ -139,9 +142,9 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "simulation study"
         ),
         "__init__": (
-            "_core build case doctor errors evaluation imaging io meshing model node_kinds "
-            "osteotomy patient phantom planning scene simulation study surface_checks "
-            "surface_repair template"
+            "_core build case doctor equivalent errors evaluation imaging io meshing model "
+            "musculature node_kinds osteotomy patient phantom planning registration scene "
+            "simulation study surface_checks surface_repair template"
         ),
     }.items()
 }

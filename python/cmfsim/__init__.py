@@ -70,6 +70,7 @@ from cmfsim.meshing import (
     tissue_level,
 )
 from cmfsim.model import PatientModel
+from cmfsim.musculature import MuscleSurface, Musculature
 from cmfsim.node_kinds import (
     ClassifiedNodes,
     KindOptions,
@@ -133,6 +134,8 @@ __all__ = [
     "MeshReport",
     "MovedSurface",
     "Muscle",
+    "MuscleSurface",
+    "Musculature",
     "NodeKinds",
     "PatientModel",
     "PhantomHead",
