@@ -131,6 +131,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         ),
         "study": "build case errors template simulation evaluation scene",
         "pictures": "case checks errors scene",
+        "muscle_pictures": "checks errors musculature pictures scene _core",
         "report": "case errors scene",
         "topology": "",
         "crossings": "checks",
