@@ -20,6 +20,7 @@ __all__ = [
     "MeshError",
     "MeshQuality",
     "MuscleFibres",
+    "MuscleShares",
     "PlanOperator",
     "RegistrationError",
     "Solution",
@@ -32,6 +33,7 @@ __all__ = [
     "__version__",
     "distance_image",
     "part_mesh",
+    "sample_muscles",
     "signed_distance_image",
     "stuff_image",
 ]
@@ -290,6 +292,34 @@ class PlanOperator:
     def matrix(self) -> _Floats: ...
     def __call__(self, plan: _Plan) -> _Floats: ...
 
+@final
+class MuscleShares:
+    @property
+    def fraction(self) -> _Floats: ...
+    @property
+    def error(self) -> _Floats: ...
+    @property
+    def fibre(self) -> _Floats: ...
+    @property
+    def coherence(self) -> _Floats: ...
+    @property
+    def volumes(self) -> dict[str, Any]: ...
+    @property
+    def shares(self) -> tuple[_Indices, _Indices, _Floats, _Floats, _Floats]: ...
+    @property
+    def counts(self) -> dict[str, int]: ...
+    @property
+    def timings(self) -> dict[str, float]: ...
+    def tissue(self, preset: str, *, mixing: str) -> Tissue: ...
+
+def sample_muscles(
+    mesh: TetMesh,
+    muscles: Sequence[tuple[Surface, MuscleFibres]],
+    *,
+    samples: int,
+    seed: int,
+    inside: str,
+) -> MuscleShares: ...
 def stuff_image(
     values: ArrayLike,
     spacing: tuple[float, float, float],
