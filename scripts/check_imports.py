@@ -39,7 +39,22 @@ CORE: Mapping[str, frozenset[str]] = {
         "fibre/parts": "triangle fibre/centre_line fibre/region",
         "fibre/course": "triangle",
         "fibre": "surface triangle",
-        "equivalent": "fibre mesh surface winding material",
+        "equivalent/aligned_box": "triangle",
+        "equivalent/tet_tree": "equivalent/aligned_box triangle",
+        "equivalent/border": "surface triangle",
+        "equivalent/shape": "equivalent/aligned_box equivalent/border surface triangle winding",
+        "equivalent/crossing": (
+            "equivalent/aligned_box equivalent/shape equivalent/tet_tree mesh triangle"
+        ),
+        "equivalent/sequence": "triangle",
+        "equivalent/packet": "equivalent/sequence equivalent/shape triangle",
+        "equivalent/direction": "triangle",
+        "equivalent/shares": (
+            "equivalent equivalent/crossing equivalent/direction equivalent/packet "
+            "equivalent/sequence equivalent/shape mesh triangle"
+        ),
+        "equivalent/stiffness": "equivalent/shares material",
+        "equivalent": "fibre mesh surface triangle",
         "tensors": "blocks mesh material",
         "motion": "surface mesh triangle",
         "registration/spread": "triangle",

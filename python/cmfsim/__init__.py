@@ -29,6 +29,7 @@ from cmfsim._core import (
 from cmfsim.build import build_case, build_model, write_phantom_case
 from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.doctor import diagnose
+from cmfsim.equivalent import Mixture, MuscleVolume, equivalent_material
 from cmfsim.errors import (
     BoundaryError,
     CaseError,
@@ -152,10 +153,12 @@ __all__ = [
     "MeshOptions",
     "MeshQuality",
     "MeshReport",
+    "Mixture",
     "MovedSurface",
     "Muscle",
     "MuscleFibres",
     "MuscleSurface",
+    "MuscleVolume",
     "Musculature",
     "NodeKinds",
     "PatientModel",
@@ -196,6 +199,7 @@ __all__ = [
     "cut_bones",
     "decompose_motion",
     "diagnose",
+    "equivalent_material",
     "fold_report",
     "free_cut",
     "icp",

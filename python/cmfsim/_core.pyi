@@ -22,6 +22,7 @@ __all__ = [
     "MeshError",
     "MeshQuality",
     "MuscleFibres",
+    "MuscleShares",
     "PlanOperator",
     "RegistrationError",
     "RigidFit",
@@ -38,6 +39,8 @@ __all__ = [
     "icp",
     "part_mesh",
     "rigid_fit",
+@final
+    "sample_muscles",
     "signed_distance_image",
     "stuff_image",
 ]
@@ -384,6 +387,34 @@ def icp(
     keep_border: bool,
     normals: ArrayLike | None,
 ) -> IcpFit: ...
+@final
+class MuscleShares:
+    @property
+    def fraction(self) -> _Floats: ...
+    @property
+    def error(self) -> _Floats: ...
+    @property
+    def fibre(self) -> _Floats: ...
+    @property
+    def coherence(self) -> _Floats: ...
+    @property
+    def volumes(self) -> dict[str, Any]: ...
+    @property
+    def shares(self) -> tuple[_Indices, _Indices, _Floats, _Floats, _Floats]: ...
+    @property
+    def counts(self) -> dict[str, int]: ...
+    @property
+    def timings(self) -> dict[str, float]: ...
+    def tissue(self, preset: str, *, mixing: str) -> Tissue: ...
+
+def sample_muscles(
+    mesh: TetMesh,
+    muscles: Sequence[tuple[Surface, MuscleFibres]],
+    *,
+    samples: int,
+    seed: int,
+    inside: str,
+) -> MuscleShares: ...
 def stuff_image(
     values: ArrayLike,
     spacing: tuple[float, float, float],

@@ -29,6 +29,7 @@ __all__ = [
     "LandmarkError",
     "LandmarkInputError",
     "MaterialError",
+    "MaterialInputError",
     "MeshError",
     "MeshInputError",
     "RegistrationError",
@@ -42,6 +43,10 @@ class BoundaryInputError(BoundaryError, ValueError):
 
 class CaseInputError(CaseError, ValueError):
     """A scene or case, in memory or on disk, that cannot be meant."""
+
+
+class MaterialInputError(MaterialError, ValueError):
+    """Options of a tissue that cannot be meant."""
 
 
 class MeshInputError(MeshError, ValueError):

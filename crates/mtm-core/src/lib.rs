@@ -56,6 +56,7 @@ pub mod cholesky;
 pub mod constraints;
 pub mod contact;
 pub mod crease;
+pub mod equivalent;
 pub mod error;
 mod error_bound;
 pub mod fibre;
@@ -86,6 +87,7 @@ pub mod winding;
 
 pub use boundary::{Boundary, Conflicts, Gap, Motion, NodeKind, Plan, Segment};
 pub use contact::{ContactMode, ContactOptions};
+pub use equivalent::{Muscle, MuscleShares, SamplingOptions, sample_muscles};
 pub use error::{ErrorKind, MtmError, Result};
 pub use fibre::{MuscleFibres, MuscleKind, OrientedBox};
 pub use material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};

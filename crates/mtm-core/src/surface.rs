@@ -4,6 +4,7 @@
 //! distance to a triangle is computed in [`crate::triangle`].
 
 use std::cell::Cell;
+use std::cmp::Ordering;
 use std::f64::consts::PI;
 use std::sync::Arc;
 
@@ -342,6 +343,19 @@ impl Surface {
     /// Mean edge length, mm; an edge of two triangles counts once.
     pub fn mean_edge_length(&self) -> f64 {
         self.shape.mean_edge
+    }
+
+    /// An order of surfaces by their shape alone, so that sums over several of them do not depend on the
+    /// order in which they are listed; only equal shapes tie.
+    pub(crate) fn order(&self, other: &Self) -> Ordering {
+        let coordinates = |s: &Self| s.shape.vertices.as_flattened().to_vec();
+        let by_area = self.area().total_cmp(&other.area());
+        by_area
+            .then_with(|| {
+                let pairs = coordinates(self).into_iter().zip(coordinates(other));
+                pairs.map(|(a, b)| a.total_cmp(&b)).find(|o| o.is_ne()).unwrap_or(Ordering::Equal)
+            })
+            .then_with(|| self.triangles().cmp(other.triangles()))
     }
 
     pub(crate) fn corners(&self, triangle: usize) -> [Vec3; 3] {

@@ -1,6 +1,7 @@
 //! `cmfsim._core`: the binding of mtm-core. It converts, detaches and maps errors; it decides nothing.
 
 mod arrays;
+mod equivalent;
 mod errors;
 mod fibres;
 mod geometry;
@@ -18,6 +19,8 @@ static MEMORY: mtm_core::memory::HugePages = mtm_core::memory::HugePages;
 mod _core {
     use pyo3::prelude::*;
 
+    #[pymodule_export]
+    use crate::equivalent::{PyMuscleShares, sample};
     #[pymodule_export]
     use crate::fibres::PyMuscleFibres;
     #[pymodule_export]
