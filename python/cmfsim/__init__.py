@@ -35,7 +35,14 @@ from cmfsim.errors import (
     RegistrationError,
     SolverError,
 )
-from cmfsim.imaging import SegmentOptions, segment_head
+from cmfsim.imaging import (
+    AlignmentOptions,
+    SegmentOptions,
+    VolumeAlignment,
+    register_volumes,
+    segment_head,
+    undeformed_mask,
+)
 from cmfsim.io import (
     Case,
     read_image,
@@ -109,6 +116,7 @@ __all__ = [
     "LAWS",
     "METHODS",
     "PRESETS",
+    "AlignmentOptions",
     "Anatomy",
     "BoneSegment",
     "Boundary",
@@ -163,6 +171,7 @@ __all__ = [
     "TissueData",
     "TissueMesh",
     "TissueRegion",
+    "VolumeAlignment",
     "__version__",
     "anatomy_from_surfaces",
     "build_case",
@@ -191,6 +200,7 @@ __all__ = [
     "read_surface",
     "read_tet_mesh",
     "read_transform",
+    "register_volumes",
     "repair_surface",
     "rigid_motion",
     "scene_plan",
@@ -201,6 +211,7 @@ __all__ = [
     "signed_level",
     "solve_scene",
     "tissue_level",
+    "undeformed_mask",
     "write_image",
     "write_landmarks",
     "write_model",

@@ -26,6 +26,7 @@ MADE_BY_STAGES = {
     "RigidMotion",
     "SceneResult",
     "TissueMesh",
+    "VolumeAlignment",
 }
 
 
