@@ -20,11 +20,17 @@ MODULES = sorted(
 MADE_BY_STAGES = {
     "Anatomy",
     "BoneSegment",
+    "DistanceStatistics",
+    "ErrorTable",
     "Finding",
+    "Improvement",
     "MeshReport",
+    "ModelComparison",
     "NodeKinds",
+    "PairedTest",
     "RigidMotion",
     "SceneResult",
+    "SkinComparison",
     "TissueMesh",
     "VolumeAlignment",
 }

@@ -204,7 +204,7 @@ def register_volumes(
     far = _Clipped(moving, low, high)
     low, high = _range("fixed volume", fixed.values[chosen])
     near = _Clipped(fixed, low, high)
-    transform = places.transform(np.linalg.inv(start))
+    transform = places.transform(_inverse(start))
     iterations: list[int] = []
     information = 0.0
     for size in options.resolutions:
@@ -234,9 +234,7 @@ def register_volumes(
             f"needed {options.least_similarity:g}; start nearer with `initial`, mask out what was "
             "moved, and see whether both show the same person"
         )
-    return VolumeAlignment(
-        np.linalg.inv(to_moving), information, similarity, overlap, tuple(iterations)
-    )
+    return VolumeAlignment(_inverse(to_moving), information, similarity, overlap, tuple(iterations))
 
 
 def undeformed_mask(
@@ -286,7 +284,9 @@ def undeformed_mask(
             f"landmarks lack {', '.join(missing)}: the plane above the jaws runs through "
             f"{', '.join(CRANIAL_LANDMARKS)}"
         )
-    points = as_rows("landmarks", [landmarks[name] for name in CRANIAL_LANDMARKS], 3)
+    points = as_rows(
+        "landmarks", np.array([as_floats(name, landmarks[name]) for name in CRANIAL_LANDMARKS]), 3
+    )
     centre = points.mean(axis=0)
     _, sizes, axes = np.linalg.svd(points - centre)
     # Up is +z in LPS, whichever way the head is tilted by less than a right angle.
@@ -529,4 +529,12 @@ def _matrix_of(transform: Any) -> Floats:
     matrix[:3, :3] = np.reshape(transform.GetMatrix(), (3, 3))
     centre = np.array(transform.GetCenter())
     matrix[:3, 3] = np.array(transform.GetTranslation()) + centre - matrix[:3, :3] @ centre
+    return matrix
+
+
+def _inverse(rigid: Floats) -> Floats:
+    """The rigid motion back."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rigid[:3, :3].T
+    matrix[:3, 3] = -rigid[:3, :3].T @ rigid[:3, 3]
     return matrix
