@@ -313,6 +313,26 @@ def test_models_are_compared_at_the_same_vertices_and_with_no_change():
     assert table.as_dict()["averages_mm"]["nose"]["half"] == table.average("half", "nose")
 
 
+def test_figures_are_written_whole_or_not_at_all(tmp_path):
+    skin = plane(5, 4)
+    found = cmfsim.compare_models(skin, {"H": np.asarray(skin.vertices) + [0, 0, 1.0]}, skin)
+    table = cmfsim.error_table({"P1": found})
+    for name, value in (("all.json", found), ("one.json", {"a": [1.0, None]}), ("t.csv", table)):
+        cmfsim.write_metrics(tmp_path / name, value)
+    assert json.loads((tmp_path / "all.json").read_text("utf-8")) == found.as_dict()
+    assert (tmp_path / "t.csv").read_text("utf-8") == table.csv()
+    for name, value, pattern in [
+        ("all.json", {"a": np.nan}, "cannot be written as JSON"),
+        ("all.json", 3, "a int has no as_dict"),
+        ("t.csv", found, r"ModelComparison has no csv\(\)"),
+        ("t.txt", table, r"written as \.json or \.csv"),
+    ]:
+        with pytest.raises(cmfsim.CaseError, match=pattern):
+            cmfsim.write_metrics(tmp_path / name, value)
+    assert json.loads((tmp_path / "all.json").read_text("utf-8")) == found.as_dict()
+    assert len(list(tmp_path.iterdir())) == 3
+
+
 def test_models_that_cannot_be_compared_are_named():
     skin = plane(5, 4)
     vertices = np.asarray(skin.vertices)
