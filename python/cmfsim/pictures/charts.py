@@ -42,7 +42,7 @@ def chart_errors(
 
     A box runs from the lower to the upper quartile with a line at the median and a diamond at the
     mean; whiskers reach to the last value within 1.5 boxes, and what lies beyond is drawn as dots
-    and counted above the box.
+    and, above the box, counted.
 
     Parameters
     ----------
@@ -161,7 +161,9 @@ def _boxes(axes: Any, groups: Mapping[str, Mapping[str, Any]], colours: Mapping[
                     "rasterized": True,
                 },
             )
-            outliers = drawn["fliers"][0].get_ydata()
+            # As the statistics count them: the low ones are the good ones.
+            fliers = drawn["fliers"][0].get_ydata()
+            outliers = fliers[fliers > np.median(by_model[model])]
             if len(outliers):
                 axes.annotate(
                     str(len(outliers)),
