@@ -9,9 +9,12 @@ from cmfsim._core import (
     METHODS,
     PRESETS,
     Boundary,
+    Folds,
+    IcpFit,
     MassTensors,
     MeshQuality,
     PlanOperator,
+    RigidFit,
     Solution,
     StaticSolver,
     Surface,
@@ -20,6 +23,7 @@ from cmfsim._core import (
     ThinPlateSpline,
     Tissue,
     __version__,
+    rigid_fit,
 )
 from cmfsim.build import build_case, build_model, write_phantom_case
 from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
@@ -115,6 +119,15 @@ from cmfsim.osteotomy import (
 )
 from cmfsim.phantom import HeadParameters, Muscle, PhantomHead, make_head
 from cmfsim.planning import RigidMotion, decompose_motion, rigid_motion
+from cmfsim.registration import (
+    FoldReport,
+    LandmarkAgreement,
+    LandmarkMatch,
+    fold_report,
+    icp,
+    leave_one_out,
+    match_landmarks,
+)
 from cmfsim.scene import (
     MovedSurface,
     Scene,
@@ -147,12 +160,17 @@ __all__ = [
     "DistanceStatistics",
     "ErrorTable",
     "Finding",
+    "FoldReport",
+    "Folds",
     "HeadParameters",
+    "IcpFit",
     "ImageData",
     "ImageError",
     "Improvement",
     "KindOptions",
+    "LandmarkAgreement",
     "LandmarkError",
+    "LandmarkMatch",
     "MassTensors",
     "MaterialError",
     "MeshError",
@@ -172,6 +190,7 @@ __all__ = [
     "Procedure",
     "RegistrationError",
     "RepairOptions",
+    "RigidFit",
     "RigidMotion",
     "Scene",
     "SceneResult",
@@ -209,8 +228,12 @@ __all__ = [
     "diagnose",
     "distance_statistics",
     "error_table",
+    "fold_report",
     "free_cut",
+    "icp",
+    "leave_one_out",
     "make_head",
+    "match_landmarks",
     "mesh_from_labels",
     "mesh_from_level",
     "mesh_report",
@@ -229,6 +252,7 @@ __all__ = [
     "read_transform",
     "register_volumes",
     "repair_surface",
+    "rigid_fit",
     "rigid_motion",
     "scene_plan",
     "scene_solver",
