@@ -127,7 +127,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "osteotomy": "case checks errors planning scene _core",
         "node_kinds": "case checks errors scene _core",
         "simulation": "scene errors _core",
-        "evaluation": "case checks errors scene topology _core",
+        "evaluation": "case checks errors registration scene topology _core",
         "build": (
             "case checks doctor errors imaging io meshing model node_kinds osteotomy patient "
             "phantom pictures scene surface_repair _core"

@@ -174,7 +174,9 @@ def test_mappings_are_matched_by_name_and_the_result_ignores_their_order():
     places = 30.0 * meshes.unit_vectors(8, seed=2)
     ours = dict(zip(names, places, strict=True))
     theirs = {n: 31.0 / 30.0 * ours[n] for n in reversed(names)}
-    by_name = cmfsim.compare_skins(skin, scan, landmarks=(ours, {**theirs, "other": [0, 0, 0]}))
+    more = {**theirs, "other": [0, 0, 0]}
+    by_name = cmfsim.compare_skins(skin, scan, landmarks=(ours, more))
+    assert [f.code for f in by_name.findings] == ["landmark-extra"]
     by_order = cmfsim.compare_skins(skin, scan, landmarks=(places, places * 31.0 / 30.0))
     np.testing.assert_allclose(by_name.signed, by_order.signed, rtol=0, atol=1e-9)
     np.testing.assert_allclose(by_name.signed, -1.0, rtol=0, atol=1e-9)
@@ -195,7 +197,7 @@ def test_mappings_are_matched_by_name_and_the_result_ignores_their_order():
         (
             {"landmarks": ({"a": [0, 0, 0]}, {"A": [0, 0, 0]})},
             cmfsim.LandmarkError,
-            r"share 0 names \(none\)",
+            r"of the predicted skin .*: 1 landmarks are shared",
         ),
         (
             {"landmarks": (np.eye(4)[:, :3], np.eye(3))},
@@ -213,6 +215,14 @@ def test_bad_comparisons_are_named(arguments, error, pattern):
     with pytest.raises(error, match=pattern) as caught:
         cmfsim.compare_skins(plane(5, 4, 1.0), plane(5, 4), **arguments)
     assert isinstance(caught.value, ValueError)
+
+
+def test_swapped_landmarks_are_named():
+    """Left and right of the mouth exchanged on one skin would fold the map between them."""
+    skin, marks = face()
+    wrong = {**marks, "cheilion_L": marks["cheilion_R"], "cheilion_R": marks["cheilion_L"]}
+    with pytest.raises(cmfsim.LandmarkError, match=r"swapped .*cheilion"):
+        cmfsim.compare_skins(skin, skin, landmarks=(marks, wrong))
 
 
 def test_skins_that_do_not_meet_are_refused():

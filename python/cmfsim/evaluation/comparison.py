@@ -12,17 +12,22 @@ from cmfsim._core import Surface, ThinPlateSpline
 from cmfsim.case import Finding
 from cmfsim.checks import (
     Floats,
-    as_floats,
     as_indices,
     as_positive,
     as_rows,
     check_one_of,
     frozen,
 )
-from cmfsim.errors import CaseInputError, LandmarkInputError, RegistrationInputError
+from cmfsim.errors import (
+    CaseInputError,
+    LandmarkError,
+    LandmarkInputError,
+    RegistrationInputError,
+)
 from cmfsim.evaluation.correspondence import Matches, Skin, match_skins
 from cmfsim.evaluation.regions import SKIN_LANDMARKS, skin_regions
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
+from cmfsim.registration import match_landmarks
 from cmfsim.scene import SurfaceData
 
 __all__ = ["MATCHINGS", "SkinComparison", "compare_skins"]
@@ -209,8 +214,8 @@ def compare_skins(
     simulated, postoperative : SurfaceData or Surface
         Skins in one frame with outward normals; they may be open, at the neck for one.
     landmarks : (landmarks, landmarks), optional
-        Of the simulated and of the post-operative skin: mappings of name to place, matched by name,
-        or (n, 3) arrays in one order, mm.
+        Of the simulated and of the post-operative skin: mappings of name to place, matched by name
+        (`match_landmarks`), or (n, 3) arrays in one order, mm.
     method : str, optional
         "landmarks": a thin-plate spline through the landmarks carries the simulated skin near the
         post-operative one, and the point closest to the carried vertex is its partner (Kim et al.
@@ -236,7 +241,7 @@ def compare_skins(
     RegistrationError
         (also `ValueError`) No vertex is left; landmarks in one plane, coincident, too few.
     LandmarkError
-        (also `ValueError`) Landmarks are missing, or are no face's.
+        (also `ValueError`) Landmarks are missing, swapped between left and right, or are no face's.
     CaseError
         (also `ValueError`) An unknown method, a mask or region of another skin.
     MeshError
@@ -274,7 +279,8 @@ def compare_skins(
                 "method is 'landmarks', but there are none: give landmarks=(of the simulated skin, "
                 "of the post-operative skin), or use method='closest'"
             )
-        ours, theirs = paired_landmarks(*landmarks)
+        ours, theirs, known = _paired(*landmarks)
+        findings += known
         forth, back = ThinPlateSpline(ours, theirs), ThinPlateSpline(theirs, ours)
     names = landmarks[0] if landmarks is not None else None
     has_names = isinstance(names, Mapping) and all(n in names for n in SKIN_LANDMARKS)
@@ -330,36 +336,36 @@ def compare_skins(
     )
 
 
-def paired_landmarks(ours: Landmarks, theirs: Landmarks) -> tuple[Floats, Floats]:
-    """Landmarks of two skins in one order: by name, or as they stand."""
-    if isinstance(ours, Mapping) != isinstance(theirs, Mapping):
+def _paired(ours: Landmarks, theirs: Landmarks) -> tuple[Floats, Floats, tuple[Finding, ...]]:
+    """Landmarks of two skins in one order, by name or as they stand, and what to know of them."""
+    if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
+        try:
+            # Those that both have are enough; the others are findings.
+            match = match_landmarks(ours, theirs, required=())
+        except LandmarkError as error:
+            raise LandmarkInputError(
+                f"landmarks of the predicted skin (source) and the post-operative one (target): "
+                f"{error}"
+            ) from error
+        return match.source, match.target, match.findings
+    if isinstance(ours, Mapping) or isinstance(theirs, Mapping):
         raise LandmarkInputError(
             "one set of landmarks has names and the other has not: give two mappings, or two arrays"
         )
-    if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
-        names = [name for name in ours if name in theirs]
-        if len(names) < 4:
-            raise LandmarkInputError(
-                f"the sets share {len(names)} names ({', '.join(names) or 'none'}), and four are "
-                f"needed; one has {', '.join(ours)}, the other {', '.join(theirs)}"
-            )
-        pair = [np.array([as_floats(f"landmark {n}", s[n]) for n in names]) for s in (ours, theirs)]
-    else:
-        pair = [as_floats("landmarks", s) for s in (ours, theirs)]  # type: ignore[arg-type]
-    first, second = (as_rows("landmarks", p, 3) for p in pair)
+    first, second = (as_rows("landmarks", given, 3) for given in (ours, theirs))
     if len(first) != len(second):
         raise LandmarkInputError(
             f"there are {len(first)} landmarks of one skin and {len(second)} of the other: as many "
             "are needed, in the same order"
         )
-    return first, second
+    return first, second, ()
 
 
 def _chosen_regions(
     regions: Mapping[str, ArrayLike] | None, skin: Skin, names: Landmarks | None
 ) -> dict[str, NDArray[np.bool_]]:
     if regions is not None:
-        return {n: as_choice(f"region {n!r}", v, len(skin.vertices)) for n, v in regions.items()}
+        return {n: _as_choice(f"region {n!r}", v, len(skin.vertices)) for n, v in regions.items()}
     return skin_regions(skin.vertices, names) if isinstance(names, Mapping) else {}
 
 
@@ -375,10 +381,10 @@ def _chosen_vertices(
         return parts[mask]
     if mask is None:
         return np.ones(len(skin.vertices), dtype=bool)
-    return as_choice("mask", mask, len(skin.vertices))
+    return _as_choice("mask", mask, len(skin.vertices))
 
 
-def as_choice(name: str, value: ArrayLike, count: int) -> NDArray[np.bool_]:
+def _as_choice(name: str, value: ArrayLike, count: int) -> NDArray[np.bool_]:
     """Chosen vertices as (count,) bool, from bools or indices; at least one."""
     given = np.asarray(value)
     if given.dtype.kind == "b":
