@@ -124,6 +124,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "template": "case checks errors io musculature registration scene _core",
         "phantom": "case checks errors scene",
         "planning": "errors",
+        "achieved": "case checks errors planning registration scene _core",
         "osteotomy": "case checks errors planning scene _core",
         "node_kinds": "case checks errors scene _core",
         "simulation": "scene errors _core",
@@ -149,8 +150,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "simulation study"
         ),
         "__init__": (
-            "_core build case doctor equivalent errors evaluation imaging io meshing model "
-            "musculature node_kinds osteotomy patient phantom planning registration scene "
+            "_core achieved build case doctor equivalent errors evaluation imaging io meshing "
+            "model musculature node_kinds osteotomy patient phantom planning registration scene "
             "simulation study surface_checks surface_repair template"
         ),
     }.items()

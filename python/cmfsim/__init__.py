@@ -25,6 +25,13 @@ from cmfsim._core import (
     __version__,
     rigid_fit,
 )
+from cmfsim.achieved import (
+    AchievedMotion,
+    AchievedPlan,
+    MatchOptions,
+    achieved_plan,
+    measure_motion,
+)
 from cmfsim.build import build_case, build_model, write_phantom_case
 from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.doctor import diagnose
@@ -145,6 +152,8 @@ __all__ = [
     "LAWS",
     "METHODS",
     "PRESETS",
+    "AchievedMotion",
+    "AchievedPlan",
     "AlignmentOptions",
     "Anatomy",
     "BoneSegment",
@@ -172,6 +181,7 @@ __all__ = [
     "LandmarkError",
     "LandmarkMatch",
     "MassTensors",
+    "MatchOptions",
     "MaterialError",
     "MeshError",
     "MeshOptions",
@@ -215,6 +225,7 @@ __all__ = [
     "TissueRegion",
     "VolumeAlignment",
     "__version__",
+    "achieved_plan",
     "anatomy_from_surfaces",
     "build_case",
     "build_model",
@@ -234,6 +245,7 @@ __all__ = [
     "leave_one_out",
     "make_head",
     "match_landmarks",
+    "measure_motion",
     "mesh_from_labels",
     "mesh_from_level",
     "mesh_report",

@@ -18,6 +18,8 @@ MODULES = sorted(
 )
 # Values that only stages make: their attributes are described, an example would say nothing.
 MADE_BY_STAGES = {
+    "AchievedMotion",
+    "AchievedPlan",
     "Anatomy",
     "BoneSegment",
     "DistanceStatistics",
