@@ -143,17 +143,17 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "template": "case checks errors io musculature registration scene _core",
         "phantom": "case checks errors scene",
         "planning": "errors",
+        "achieved": "case checks errors planning registration scene _core",
         "osteotomy": "case checks errors planning scene _core",
         "node_kinds": "case checks errors scene _core",
         "simulation": "scene errors _core",
-        "evaluation": "case checks errors scene _core",
+        "evaluation": "case checks errors registration scene topology _core",
         "build": (
             "case checks doctor errors imaging io meshing model node_kinds osteotomy patient "
             "phantom pictures scene surface_repair _core"
         ),
         "study": "build case errors template simulation evaluation scene",
-        "pictures": "case checks errors scene",
-        "muscle_pictures": "checks errors musculature pictures scene _core",
+        "pictures": "case checks errors musculature scene _core",
         "report": "case errors scene",
         "topology": "",
         "crossings": "checks",
@@ -169,8 +169,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "simulation study"
         ),
         "__init__": (
-            "_core build case doctor equivalent errors evaluation imaging io meshing model "
-            "musculature node_kinds osteotomy patient phantom planning registration scene "
+            "_core achieved build case doctor equivalent errors evaluation imaging io meshing "
+            "model musculature node_kinds osteotomy patient phantom planning registration scene "
             "simulation study surface_checks surface_repair template"
         ),
     }.items()

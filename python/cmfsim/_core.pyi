@@ -39,7 +39,6 @@ __all__ = [
     "icp",
     "part_mesh",
     "rigid_fit",
-@final
     "sample_muscles",
     "signed_distance_image",
     "stuff_image",
@@ -387,6 +386,7 @@ def icp(
     keep_border: bool,
     normals: ArrayLike | None,
 ) -> IcpFit: ...
+
 @final
 class MuscleShares:
     @property

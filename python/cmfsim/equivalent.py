@@ -290,7 +290,9 @@ def _named(
     return named
 
 
-def _ready(name: str, muscle: MuscleSurface | SurfaceData | Surface) -> tuple[Surface, MuscleFibres]:
+def _ready(
+    name: str, muscle: MuscleSurface | SurfaceData | Surface
+) -> tuple[Surface, MuscleFibres]:
     """The surface and the fibres of a muscle, ready for the core."""
     try:
         if isinstance(muscle, MuscleSurface):

@@ -18,20 +18,29 @@ MODULES = sorted(
 )
 # Values that only stages make: their attributes are described, an example would say nothing.
 MADE_BY_STAGES = {
+    "AchievedMotion",
+    "AchievedPlan",
     "Anatomy",
     "BoneSegment",
+    "DistanceStatistics",
+    "ErrorTable",
     "Finding",
+    "Improvement",
     "FoldReport",
     "Folds",
     "IcpFit",
     "LandmarkAgreement",
     "LandmarkMatch",
     "MeshReport",
+    "ModelComparison",
     "NodeKinds",
+    "PairedTest",
     "RigidFit",
     "RigidMotion",
     "SceneResult",
+    "SkinComparison",
     "TissueMesh",
+    "VolumeAlignment",
 }
 
 

@@ -9,7 +9,7 @@ from cmfsim._core import MuscleFibres, Surface
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.musculature import MuscleSurface, Musculature
-from cmfsim.pictures import SIZE, View, bounds, draw, polydata
+from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
 from cmfsim.scene import SurfaceData
 
 __all__ = ["picture_muscles"]
@@ -53,8 +53,8 @@ def picture_muscles(
 
     Examples
     --------
-    >>> import cmfsim.muscle_pictures
-    >>> cmfsim.muscle_pictures.picture_muscles("muscles.png", muscles)  # doctest: +SKIP
+    >>> import cmfsim.pictures
+    >>> cmfsim.pictures.picture_muscles("muscles.png", muscles)  # doctest: +SKIP
     """
     if not len(musculature):
         raise CaseInputError("there is no muscle to draw")
