@@ -17,6 +17,7 @@ from cmfsim._core import (
     Surface,
     SurfaceMotion,
     TetMesh,
+    ThinPlateSpline,
     Tissue,
     __version__,
 )
@@ -159,6 +160,7 @@ __all__ = [
     "SurfaceMotion",
     "SurfaceReport",
     "TetMesh",
+    "ThinPlateSpline",
     "Tissue",
     "TissueData",
     "TissueMesh",

@@ -287,6 +287,48 @@ pub enum MtmError {
         /// What to try.
         advice: &'static str,
     },
+    /// Fewer points than a registration needs.
+    #[error("{what} needs {needed} {shape} at least, and there are {found}")]
+    TooFewPoints {
+        /// What needs them.
+        what: &'static str,
+        /// How many there are.
+        found: usize,
+        /// How many are needed.
+        needed: usize,
+        /// What they must be, in words.
+        shape: &'static str,
+    },
+    /// Two points of a registration are one.
+    #[error(
+        "{what} {first} and {second} coincide: {distance:.3e} mm apart; remove one of them or place it again"
+    )]
+    CoincidentPoints {
+        /// The points.
+        what: &'static str,
+        /// First of the pair.
+        first: usize,
+        /// Second of the pair.
+        second: usize,
+        /// Their distance, mm.
+        distance: f64,
+    },
+    /// The points of a registration do not span the space that it needs.
+    #[error(
+        "{what} lie in one {shape}: {thickness:.3e} mm across for an extent of {size:.3e} mm, where more than {limit:.0e} of it is needed; add a point away from it"
+    )]
+    FlatPoints {
+        /// The points.
+        what: &'static str,
+        /// "plane" or "line".
+        shape: &'static str,
+        /// Their extent across it, mm.
+        thickness: f64,
+        /// Their longest extent, mm.
+        size: f64,
+        /// Allowed ratio of both.
+        limit: f64,
+    },
     /// The caller asked to stop.
     #[error("interrupted by the caller")]
     Interrupted,
@@ -318,6 +360,8 @@ pub enum ErrorKind {
     Contact,
     /// Solver options and outcomes.
     Solver,
+    /// Landmarks and points that are to be brought together.
+    Registration,
     /// The caller asked to stop.
     Interrupted,
 }
@@ -349,6 +393,9 @@ impl MtmError {
             Self::NotPositiveDefinite { .. }
             | Self::NotConverged { .. }
             | Self::OutOfMemory { .. } => ErrorKind::Solver,
+            Self::TooFewPoints { .. } | Self::CoincidentPoints { .. } | Self::FlatPoints { .. } => {
+                ErrorKind::Registration
+            }
             Self::Interrupted => ErrorKind::Interrupted,
         }
     }

@@ -76,6 +76,7 @@ fn raise(kind: ErrorKind, is_input: bool, message: String) -> PyErr {
         ErrorKind::Boundary => 3,
         ErrorKind::Contact => 4,
         ErrorKind::Solver => 5,
+        ErrorKind::Registration => 6,
         _ => 0,
     };
     Python::attach(|py| match family(py) {

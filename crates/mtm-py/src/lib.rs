@@ -5,6 +5,7 @@ mod errors;
 mod geometry;
 mod materials;
 mod model;
+mod registration;
 mod running;
 mod stuffing;
 
@@ -22,6 +23,8 @@ mod _core {
     use crate::materials::{PyMassTensors, PyTissue};
     #[pymodule_export]
     use crate::model::{PyBoundary, PyPlanOperator, PySolution, PyStaticSolver};
+    #[pymodule_export]
+    use crate::registration::{PyFolds, PyThinPlateSpline};
 
     #[pymodule_export]
     use crate::stuffing::{distance_image, part_mesh, signed_distance_image, stuff_image};

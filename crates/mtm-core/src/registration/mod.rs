@@ -1,0 +1,3 @@
+//! Registration: maps that bring landmarks or points to others.
+
+pub mod thin_plate;
