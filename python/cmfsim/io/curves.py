@@ -36,7 +36,7 @@ def read_curves(path: str | os.PathLike[str]) -> tuple[Floats, ...]:
     FileNotFoundError
         The file does not exist.
     LandmarkError
-        (also `ValueError`) Not such a file, another markup, a curve of one point, points not placed.
+        (also `ValueError`) Not such a file, another markup, a curve of one point.
     """
     path = Path(path)
     text = markup_text(path)
