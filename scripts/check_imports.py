@@ -109,13 +109,18 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "case": "checks errors scene",
         "patient": "checks errors",
         "model": "case checks scene",
-        "io": "case checks errors model patient planning scene",
+        "io": "case checks errors model musculature patient planning scene template_data",
         "imaging": "case checks errors scene _core",
         "meshing": "case checks errors scene _core",
         "musculature": "case checks errors scene",
         "registration": "case checks errors scene _core",
         "equivalent": "case checks errors musculature scene _core",
-        "template": "case checks errors io musculature registration scene _core",
+        "landmark_sites": "",
+        "template_data": "case checks errors musculature scene",
+        "template": (
+            "case checks errors io landmark_sites musculature phantom registration scene "
+            "surface_checks surface_repair template_data _core"
+        ),
         "phantom": "case checks errors scene",
         "planning": "errors",
         "osteotomy": "case checks errors planning scene _core",
@@ -127,7 +132,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "phantom pictures scene surface_repair _core"
         ),
         "study": "build case errors template simulation evaluation scene",
-        "pictures": "case checks errors scene",
+        "pictures": "case checks errors musculature scene",
         "report": "case errors scene",
         "topology": "",
         "crossings": "checks",
@@ -139,13 +144,13 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "_core"
         ),
         "cli": (
-            "cmfsim build case checks doctor errors io meshing phantom pictures report scene "
-            "simulation study"
+            "cmfsim build case checks doctor errors io meshing musculature phantom pictures report "
+            "scene simulation study template"
         ),
         "__init__": (
-            "_core build case doctor equivalent errors evaluation imaging io meshing model "
-            "musculature node_kinds osteotomy patient phantom planning registration scene "
-            "simulation study surface_checks surface_repair template"
+            "_core build case doctor equivalent errors evaluation imaging io landmark_sites "
+            "meshing model musculature node_kinds osteotomy patient phantom planning registration "
+            "scene simulation study surface_checks surface_repair template"
         ),
     }.items()
 }
