@@ -1,4 +1,4 @@
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeAlias, final
 
 import numpy as np
@@ -20,6 +20,7 @@ __all__ = [
     "MaterialError",
     "MeshError",
     "MeshQuality",
+    "MuscleFibres",
     "PlanOperator",
     "RegistrationError",
     "Solution",
@@ -107,6 +108,29 @@ class Surface:
     def winding_number(self, points: ArrayLike) -> _Floats: ...
     def moved(self, vertices: ArrayLike) -> Surface: ...
     def transformed(self, matrix: ArrayLike) -> Surface: ...
+
+@final
+class MuscleFibres:
+    def __new__(
+        cls,
+        surface: Surface,
+        kind: str = "strap",
+        boxes: int | None = None,
+        course: Sequence[ArrayLike] = ...,
+    ) -> MuscleFibres: ...
+    def directions(self, points: ArrayLike) -> _Floats: ...
+    @property
+    def boxes(self) -> tuple[_Floats, _Floats, _Floats]: ...
+    @property
+    def course(self) -> list[_Floats]: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def extents(self) -> _Floats: ...
+    @property
+    def sheet_ratio(self) -> float: ...
+    @property
+    def is_sheet(self) -> bool: ...
 
 @final
 class SurfaceMotion:

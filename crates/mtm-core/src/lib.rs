@@ -87,7 +87,7 @@ pub mod winding;
 pub use boundary::{Boundary, Conflicts, Gap, Motion, NodeKind, Plan, Segment};
 pub use contact::{ContactMode, ContactOptions};
 pub use error::{ErrorKind, MtmError, Result};
-pub use fibre::MuscleFibres;
+pub use fibre::{MuscleFibres, MuscleKind, OrientedBox};
 pub use material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
 pub use mesh::{MeshQuality, TetMesh};
 pub use method::{Interrupt, Method, StaticOptions};

@@ -2,6 +2,7 @@
 
 mod arrays;
 mod errors;
+mod fibres;
 mod geometry;
 mod materials;
 mod model;
@@ -17,6 +18,8 @@ static MEMORY: mtm_core::memory::HugePages = mtm_core::memory::HugePages;
 mod _core {
     use pyo3::prelude::*;
 
+    #[pymodule_export]
+    use crate::fibres::PyMuscleFibres;
     #[pymodule_export]
     use crate::geometry::{PyMeshQuality, PySurface, PySurfaceMotion, PyTetMesh};
     #[pymodule_export]
