@@ -136,7 +136,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "phantom pictures scene surface_repair _core"
         ),
         "study": "build case errors template simulation evaluation scene",
-        "pictures": "case checks errors musculature scene",
+        "pictures": "case checks errors scene",
+        "muscle_pictures": "checks errors musculature pictures scene _core",
         "report": "case errors scene",
         "topology": "",
         "crossings": "checks",

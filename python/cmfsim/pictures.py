@@ -27,7 +27,15 @@ from cmfsim.checks import Floats, as_index_rows, as_positive, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.scene import SurfaceData
 
-__all__ = ["picture_anatomy", "picture_node_kinds", "picture_segments"]
+__all__ = [
+    "View",
+    "bounds",
+    "draw",
+    "picture_anatomy",
+    "picture_node_kinds",
+    "picture_segments",
+    "polydata",
+]
 
 SIZE = (1600, 900)
 SKIN_COLOUR = "#e3b7a0"
@@ -109,15 +117,15 @@ def picture_segments(
     if not segments:
         raise CaseInputError("there is no segment to draw")
     colours = _colours([s.name for s in segments])
-    corners = _bounds([np.asarray(s.surface.vertices) for s in segments])
+    corners = bounds([np.asarray(s.surface.vertices) for s in segments])
 
-    def paint(plotter: Any, view: _View) -> None:
+    def paint(plotter: Any, view: View) -> None:
         del view
         for segment in segments:
             _add_bone(plotter, segment, colours[segment.name])
 
-    views = tuple(_View(name, name) for name in ("front", "left front", "left"))
-    _draw(path, views, corners, size, paint, list(colours.items()))
+    views = tuple(View(name, name) for name in ("front", "left front", "left"))
+    draw(path, views, corners, size, paint, list(colours.items()))
 
 
 def picture_anatomy(
@@ -148,17 +156,17 @@ def picture_anatomy(
     >>> cmfsim.pictures.picture_anatomy("anatomy.png", skin, segments)  # doctest: +SKIP
     """
     colours = _colours([s.name for s in segments])
-    corners = _bounds([np.asarray(skin.vertices), *(s.surface.vertices for s in segments)])
+    corners = bounds([np.asarray(skin.vertices), *(s.surface.vertices for s in segments)])
 
-    def paint(plotter: Any, view: _View) -> None:
+    def paint(plotter: Any, view: View) -> None:
         del view
         for segment in segments:
             _add_bone(plotter, segment, colours[segment.name])
-        shape = _polydata(skin.vertices, skin.triangles)
+        shape = polydata(skin.vertices, skin.triangles)
         plotter.add_mesh(shape, color=SKIN_COLOUR, opacity=0.35, smooth_shading=True)
 
-    views = tuple(_View(name, name) for name in ("right", "front", "left"))
-    _draw(path, views, corners, size, paint, [("skin", SKIN_COLOUR), *colours.items()])
+    views = tuple(View(name, name) for name in ("right", "front", "left"))
+    draw(path, views, corners, size, paint, [("skin", SKIN_COLOUR), *colours.items()])
 
 
 def picture_node_kinds(
@@ -203,7 +211,7 @@ def picture_node_kinds(
     if not len(triangles):
         raise CaseInputError("the mesh has no boundary triangles to draw")
     held = (kinds.kind[triangles] > 0).any(axis=1)
-    corners = _bounds([points[np.unique(triangles)]])
+    corners = bounds([points[np.unique(triangles)]])
     # What closes the mesh behind would hide all else from there: the rearmost cut is left out.
     edge = points[triangles[:, 0]] - points[triangles[:, 1]]
     rear = corners[1, 1] - 0.5 * float(np.median(np.linalg.norm(edge, axis=1)))
@@ -213,7 +221,7 @@ def picture_node_kinds(
         for name in ("fixed", "joined", "sliding", "free")
     ]
 
-    def paint(plotter: Any, view: _View) -> None:
+    def paint(plotter: Any, view: View) -> None:
         shown = triangles
         if view.bare:
             shown = triangles[held & ~closing]
@@ -222,19 +230,19 @@ def picture_node_kinds(
             if len(corner):
                 count = np.arange(3 * len(corner)).reshape(-1, 3)
                 plotter.add_mesh(
-                    _polydata(corner.reshape(-1, 3), count),
+                    polydata(corner.reshape(-1, 3), count),
                     color=KIND_COLOURS[name],
                     ambient=0.25,
                     specular=0.0,
                 )
 
     views = (
-        _View("left front", "whole boundary"),
-        _View("left", "left, without the free part", bare=True),
-        _View("front", "front, without the free part", bare=True),
-        _View("behind", "from behind, without the free part", bare=True),
+        View("left front", "whole boundary"),
+        View("left", "left, without the free part", bare=True),
+        View("front", "front, without the free part", bare=True),
+        View("behind", "from behind, without the free part", bare=True),
     )
-    _draw(path, views, corners, size, paint, entries)
+    draw(path, views, corners, size, paint, entries)
 
 
 def _corners_of_kind(
@@ -253,7 +261,7 @@ def _corners_of_kind(
 
 
 @dataclass(frozen=True)
-class _View:
+class View:
     """One of the views side by side: where the camera stands, and what is written below."""
 
     direction: str
@@ -261,12 +269,12 @@ class _View:
     bare: bool = False
 
 
-def _draw(
+def draw(
     path: str | os.PathLike[str],
-    views: Sequence[_View],
+    views: Sequence[View],
     corners: Floats,
     size: tuple[int, int],
-    paint: Callable[[Any, _View], None],
+    paint: Callable[[Any, View], None],
     legend: Sequence[tuple[str, str]],
 ) -> None:
     """Writes the views side by side, under a temporary name first."""
@@ -330,7 +338,7 @@ def _toward(direction: str) -> Floats:
     return unit
 
 
-def _half_height(view: _View, corners: Floats, width: float, height: float) -> float:
+def _half_height(view: View, corners: Floats, width: float, height: float) -> float:
     """Half the height, in mm, that a view needs to show the whole box."""
     toward = _toward(view.direction)
     across = np.cross(toward, (0.0, 0.0, 1.0))
@@ -341,7 +349,7 @@ def _half_height(view: _View, corners: Floats, width: float, height: float) -> f
     return MARGIN * float(max(upright, np.abs(box @ across).max() * height / width))
 
 
-def _place_camera(plotter: Any, view: _View, corners: Floats, half_height: float) -> None:
+def _place_camera(plotter: Any, view: View, corners: Floats, half_height: float) -> None:
     """Looks at the middle of the box in parallel projection."""
     middle = corners.mean(axis=0)
     distance = 4.0 * float(np.linalg.norm(corners[1] - corners[0]))
@@ -357,7 +365,7 @@ def _place_camera(plotter: Any, view: _View, corners: Floats, half_height: float
 
 def _add_bone(plotter: Any, segment: BoneSegment, colour: str) -> None:
     plotter.add_mesh(
-        _polydata(segment.surface.vertices, segment.surface.triangles),
+        polydata(segment.surface.vertices, segment.surface.triangles),
         color=colour,
         smooth_shading=True,
         split_sharp_edges=True,
@@ -390,7 +398,7 @@ def _colours(names: Sequence[str]) -> dict[str, str]:
     return {n: SEGMENT_COLOURS[n] if n in SEGMENT_COLOURS else next(others) for n in names}
 
 
-def _bounds(clouds: Sequence[ArrayLike]) -> Floats:
+def bounds(clouds: Sequence[ArrayLike]) -> Floats:
     """Lowest and highest corner of all points, (2, 3)."""
     arrays = [np.asarray(c, dtype=np.float64) for c in clouds]
     return np.array(
@@ -401,7 +409,8 @@ def _bounds(clouds: Sequence[ArrayLike]) -> Floats:
     )
 
 
-def _polydata(vertices: ArrayLike, triangles: ArrayLike) -> Any:
+def polydata(vertices: ArrayLike, triangles: ArrayLike) -> Any:
+    """A surface as PyVista has it."""
     return _pyvista().PolyData.from_regular_faces(
         np.asarray(vertices, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
     )

@@ -1,0 +1,113 @@
+"""Pictures of muscles with their fibre boxes and directions, after Kim et al. (2010), Figure 2."""
+
+import os
+from typing import Any
+
+import numpy as np
+
+from cmfsim._core import MuscleFibres, Surface
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError
+from cmfsim.musculature import MuscleSurface, Musculature
+from cmfsim.pictures import SIZE, View, bounds, draw, polydata
+from cmfsim.scene import SurfaceData
+
+__all__ = ["picture_muscles"]
+
+MUSCLE_COLOUR, BONE_COLOUR = "#b8564b", "#e6dcc3"
+# Boxes whose direction the outline hardly tells are drawn in the second colour.
+BOX_COLOUR, SHEET_COLOUR, LINE_COLOUR = "#1f5fbf", "#e08a00", "#202020"
+# Length of a direction on the surface, as a share of the picture's diagonal.
+STROKE = 0.012
+# About as many directions are drawn on each muscle.
+STROKES = 60
+
+
+def picture_muscles(
+    path: str | os.PathLike[str],
+    musculature: Musculature,
+    skull: SurfaceData | None = None,
+    *,
+    size: tuple[int, int] = SIZE,
+) -> None:
+    """Writes a picture of muscles with boxes and fibre directions: front, left front and left.
+
+    Boxes of muscles whose outline hardly tells the direction are orange, others blue. Where fibre
+    lines are known the directions follow them.
+
+    Parameters
+    ----------
+    path : path
+        Ends in `.png`.
+    musculature : Musculature
+    skull : SurfaceData or None
+        Drawn behind the muscles.
+    size : (int, int), pixels
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) PyVista or OpenGL is missing, no muscle, another ending.
+    MeshError
+        (also `ValueError`) A muscle's surface that cannot be used.
+
+    Examples
+    --------
+    >>> import cmfsim.muscle_pictures
+    >>> cmfsim.muscle_pictures.picture_muscles("muscles.png", muscles)  # doctest: +SKIP
+    """
+    if not len(musculature):
+        raise CaseInputError("there is no muscle to draw")
+    clouds = [np.asarray(muscle.surface.vertices) for muscle in musculature]
+    if skull is not None:
+        clouds.append(np.asarray(skull.vertices))
+    corners = bounds(clouds)
+    length = STROKE * float(np.linalg.norm(corners[1] - corners[0]))
+    drawn = [(muscle, *_lines(muscle, length)) for muscle in musculature]
+
+    def paint(plotter: Any, view: View) -> None:
+        del view
+        if skull is not None:
+            plotter.add_mesh(polydata(skull.vertices, skull.triangles), color=BONE_COLOUR)
+        for muscle, strokes, edges, colour in drawn:
+            surface = polydata(muscle.surface.vertices, muscle.surface.triangles)
+            plotter.add_mesh(surface, color=MUSCLE_COLOUR, smooth_shading=True, ambient=0.2)
+            plotter.add_lines(strokes, color=LINE_COLOUR, width=2)
+            plotter.add_lines(edges, color=colour, width=1)
+
+    views = tuple(View(name, name) for name in ("front", "left front", "left"))
+    legend = [
+        ("muscle", MUSCLE_COLOUR),
+        ("fibre direction", LINE_COLOUR),
+        ("box", BOX_COLOUR),
+        ("box of a sheet", SHEET_COLOUR),
+    ]
+    draw(path, views, corners, size, paint, legend)
+
+
+def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:
+    """Fibre strokes and box edges as pairs of points, and the colour of the boxes."""
+    vertices, triangles = muscle.surface.vertices, muscle.surface.triangles
+    surface = Surface(vertices, triangles)
+    fibres = MuscleFibres(surface, muscle.kind, muscle.boxes, muscle.course)
+    every = max(1, len(triangles) // STROKES)
+    corners = np.asarray(vertices)[np.asarray(triangles)[::every]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    # Just above the surface, so that they show.
+    middle = corners.mean(axis=1) + 0.15 * length * normals
+    half = 0.5 * length * fibres.directions(middle)
+    strokes = np.stack([middle - half, middle + half], axis=1).reshape(-1, 3)
+    centres, axes, half_extents = fibres.boxes
+    edges = []
+    for centre, frame, extent in zip(centres, axes, half_extents, strict=True):
+        for axis in range(3):
+            others = [k for k in range(3) if k != axis]
+            for a in (-1.0, 1.0):
+                for b in (-1.0, 1.0):
+                    at = centre + a * extent[others[0]] * frame[others[0]]
+                    at = at + b * extent[others[1]] * frame[others[1]]
+                    along = extent[axis] * frame[axis]
+                    edges += [at - along, at + along]
+    colour = SHEET_COLOUR if fibres.is_sheet else BOX_COLOUR
+    return strokes, np.array(edges), colour
