@@ -42,7 +42,13 @@ CORE: Mapping[str, frozenset[str]] = {
         "equivalent": "fibre mesh surface winding material",
         "tensors": "blocks mesh material",
         "motion": "surface mesh triangle",
-        "registration/thin_plate": "triangle",
+        "registration/spread": "triangle",
+        "registration/thin_plate": "registration/spread triangle",
+        "registration/rigid": "registration/spread triangle",
+        "registration/nearest": "registration/spread",
+        "registration/icp": (
+            "motion registration/nearest registration/rigid registration/spread surface triangle"
+        ),
         "registration": "",
         "boundary": "surface motion mesh",
         "restraint": "mesh",
@@ -145,8 +151,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "surface_checks": "checks crossings scene topology",
         "surface_repair": "capping case checks errors scene surface_checks topology _core",
         "doctor": (
-            "case checks errors io osteotomy patient planning scene surface_checks surface_repair "
-            "_core"
+            "case checks errors io osteotomy patient planning registration scene surface_checks "
+            "surface_repair _core"
         ),
         "cli": (
             "cmfsim build case checks doctor errors io meshing musculature phantom pictures report "

@@ -9,10 +9,13 @@ from cmfsim._core import (
     METHODS,
     PRESETS,
     Boundary,
+    Folds,
+    IcpFit,
     MassTensors,
     MeshQuality,
     MuscleFibres,
     PlanOperator,
+    RigidFit,
     Solution,
     StaticSolver,
     Surface,
@@ -21,6 +24,7 @@ from cmfsim._core import (
     ThinPlateSpline,
     Tissue,
     __version__,
+    rigid_fit,
 )
 from cmfsim.build import build_case, build_model, write_phantom_case
 from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
@@ -94,6 +98,15 @@ from cmfsim.osteotomy import (
 )
 from cmfsim.phantom import HeadParameters, Muscle, PhantomHead, make_head
 from cmfsim.planning import RigidMotion, decompose_motion, rigid_motion
+from cmfsim.registration import (
+    FoldReport,
+    LandmarkAgreement,
+    LandmarkMatch,
+    fold_report,
+    icp,
+    leave_one_out,
+    match_landmarks,
+)
 from cmfsim.scene import (
     MovedSurface,
     Scene,
@@ -123,11 +136,16 @@ __all__ = [
     "CutBones",
     "CuttingPlane",
     "Finding",
+    "FoldReport",
+    "Folds",
     "HeadParameters",
+    "IcpFit",
     "ImageData",
     "ImageError",
     "KindOptions",
+    "LandmarkAgreement",
     "LandmarkError",
+    "LandmarkMatch",
     "MassTensors",
     "MaterialError",
     "MeshError",
@@ -146,6 +164,7 @@ __all__ = [
     "Procedure",
     "RegistrationError",
     "RepairOptions",
+    "RigidFit",
     "RigidMotion",
     "Scene",
     "SceneResult",
@@ -177,8 +196,12 @@ __all__ = [
     "cut_bones",
     "decompose_motion",
     "diagnose",
+    "fold_report",
     "free_cut",
+    "icp",
+    "leave_one_out",
     "make_head",
+    "match_landmarks",
     "mesh_from_labels",
     "mesh_from_level",
     "mesh_report",
@@ -196,6 +219,7 @@ __all__ = [
     "read_tet_mesh",
     "read_transform",
     "repair_surface",
+    "rigid_fit",
     "rigid_motion",
     "scene_plan",
     "scene_solver",

@@ -14,6 +14,7 @@ __all__ = [
     "CmfsimError",
     "ContactError",
     "Folds",
+    "IcpFit",
     "ImageError",
     "LandmarkError",
     "MassTensors",
@@ -23,6 +24,7 @@ __all__ = [
     "MuscleFibres",
     "PlanOperator",
     "RegistrationError",
+    "RigidFit",
     "Solution",
     "SolverError",
     "StaticSolver",
@@ -33,7 +35,9 @@ __all__ = [
     "Tissue",
     "__version__",
     "distance_image",
+    "icp",
     "part_mesh",
+    "rigid_fit",
     "signed_distance_image",
     "stuff_image",
 ]
@@ -96,6 +100,8 @@ class Surface:
     def vertices(self) -> _Floats: ...
     @property
     def triangles(self) -> _Indices: ...
+    @property
+    def vertex_normals(self) -> _Floats: ...
     @property
     def is_closed(self) -> bool: ...
     @property
@@ -327,6 +333,57 @@ class Folds:
     @property
     def smallest(self) -> float | None: ...
 
+@final
+class RigidFit:
+    @property
+    def matrix(self) -> _Floats: ...
+    @property
+    def scale(self) -> float: ...
+    @property
+    def residuals(self) -> _Floats: ...
+    @property
+    def rms(self) -> float: ...
+
+@final
+class IcpFit:
+    @property
+    def matrix(self) -> _Floats: ...
+    @property
+    def rms(self) -> float: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def converged(self) -> bool: ...
+    @property
+    def kept(self) -> NDArray[np.bool_]: ...
+    @property
+    def kept_fraction(self) -> float: ...
+    @property
+    def distances(self) -> _Floats: ...
+    @property
+    def rms_history(self) -> _Floats: ...
+
+def rigid_fit(
+    moving: ArrayLike,
+    fixed: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    scale: bool = False,
+) -> RigidFit: ...
+def icp(
+    moving: ArrayLike,
+    fixed: Surface | ArrayLike,
+    *,
+    initial: ArrayLike | None,
+    trim: float,
+    method: str | None,
+    max_iterations: int,
+    tolerance: float,
+    max_distance: float | None,
+    max_angle: float | None,
+    keep_border: bool,
+    normals: ArrayLike | None,
+) -> IcpFit: ...
 def stuff_image(
     values: ArrayLike,
     spacing: tuple[float, float, float],

@@ -329,6 +329,36 @@ pub enum MtmError {
         /// Allowed ratio of both.
         limit: f64,
     },
+    /// The points of a registration leave its motion open.
+    #[error("{what} is not determined: {reason}")]
+    NotDetermined {
+        /// What is sought.
+        what: &'static str,
+        /// Why, and what to do.
+        reason: String,
+    },
+    /// A matrix that a registration begins with is no rigid motion.
+    #[error("{what}: {problem}")]
+    NotRigid {
+        /// The matrix.
+        what: &'static str,
+        /// What is wrong with it, and the mend.
+        problem: String,
+    },
+    /// Iterative closest points were still moving at the last step.
+    #[error(
+        "icp did not converge: in step {iterations} the points still moved by {motion:.3e} mm where {tolerance:.3e} mm counts as rest, rms distance {:.4e} mm after {:.4e} mm at first; begin nearer (initial), leave out pairs that have no partner (trim, max_distance), or allow more steps", .history.last().copied().unwrap_or(f64::NAN), .history.first().copied().unwrap_or(f64::NAN)
+    )]
+    IcpNotConverged {
+        /// Steps done.
+        iterations: usize,
+        /// Largest motion of a point in the last step, mm.
+        motion: f64,
+        /// Motion that counts as rest, mm.
+        tolerance: f64,
+        /// Root mean square distance before the first step and after each, mm.
+        history: Vec<f64>,
+    },
     /// The caller asked to stop.
     #[error("interrupted by the caller")]
     Interrupted,
@@ -393,9 +423,12 @@ impl MtmError {
             Self::NotPositiveDefinite { .. }
             | Self::NotConverged { .. }
             | Self::OutOfMemory { .. } => ErrorKind::Solver,
-            Self::TooFewPoints { .. } | Self::CoincidentPoints { .. } | Self::FlatPoints { .. } => {
-                ErrorKind::Registration
-            }
+            Self::TooFewPoints { .. }
+            | Self::CoincidentPoints { .. }
+            | Self::FlatPoints { .. }
+            | Self::NotDetermined { .. }
+            | Self::NotRigid { .. }
+            | Self::IcpNotConverged { .. } => ErrorKind::Registration,
             Self::Interrupted => ErrorKind::Interrupted,
         }
     }
@@ -407,6 +440,7 @@ impl MtmError {
             Self::ContactCycle { .. }
                 | Self::NotPositiveDefinite { .. }
                 | Self::NotConverged { .. }
+                | Self::IcpNotConverged { .. }
                 | Self::OutOfMemory { .. }
                 | Self::Interrupted
         )

@@ -92,6 +92,8 @@ pub use material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
 pub use mesh::{MeshQuality, TetMesh};
 pub use method::{Interrupt, Method, StaticOptions};
 pub use motion::{RigidMotion, SurfaceMotion};
+pub use registration::icp::{IcpFit, IcpOptions};
+pub use registration::rigid::{RigidFit, RigidFitOptions};
 pub use registration::thin_plate::ThinPlateSpline;
 pub use replan::PlanOperator;
 pub use solution::{ContactResult, Solution, Timings};

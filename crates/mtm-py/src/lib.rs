@@ -27,7 +27,7 @@ mod _core {
     #[pymodule_export]
     use crate::model::{PyBoundary, PyPlanOperator, PySolution, PyStaticSolver};
     #[pymodule_export]
-    use crate::registration::{PyFolds, PyThinPlateSpline};
+    use crate::registration::{PyFolds, PyIcpFit, PyRigidFit, PyThinPlateSpline, icp, rigid_fit};
 
     #[pymodule_export]
     use crate::stuffing::{distance_image, part_mesh, signed_distance_image, stuff_image};

@@ -14,7 +14,8 @@ use std::f64::consts::PI;
 use nalgebra::{Cholesky, DMatrix, Dyn, Matrix3};
 use rayon::prelude::*;
 
-use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
+use crate::error::{ErrorKind, MtmError, Result};
+use crate::registration::spread::{check_coordinates, check_not_in_plane, extents};
 use crate::triangle::Vec3;
 
 /// Landmarks that a spline needs: four that are not in one plane fix its affine part.
@@ -22,14 +23,6 @@ pub const LEAST_LANDMARKS: usize = 4;
 
 /// Landmarks that a spline takes at most: its dense system has their number squared, 134 MB.
 pub const MOST_LANDMARKS: usize = 4096;
-
-/// Largest coordinate of a landmark, mm (1 km): its squares and sums stay far from overflow.
-pub const LARGEST_COORDINATE: f64 = 1e6;
-
-/// Thickness of the landmarks over their longest extent below which they count as lying in a plane.
-///
-/// At this limit, 0.015 mm in a head, no operator places points well enough to tell the third direction.
-pub const PLANAR_THICKNESS: f64 = 1e-4;
 
 /// Distance of two landmarks over the longest extent below which they count as one point.
 pub const COINCIDENT_DISTANCE: f64 = 1e-6;
@@ -87,7 +80,7 @@ impl ThinPlateSpline {
     ///
     /// # Errors
     /// [`MtmError::Length`] for sets of different size, [`MtmError::TooFewPoints`] and
-    /// [`MtmError::OutOfRange`] for their number, coordinates beyond [`LARGEST_COORDINATE`] and a
+    /// [`MtmError::OutOfRange`] for their number, coordinates beyond [`LARGEST_COORDINATE`](super::spread::LARGEST_COORDINATE) and a
     /// negative smoothing, [`MtmError::NotFinite`], [`MtmError::CoincidentPoints`] and
     /// [`MtmError::FlatPoints`] for the source.
     pub fn new(source: Vec<[f64; 3]>, target: Vec<[f64; 3]>, smoothing: f64) -> Result<Self> {
@@ -137,7 +130,8 @@ impl ThinPlateSpline {
     /// Parallel; the result depends neither on the number of threads nor on the other points.
     ///
     /// # Errors
-    /// [`MtmError::NotFinite`] and, for a coordinate beyond [`LARGEST_COORDINATE`],
+    /// [`MtmError::NotFinite`] and, for a coordinate beyond
+    /// [`LARGEST_COORDINATE`](super::spread::LARGEST_COORDINATE),
     /// [`MtmError::OutOfRange`] with the row.
     pub fn warp(&self, points: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
         check_coordinates("points", points)?;
@@ -429,51 +423,12 @@ fn check_landmarks(source: &[[f64; 3]], target: &[[f64; 3]], smoothing: f64) -> 
     check_coordinates("target landmarks", target)
 }
 
-fn check_coordinates(what: &str, points: &[[f64; 3]]) -> Result<()> {
-    let kind = ErrorKind::Registration;
-    check_finite_rows(what, points, kind)?;
-    for (index, point) in points.iter().enumerate() {
-        if let Some(&value) = point.iter().find(|x| x.abs() > LARGEST_COORDINATE) {
-            return Err(MtmError::OutOfRange {
-                what: what.to_owned(),
-                index,
-                value,
-                allowed: "-1e6 to 1e6 mm; check the units",
-                kind,
-            });
-        }
-    }
-    Ok(())
-}
-
 /// Refuses points of which two coincide, or that all lie in one plane.
 fn check_spread(about: &[Vec3]) -> Result<()> {
-    let what = "source landmarks";
-    let scatter = about.iter().fold(Matrix3::zeros(), |sum, p| sum + p * p.transpose());
-    let axes = scatter.symmetric_eigen().eigenvectors;
-    let mut extents = [0, 1, 2].map(|k| {
-        let along = |p: &Vec3| p.dot(&axes.column(k));
-        let (low, high) = about
-            .iter()
-            .map(along)
-            .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(x), high.max(x)));
-        high - low
-    });
-    extents.sort_by(f64::total_cmp);
-    let [thickness, width, size] = extents;
+    let [.., size] = extents(about);
     let closest = closest_pair(about);
     if closest.distance <= COINCIDENT_DISTANCE * size {
         return Err(closest.into_error());
     }
-    if thickness <= PLANAR_THICKNESS * size {
-        let in_line = width <= PLANAR_THICKNESS * size;
-        return Err(MtmError::FlatPoints {
-            what,
-            shape: if in_line { "line" } else { "plane" },
-            thickness: if in_line { width } else { thickness },
-            size,
-            limit: PLANAR_THICKNESS,
-        });
-    }
-    Ok(())
+    check_not_in_plane("source landmarks", about)
 }
