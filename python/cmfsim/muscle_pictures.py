@@ -87,11 +87,12 @@ def picture_muscles(
 
 def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:
     """Fibre strokes and box edges as pairs of points, and the colour of the boxes."""
-    vertices, triangles = muscle.surface.vertices, muscle.surface.triangles
+    vertices = np.asarray(muscle.surface.vertices, dtype=np.float64)
+    triangles = np.asarray(muscle.surface.triangles, dtype=np.int64)
     surface = Surface(vertices, triangles)
     fibres = MuscleFibres(surface, muscle.kind, muscle.boxes, muscle.course)
     every = max(1, len(triangles) // STROKES)
-    corners = np.asarray(vertices)[np.asarray(triangles)[::every]]
+    corners = vertices[triangles[::every]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     # Just above the surface, so that they show.
