@@ -155,8 +155,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "surface_repair _core"
         ),
         "cli": (
-            "cmfsim build case checks doctor errors io meshing musculature phantom pictures report "
-            "scene simulation study template"
+            "cmfsim build case checks doctor errors io meshing muscle_pictures musculature phantom "
+            "pictures report scene simulation study template"
         ),
         "__init__": (
             "_core build case doctor equivalent errors evaluation imaging io landmark_sites "

@@ -61,6 +61,7 @@ from cmfsim.io import (
     write_surface,
     write_transform,
 )
+from cmfsim.landmark_sites import SKULL_LANDMARKS
 from cmfsim.meshing import (
     MeshOptions,
     MeshReport,
@@ -119,11 +120,19 @@ from cmfsim.scene import (
 from cmfsim.simulation import scene_plan, scene_solver, solve_scene
 from cmfsim.surface_checks import SurfaceReport, check_surface
 from cmfsim.surface_repair import RepairOptions, repair_surface
+from cmfsim.template import (
+    MorphedMusculature,
+    MuscleTemplate,
+    check_template,
+    import_bodyparts3d,
+    template_names,
+)
 
 __all__ = [
     "LAWS",
     "METHODS",
     "PRESETS",
+    "SKULL_LANDMARKS",
     "Anatomy",
     "BoneSegment",
     "Boundary",
@@ -152,10 +161,12 @@ __all__ = [
     "MeshOptions",
     "MeshQuality",
     "MeshReport",
+    "MorphedMusculature",
     "MovedSurface",
     "Muscle",
     "MuscleFibres",
     "MuscleSurface",
+    "MuscleTemplate",
     "Musculature",
     "NodeKinds",
     "PatientModel",
@@ -191,6 +202,7 @@ __all__ = [
     "build_case",
     "build_model",
     "check_surface",
+    "check_template",
     "classify_nodes",
     "contact_surface",
     "cut_bones",
@@ -199,6 +211,7 @@ __all__ = [
     "fold_report",
     "free_cut",
     "icp",
+    "import_bodyparts3d",
     "leave_one_out",
     "make_head",
     "match_landmarks",
@@ -228,6 +241,7 @@ __all__ = [
     "segments_from_surfaces",
     "signed_level",
     "solve_scene",
+    "template_names",
     "tissue_level",
     "write_image",
     "write_landmarks",

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cmfsim.case import Finding
 from cmfsim.checks import Floats, as_rows, as_text, check_instance
@@ -13,7 +14,7 @@ from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.musculature import MuscleSurface, Musculature
 from cmfsim.scene import SurfaceData
 
-__all__ = ["TemplateData", "is_template_name"]
+__all__ = ["TemplateData", "as_landmarks", "is_template_name"]
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]{0,63}")
 
@@ -25,29 +26,9 @@ def is_template_name(name: object) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class TemplateData:
-    """What a template holds, with its names checked; `MuscleTemplate` is what works with it.
+    """What a template holds, with its names checked.
 
-    Attributes
-    ----------
-    name : str
-    muscles : tuple of MuscleSurface
-    skull : SurfaceData
-        The bones that the muscles lie on, LPS mm.
-    landmarks : mapping of str to (3,) float64, mm
-        On that skull.
-    licence, attribution, source : str
-        Under which terms it may be used, whom to name, where it comes from.
-    definitions : mapping of str to str
-        Where each landmark lies, in words.
-    concepts : mapping of str to tuple of str
-        Names of muscles in an outside vocabulary, such as their FMA ids.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) No muscle, a name twice or one that cannot be a file name, no licence.
-    LandmarkError
-        (also `ValueError`) No landmark, or one that is not three finite numbers.
+    `MuscleTemplate` is what works with it, and describes the attributes.
     """
 
     name: str
@@ -85,7 +66,7 @@ class TemplateData:
                     "which some file systems do not tell apart"
                 )
         object.__setattr__(self, "muscles", muscles)
-        object.__setattr__(self, "landmarks", _points(self.landmarks))
+        object.__setattr__(self, "landmarks", as_landmarks(self.landmarks))
         for name in ("definitions", "concepts"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
         object.__setattr__(self, "findings", tuple(self.findings))
@@ -96,7 +77,8 @@ class TemplateData:
         return Musculature(self.muscles, self.findings)
 
 
-def _points(landmarks: Mapping[str, Floats]) -> Mapping[str, Floats]:
+def as_landmarks(landmarks: Mapping[str, ArrayLike]) -> Mapping[str, Floats]:
+    """Read-only points by name, or an error about what is no point."""
     if not landmarks:
         raise LandmarkInputError("the template has no landmark")
     try:
