@@ -54,7 +54,7 @@ CORE: Mapping[str, frozenset[str]] = {
             "equivalent/sequence equivalent/shape mesh triangle"
         ),
         "equivalent/stiffness": "equivalent/shares material",
-        "equivalent": "fibre mesh surface triangle",
+        "equivalent": "fibre material mesh surface triangle winding",
         "tensors": "blocks mesh material",
         "motion": "surface mesh triangle",
         "registration/spread": "triangle",
@@ -134,13 +134,18 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "case": "checks errors scene",
         "patient": "checks errors",
         "model": "case checks scene",
-        "io": "case checks errors model patient planning scene",
+        "io": "case checks errors model musculature patient planning scene template_data",
         "imaging": "case checks errors scene _core",
         "meshing": "case checks errors scene _core",
         "musculature": "case checks errors scene",
         "registration": "case checks errors scene _core",
         "equivalent": "case checks errors musculature scene _core",
-        "template": "case checks errors io musculature registration scene _core",
+        "landmark_sites": "",
+        "template_data": "case checks errors musculature scene",
+        "template": (
+            "case checks errors io landmark_sites musculature phantom registration scene "
+            "surface_checks surface_repair template_data _core"
+        ),
         "phantom": "case checks errors scene",
         "planning": "errors",
         "achieved": "case checks errors planning registration scene _core",
@@ -165,13 +170,14 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "surface_repair _core"
         ),
         "cli": (
-            "cmfsim build case checks doctor errors io meshing phantom pictures report scene "
-            "simulation study"
+            "build case checks cmfsim doctor errors io meshing musculature "
+            "phantom pictures report scene simulation study template"
         ),
         "__init__": (
-            "_core achieved build case doctor equivalent errors evaluation imaging io meshing "
-            "model musculature node_kinds osteotomy patient phantom planning registration scene "
-            "simulation study surface_checks surface_repair template"
+            "achieved build case doctor equivalent errors evaluation imaging io "
+            "landmark_sites meshing model musculature node_kinds osteotomy patient phantom "
+            "planning registration scene simulation study surface_checks surface_repair "
+            "template _core"
         ),
     }.items()
 }

@@ -91,6 +91,7 @@ from cmfsim.io import (
     write_surface,
     write_transform,
 )
+from cmfsim.landmark_sites import SKULL_LANDMARKS
 from cmfsim.meshing import (
     MeshOptions,
     MeshReport,
@@ -149,11 +150,19 @@ from cmfsim.scene import (
 from cmfsim.simulation import scene_plan, scene_solver, solve_scene
 from cmfsim.surface_checks import SurfaceReport, check_surface
 from cmfsim.surface_repair import RepairOptions, repair_surface
+from cmfsim.template import (
+    MorphedMusculature,
+    MuscleTemplate,
+    check_template,
+    import_bodyparts3d,
+    template_names,
+)
 
 __all__ = [
     "LAWS",
     "METHODS",
     "PRESETS",
+    "SKULL_LANDMARKS",
     "AchievedMotion",
     "AchievedPlan",
     "AlignmentOptions",
@@ -191,10 +200,12 @@ __all__ = [
     "MeshReport",
     "Mixture",
     "ModelComparison",
+    "MorphedMusculature",
     "MovedSurface",
     "Muscle",
     "MuscleFibres",
     "MuscleSurface",
+    "MuscleTemplate",
     "MuscleVolume",
     "Musculature",
     "NodeKinds",
@@ -235,6 +246,7 @@ __all__ = [
     "build_case",
     "build_model",
     "check_surface",
+    "check_template",
     "classify_nodes",
     "compare_models",
     "compare_skins",
@@ -248,6 +260,7 @@ __all__ = [
     "fold_report",
     "free_cut",
     "icp",
+    "import_bodyparts3d",
     "leave_one_out",
     "make_head",
     "match_landmarks",
@@ -280,6 +293,7 @@ __all__ = [
     "signed_level",
     "skin_regions",
     "solve_scene",
+    "template_names",
     "tissue_level",
     "undeformed_mask",
     "wilcoxon_test",

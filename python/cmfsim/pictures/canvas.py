@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError
 
-__all__ = ["SIZE", "View", "bounds", "draw", "polydata"]
+__all__ = ["LEGEND_ROW", "SIZE", "View", "bounds", "draw", "polydata"]
 
 SIZE = (1600, 900)
 # Where the camera stands, as a direction from the head, in LPS.

@@ -1,5 +1,9 @@
-"""Pictures of muscles with their fibre boxes and directions, after Kim et al. (2010), Figure 2."""
+"""Pictures of muscles: with their names, or with fibre boxes and directions.
 
+The latter after Kim et al. (2010), Figure 2.
+"""
+
+import colorsys
 import os
 from typing import Any
 
@@ -9,10 +13,10 @@ from cmfsim._core import MuscleFibres, Surface
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.musculature import MuscleSurface, Musculature
-from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
+from cmfsim.pictures.canvas import LEGEND_ROW, SIZE, View, bounds, draw, polydata
 from cmfsim.scene import SurfaceData
 
-__all__ = ["picture_muscles"]
+__all__ = ["picture_muscle_names", "picture_muscles"]
 
 MUSCLE_COLOUR, BONE_COLOUR = "#b8564b", "#e6dcc3"
 # Boxes whose direction the outline hardly tells are drawn in the second colour.
@@ -85,6 +89,64 @@ def picture_muscles(
     draw(path, views, corners, size, paint, legend)
 
 
+def picture_muscle_names(
+    path: str | os.PathLike[str],
+    musculature: Musculature,
+    skull: SurfaceData | None = None,
+    *,
+    size: tuple[int, int] = SIZE,
+) -> None:
+    """Writes a picture of muscles in colours with their names: from the front and the left.
+
+    Muscles of both sides that are called alike have one colour.
+
+    Parameters
+    ----------
+    path : path
+        Ends in `.png`.
+    musculature : Musculature
+    skull : SurfaceData, optional
+        Drawn with them, such as the patient's bones.
+    size : (int, int), pixels
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) PyVista or OpenGL is missing, no muscle, another ending.
+
+    Examples
+    --------
+    >>> import cmfsim, cmfsim.pictures
+    >>> template = cmfsim.MuscleTemplate.load("default")
+    >>> cmfsim.pictures.picture_muscle_names(
+    ...     "muscles.png", template.musculature, template.skull
+    ... )  # doctest: +SKIP
+    """
+    if not len(musculature):
+        raise CaseInputError("there is no muscle to draw")
+    names = list(dict.fromkeys(_without_side(muscle.name) for muscle in musculature))
+    colours = {name: _hue(number) for number, name in enumerate(names)}
+    drawn = [np.asarray(muscle.surface.vertices) for muscle in musculature]
+    corners = bounds(drawn if skull is None else [*drawn, np.asarray(skull.vertices)])
+
+    def paint(plotter: Any, view: View) -> None:
+        if not view.caption:
+            return
+        if skull is not None:
+            shape = polydata(skull.vertices, skull.triangles)
+            plotter.add_mesh(shape, color=BONE_COLOUR, smooth_shading=True)
+        for muscle in musculature:
+            shape = polydata(muscle.surface.vertices, muscle.surface.triangles)
+            colour = colours[_without_side(muscle.name)]
+            plotter.add_mesh(shape, color=colour, smooth_shading=True, ambient=0.15)
+
+    # The legend stands beside the heads, not on them.
+    blank = View("front", "")
+    views = (blank, View("front", "front"), View("left", "left"))
+    rows = int(size[1]) // LEGEND_ROW - 1
+    draw(path, views, corners, size, paint, list(colours.items())[:rows])
+
+
 def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:
     """Fibre strokes and box edges as pairs of points, and the colour of the boxes."""
     vertices = np.asarray(muscle.surface.vertices, dtype=np.float64)
@@ -112,3 +174,15 @@ def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:
                     edges += [at - along, at + along]
     colour = SHEET_COLOUR if fibres.is_sheet else BOX_COLOUR
     return strokes, np.array(edges), colour
+
+
+def _without_side(name: str) -> str:
+    return name.removesuffix("_L").removesuffix("_R")
+
+
+def _hue(number: int) -> str:
+    """A colour that differs from those of the numbers near it."""
+    # Steps of the golden section spread hues evenly, however many there are.
+    hue = (number * 0.6180339887) % 1.0
+    channels = colorsys.hsv_to_rgb(hue, 0.75, 0.62 + 0.28 * (number % 2))
+    return "#" + "".join(f"{round(255 * channel):02x}" for channel in channels)
