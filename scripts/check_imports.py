@@ -133,8 +133,10 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "scene": "checks errors",
         "case": "checks errors scene",
         "patient": "checks errors",
-        "model": "case checks scene",
-        "io": "case checks errors model musculature patient planning scene template_data",
+        "model": "case checks musculature scene",
+        "io": (
+            "case checks errors model musculature patient planning prediction scene template_data"
+        ),
         "imaging": "case checks errors scene _core",
         "meshing": "case checks errors scene _core",
         "musculature": "case checks errors scene",
@@ -142,6 +144,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "equivalent": "case checks errors musculature scene _core",
         "landmark_sites": "",
         "template_data": "case checks errors musculature scene",
+        "prediction": "case checks model musculature scene",
         "template": (
             "case checks errors io landmark_sites musculature phantom registration scene "
             "surface_checks surface_repair template_data _core"
@@ -151,15 +154,19 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "achieved": "case checks errors planning registration scene _core",
         "osteotomy": "case checks errors planning scene _core",
         "node_kinds": "case checks errors scene _core",
-        "simulation": "scene errors _core",
+        "simulation": "checks errors model planning prediction scene _core",
         "evaluation": "case checks errors registration scene topology _core",
         "build": (
-            "case checks doctor errors imaging io meshing model node_kinds osteotomy patient "
-            "phantom pictures scene surface_repair _core"
+            "case checks doctor equivalent errors imaging io meshing model musculature "
+            "node_kinds osteotomy patient phantom pictures scene surface_repair template "
+            "_core"
         ),
-        "study": "build case errors template simulation evaluation scene",
-        "pictures": "case checks errors musculature scene _core",
-        "report": "case errors scene",
+        "study": (
+            "build case checks errors evaluation io model musculature patient prediction "
+            "scene simulation template _core"
+        ),
+        "pictures": "case checks errors musculature prediction scene _core",
+        "report": "case errors io scene",
         "topology": "",
         "crossings": "checks",
         "capping": "checks",
@@ -170,14 +177,14 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "surface_repair _core"
         ),
         "cli": (
-            "build case checks cmfsim doctor errors io meshing musculature "
-            "phantom pictures report scene simulation study template"
+            "build case checks cmfsim doctor errors evaluation io meshing musculature phantom "
+            "pictures prediction report scene simulation study template"
         ),
         "__init__": (
             "achieved build case doctor equivalent errors evaluation imaging io "
             "landmark_sites meshing model musculature node_kinds osteotomy patient phantom "
-            "planning registration scene simulation study surface_checks surface_repair "
-            "template _core"
+            "planning prediction registration scene simulation study surface_checks "
+            "surface_repair template _core"
         ),
     }.items()
 }

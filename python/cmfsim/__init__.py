@@ -33,7 +33,7 @@ from cmfsim.achieved import (
     achieved_plan,
     measure_motion,
 )
-from cmfsim.build import build_case, build_model, write_phantom_case
+from cmfsim.build import build_case, build_model, with_muscles, write_phantom_case
 from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.doctor import diagnose
 from cmfsim.equivalent import Mixture, MuscleVolume, equivalent_material
@@ -73,6 +73,7 @@ from cmfsim.imaging import (
 )
 from cmfsim.io import (
     Case,
+    Cohort,
     read_image,
     read_landmarks,
     read_moved_surface,
@@ -86,6 +87,7 @@ from cmfsim.io import (
     write_landmarks,
     write_metrics,
     write_model,
+    write_prediction,
     write_result,
     write_scene,
     write_surface,
@@ -127,8 +129,10 @@ from cmfsim.osteotomy import (
     procedure_options,
     segments_from_surfaces,
 )
+from cmfsim.patient import CaseMuscles
 from cmfsim.phantom import HeadParameters, Muscle, PhantomHead, make_head
 from cmfsim.planning import RigidMotion, decompose_motion, rigid_motion
+from cmfsim.prediction import MODELS, Prediction
 from cmfsim.registration import (
     FoldReport,
     LandmarkAgreement,
@@ -147,7 +151,18 @@ from cmfsim.scene import (
     SurfaceData,
     TissueData,
 )
-from cmfsim.simulation import scene_plan, scene_solver, solve_scene
+from cmfsim.simulation import model_scene, predict_patient, scene_plan, scene_solver, solve_scene
+from cmfsim.study import (
+    CaseEvaluation,
+    SensitivityReport,
+    StudyReport,
+    evaluate,
+    landmark_trials,
+    predict,
+    predict_models,
+    run_study,
+    sensitivity,
+)
 from cmfsim.surface_checks import SurfaceReport, check_surface
 from cmfsim.surface_repair import RepairOptions, repair_surface
 from cmfsim.template import (
@@ -161,6 +176,7 @@ from cmfsim.template import (
 __all__ = [
     "LAWS",
     "METHODS",
+    "MODELS",
     "PRESETS",
     "SKULL_LANDMARKS",
     "AchievedMotion",
@@ -172,8 +188,11 @@ __all__ = [
     "BoundaryError",
     "Case",
     "CaseError",
+    "CaseEvaluation",
+    "CaseMuscles",
     "ClassifiedNodes",
     "CmfsimError",
+    "Cohort",
     "ContactError",
     "CutBones",
     "CuttingPlane",
@@ -213,6 +232,7 @@ __all__ = [
     "PatientModel",
     "PhantomHead",
     "PlanOperator",
+    "Prediction",
     "Procedure",
     "RegistrationError",
     "RepairOptions",
@@ -222,6 +242,7 @@ __all__ = [
     "SceneResult",
     "SegmentData",
     "SegmentOptions",
+    "SensitivityReport",
     "SkinComparison",
     "SlidingBox",
     "SlidingSphere",
@@ -229,6 +250,7 @@ __all__ = [
     "SolverError",
     "SolverOptions",
     "StaticSolver",
+    "StudyReport",
     "Surface",
     "SurfaceData",
     "SurfaceMotion",
@@ -257,10 +279,12 @@ __all__ = [
     "distance_statistics",
     "equivalent_material",
     "error_table",
+    "evaluate",
     "fold_report",
     "free_cut",
     "icp",
     "import_bodyparts3d",
+    "landmark_trials",
     "leave_one_out",
     "make_head",
     "match_landmarks",
@@ -269,8 +293,12 @@ __all__ = [
     "mesh_from_level",
     "mesh_report",
     "mesh_with_tetwild",
+    "model_scene",
     "part_mesh",
     "place_procedure",
+    "predict",
+    "predict_models",
+    "predict_patient",
     "procedure_options",
     "read_image",
     "read_landmarks",
@@ -285,11 +313,13 @@ __all__ = [
     "repair_surface",
     "rigid_fit",
     "rigid_motion",
+    "run_study",
     "scene_plan",
     "scene_solver",
     "segment_data",
     "segment_head",
     "segments_from_surfaces",
+    "sensitivity",
     "signed_level",
     "skin_regions",
     "solve_scene",
@@ -297,11 +327,13 @@ __all__ = [
     "tissue_level",
     "undeformed_mask",
     "wilcoxon_test",
+    "with_muscles",
     "write_image",
     "write_landmarks",
     "write_metrics",
     "write_model",
     "write_phantom_case",
+    "write_prediction",
     "write_result",
     "write_scene",
     "write_surface",

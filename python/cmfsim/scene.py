@@ -62,6 +62,8 @@ TISSUE_OPTIONAL = frozenset({("preset", "fibre")})
 METHODS = ("auto", "cholesky", "pcg", "relaxation")
 CONTACTS = ("bilateral", "unilateral")
 CONFLICTS = ("error", "resolve")
+PRESETS = ("kim2010", "kim2010-swapped")
+MIXINGS = ("moduli", "stiffness")
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,8 +5,15 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim import __version__
-from cmfsim.cli import case_commands, phantom_command, scene_commands, template_commands
+from cmfsim.cli import (
+    case_commands,
+    phantom_command,
+    scene_commands,
+    study_commands,
+    template_commands,
+)
 from cmfsim.io import result_suffixes
+from cmfsim.prediction import MODELS
 from cmfsim.scene import CONTACTS, METHODS
 from cmfsim.template import WHERE
 
@@ -43,15 +50,19 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     )
     doctor.set_defaults(run=case_commands.doctor)
 
-    build = commands.add_parser("build", parents=[named], help="build a case: image to scene")
-    build.add_argument(
+    changed = argparse.ArgumentParser(add_help=False, parents=[named])
+    changed.add_argument(
         "-o", "--output", metavar="OUT", type=Path, help="folder instead of the case's own"
     )
-    build.add_argument(
+    changed.add_argument(
         "--edge-length", metavar="H", type=float, help="mm, instead of the case's own"
     )
-    build.add_argument("--no-doctor", action="store_true", help="build without checks before")
+    changed.add_argument("--no-doctor", action="store_true", help="work without checks before")
+
+    build = commands.add_parser("build", parents=[changed], help="build a case: image to scene")
     build.set_defaults(run=case_commands.build)
+
+    _add_study_commands(commands, common, changed)
 
     phantom = commands.add_parser(
         "phantom", parents=[common], help="write the case of a head made by code"
@@ -64,6 +75,59 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         "--spacing", metavar="MM", type=float, default=1.0, help="of the CT (default 1)"
     )
     phantom.set_defaults(run=phantom_command.phantom)
+
+
+def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentParser) -> None:
+    models = {"metavar": "MODEL", "choices": (*MODELS, "all"), "action": "append"}
+    predict = commands.add_parser(
+        "predict", parents=[changed], help="predict the face after the operation"
+    )
+    predict.add_argument(
+        "--model",
+        **models,
+        help="H, M, H+S or M+S: homogeneous or with muscles, without or with sliding; or all; may "
+        "be repeated (default M+S)",
+    )
+    predict.set_defaults(run=study_commands.predict)
+
+    evaluate = commands.add_parser(
+        "evaluate", parents=[changed], help="predict, and compare with the face after it"
+    )
+    evaluate.add_argument("--model", **models, help="as in predict (default all)")
+    evaluate.set_defaults(run=study_commands.evaluate)
+
+    sensitivity = commands.add_parser(
+        "sensitivity", parents=[changed], help="what the error of skull landmarks does to the face"
+    )
+    sensitivity.add_argument("--model", choices=("M", "M+S"), default="M+S", help="(default M+S)")
+    sensitivity.add_argument("--trials", metavar="N", type=int, default=3, help="(default 3)")
+    sensitivity.add_argument(
+        "--std", metavar="MM", type=float, default=2.0, help="of a landmark along each axis (2)"
+    )
+    sensitivity.add_argument("--seed", type=int, default=0, help="of the trials (default 0)")
+    sensitivity.add_argument(
+        "--landmarks",
+        metavar="FILE",
+        type=Path,
+        action="append",
+        help="landmarks placed again, one file per trial, instead of drawn ones",
+    )
+    sensitivity.set_defaults(run=study_commands.sensitivity)
+
+    study = commands.add_parser(
+        "study", parents=[common], help="every case of a cohort by every model"
+    )
+    study.add_argument("cohort", metavar="COHORT", type=Path, help="cohort.toml")
+    study.add_argument("--workers", metavar="N", type=int, help="cases at a time")
+    study.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a Dask cluster that sees the same files"
+    )
+    study.add_argument("--fresh", action="store_true", help="work on finished cases again")
+    study.set_defaults(run=study_commands.study)
+
+    report = commands.add_parser("report", help="make the report of a folder of results anew")
+    report.add_argument("folder", metavar="FOLDER", type=Path, help="what predict wrote")
+    report.set_defaults(run=study_commands.report)
 
 
 def _add_scene_commands(commands: Any, common: argparse.ArgumentParser) -> None:

@@ -1,7 +1,13 @@
 """Predictions against the post-operative skin: partners, distances, regions, tests (paper 3.2)."""
 
 from cmfsim.evaluation.comparison import MATCHINGS, SkinComparison, compare_skins
-from cmfsim.evaluation.models import NO_CHANGE, Improvement, ModelComparison, compare_models
+from cmfsim.evaluation.models import (
+    NO_CHANGE,
+    WHOLE,
+    Improvement,
+    ModelComparison,
+    compare_models,
+)
 from cmfsim.evaluation.regions import REGIONS, SKIN_LANDMARKS, skin_regions
 from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
 from cmfsim.evaluation.statistics import LIMITS, DistanceStatistics, distance_statistics
@@ -13,6 +19,7 @@ __all__ = [
     "NO_CHANGE",
     "REGIONS",
     "SKIN_LANDMARKS",
+    "WHOLE",
     "DistanceStatistics",
     "ErrorTable",
     "Improvement",

@@ -22,7 +22,7 @@ from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.scene import SurfaceData
 
-__all__ = ["NO_CHANGE", "Improvement", "ModelComparison", "compare_models"]
+__all__ = ["NO_CHANGE", "WHOLE", "Improvement", "ModelComparison", "compare_models"]
 
 # The pre-operative skin taken as a prediction: what any model must beat.
 NO_CHANGE = "no change"

@@ -9,6 +9,7 @@ from cmfsim.pictures.anatomy import (
 )
 from cmfsim.pictures.charts import MODEL_COLOURS, chart_errors
 from cmfsim.pictures.distances import DISTANCE_LIMIT, distance_colour, picture_distances
+from cmfsim.pictures.faces import picture_plan, picture_prediction
 from cmfsim.pictures.muscles import picture_muscle_names, picture_muscles
 
 __all__ = [
@@ -23,5 +24,7 @@ __all__ = [
     "picture_muscle_names",
     "picture_muscles",
     "picture_node_kinds",
+    "picture_plan",
+    "picture_prediction",
     "picture_segments",
 ]

@@ -14,7 +14,13 @@ from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
 from cmfsim.scene import SurfaceData
 
-__all__ = ["picture_anatomy", "picture_node_kinds", "picture_segments"]
+__all__ = [
+    "add_bone",
+    "picture_anatomy",
+    "picture_node_kinds",
+    "picture_segments",
+    "segment_colours",
+]
 
 SKIN_COLOUR = "#e3b7a0"
 # Kim et al. (2010), Figure 4: fixed pink, joined orange, sliding blue, free white.
@@ -65,13 +71,13 @@ def picture_segments(
     """
     if not segments:
         raise CaseInputError("there is no segment to draw")
-    colours = _colours([s.name for s in segments])
+    colours = segment_colours([s.name for s in segments])
     corners = bounds([np.asarray(s.surface.vertices) for s in segments])
 
     def paint(plotter: Any, view: View) -> None:
         del view
         for segment in segments:
-            _add_bone(plotter, segment, colours[segment.name])
+            add_bone(plotter, segment, colours[segment.name])
 
     views = tuple(View(name, name) for name in ("front", "left front", "left"))
     draw(path, views, corners, size, paint, list(colours.items()))
@@ -104,13 +110,13 @@ def picture_anatomy(
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_anatomy("anatomy.png", skin, segments)  # doctest: +SKIP
     """
-    colours = _colours([s.name for s in segments])
+    colours = segment_colours([s.name for s in segments])
     corners = bounds([np.asarray(skin.vertices), *(s.surface.vertices for s in segments)])
 
     def paint(plotter: Any, view: View) -> None:
         del view
         for segment in segments:
-            _add_bone(plotter, segment, colours[segment.name])
+            add_bone(plotter, segment, colours[segment.name])
         shape = polydata(skin.vertices, skin.triangles)
         plotter.add_mesh(shape, color=SKIN_COLOUR, opacity=0.35, smooth_shading=True)
 
@@ -209,12 +215,14 @@ def _corners_of_kind(
     return np.concatenate(parts)
 
 
-def _colours(names: Sequence[str]) -> dict[str, str]:
+def segment_colours(names: Sequence[str]) -> dict[str, str]:
+    """The colour of each segment, by name; the same for the same names."""
     others = iter(OTHER_COLOURS * (1 + len(names) // len(OTHER_COLOURS)))
     return {n: SEGMENT_COLOURS[n] if n in SEGMENT_COLOURS else next(others) for n in names}
 
 
-def _add_bone(plotter: Any, segment: BoneSegment, colour: str) -> None:
+def add_bone(plotter: Any, segment: BoneSegment, colour: str) -> None:
+    """Adds a bone segment in a colour to a view."""
     plotter.add_mesh(
         polydata(segment.surface.vertices, segment.surface.triangles),
         color=colour,

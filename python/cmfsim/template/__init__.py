@@ -6,6 +6,7 @@ from cmfsim.template.checking import check_template
 from cmfsim.template.from_phantom import phantom_muscle, phantom_template
 from cmfsim.template.morphing import MorphedMusculature
 from cmfsim.template.muscle_template import MuscleTemplate
+from cmfsim.template.skull_reference import joined_surface
 
 __all__ = [
     "WHERE",
@@ -13,6 +14,7 @@ __all__ = [
     "MuscleTemplate",
     "check_template",
     "import_bodyparts3d",
+    "joined_surface",
     "phantom_muscle",
     "phantom_template",
     "template_names",
