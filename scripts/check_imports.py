@@ -54,10 +54,17 @@ CORE: Mapping[str, frozenset[str]] = {
             "equivalent/sequence equivalent/shape mesh triangle"
         ),
         "equivalent/stiffness": "equivalent/shares material",
-        "equivalent": "fibre mesh surface triangle",
+        "equivalent": "fibre material mesh surface triangle winding",
         "tensors": "blocks mesh material",
         "motion": "surface mesh triangle",
-        "registration": "surface motion mesh",
+        "registration/spread": "triangle",
+        "registration/thin_plate": "registration/spread triangle",
+        "registration/rigid": "registration/spread triangle",
+        "registration/nearest": "registration/spread",
+        "registration/icp": (
+            "motion registration/nearest registration/rigid registration/spread surface triangle"
+        ),
+        "registration": "",
         "boundary": "surface motion mesh",
         "restraint": "mesh",
         "crease": "mesh motion surface",
@@ -127,25 +134,31 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "case": "checks errors scene",
         "patient": "checks errors",
         "model": "case checks scene",
-        "io": "case checks errors model patient planning scene",
+        "io": "case checks errors model musculature patient planning scene template_data",
         "imaging": "case checks errors scene _core",
         "meshing": "case checks errors scene _core",
         "musculature": "case checks errors scene",
         "registration": "case checks errors scene _core",
         "equivalent": "case checks errors musculature scene _core",
-        "template": "case checks errors io musculature registration scene _core",
+        "landmark_sites": "",
+        "template_data": "case checks errors musculature scene",
+        "template": (
+            "case checks errors io landmark_sites musculature phantom registration scene "
+            "surface_checks surface_repair template_data _core"
+        ),
         "phantom": "case checks errors scene",
         "planning": "errors",
+        "achieved": "case checks errors planning registration scene _core",
         "osteotomy": "case checks errors planning scene _core",
         "node_kinds": "case checks errors scene _core",
         "simulation": "scene errors _core",
-        "evaluation": "case checks errors scene _core",
+        "evaluation": "case checks errors registration scene topology _core",
         "build": (
             "case checks doctor errors imaging io meshing model node_kinds osteotomy patient "
             "phantom pictures scene surface_repair _core"
         ),
         "study": "build case errors template simulation evaluation scene",
-        "pictures": "case checks errors scene",
+        "pictures": "case checks errors musculature scene _core",
         "report": "case errors scene",
         "topology": "",
         "crossings": "checks",
@@ -153,17 +166,18 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "surface_checks": "checks crossings scene topology",
         "surface_repair": "capping case checks errors scene surface_checks topology _core",
         "doctor": (
-            "case checks errors io osteotomy patient planning scene surface_checks surface_repair "
-            "_core"
+            "case checks errors io osteotomy patient planning registration scene surface_checks "
+            "surface_repair _core"
         ),
         "cli": (
-            "cmfsim build case checks doctor errors io meshing phantom pictures report scene "
-            "simulation study"
+            "build case checks cmfsim doctor errors io meshing musculature "
+            "phantom pictures report scene simulation study template"
         ),
         "__init__": (
-            "_core build case doctor equivalent errors evaluation imaging io meshing model "
-            "musculature node_kinds osteotomy patient phantom planning registration scene "
-            "simulation study surface_checks surface_repair template"
+            "achieved build case doctor equivalent errors evaluation imaging io "
+            "landmark_sites meshing model musculature node_kinds osteotomy patient phantom "
+            "planning registration scene simulation study surface_checks surface_repair "
+            "template _core"
         ),
     }.items()
 }

@@ -13,6 +13,8 @@ __all__ = [
     "CaseError",
     "CmfsimError",
     "ContactError",
+    "Folds",
+    "IcpFit",
     "ImageError",
     "LandmarkError",
     "MassTensors",
@@ -23,16 +25,20 @@ __all__ = [
     "MuscleShares",
     "PlanOperator",
     "RegistrationError",
+    "RigidFit",
     "Solution",
     "SolverError",
     "StaticSolver",
     "Surface",
     "SurfaceMotion",
     "TetMesh",
+    "ThinPlateSpline",
     "Tissue",
     "__version__",
     "distance_image",
+    "icp",
     "part_mesh",
+    "rigid_fit",
     "sample_muscles",
     "signed_distance_image",
     "stuff_image",
@@ -96,6 +102,8 @@ class Surface:
     def vertices(self) -> _Floats: ...
     @property
     def triangles(self) -> _Indices: ...
+    @property
+    def vertex_normals(self) -> _Floats: ...
     @property
     def is_closed(self) -> bool: ...
     @property
@@ -291,6 +299,93 @@ class PlanOperator:
     @property
     def matrix(self) -> _Floats: ...
     def __call__(self, plan: _Plan) -> _Floats: ...
+
+@final
+class ThinPlateSpline:
+    def __new__(
+        cls, source: ArrayLike, target: ArrayLike, smoothing: float = 0.0
+    ) -> ThinPlateSpline: ...
+    @property
+    def source(self) -> _Floats: ...
+    @property
+    def target(self) -> _Floats: ...
+    @property
+    def smoothing(self) -> float: ...
+    @property
+    def residuals(self) -> _Floats: ...
+    @property
+    def bending_energy(self) -> float: ...
+    @property
+    def weights(self) -> _Floats: ...
+    @property
+    def affine(self) -> _Floats: ...
+    def __call__(self, points: ArrayLike) -> _Floats: ...
+    def jacobian(self, points: ArrayLike) -> _Floats: ...
+    def folds(self, points: ArrayLike) -> Folds: ...
+    def landmark_folds(self) -> Folds: ...
+
+@final
+class Folds:
+    @property
+    def determinants(self) -> _Floats: ...
+    @property
+    def count(self) -> int: ...
+    @property
+    def worst(self) -> int | None: ...
+    @property
+    def smallest(self) -> float | None: ...
+
+@final
+class RigidFit:
+    @property
+    def matrix(self) -> _Floats: ...
+    @property
+    def scale(self) -> float: ...
+    @property
+    def residuals(self) -> _Floats: ...
+    @property
+    def rms(self) -> float: ...
+
+@final
+class IcpFit:
+    @property
+    def matrix(self) -> _Floats: ...
+    @property
+    def rms(self) -> float: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def converged(self) -> bool: ...
+    @property
+    def kept(self) -> NDArray[np.bool_]: ...
+    @property
+    def kept_fraction(self) -> float: ...
+    @property
+    def distances(self) -> _Floats: ...
+    @property
+    def rms_history(self) -> _Floats: ...
+
+def rigid_fit(
+    moving: ArrayLike,
+    fixed: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    scale: bool = False,
+) -> RigidFit: ...
+def icp(
+    moving: ArrayLike,
+    fixed: Surface | ArrayLike,
+    *,
+    initial: ArrayLike | None,
+    trim: float,
+    method: str | None,
+    max_iterations: int,
+    tolerance: float,
+    max_distance: float | None,
+    max_angle: float | None,
+    keep_border: bool,
+    normals: ArrayLike | None,
+) -> IcpFit: ...
 
 @final
 class MuscleShares:

@@ -33,6 +33,7 @@ __all__ = [
     "MeshError",
     "MeshInputError",
     "RegistrationError",
+    "RegistrationInputError",
     "SolverError",
 ]
 
@@ -59,3 +60,7 @@ class LandmarkInputError(LandmarkError, ValueError):
 
 class ImageInputError(ImageError, ValueError):
     """An image that cannot be meant: not three axes, no CT, damaged, no head in it."""
+
+
+class RegistrationInputError(RegistrationError, ValueError):
+    """Points, surfaces or volumes that cannot be brought together as they are."""

@@ -18,14 +18,29 @@ MODULES = sorted(
 )
 # Values that only stages make: their attributes are described, an example would say nothing.
 MADE_BY_STAGES = {
+    "AchievedMotion",
+    "AchievedPlan",
     "Anatomy",
     "BoneSegment",
+    "DistanceStatistics",
+    "ErrorTable",
     "Finding",
+    "Improvement",
+    "FoldReport",
+    "Folds",
+    "IcpFit",
+    "LandmarkAgreement",
+    "LandmarkMatch",
     "MeshReport",
+    "ModelComparison",
     "NodeKinds",
+    "PairedTest",
+    "RigidFit",
     "RigidMotion",
     "SceneResult",
+    "SkinComparison",
     "TissueMesh",
+    "VolumeAlignment",
 }
 
 
@@ -65,7 +80,7 @@ def test_every_public_function_of_the_package_has_an_example():
             assert "Examples\n" in (value.__doc__ or ""), name
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/templates.md"])
 def test_documented_code_runs(page, tmp_path, monkeypatch):
     """Python blocks of the page, in order, in one namespace."""
     monkeypatch.chdir(tmp_path)

@@ -7,6 +7,7 @@ mod fibres;
 mod geometry;
 mod materials;
 mod model;
+mod registration;
 mod running;
 mod stuffing;
 
@@ -28,6 +29,8 @@ mod _core {
     use crate::materials::{PyMassTensors, PyTissue};
     #[pymodule_export]
     use crate::model::{PyBoundary, PyPlanOperator, PySolution, PyStaticSolver};
+    #[pymodule_export]
+    use crate::registration::{PyFolds, PyIcpFit, PyRigidFit, PyThinPlateSpline, icp, rigid_fit};
 
     #[pymodule_export]
     use crate::stuffing::{distance_image, part_mesh, signed_distance_image, stuff_image};

@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim import __version__
-from cmfsim.cli import case_commands, phantom_command, scene_commands
+from cmfsim.cli import case_commands, phantom_command, scene_commands, template_commands
 from cmfsim.io import result_suffixes
 from cmfsim.scene import CONTACTS, METHODS
+from cmfsim.template import WHERE
 
 __all__ = ["make_parser"]
 
@@ -26,6 +27,7 @@ def make_parser() -> argparse.ArgumentParser:
     common.add_argument("-q", "--quiet", action="store_true", help="no progress lines")
     _add_case_commands(commands, common)
     _add_scene_commands(commands, common)
+    _add_template_commands(commands, common)
     return parser
 
 
@@ -87,3 +89,66 @@ def _add_scene_commands(commands: Any, common: argparse.ArgumentParser) -> None:
 
     info = commands.add_parser("info", parents=[common], help="say what a scene holds")
     info.set_defaults(run=scene_commands.info)
+
+
+def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> None:
+    template = commands.add_parser("template", help="muscle templates: list, check, import, morph")
+    actions = template.add_subparsers(dest="action", metavar="ACTION", required=True)
+    named = argparse.ArgumentParser(add_help=False, parents=[common])
+    named.add_argument(
+        "template", metavar="TEMPLATE", help="folder, archive or name of a built-in template"
+    )
+
+    listing = actions.add_parser("list", parents=[common], help="name the built-in templates")
+    listing.set_defaults(run=template_commands.list_templates)
+
+    check = actions.add_parser(
+        "check",
+        parents=[named],
+        help="say what is wrong with a template, and how to mend it",
+        epilog="Exit codes: 0 no errors found, 2 errors found or there is no such template.",
+    )
+    check.set_defaults(run=template_commands.check)
+
+    imports = actions.add_parser(
+        "import",
+        parents=[common],
+        help="make a template of an atlas's files",
+        epilog=f"BodyParts3D: download the OBJ files from {WHERE}.",
+    )
+    imports.add_argument("atlas", choices=["bodyparts3d"], help="which atlas")
+    imports.add_argument("folder", metavar="FOLDER", type=Path, help="the atlas's files")
+    imports.add_argument(
+        "--landmarks", metavar="FILE", type=Path, required=True, help="on its bones: .mrk.json"
+    )
+    imports.add_argument(
+        "-o", "--output", metavar="OUT", type=Path, required=True, help="folder, or .npz"
+    )
+    imports.add_argument(
+        "--any-files", action="store_true", help="take files with other hashes than the known ones"
+    )
+    imports.set_defaults(run=template_commands.import_atlas)
+
+    morph = actions.add_parser(
+        "morph", parents=[named], help="carry a template's muscles to a patient by landmarks"
+    )
+    morph.add_argument(
+        "landmarks", metavar="LANDMARKS", type=Path, help="the patient's: .mrk.json or .fcsv"
+    )
+    morph.add_argument(
+        "-o", "--output", metavar="OUT", type=Path, required=True, help="folder, or .npz"
+    )
+    morph.add_argument(
+        "--smoothing", metavar="MM", type=float, default=0.0, help="0 (default) meets every one"
+    )
+    morph.set_defaults(run=template_commands.morph)
+
+    show = actions.add_parser("show", parents=[named], help="draw a template's muscles")
+    show.add_argument("-o", "--output", metavar="PNG", type=Path, required=True, help="picture")
+    show.add_argument(
+        "--only", metavar="NAME", nargs="+", help="these muscles; without _L or _R on both sides"
+    )
+    show.add_argument(
+        "--fibres", action="store_true", help="fibre boxes and directions instead of names"
+    )
+    show.set_defaults(run=template_commands.show)

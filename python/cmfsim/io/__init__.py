@@ -4,6 +4,7 @@ from cmfsim.io.case_files import Case
 from cmfsim.io.images import read_image, write_image
 from cmfsim.io.landmarks import LandmarkFile, read_landmark_file, read_landmarks, write_landmarks
 from cmfsim.io.meshes import read_tet_mesh
+from cmfsim.io.metrics import write_metrics
 from cmfsim.io.models import write_model
 from cmfsim.io.results import read_result, result_suffixes, write_result
 from cmfsim.io.scenes import read_plan, read_scene, write_scene
@@ -26,6 +27,7 @@ __all__ = [
     "result_suffixes",
     "write_image",
     "write_landmarks",
+    "write_metrics",
     "write_model",
     "write_result",
     "write_scene",

@@ -16,6 +16,13 @@ const ROUNDS: usize = 5;
 /// shows beyond a straight line is the shape of its ends, not a bend.
 const SLENDERNESS_PER_DEGREE: f64 = 2.0;
 
+/// How much less the slices at the ends count than those in the middle: a slanting end cuts off one
+/// side of them, and draws their centroids to the other.
+const END_DOUBT: f64 = 0.9;
+
+/// Slices at each end whose tangent is that of their neighbour: a polynomial swings out at its ends.
+const END_SLICES: f64 = 1.0;
+
 /// Highest degree of the line: two bends.
 const HIGHEST_DEGREE: usize = 4;
 
@@ -58,7 +65,7 @@ impl CentreLine {
     }
 
     fn straight(axis: Vec3) -> Self {
-        let places = vec![-1.0, 1.0];
+        let places = (0..SLICES).map(|i| 2.0 * i as f64 / (SLICES as f64 - 1.0) - 1.0).collect();
         Self { coefficients: vec![Vec3::zeros(), axis], places }
     }
 
@@ -86,8 +93,12 @@ impl CentreLine {
         let degrees = [across[0].max(across[1]), across[0], across[1]];
         let mut coefficients = vec![Vec3::zeros(); degrees[0] + 1];
         for (axis, degree) in axes.iter().zip(degrees) {
-            let powers = DMatrix::from_fn(SLICES, degree + 1, |i, k| places[i].powi(k as i32));
-            let values = DVector::from_fn(SLICES, |i, _| axis.dot(&slices[i].1.centroid));
+            let doubt = if degree == 1 { END_DOUBT } else { 0.0 };
+            let weight = |i: usize| 1.0 - doubt * places[i].powi(2);
+            let powers =
+                DMatrix::from_fn(SLICES, degree + 1, |i, k| weight(i) * places[i].powi(k as i32));
+            let values =
+                DVector::from_fn(SLICES, |i, _| weight(i) * axis.dot(&slices[i].1.centroid));
             // Distinct places make the columns independent, so that QR has a solution.
             let qr = powers.qr();
             let solution = qr.r().solve_upper_triangular(&(qr.q().transpose() * values))?;
@@ -101,7 +112,8 @@ impl CentreLine {
     /// Unit tangent where `share` (0 to 1) of the area lies before.
     pub fn tangent(&self, share: f64) -> Vec3 {
         let last = self.places.len() - 1;
-        let at = (share * self.places.len() as f64 - 0.5).clamp(0.0, last as f64);
+        let at =
+            (share * self.places.len() as f64 - 0.5).clamp(END_SLICES, last as f64 - END_SLICES);
         let i = (at as usize).min(last - 1);
         let t = self.places[i] + (at - i as f64) * (self.places[i + 1] - self.places[i]);
         let mut slope = Vec3::zeros();

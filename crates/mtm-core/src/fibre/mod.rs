@@ -139,15 +139,12 @@ impl MuscleFibres {
             .moments()
             .ok_or(MtmError::Empty { what: "area of the muscle", kind: ErrorKind::Mesh })?;
         let axes = moments.axes();
-        let found = match (kind, boxes) {
-            (MuscleKind::Strap, _) | (MuscleKind::Sheet, Some(_)) => {
-                parts::in_series(&region, boxes)
-            }
-            (MuscleKind::Sheet, None) => parts::in_lanes(&region, axes[0], None),
-            (MuscleKind::Fan, _) => {
+        let found = match kind {
+            MuscleKind::Strap | MuscleKind::Sheet => parts::in_series(&region, boxes),
+            MuscleKind::Fan => {
                 parts::in_lanes(&region, parts::taper_direction(&region, &moments), boxes)
             }
-            (MuscleKind::Ring, _) => parts::in_ring(&region, boxes),
+            MuscleKind::Ring => parts::in_ring(&region, boxes),
         };
         let extents = axes.map(|axis| {
             let [low, high] = region.range(&axis);

@@ -1,6 +1,6 @@
 //! The parts of a muscle, each with one direction: in series, side by side, or round an opening.
 
-use std::f64::consts::TAU;
+use std::f64::consts::{FRAC_PI_2, PI};
 
 use super::centre_line::{CentreLine, EXTENT_PER_DEVIATION};
 use super::region::{Moments, Region};
@@ -12,8 +12,8 @@ const TURN_PER_BOX: f64 = 0.14;
 /// Most boxes one after another: a line that turns further turns back.
 const MOST_IN_SERIES: usize = 12;
 
-/// Boxes round an opening where no number is given: each stands for 22.5°.
-const BOXES_ROUND: usize = 16;
+/// Boxes round an opening where no number is given: each stands for 15°.
+const BOXES_ROUND: usize = 24;
 
 /// Angle between neighbouring lanes of a fan, rad (9°).
 const TURN_PER_LANE: f64 = 0.16;
@@ -57,15 +57,16 @@ impl Part {
 
 /// Parts one after another along the centre line; `count`, or as many as it turns.
 ///
-/// One part alone has its principal axis (Kim et al. 2010), more have the tangents of the line.
+/// One part that was asked for has its principal axis (Kim et al. 2010), otherwise the tangents of the
+/// line are the directions.
 pub(super) fn in_series(region: &Region, count: Option<usize>) -> Vec<Part> {
     let Some(moments) = region.moments() else { return Vec::new() };
+    if count == Some(1) {
+        return Part::new(region.clone(), moments.axes()[0]).into_iter().collect();
+    }
     let line = CentreLine::new(region, &moments);
     let needed = || ((line.turning() / TURN_PER_BOX).ceil() as usize).clamp(1, MOST_IN_SERIES);
     let count = count.unwrap_or_else(needed);
-    if count == 1 {
-        return Part::new(region.clone(), moments.axes()[0]).into_iter().collect();
-    }
     let middle = |i: usize| line.tangent((i as f64 + 0.5) / count as f64);
     let slices = line.cut(region, count).into_iter().enumerate();
     slices.filter_map(|(i, slice)| Part::new(slice, middle(i))).collect()
@@ -96,26 +97,19 @@ pub(super) fn in_lanes(region: &Region, towards: Vec3, lanes: Option<usize>) -> 
 
 /// Parts round an opening, each with the tangent of the line through the parts.
 ///
-/// Sectors of equal angle once the ring is stretched to a round one.
+/// The opening is a slit along the longer axis, as long as the ring is longer than wide: rays leave it
+/// square where it is straight and turn about its ends.
 pub(super) fn in_ring(region: &Region, count: Option<usize>) -> Vec<Part> {
     let Some(moments) = region.moments() else { return Vec::new() };
     let count = count.unwrap_or(BOXES_ROUND);
-    let axes = moments.axes();
-    // Rows that turn x − centre into coordinates of unit variance in the plane of the ring.
-    let [u, v] = [0, 1].map(|k| {
-        let variance = axes[k].dot(&(moments.covariance * axes[k]));
-        axes[k] / variance.sqrt()
-    });
-    // Height over the plane through the ring's axis and the start of sector i, linear in x.
-    let height = |i: usize, x: &Vec3| {
-        let (sine, cosine) = (TAU * i as f64 / count as f64).sin_cos();
-        let x = x - moments.centroid;
-        v.dot(&x) * cosine - u.dot(&x) * sine
-    };
+    let track = Track::new(region, &moments);
     let sectors: Vec<(Region, Moments)> = (0..count)
         .filter_map(|i| {
-            let [_, after] = region.split(|x| height(i, x));
-            let [sector, _] = after.split(|x| height(i + 1, x));
+            let [from, middle, to] =
+                [0.0, 0.5, 1.0].map(|k| track.ray((i as f64 + k) / count as f64));
+            let [_, outside] = region.split(|x| middle.ahead(x));
+            let [_, after] = outside.split(|x| from.left(x));
+            let [sector, _] = after.split(|x| to.left(x));
             sector.moments().map(|m| (sector, m))
         })
         .collect();
@@ -125,6 +119,69 @@ pub(super) fn in_ring(region: &Region, count: Option<usize>) -> Vec<Part> {
     let directions: Vec<Vec3> = (0..n).map(tangent).collect();
     let parts = sectors.into_iter().zip(directions);
     parts.map(|((region, moments), direction)| Part { region, moments, direction }).collect()
+}
+
+/// The way round a slit at half the width of a ring.
+struct Track {
+    centre: Vec3,
+    /// Unit vectors along and across the slit, in the plane of the ring.
+    axes: [Vec3; 2],
+    /// Half the length of the slit, mm.
+    slit: f64,
+    /// Distance of the track from the slit, mm.
+    radius: f64,
+}
+
+/// A ray from the slit outward, in the plane of the ring.
+struct Ray {
+    origin: Vec3,
+    outward: Vec3,
+    onward: Vec3,
+}
+
+impl Track {
+    fn new(region: &Region, moments: &Moments) -> Self {
+        let [u, v, w] = moments.axes();
+        let [along, across] = [region.range(&u), region.range(&v)];
+        let centre = u * along[0].midpoint(along[1])
+            + v * across[0].midpoint(across[1])
+            + w * w.dot(&moments.centroid);
+        let halves = [along, across].map(|[low, high]| 0.5 * (high - low));
+        let (slit, radius) = (halves[0] - halves[1], 0.5 * halves[0].min(halves[1]));
+        let axes = if slit < 0.0 { [v, -u] } else { [u, v] };
+        Self { centre, axes, slit: slit.abs(), radius }
+    }
+
+    /// The ray at a share of the way round.
+    fn ray(&self, share: f64) -> Ray {
+        let [u, v] = self.axes;
+        let (straight, bend) = (2.0 * self.slit, PI * self.radius);
+        let half = straight + bend;
+        // Both halves are alike but for a half turn.
+        let way = 2.0 * share.rem_euclid(1.0);
+        let (sign, way) = if way < 1.0 { (1.0, way * half) } else { (-1.0, (way - 1.0) * half) };
+        let (place, angle) = if way < straight {
+            (self.slit - way, FRAC_PI_2)
+        } else {
+            (-self.slit, FRAC_PI_2 + (way - straight) / self.radius)
+        };
+        let (sine, cosine) = angle.sin_cos();
+        Ray {
+            origin: self.centre + u * (sign * place),
+            outward: (u * cosine + v * sine) * sign,
+            onward: (v * cosine - u * sine) * sign,
+        }
+    }
+}
+
+impl Ray {
+    fn ahead(&self, x: &Vec3) -> f64 {
+        self.outward.dot(&(x - self.origin))
+    }
+
+    fn left(&self, x: &Vec3) -> f64 {
+        self.onward.dot(&(x - self.origin))
+    }
 }
 
 /// The direction in which a fan tapers: that of the third moment of its area in its own plane.
