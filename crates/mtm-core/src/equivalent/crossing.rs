@@ -1,7 +1,7 @@
 //! Which tets the surface of a muscle crosses, and which lie wholly inside.
 
 use crate::equivalent::aligned_box::AlignedBox;
-use crate::equivalent::shape::MuscleShape;
+use crate::equivalent::shape::{InsideTest, MuscleShape, Side};
 use crate::equivalent::tet_tree::{Branch, TetTree};
 use crate::mesh::TetMesh;
 use crate::triangle::Vec3;
@@ -15,8 +15,10 @@ pub(super) struct Touch {
     pub tet: u32,
     /// Where the triangles that may cross the tet start in [`Touches::triangles`].
     first: u32,
-    /// How many there are; none for a tet that lies wholly inside.
+    /// How many there are.
     count: u32,
+    /// Whether the tet lies wholly inside.
+    is_whole: bool,
 }
 
 /// The tets that a muscle has a part in.
@@ -33,7 +35,11 @@ pub(super) struct Touches {
 impl Touch {
     /// Whether the tet lies wholly inside the muscle.
     pub fn is_whole(&self) -> bool {
-        self.count == 0
+        self.is_whole
+    }
+
+    fn whole(tet: u32) -> Self {
+        Self { tet, first: 0, count: 0, is_whole: true }
     }
 }
 
@@ -65,8 +71,8 @@ pub(super) struct Passage<'a> {
 impl Passage<'_> {
     /// The tets that the muscle has a part in, or some of them after `stop` has said so.
     ///
-    /// A branch of tets whose box no triangle meets is settled by one evaluation; below it no tet is
-    /// looked at.
+    /// A branch of tets whose box no triangle meets is settled by one evaluation where the winding number
+    /// can; below it no tet is looked at.
     pub fn touches(&self) -> Touches {
         let all: Vec<u32> = (0..self.muscle.n_triangles() as u32).collect();
         self.visit(0, &all)
@@ -79,17 +85,16 @@ impl Passage<'_> {
             return found;
         }
         let near: Vec<u32> = self.near(triangles, &branch.bounds);
-        if near.is_empty() {
+        if near.is_empty() && self.muscle.test == InsideTest::Winding {
             found.evaluations += 1;
             let (centre, radius) = (branch.bounds.centre(), branch.bounds.radius());
-            match self.muscle.holds_all(&centre, radius) {
-                Some(true) => {
-                    let whole = |&tet: &u32| Touch { tet, first: 0, count: 0 };
-                    found.tets.extend(self.tree.tets(branch).iter().map(whole));
+            match self.muscle.side_of(&centre, radius) {
+                Side::Inside => {
+                    found.tets.extend(self.tree.tets(branch).iter().map(|&t| Touch::whole(t)));
                     return found;
                 }
-                Some(false) => return found,
-                None => {}
+                Side::Outside => return found,
+                Side::Mixed => {}
             }
         }
         match branch.halves(at) {
@@ -138,11 +143,16 @@ impl Passage<'_> {
             let count = (found.triangles.len() - first) as u32;
             if count == 0 {
                 found.evaluations += 1;
-                if !self.muscle.holds(&(corners.iter().sum::<Vec3>() / 4.0)) {
-                    continue;
+                let centroid = corners.iter().sum::<Vec3>() / 4.0;
+                let radius = corners.iter().map(|c| (c - centroid).norm()).fold(0.0, f64::max);
+                match self.muscle.side_of(&centroid, radius) {
+                    Side::Inside => found.tets.push(Touch::whole(tet)),
+                    Side::Outside => {}
+                    Side::Mixed => found.tets.push(Touch { tet, first: 0, count, is_whole: false }),
                 }
+            } else {
+                found.tets.push(Touch { tet, first: first as u32, count, is_whole: false });
             }
-            found.tets.push(Touch { tet, first: first as u32, count });
         }
     }
 }

@@ -189,3 +189,167 @@ pub fn sample_muscles(
     made.counts.pairs = touches.iter().map(|t| t.looked_at).sum();
     Ok(made)
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use super::*;
+    use crate::fibre::OrientedBox;
+    use crate::winding::winding_number_exact;
+    use sequence::place;
+
+    type Triangles = (Vec<[f64; 3]>, Vec<[u32; 3]>);
+
+    /// A cube from −1 to 1 with its faces cut into n² squares, blown up towards a sphere by `round` (0 to 1).
+    fn cube(n: u32, round: f64, centre: f64) -> Triangles {
+        let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
+        for axis in 0..3 {
+            for side in [-1.0, 1.0] {
+                let start = vertices.len() as u32;
+                for i in 0..=n {
+                    for j in 0..=n {
+                        let [u, v] = [i, j].map(|k| 2.0 * f64::from(k) / f64::from(n) - 1.0);
+                        let mut p = Vec3::zeros();
+                        (p[axis], p[(axis + 1) % 3], p[(axis + 2) % 3]) = (side, u, v);
+                        let p = p.lerp(&p.normalize(), round) + Vec3::repeat(centre);
+                        vertices.push(p.into());
+                    }
+                }
+                for i in 0..n {
+                    for j in 0..n {
+                        let at = |a: u32, b: u32| start + (i + a) * (n + 1) + j + b;
+                        let (mut s, mut t) =
+                            ([at(0, 0), at(1, 0), at(1, 1)], [at(0, 0), at(1, 1), at(0, 1)]);
+                        if side < 0.0 {
+                            s.swap(1, 2);
+                            t.swap(1, 2);
+                        }
+                        triangles.extend([s, t]);
+                    }
+                }
+            }
+        }
+        (vertices, triangles)
+    }
+
+    fn joined((mut vertices, mut triangles): Triangles, (more, others): Triangles) -> Triangles {
+        let n = vertices.len() as u32;
+        vertices.extend(more);
+        triangles.extend(others.iter().map(|t| t.map(|v| v + n)));
+        (vertices, triangles)
+    }
+
+    fn muscle((vertices, triangles): Triangles) -> Muscle {
+        let axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        let boxes = vec![OrientedBox { centre: [0.0; 3], axes, half_extents: [1.0; 3] }];
+        Muscle {
+            surface: Arc::new(Surface::new(vertices, triangles).unwrap()),
+            fibres: Arc::new(MuscleFibres::from_boxes(boxes).unwrap()),
+        }
+    }
+
+    /// Tets of cubes of edge `h` about the origin, `n` to either side, shifted by `shift`.
+    fn lattice(n: i32, h: f64, shift: f64) -> TetMesh {
+        let side = 2 * n as u32 + 1;
+        let id = |at: [u32; 3]| (at[0] * side + at[1]) * side + at[2];
+        let (mut nodes, mut tets) = (Vec::new(), Vec::new());
+        for i in 0..side {
+            for j in 0..side {
+                for k in 0..side {
+                    nodes.push([i, j, k].map(|x| (f64::from(x) - f64::from(n)) * h + shift));
+                    if i.max(j).max(k) == side - 1 {
+                        continue;
+                    }
+                    let paths = [[0, 1, 2], [1, 2, 0], [2, 0, 1], [1, 0, 2], [0, 2, 1], [2, 1, 0]];
+                    for (p, path) in paths.into_iter().enumerate() {
+                        let mut at = [i, j, k];
+                        let mut tet = [id(at); 4];
+                        for (corner, axis) in path.into_iter().enumerate() {
+                            at[axis] += 1;
+                            tet[corner + 1] = id(at);
+                        }
+                        if p >= 3 {
+                            tet.swap(1, 2);
+                        }
+                        tets.push(tet);
+                    }
+                }
+            }
+        }
+        TetMesh::new(nodes, tets).unwrap()
+    }
+
+    /// Fractions of all tets by the exact winding number of every sample, and how many samples of each
+    /// lie where the hierarchical one, off by 0.01 at most, might see them on the other side.
+    fn exact(mesh: &TetMesh, surface: &Surface, options: &SamplingOptions) -> Vec<(f64, f64)> {
+        let sequence = Sequence::new(options.samples);
+        let sign = if surface.volume().is_some_and(|v| v < 0.0) { -1.0 } else { 1.0 };
+        (0..mesh.n_tets())
+            .map(|tet| {
+                let corners = mesh.tets()[tet].map(|v| Vec3::from(mesh.nodes()[v as usize]));
+                let edges = [1, 2, 3].map(|k| corners[k] - corners[0]);
+                let points: Vec<[f64; 3]> = sequence
+                    .in_tet(options.seed, tet as u32)
+                    .map(|w| (corners[0] + place(&edges, w)).into())
+                    .collect();
+                let winding = winding_number_exact(surface, &points);
+                let n = points.len() as f64;
+                let inside = winding.iter().filter(|&&w| sign * w > 0.5).count();
+                let unsure = winding.iter().filter(|&&w| (sign * w - 0.5).abs() < 0.01).count();
+                (inside as f64 / n, unsure as f64 / n)
+            })
+            .collect()
+    }
+
+    /// Closed, overlapping, open, with flipped triangles, unmerged vertices, inside out; tets at random
+    /// places, and tets whose nodes, faces and centroids lie on the surface.
+    #[test]
+    fn every_sample_falls_on_the_side_of_its_exact_winding_number() {
+        let ball = || cube(9, 0.9, 0.0);
+        let with_hole = || {
+            let (vertices, mut triangles) = ball();
+            triangles.drain(40..58);
+            (vertices, triangles)
+        };
+        let flipped = || {
+            let (vertices, mut triangles) = ball();
+            triangles.iter_mut().skip(7).step_by(90).for_each(|t| t.swap(0, 1));
+            (vertices, triangles)
+        };
+        let turned = || {
+            let (vertices, mut triangles) = ball();
+            triangles.iter_mut().for_each(|t| t.swap(0, 1));
+            (vertices, triangles)
+        };
+        let loose = || {
+            let (vertices, triangles) = ball();
+            let corners = triangles.iter().flatten().map(|&v| vertices[v as usize]).collect();
+            (corners, (0..triangles.len() as u32).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect())
+        };
+        let cases: [(&str, Triangles, TetMesh); 7] = [
+            ("ball", ball(), lattice(4, 0.31, 0.013)),
+            ("overlapping", joined(ball(), cube(7, 0.5, 0.4)), lattice(4, 0.41, 0.013)),
+            ("with a hole", with_hole(), lattice(4, 0.31, 0.013)),
+            ("with flipped triangles", flipped(), lattice(4, 0.31, 0.013)),
+            ("inside out", turned(), lattice(3, 0.41, 0.013)),
+            ("unmerged", loose(), lattice(3, 0.41, 0.013)),
+            ("cube on the lattice", cube(4, 0.0, 0.0), lattice(4, 0.25, 0.0)),
+        ];
+        let options = SamplingOptions { samples: 24, seed: 5, ..Default::default() };
+        for (name, triangles, mesh) in cases {
+            let muscle = muscle(triangles);
+            let made =
+                sample_muscles(&mesh, std::slice::from_ref(&muscle), &options, &|| false).unwrap();
+            let expected = exact(&mesh, &muscle.surface, &options);
+            for (tet, (&found, &(p, unsure))) in made.fraction.iter().zip(&expected).enumerate() {
+                assert!((found - p).abs() <= unsure + 1e-12, "{name}: tet {tet}: {found} for {p}");
+            }
+            assert!(
+                made.fraction.iter().any(|&p| p > 0.0 && p < 1.0) || name == "cube on the lattice"
+            );
+            let unsure: f64 = expected.iter().map(|e| e.1).sum();
+            assert!(unsure < 0.01 * mesh.n_tets() as f64, "{name}: {unsure} tets unsure");
+        }
+    }
+}

@@ -24,6 +24,15 @@ pub enum InsideTest {
     Normal,
 }
 
+/// Where a region lies.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Side {
+    Inside,
+    Outside,
+    /// Perhaps both: next to a hole, a level of the winding number parts them, not a triangle.
+    Mixed,
+}
+
 /// A muscle's surface with what the inside tests need.
 #[derive(Debug)]
 pub(super) struct MuscleShape<'a> {
@@ -83,15 +92,21 @@ impl<'a> MuscleShape<'a> {
         }
     }
 
-    /// Whether all of a ball that no triangle meets lies inside; none where one evaluation cannot tell.
-    pub fn holds_all(&self, centre: &Vec3, radius: f64) -> Option<bool> {
-        match self.test {
+    /// Side of a ball that no triangle meets, by one evaluation at its centre.
+    ///
+    /// The closest normal cannot tell where its answer changes: it stands for the whole ball.
+    pub fn side_of(&self, centre: &Vec3, radius: f64) -> Side {
+        let is_inside = match self.test {
             InsideTest::Winding => {
                 let w = self.winding(centre);
-                self.is_settled(w, centre, radius).then(|| is_inside(w))
+                if !self.is_settled(w, centre, radius) {
+                    return Side::Mixed;
+                }
+                is_inside(w)
             }
-            InsideTest::Normal => None,
-        }
+            InsideTest::Normal => self.holds(centre),
+        };
+        if is_inside { Side::Inside } else { Side::Outside }
     }
 
     /// Whether a winding number `w` at `centre`, counted on by the surface's crossings, decides for every

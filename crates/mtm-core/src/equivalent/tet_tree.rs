@@ -4,7 +4,7 @@ use crate::equivalent::aligned_box::AlignedBox;
 use crate::triangle::Vec3;
 
 /// Tets below which a branch is not split: their boxes are looked at one by one.
-const LEAF_TETS: usize = 8;
+const LEAF_TETS: usize = 4;
 /// Tets above which the two halves of a branch are built by different threads.
 const PARALLEL_TETS: usize = 4096;
 
@@ -108,7 +108,7 @@ mod tests {
 
     #[test]
     fn every_tet_lies_in_one_leaf_and_in_the_boxes_above_it() {
-        for n in [0, 1, 8, 9, 100, 5000] {
+        for n in [0, 1, LEAF_TETS, LEAF_TETS + 1, 100, 2 * PARALLEL_TETS] {
             let boxes = cubes(n);
             let tets: Vec<u32> = (0..n as u32).collect();
             let tree = TetTree::new(&tets, &boxes);
