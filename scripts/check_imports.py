@@ -173,8 +173,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "surface_checks": "checks crossings scene topology",
         "surface_repair": "capping case checks errors scene surface_checks topology _core",
         "doctor": (
-            "case checks errors io osteotomy patient planning registration scene surface_checks "
-            "surface_repair _core"
+            "case checks errors io osteotomy patient planning registration scene "
+            "surface_checks surface_repair template _core"
         ),
         "cli": (
             "build case checks cmfsim doctor errors evaluation io meshing musculature phantom "

@@ -311,6 +311,12 @@ class CaseMuscles:
     samples : int
         Points in a tet that a muscle's surface crosses.
     seed : int
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.CaseMuscles(samples=16).template
+    'default'
     """
 
     template: Path | str = "default"
