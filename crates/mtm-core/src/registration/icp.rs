@@ -395,7 +395,7 @@ fn check(
         return refuse("tolerance", options.tolerance, "0 or more, finite");
     }
     if let Some(distance) = options.max_distance
-        && !(distance > 0.0)
+        && (distance.is_nan() || distance <= 0.0)
     {
         return refuse("max_distance", distance, "above 0 mm");
     }

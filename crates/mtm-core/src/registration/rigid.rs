@@ -117,6 +117,13 @@ pub(crate) fn fit_pairs(
         fixed_squares += w / total * y.norm_squared();
     }
     let spread = (moving_squares * fixed_squares).sqrt();
+    if spread == 0.0 {
+        return Err(MtmError::NotDetermined {
+            what: "the rotation between the two sets",
+            reason: "all points of one set lie at one place; are all pairs with the same point?"
+                .to_owned(),
+        });
+    }
     let rotation = best_rotation(&(m / spread))?;
     // Σ y·R x = tr(R M), since (R x)·y = tr(R x yᵀ).
     let scale = if with_scale {
@@ -127,7 +134,7 @@ pub(crate) fn fit_pairs(
     Ok(Pose { rotation, scale, centre, image })
 }
 
-/// Rotation of largest tr(R M).
+/// Rotation of largest tr(R M), with M (finite) over the spread of the points.
 ///
 /// The quaternion is the eigenvector of the largest eigenvalue of the symmetric N (Horn 1987).
 fn best_rotation(m: &Matrix3<f64>) -> Result<UnitQuaternion<f64>> {
@@ -144,8 +151,7 @@ fn best_rotation(m: &Matrix3<f64>) -> Result<UnitQuaternion<f64>> {
     let mut order = [0, 1, 2, 3];
     order.sort_by(|&i, &j| eigen.eigenvalues[j].total_cmp(&eigen.eigenvalues[i]));
     let gap = eigen.eigenvalues[order[0]] - eigen.eigenvalues[order[1]];
-    // Not `<=`: a NaN gap must be refused too.
-    if !(gap > UNDETERMINED_GAP) {
+    if gap <= UNDETERMINED_GAP {
         return Err(MtmError::NotDetermined {
             what: "the rotation between the two sets",
             reason: format!(
