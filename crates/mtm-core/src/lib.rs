@@ -50,12 +50,14 @@
 //! # }
 //! ```
 
+mod acceleration;
 pub mod blocks;
 pub mod boundary;
 pub mod cholesky;
 pub mod constraints;
 pub mod contact;
 pub mod crease;
+mod curvature;
 pub mod equivalent;
 pub mod error;
 mod error_bound;
@@ -74,6 +76,7 @@ pub mod relaxation;
 pub mod replan;
 pub mod restraint;
 mod row_sums;
+mod settling;
 pub mod signed_distance;
 pub mod solution;
 pub mod statics;
