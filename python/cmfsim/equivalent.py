@@ -53,7 +53,8 @@ class MuscleVolume:
     error : float, mm³
         Standard error of `inside`, from those of the tets' fractions.
     enclosed : float or None, mm³
-        What the surface encloses, in the mesh or not; None where it is not closed.
+        What the surface encloses, in the mesh or not, what overlaps itself twice; None where it is
+        not closed.
     """
 
     inside: float
@@ -76,8 +77,9 @@ class Mixture:
         How far one direction leads in the tet: 1 parallel fibres, 0 none (then the fibre is that of
         the first of the muscles, in an order that their shapes give).
     error : (m,) float64
-        Standard error of `fraction`, √(p(1−p)) samples^(−2/3), where the surface is smooth over the
-        tet; that of as many random points, √(p(1−p)/samples), at most. 0 where no surface crosses.
+        Standard error of `fraction`, 0.7 q^(1/3) samples^(−2/3) with q = min(p, 1−p), where the
+        surface is smooth over the tet; that of as many random points, √(p(1−p)/samples), at most.
+        0 where no surface crosses.
     tissue : Tissue
     volumes : mapping of str to MuscleVolume
         By the muscle's name, in the order given.
@@ -332,7 +334,7 @@ def _findings(
                 f"the surface of {name} is inside out; it was turned",
                 where=name,
             )
-        if not surface.is_closed:
+        if volume.enclosed is None:
             yield Finding(
                 "note",
                 "muscle-open",

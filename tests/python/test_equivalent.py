@@ -218,7 +218,7 @@ def test_phantom_muscles_keep_their_volume_and_their_course():
     centroid = mesh.nodes[mesh.tets].mean(1)
     for name in names:
         inside = mixture.muscle_fraction(name) > 0.99
-        known = head.muscles[name].directions(centroid[inside])
+        known = head.muscles[name].fibre(centroid[inside])
         cosine = np.abs(np.einsum("na,na->n", known, mixture.fibre[inside]))
         assert np.degrees(np.arccos(np.clip(np.median(cosine), 0, 1))) < 10.0, name
 

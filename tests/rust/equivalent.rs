@@ -84,7 +84,8 @@ fn tets_cut_by_a_plane_have_their_exact_fraction_within_the_stated_error() {
                 if made.error[t] == 0.0 {
                     assert!(error.abs() < 1e-9, "tet {t}: {} for {exact}", made.fraction[t]);
                 } else {
-                    assert!(error.abs() < 5.0 * made.error[t], "tet {t}: {error}");
+                    let stated = made.error[t];
+                    assert!(error.abs() < 6.0 * stated, "tet {t}: {error}, {stated} stated");
                     squares += error * error;
                     stated += made.error[t].powi(2);
                     cut += 1;
@@ -92,7 +93,8 @@ fn tets_cut_by_a_plane_have_their_exact_fraction_within_the_stated_error() {
             }
         }
         let (error, stated) = ((squares / f64::from(cut)).sqrt(), (stated / f64::from(cut)).sqrt());
-        assert!(error < stated, "{samples} samples: {error} where {stated} is stated");
+        let share = error / stated;
+        assert!((0.5..1.0).contains(&share), "{samples} samples: {error} where {stated} is stated");
         if let Some(before) = previous {
             rates.push((before / error).log2() / 2.0);
         }
@@ -186,7 +188,9 @@ fn tets_away_from_every_muscle_cost_nothing() {
     assert_eq!(made.volumes[0].inside, 0.0);
     let near = muscle(ball(2.0, [8.0; 3]), [0.0, 0.0, 1.0]);
     let one = sampled(&mesh, std::slice::from_ref(&near), 64);
-    assert_eq!(sampled(&mesh, &[far, near], 64).counts, one.counts);
+    let both = sampled(&mesh, &[far, near], 64).counts;
+    assert_eq!(both.crossed, one.counts.crossed);
+    assert!(both.pairs * 10 < one.counts.pairs * 11, "{both:?} for {:?}", one.counts);
     // The ball fills 1 % of the mesh; its box, and the leaves of the tree that meet it, a little more.
     assert!(one.counts.pairs * 20 < mesh.n_tets(), "{:?} of {}", one.counts, mesh.n_tets());
     assert!(one.counts.crossed < one.counts.pairs);

@@ -42,6 +42,8 @@ pub(super) struct MuscleShape<'a> {
     bounds: AlignedBox,
     border: Border,
     tree: WindingTree,
+    /// Volume between the triangles and the middle of their box, mm³.
+    signed_volume: f64,
     /// −1 for a surface that is inside out, whose normals are turned; else 1.
     pub orientation: f64,
     pub test: InsideTest,
@@ -53,9 +55,10 @@ impl<'a> MuscleShape<'a> {
         let corners: Vec<[Vec3; 3]> = (0..n).map(|t| surface.corners(t)).collect();
         let boxes: Vec<AlignedBox> = corners.iter().map(|c| AlignedBox::of(c)).collect();
         let bounds = boxes.iter().fold(AlignedBox::EMPTY, |all, one| all.joined(one));
-        let orientation = if signed_volume(&corners, &bounds.centre()) < 0.0 { -1.0 } else { 1.0 };
+        let signed_volume = signed_volume(&corners, &bounds.centre());
+        let orientation = if signed_volume < 0.0 { -1.0 } else { 1.0 };
         let (border, tree) = (Border::new(surface), WindingTree::new(surface));
-        Self { surface, corners, boxes, bounds, border, tree, orientation, test }
+        Self { surface, corners, boxes, bounds, border, tree, signed_volume, orientation, test }
     }
 
     pub fn n_triangles(&self) -> usize {
@@ -73,6 +76,11 @@ impl<'a> MuscleShape<'a> {
     /// Box round the whole surface: outside of it no point counts as inside.
     pub fn bounds(&self) -> &AlignedBox {
         &self.bounds
+    }
+
+    /// Volume that the surface encloses, mm³; none where it has a border. Vertices at one place are one.
+    pub fn enclosed(&self) -> Option<f64> {
+        self.border.is_empty().then_some(self.signed_volume.abs())
     }
 
     /// Winding number at `p`, positive inside whichever way the triangles turn.
