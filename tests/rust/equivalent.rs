@@ -84,8 +84,8 @@ fn tets_cut_by_a_plane_have_their_exact_fraction_within_the_stated_error() {
                 if made.error[t] == 0.0 {
                     assert!(error.abs() < 1e-9, "tet {t}: {} for {exact}", made.fraction[t]);
                 } else {
-                    let stated = made.error[t];
-                    assert!(error.abs() < 6.0 * stated, "tet {t}: {error}, {stated} stated");
+                    let limit = 6.0 * made.error[t];
+                    assert!(error.abs() < limit, "tet {t}: {error}, 6 standard errors {limit}");
                     squares += error * error;
                     stated += made.error[t].powi(2);
                     cut += 1;
