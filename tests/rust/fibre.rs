@@ -1,4 +1,5 @@
 //! Fibre directions from boxes: shapes whose fibres are known in closed form, and bad input.
+#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
