@@ -55,7 +55,14 @@ CORE: Mapping[str, frozenset[str]] = {
         ),
         "equivalent/stiffness": "equivalent/shares material",
         "equivalent": "fibre material mesh surface triangle winding",
-        "tensors": "blocks mesh material",
+        "element": "mesh",
+        "kinematics": "",
+        "quadratic": "blocks element",
+        "nodal_pressure": "blocks material mesh",
+        "tensors": "blocks element material mesh nodal_pressure quadratic",
+        "polar": "",
+        "density": "kinematics material polar",
+        "strain_energy": "blocks density element kinematics nodal_pressure tensors",
         "motion": "surface mesh triangle",
         "registration/spread": "triangle",
         "registration/thin_plate": "registration/spread triangle",
@@ -108,14 +115,22 @@ CORE: Mapping[str, frozenset[str]] = {
         ),
         "multigrid": "blocks krylov row_sums",
         "relaxation": "blocks",
-        "method": "contact",
+        "method": "contact kinematics",
+        "reduction": "blocks boundary",
         "solution": "",
         "system": (
             "blocks boundary cholesky constraints contact crease krylov mesh method multigrid "
             "relaxation restraint solution"
         ),
-        "statics": ("blocks boundary contact mesh method restraint solution system tensors"),
-        "replan": "boundary crease mesh method motion statics system",
+        "equilibrium": (
+            "blocks boundary cholesky constraints contact krylov mesh method multigrid reduction "
+            "solution strain_energy system tensors"
+        ),
+        "statics": (
+            "blocks boundary contact equilibrium kinematics mesh method reduction restraint "
+            "solution system tensors"
+        ),
+        "replan": "boundary crease kinematics mesh method motion reduction statics system",
     }.items()
 }
 # The one place, below crates/, that may name each outside crate.

@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
+use crate::mesh::{add, scaled};
 use crate::motion::{RigidMotion, SurfaceMotion};
 use crate::surface::Surface;
 
@@ -51,6 +52,8 @@ pub struct Boundary {
     /// Joined nodes as the caller gave them: rows of a plan's displacements follow this order.
     given: Vec<Vec<u32>>,
     conflicts: usize,
+    /// Joined nodes in the middle of an edge, with its ends.
+    inherited: HashMap<u32, [u32; 2]>,
 }
 
 /// How a segment moves.
@@ -94,6 +97,7 @@ impl Boundary {
             given: segments.iter().map(|s| s.joined.clone()).collect(),
             segments,
             conflicts: 0,
+            inherited: HashMap::new(),
         };
         boundary.check_segments()?;
         let mut taken: HashMap<u32, String> = HashMap::new();
@@ -138,6 +142,55 @@ impl Boundary {
         }
         boundary.conflicts = lost;
         Ok(boundary)
+    }
+
+    /// The boundary with the nodes in the middle of edges: node `n_corners + i` lies between `edges[i]`.
+    ///
+    /// A node is fixed or joined where both ends of its edge are (to one segment). It slides where its edge
+    /// lies on the surface of the body and one end slides, the other on the same segment, joined to it or
+    /// fixed. All others are free. A prescribed gap is the mean of the sliding ends'.
+    ///
+    /// # Errors
+    /// A node index of `n_corners` or more.
+    pub fn with_mid_edges(
+        &self,
+        n_corners: usize,
+        edges: &[[u32; 2]],
+        on_surface: impl Fn([u32; 2]) -> bool,
+    ) -> Result<Self> {
+        use NodeKind::{Fixed, Joined, Sliding};
+        let kinds = self.kinds(n_corners)?;
+        let mut out = self.clone();
+        let mut gap_of: HashMap<u32, f64> = HashMap::new();
+        for segment in &self.segments {
+            if let Gap::PerNode(values) = &segment.gap {
+                gap_of.extend(segment.sliding.iter().copied().zip(values.iter().copied()));
+            }
+        }
+        for (i, &[a, b]) in edges.iter().enumerate() {
+            let node = (n_corners + i) as u32;
+            let slides_on = match (kinds[a as usize], kinds[b as usize]) {
+                (Fixed, Fixed) => {
+                    out.fixed.push(node);
+                    None
+                }
+                (Joined(s), Joined(other)) if s == other => {
+                    out.segments[s].joined.push(node);
+                    out.inherited.insert(node, [a, b]);
+                    None
+                }
+                (Sliding(s), Fixed) | (Fixed, Sliding(s)) => Some(s),
+                (Sliding(s), Joined(o) | Sliding(o)) | (Joined(o), Sliding(s)) if s == o => Some(s),
+                _ => None,
+            };
+            let Some(s) = slides_on.filter(|_| on_surface([a, b])) else { continue };
+            out.segments[s].sliding.push(node);
+            if let Gap::PerNode(values) = &mut out.segments[s].gap {
+                let ends: Vec<f64> = [a, b].iter().filter_map(|j| gap_of.get(j).copied()).collect();
+                values.push(ends.iter().sum::<f64>() / ends.len() as f64);
+            }
+        }
+        Ok(out)
     }
 
     fn check_segments(&self) -> Result<()> {
@@ -313,7 +366,14 @@ impl Boundary {
                         });
                     }
                 }
-                segment.joined.iter().map(|&j| (j, seen[&j])).collect()
+                segment
+                    .joined
+                    .iter()
+                    .map(|j| match self.inherited.get(j) {
+                        Some([a, b]) => (*j, scaled(add(seen[a], seen[b]), 0.5)),
+                        None => (*j, seen[j]),
+                    })
+                    .collect()
             }
         })
     }

@@ -135,13 +135,15 @@ pub struct Response {
 impl Sliding {
     /// The sliding nodes of `boundary`, or nothing where no node slides.
     ///
-    /// `row_of`: row of each node among the unknowns. `stiffness`: of each node by itself, N/mm.
+    /// `places`: position of each node at rest, those in the middle of edges included. `row_of`: row of
+    /// each node among the unknowns. `stiffness`: of each node by itself, N/mm.
     ///
     /// # Errors
     /// A contact surface that faces away from the tissue where that matters.
     pub fn new(
         boundary: &Boundary,
         mesh: &TetMesh,
+        places: &[[f64; 3]],
         row_of: &[u32],
         stiffness: impl Fn(usize) -> f64,
         mode: ContactMode,
@@ -167,7 +169,7 @@ impl Sliding {
                 continue;
             };
             let positions: Vec<[f64; 3]> =
-                segment.sliding.iter().map(|&j| mesh.nodes()[j as usize]).collect();
+                segment.sliding.iter().map(|&j| places[j as usize]).collect();
             let closest = surface.closest(&positions);
             let normals: Vec<[f64; 3]> = closest.iter().map(|c| c.normal).collect();
             check_facing(mesh, &segment.name, &segment.sliding, surface, &normals, mode)?;
@@ -276,9 +278,11 @@ fn check_facing(
     if mode == ContactMode::Bilateral && !inside_out {
         return Ok(());
     }
+    let corners = nodes.iter().filter(|&&j| (j as usize) < mesh.n_nodes()).count();
     let away: Vec<u32> = nodes
         .iter()
         .zip(normals)
+        .filter(|&(&j, _)| (j as usize) < mesh.n_nodes())
         .filter(|&(&j, &n)| {
             // Σ_t V_t ∇φ_j = ∫ φ_j dA over the boundary round j: a third of its area vector, out of the
             // tissue, whatever the shape of the tets; zero but for rounding inside the body.
@@ -296,7 +300,7 @@ fn check_facing(
         })
         .map(|(&j, _)| j)
         .collect();
-    if away.len() as f64 <= MOSTLY * nodes.len() as f64 {
+    if away.len() as f64 <= MOSTLY * corners as f64 {
         return Ok(());
     }
     Err(MtmError::ContactSurface {
@@ -305,7 +309,7 @@ fn check_facing(
             "is inverted: its normals point away from the tissue at {} of {} sliding nodes (for example \
              node {}); normals point out of the bone: reverse the order of each triangle's vertices",
             away.len(),
-            nodes.len(),
+            corners,
             away[0]
         ),
     })

@@ -613,8 +613,13 @@ fn check_voigt(tet: usize, c: &Voigt) -> Result<()> {
     check_definite(tet, voigt_eigenvalues(c), || "a given stiffness".to_owned())
 }
 
+/// The symmetric part of `c`.
+pub(crate) fn voigt_matrix(c: &Voigt) -> Matrix6<f64> {
+    Matrix6::from_fn(|i, j| 0.5 * (c[i][j] + c[j][i]))
+}
+
 /// Extreme eigenvalues of C in Mandel form, where shears carry √2 and strain keeps its norm.
-fn voigt_eigenvalues(c: &Voigt) -> (f64, f64) {
+pub(crate) fn voigt_eigenvalues(c: &Voigt) -> (f64, f64) {
     let weight = |i: usize| if i < 3 { 1.0 } else { std::f64::consts::SQRT_2 };
     let mandel = Matrix6::from_fn(|i, j| 0.5 * (c[i][j] + c[j][i]) * weight(i) * weight(j));
     let values = SymmetricEigen::new(mandel).eigenvalues;

@@ -207,8 +207,8 @@ impl TetMesh {
 }
 
 impl Incidence {
-    /// Of tets on `n_nodes` nodes.
-    pub(crate) fn new(n_nodes: usize, tets: &[[u32; 4]]) -> Self {
+    /// Of tets with `N` nodes each on `n_nodes` nodes.
+    pub(crate) fn new<const N: usize>(n_nodes: usize, tets: &[[u32; N]]) -> Self {
         let mut start = vec![0_u32; n_nodes + 1];
         for &v in tets.iter().flatten() {
             start[v as usize + 1] += 1;
@@ -217,7 +217,7 @@ impl Incidence {
             start[j + 1] += start[j];
         }
         let mut next = start.clone();
-        let mut list = vec![0_u32; 4 * tets.len()];
+        let mut list = vec![0_u32; N * tets.len()];
         for (t, tet) in tets.iter().enumerate() {
             for &v in tet {
                 list[next[v as usize] as usize] = t as u32;

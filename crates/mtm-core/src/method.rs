@@ -2,6 +2,7 @@
 
 use crate::contact::ContactOptions;
 use crate::error::{ErrorKind, MtmError, Result};
+use crate::kinematics::Kinematics;
 
 /// Asked now and then whether to stop.
 pub type Interrupt<'a> = &'a (dyn Fn() -> bool + Sync);
@@ -36,6 +37,8 @@ pub struct StaticOptions {
     pub contact: ContactOptions,
     /// Memory that a factor may take, bytes; without limit if `None`.
     pub memory_limit: Option<usize>,
+    /// How strain follows from displacement.
+    pub kinematics: Kinematics,
 }
 
 impl Default for StaticOptions {
@@ -46,6 +49,7 @@ impl Default for StaticOptions {
             max_iterations: None,
             contact: ContactOptions::default(),
             memory_limit: None,
+            kinematics: Kinematics::Linear,
         }
     }
 }

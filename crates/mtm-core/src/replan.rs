@@ -9,9 +9,11 @@ use rayon::prelude::*;
 use crate::boundary::{Motion, NodeKind, Plan, matched};
 use crate::crease::ContactRow;
 use crate::error::{ErrorKind, MtmError, Result};
+use crate::kinematics::Kinematics;
 use crate::mesh::{dot, sub};
 use crate::method::Interrupt;
-use crate::statics::{NO_ROW, StaticSolver};
+use crate::reduction::NO_ROW;
+use crate::statics::StaticSolver;
 use crate::system::Frozen;
 
 /// Unit fields per segment.
@@ -49,9 +51,18 @@ impl StaticSolver {
         reference: Option<&Plan>,
         interrupted: Interrupt<'_>,
     ) -> Result<PlanOperator> {
+        if self.kinematics() != Kinematics::Linear {
+            return Err(MtmError::UnknownName {
+                what: "kinematics of a plan operator",
+                found: self.kinematics().name().into(),
+                known: "linear (no linear map gives the others; use solve)",
+                kind: ErrorKind::Solver,
+            });
+        }
         let mesh = self.tensors.mesh();
-        let n = mesh.n_nodes();
-        let nodes = nodes.unwrap_or_else(|| (0..n as u32).collect());
+        let places = self.tensors.element_nodes().positions();
+        let n = places.len();
+        let nodes = nodes.unwrap_or_else(|| (0..mesh.n_nodes() as u32).collect());
         if let Some(row) = nodes.iter().position(|&j| j as usize >= n) {
             return Err(MtmError::IndexOutOfRange {
                 what: "nodes".into(),
@@ -62,7 +73,7 @@ impl StaticSolver {
                 kind: ErrorKind::Boundary,
             });
         }
-        let segments = self.boundary.segments();
+        let segments = self.node_kinds.segments();
         let rest: Plan = segments
             .iter()
             .map(|s| (s.name.clone(), Motion::Rigid(crate::motion::RigidMotion::identity())))
@@ -77,7 +88,7 @@ impl StaticSolver {
                 let count = (s.joined.len() + s.sliding.len()) as f64;
                 let mut c = [0.0; 3];
                 for &j in members {
-                    c = [0, 1, 2].map(|i| c[i] + mesh.nodes()[j as usize][i] / count);
+                    c = [0, 1, 2].map(|i| c[i] + places[j as usize][i] / count);
                 }
                 c
             })
@@ -98,7 +109,7 @@ impl StaticSolver {
             for column in 0..COLUMNS {
                 let mut u = vec![[0.0; 3]; n];
                 for &j in &segment.joined {
-                    u[j as usize] = unit_field(column, mesh.nodes()[j as usize], centres[s]);
+                    u[j as usize] = unit_field(column, places[j as usize], centres[s]);
                 }
                 scales.push(if column < 9 { mesh.diagonal() } else { 1.0 });
                 fields.push(self.coupled(&u));
@@ -117,27 +128,27 @@ impl StaticSolver {
         }
         if contact.is_some() {
             scales.push(1.0);
-            fields.push(vec![[0.0; 3]; self.unknowns.len()]);
+            fields.push(vec![[0.0; 3]; self.reduction.unknowns.len()]);
             let rest = |(row, &foot): (&ContactRow, &[f64; 3])| {
                 let node = &sliding[row.node];
-                dot(row.normal, sub(foot, mesh.nodes()[node.node as usize]))
+                dot(row.normal, sub(foot, places[node.node as usize]))
             };
             offsets.push(rows.iter().zip(&feet).map(rest).collect());
         }
         let frozen = contact.as_ref().map(|_| Frozen { rows, offsets: &offsets });
         let solved = self.solve_columns(fields, &scales, frozen, interrupted)?;
 
-        let kinds = self.boundary.kinds(n)?;
+        let kinds = self.node_kinds.kinds(n)?;
         let mut rows = vec![[0.0; COLUMNS]; 3 * nodes.len() * segments.len()];
         let mut offset = contact.as_ref().map(|_| vec![0.0; 3 * nodes.len()]);
         for (at, &j) in nodes.iter().enumerate() {
-            let row = self.row_of[j as usize];
+            let row = self.reduction.row_of[j as usize];
             for s in 0..segments.len() {
                 for column in 0..COLUMNS {
                     let u = if row != NO_ROW {
                         solved[COLUMNS * s + column][row as usize]
                     } else if kinds[j as usize] == NodeKind::Joined(s) {
-                        unit_field(column, mesh.nodes()[j as usize], centres[s])
+                        unit_field(column, places[j as usize], centres[s])
                     } else {
                         [0.0; 3]
                     };

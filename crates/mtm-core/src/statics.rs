@@ -3,36 +3,42 @@
 
 use std::sync::Arc;
 
-use rayon::prelude::*;
-
 use crate::blocks::{Block, BlockMatrix};
 use crate::boundary::{Boundary, Motion, NodeKind, Plan};
 use crate::contact::{ContactState, Sliding};
+use crate::equilibrium::Equilibrium;
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
+use crate::kinematics::Kinematics;
 use crate::mesh::{dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
+use crate::reduction::{NO_ROW, Reduction};
 use crate::restraint;
 use crate::solution::{Clock, ContactResult, Solution, Timings};
 use crate::system::{Effort, Frozen, System};
 use crate::tensors::MassTensors;
 
-/// Row of a node that is no unknown.
-pub(crate) const NO_ROW: u32 = u32::MAX;
-
 /// A patient's tensors and node kinds, ready for any plan.
 pub struct StaticSolver {
     pub(crate) tensors: Arc<MassTensors>,
-    pub(crate) boundary: Arc<Boundary>,
+    boundary: Arc<Boundary>,
+    /// The boundary with the nodes in the middle of edges, where the element has them.
+    pub(crate) node_kinds: Arc<Boundary>,
     options: StaticOptions,
     method: Method,
-    /// Node of each row of the system.
-    pub(crate) unknowns: Vec<u32>,
-    pub(crate) row_of: Vec<u32>,
+    pub(crate) reduction: Reduction,
     pub(crate) sliding: Option<Sliding>,
-    system: System,
+    mechanics: Mechanics,
     /// Coupling of unknown rows with joined nodes: (row, node, tensor).
     couplings: Vec<(u32, u32, Block)>,
     timings: Timings,
+}
+
+/// How the unknown rows follow from a plan.
+enum Mechanics {
+    /// One linear system for every plan.
+    Linear(System),
+    /// Newton's method.
+    LargeRotation(Box<Equilibrium>),
 }
 
 impl StaticSolver {
@@ -50,57 +56,71 @@ impl StaticSolver {
         options.check()?;
         let mut clock = Clock::new();
         let mesh = tensors.mesh().clone();
-        let kinds = boundary.kinds(mesh.n_nodes())?;
-        let is_unknown = |k: &NodeKind| matches!(k, NodeKind::Free | NodeKind::Sliding(_));
-        let mut row_of = vec![NO_ROW; kinds.len()];
-        let mut unknowns = Vec::new();
-        for (j, kind) in kinds.iter().enumerate() {
-            if is_unknown(kind) {
-                row_of[j] = unknowns.len() as u32;
-                unknowns.push(j as u32);
-            }
-        }
+        let places = tensors.element_nodes().positions();
+        let node_kinds = with_mid_edges(&tensors, &boundary)?;
+        let kinds = node_kinds.kinds(places.len())?;
+        let reduction = Reduction::new(&kinds);
+        let is_unknown = |j: usize| reduction.row_of[j] != NO_ROW;
         let stiffness = |j: usize| own_stiffness(tensors.matrix(), j);
-        let sliding = Sliding::new(&boundary, &mesh, &row_of, stiffness, options.contact.mode)?;
+        let sliding = Sliding::new(
+            &node_kinds,
+            &mesh,
+            places,
+            &reduction.row_of,
+            stiffness,
+            options.contact.mode,
+        )?;
         clock.lap("contact_setup", sliding.is_some());
         let normals: Vec<(u32, [f64; 3])> = sliding
             .iter()
             .flat_map(|s| s.nodes().iter().zip(s.rest_normals()))
             .map(|(s, &n)| (s.node, n))
+            // Whole faces join the tets of a part, so its corners say how it is held.
+            .filter(|(node, _)| (*node as usize) < mesh.n_nodes())
             .collect();
-        let held = restraint::check(&mesh, |j| !is_unknown(&kinds[j]), &normals)?;
+        let held = restraint::check(&mesh, |j| !is_unknown(j), &normals)?;
         clock.lap("restraint", true);
 
-        let couplings = couplings(tensors.matrix(), &unknowns, &kinds);
-        let matrix = submatrix(tensors.matrix(), &unknowns, &row_of);
+        let couplings = couplings(tensors.matrix(), &reduction.unknowns, &kinds);
+        let matrix = reduction.matrix(tensors.matrix());
         clock.lap("reduce", true);
         if interrupted() {
             return Err(MtmError::Interrupted);
         }
-        let positions: Vec<[f64; 3]> = unknowns.iter().map(|&j| mesh.nodes()[j as usize]).collect();
-        let (system, method) = System::new(
-            matrix,
-            &positions,
-            sliding.as_ref(),
-            held,
-            tensors.tissue().largest_lame_ratio(),
-            &options,
-            &mut clock,
-            interrupted,
-        )
-        .map_err(|e| by_node(e, &unknowns))?;
+        let made = if options.kinematics == Kinematics::Linear {
+            System::new(
+                matrix,
+                &reduction.rows(places),
+                sliding.as_ref(),
+                held,
+                tensors.tissue().largest_lame_ratio(),
+                &options,
+                &mut clock,
+                interrupted,
+            )
+            .map(|(system, method)| (Mechanics::Linear(system), method))
+        } else {
+            Equilibrium::new(tensors.clone(), &matrix, &options, &mut clock)
+                .map(|(body, method)| (Mechanics::LargeRotation(Box::new(body)), method))
+        };
+        let (mechanics, method) = made.map_err(|e| by_node(e, &reduction.unknowns))?;
         Ok(Self {
             tensors,
             boundary,
+            node_kinds,
             options,
             method,
-            unknowns,
-            row_of,
+            reduction,
             sliding,
-            system,
+            mechanics,
             couplings,
             timings: clock.laps,
         })
+    }
+
+    /// How strain follows from displacement.
+    pub fn kinematics(&self) -> Kinematics {
+        self.options.kinematics
     }
 
     /// The method used: never `Auto`.
@@ -120,12 +140,15 @@ impl StaticSolver {
 
     /// Number of unknowns, three per free or sliding node.
     pub fn n_unknowns(&self) -> usize {
-        3 * self.unknowns.len()
+        3 * self.reduction.unknowns.len()
     }
 
     /// Bytes of the factor or preconditioner that is kept.
     pub fn factor_bytes(&self) -> usize {
-        self.system.bytes()
+        match &self.mechanics {
+            Mechanics::Linear(system) => system.bytes(),
+            Mechanics::LargeRotation(body) => body.bytes(),
+        }
     }
 
     /// Seconds by stage of the set-up.
@@ -133,7 +156,8 @@ impl StaticSolver {
         &self.timings
     }
 
-    /// Displacements under `plan` and nodal `loads` (N, one row per node).
+    /// Displacements under `plan` and nodal `loads` (N, one row per corner, or per node with those in the
+    /// middle of edges).
     ///
     /// Depends on its arguments alone: nothing is left over from earlier plans.
     ///
@@ -147,25 +171,14 @@ impl StaticSolver {
         interrupted: Interrupt<'_>,
     ) -> Result<Solution> {
         let mut clock = Clock::new();
-        let n = self.tensors.mesh().n_nodes();
-        if let Some(rows) = loads {
-            if rows.len() != n {
-                return Err(MtmError::Length {
-                    what: "loads".into(),
-                    found: rows.len(),
-                    expected: n,
-                    why: "one row per node",
-                    kind: ErrorKind::Boundary,
-                });
-            }
-            check_finite_rows("loads", rows, ErrorKind::Boundary)?;
-        }
-        let motions = self.boundary.motions(plan)?;
+        let loads = loads.map(|rows| self.checked_loads(rows)).transpose()?;
+        let loads = loads.as_deref();
+        let motions = self.node_kinds.motions(plan)?;
         let mut u = self.prescribed(&motions)?;
         let scale = u.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
         let mut b = self.coupled(&u);
         if let Some(rows) = loads {
-            for (b, &j) in b.iter_mut().zip(&self.unknowns) {
+            for (b, &j) in b.iter_mut().zip(&self.reduction.unknowns) {
                 *b = [0, 1, 2].map(|i| b[i] + rows[j as usize][i]);
             }
         }
@@ -173,12 +186,15 @@ impl StaticSolver {
 
         let mut effort = Effort::default();
         let (rows, contact, contact_seconds) =
-            self.solve_rows(&b, &motions, scale, &mut effort, interrupted)?;
+            self.solve_rows(&b, &u, loads, &motions, scale, &mut effort, interrupted)?;
         clock.lap("solve", true);
-        for (&j, v) in self.unknowns.iter().zip(&rows) {
+        for (&j, v) in self.reduction.unknowns.iter().zip(&rows) {
             u[j as usize] = *v;
         }
-        let forces = self.tensors.matrix().multiply(&u);
+        let forces = match &self.mechanics {
+            Mechanics::Linear(_) => self.tensors.matrix().multiply(&u),
+            Mechanics::LargeRotation(body) => body.forces(&u)?,
+        };
         let residual = self.residual(&forces, loads, contact.as_ref(), &b);
         if !(residual.is_finite() && effort.error_bound.is_finite()) {
             return Err(MtmError::NotPositiveDefinite {
@@ -210,10 +226,10 @@ impl StaticSolver {
 
     /// Displacements of all nodes with the prescribed ones filled in, mm.
     fn prescribed(&self, motions: &[&Motion]) -> Result<Vec<[f64; 3]>> {
-        let nodes = self.tensors.mesh().nodes();
+        let nodes = self.tensors.element_nodes().positions();
         let mut u = vec![[0.0; 3]; nodes.len()];
         for (s, motion) in motions.iter().enumerate() {
-            for (j, v) in self.boundary.joined_displacements(s, motion, nodes)? {
+            for (j, v) in self.node_kinds.joined_displacements(s, motion, nodes)? {
                 u[j as usize] = v;
             }
         }
@@ -222,7 +238,7 @@ impl StaticSolver {
 
     /// Forces −K_UB u_B that prescribed nodes bring to the unknown rows, N.
     pub(crate) fn coupled(&self, u: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        let mut b = vec![[0.0; 3]; self.unknowns.len()];
+        let mut b = vec![[0.0; 3]; self.reduction.unknowns.len()];
         for (row, node, k) in &self.couplings {
             let v = u[*node as usize];
             let out = &mut b[*row as usize];
@@ -233,23 +249,52 @@ impl StaticSolver {
         b
     }
 
+    /// `loads` for every node, those in the middle of edges included.
+    fn checked_loads(&self, loads: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
+        let n = self.tensors.element_nodes().n_nodes();
+        let corners = self.tensors.mesh().n_nodes();
+        if loads.len() != n && loads.len() != corners {
+            return Err(MtmError::Length {
+                what: "loads".into(),
+                found: loads.len(),
+                expected: corners,
+                why: "one row per node",
+                kind: ErrorKind::Boundary,
+            });
+        }
+        check_finite_rows("loads", loads, ErrorKind::Boundary)?;
+        let mut out = loads.to_vec();
+        out.resize(n, [0.0; 3]);
+        Ok(out)
+    }
+
     /// Displacements of the unknown rows, contact, and the seconds it took.
+    ///
+    /// `b`: forces that joined nodes and loads bring to the rows of the linear system. `u`: displacements
+    /// of all nodes, those of joined ones filled in.
     fn solve_rows(
         &self,
         b: &[[f64; 3]],
+        u: &[[f64; 3]],
+        loads: Option<&[[f64; 3]]>,
         motions: &[&Motion],
         scale: f64,
         effort: &mut Effort,
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, Option<ContactState>, f64)> {
-        let found = match &self.sliding {
-            None => self.system.solve(b, scale, effort, interrupted).map(|u| (u, None, 0.0)),
-            Some(sliding) => self
-                .system
+        let found = match (&self.mechanics, &self.sliding) {
+            (Mechanics::LargeRotation(body), sliding) => {
+                let sliding = sliding.as_ref().map(|s| (s, motions));
+                body.solve(&self.reduction, u, loads, sliding, scale, effort, interrupted)
+            }
+            (Mechanics::Linear(system), None) => {
+                system.solve(b, scale, effort, interrupted).map(|u| (u, None, 0.0))
+            }
+            (Mechanics::Linear(system), Some(sliding)) => system
                 .solve_with_contact(b, sliding, motions, &self.options, scale, effort, interrupted)
                 .map(|(u, state, seconds)| (u, Some(state), seconds)),
         };
-        found.map_err(|e| by_node(e, &self.unknowns))
+        found.map_err(|e| by_node(e, &self.reduction.unknowns))
     }
 
     /// Force out of balance at the unknown nodes over the forces that the plan brings in.
@@ -261,6 +306,7 @@ impl StaticSolver {
         b: &[[f64; 3]],
     ) -> f64 {
         let mut rest: Vec<[f64; 3]> = self
+            .reduction
             .unknowns
             .iter()
             .map(|&j| {
@@ -304,11 +350,12 @@ impl StaticSolver {
         if self.sliding.is_none() {
             return Ok(None);
         }
-        let motions = self.boundary.motions(plan)?;
+        let motions = self.node_kinds.motions(plan)?;
         let u = self.prescribed(&motions)?;
         let scale = u.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
         let b = self.coupled(&u);
-        Ok(self.solve_rows(&b, &motions, scale, &mut Effort::default(), interrupted)?.1)
+        let mut effort = Effort::default();
+        Ok(self.solve_rows(&b, &u, None, &motions, scale, &mut effort, interrupted)?.1)
     }
 
     /// Unknown rows for several right-hand sides, with contact frozen where there is any.
@@ -319,10 +366,31 @@ impl StaticSolver {
         frozen: Option<Frozen<'_>>,
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
-        self.system
+        let Mechanics::Linear(system) = &self.mechanics else {
+            unreachable!("plan operators of other kinematics are refused before they get here")
+        };
+        system
             .solve_columns(columns, scales, self.sliding.as_ref().zip(frozen), interrupted)
-            .map_err(|e| by_node(e, &self.unknowns))
+            .map_err(|e| by_node(e, &self.reduction.unknowns))
     }
+}
+
+/// `boundary` with the mid-edge nodes of `tensors`; itself where there are none.
+fn with_mid_edges(tensors: &MassTensors, boundary: &Arc<Boundary>) -> Result<Arc<Boundary>> {
+    let edges = tensors.element_nodes().mid_edges();
+    if edges.is_empty() {
+        return Ok(boundary.clone());
+    }
+    let mesh = tensors.mesh();
+    let mut surface: Vec<[u32; 2]> = mesh
+        .boundary_triangles()
+        .iter()
+        .flat_map(|&[a, b, c]| [[a, b], [b, c], [c, a]])
+        .map(|[a, b]| if a < b { [a, b] } else { [b, a] })
+        .collect();
+    surface.sort_unstable();
+    let on_surface = |edge: [u32; 2]| surface.binary_search(&edge).is_ok();
+    Ok(Arc::new(boundary.with_mid_edges(mesh.n_nodes(), edges, on_surface)?))
 }
 
 /// Mean stiffness of node `j` by itself, a third of the trace of K_jj, N/mm.
@@ -340,34 +408,6 @@ fn by_node(error: MtmError, unknowns: &[u32]) -> MtmError {
         },
         other => other,
     }
-}
-
-/// Rows and columns of `matrix` that belong to unknown nodes.
-fn submatrix(matrix: &BlockMatrix, unknowns: &[u32], row_of: &[u32]) -> BlockMatrix {
-    let kept = |j: u32| {
-        let (columns, blocks) = matrix.row(j as usize);
-        columns.iter().map(|&k| row_of[k as usize]).zip(blocks).filter(|(row, _)| *row != NO_ROW)
-    };
-    let lengths: Vec<usize> = unknowns.par_iter().map(|&j| kept(j).count()).collect();
-    let mut row_start = Vec::with_capacity(unknowns.len() + 1);
-    row_start.push(0);
-    for length in lengths {
-        row_start.push(row_start[row_start.len() - 1] + length);
-    }
-    let columns = unknowns.par_iter().flat_map_iter(|&j| kept(j).map(|(row, _)| row)).collect();
-    let mut out = BlockMatrix::from_pattern(row_start, columns);
-    out.row_tasks().into_par_iter().for_each(|task| {
-        let (first, mut blocks) = (task.first, task.blocks);
-        for &j in &unknowns[first..first + task.start.len() - 1] {
-            let row: Vec<&Block> = kept(j).map(|(_, block)| block).collect();
-            let (head, tail) = blocks.split_at_mut(row.len());
-            for (out, block) in head.iter_mut().zip(row) {
-                *out = *block;
-            }
-            blocks = tail;
-        }
-    });
-    out
 }
 
 fn couplings(matrix: &BlockMatrix, unknowns: &[u32], kinds: &[NodeKind]) -> Vec<(u32, u32, Block)> {

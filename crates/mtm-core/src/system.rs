@@ -19,7 +19,7 @@ use crate::restraint::Held;
 use crate::solution::Clock;
 
 /// Above this many unknowns `Method::Auto` takes conjugate gradients: a factor grows like n^1.4.
-const AUTO_DIRECT_UNKNOWNS: usize = 300_000;
+pub(crate) const AUTO_DIRECT_UNKNOWNS: usize = 300_000;
 /// Most sliding nodes whose dense flexibility is kept (three unknowns each, 8 bytes, twice).
 const MAX_DENSE_SLIDING: usize = 2500;
 /// Over-relaxation of the node-wise iteration.

@@ -6,9 +6,12 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use crate::blocks::{Block, BlockMatrix};
+use crate::element::{Element, ElementNodes};
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
 use crate::material::{Lame, Spencer, TetMaterial, Tissue, Voigt};
 use crate::mesh::{TetGeometry, TetMesh, dot};
+use crate::nodal_pressure::{Patches, split};
+use crate::quadratic::quadratic_tensor;
 
 /// Nodes a thread assembles at once.
 const NODES_PER_TASK: usize = 256;
@@ -17,8 +20,10 @@ const NODES_PER_TASK: usize = 256;
 /// et al. 2007): the linear finite-element stiffness exactly, N/mm.
 #[derive(Debug, Clone)]
 pub struct MassTensors {
-    mesh: Arc<TetMesh>,
+    nodes: ElementNodes,
     tissue: Arc<Tissue>,
+    /// Where volumetric strain is averaged.
+    patches: Option<Patches>,
     matrix: BlockMatrix,
 }
 
@@ -32,7 +37,7 @@ pub struct EdgeTensors {
 }
 
 impl MassTensors {
-    /// The tensors of `mesh` filled with `tissue`.
+    /// The tensors of `mesh` filled with `tissue`, on linear tets.
     ///
     /// Each row sums its tets in ascending order, so the bits do not depend on the number of threads,
     /// and K_kj is bit for bit the transpose of K_jk.
@@ -40,6 +45,14 @@ impl MassTensors {
     /// # Errors
     /// A tissue with another number of rows than the mesh has tets.
     pub fn new(mesh: Arc<TetMesh>, tissue: Arc<Tissue>) -> Result<Self> {
+        Self::with_element(mesh, tissue, Element::Linear)
+    }
+
+    /// The tensors of `mesh` filled with `tissue`, on the tets of `element`.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn with_element(mesh: Arc<TetMesh>, tissue: Arc<Tissue>, element: Element) -> Result<Self> {
         let rows = tissue.n_rows();
         if rows != 1 && rows != mesh.n_tets() {
             return Err(MtmError::Length {
@@ -50,26 +63,46 @@ impl MassTensors {
                 kind: ErrorKind::Material,
             });
         }
-        let mut matrix = pattern(&mesh);
+        let patches = (element == Element::NodalPressure).then(|| Patches::new(&mesh, &tissue));
+        let nodes = ElementNodes::new(element, mesh);
+        let mut matrix = pattern(&nodes, patches.as_ref());
         matrix.row_tasks().into_par_iter().for_each(|task| {
             let origin = task.start[0];
             for (offset, window) in task.start.windows(2).enumerate() {
                 let row = window[0] - origin..window[1] - origin;
                 let (columns, blocks) = (&task.columns[row.clone()], &mut task.blocks[row]);
-                assemble_row(&mesh, &tissue, task.first + offset, columns, blocks);
+                assemble_row(&nodes, &tissue, task.first + offset, columns, blocks);
             }
         });
-        Ok(Self { mesh, tissue, matrix })
+        if let Some(patches) = &patches {
+            let gradients = patches.gradients(nodes.mesh(), |_| nalgebra::Matrix3::identity());
+            patches.add_to(nodes.mesh(), &gradients, &mut matrix);
+        }
+        Ok(Self { nodes, tissue, patches, matrix })
     }
 
     /// The mesh.
     pub fn mesh(&self) -> &Arc<TetMesh> {
-        &self.mesh
+        self.nodes.mesh()
     }
 
     /// The tissue.
     pub fn tissue(&self) -> &Arc<Tissue> {
         &self.tissue
+    }
+
+    /// The element.
+    pub fn element(&self) -> Element {
+        self.nodes.element()
+    }
+
+    /// The nodes that carry unknowns: the corners of the mesh, then the middles of its edges if quadratic.
+    pub fn element_nodes(&self) -> &ElementNodes {
+        &self.nodes
+    }
+
+    pub(crate) fn patches(&self) -> Option<&Patches> {
+        self.patches.as_ref()
     }
 
     /// K in block rows, both triangles, N/mm.
@@ -103,9 +136,15 @@ impl MassTensors {
 
     /// Elastic energy ½ uᵀ K u, N mm.
     pub fn energy(&self, displacements: &[[f64; 3]]) -> Result<f64> {
+        if self.element() != Element::Linear {
+            let forces = self.internal_force(displacements)?;
+            return Ok(
+                0.5 * displacements.iter().zip(&forces).map(|(&u, &f)| dot(u, f)).sum::<f64>()
+            );
+        }
         let strain = self.strain(displacements)?;
         let stress = self.stress(displacements)?;
-        let volumes = self.mesh.volumes();
+        let volumes = self.mesh().volumes();
         Ok((0..strain.len())
             .map(|t| {
                 let work: f64 = (0..6).map(|i| strain[t][i] * stress[t][i]).sum();
@@ -114,36 +153,52 @@ impl MassTensors {
             .sum())
     }
 
-    /// Linear strain of each tet, Voigt with engineering shears.
+    /// Linear strain of each tet (its mean where it varies), Voigt with engineering shears.
     pub fn strain(&self, displacements: &[[f64; 3]]) -> Result<Vec<[f64; 6]>> {
         self.check_displacements(displacements)?;
-        Ok((0..self.mesh.n_tets())
+        Ok((0..self.mesh().n_tets())
             .into_par_iter()
             .map(|t| {
-                let h = displacement_gradient(&self.mesh, t, displacements);
+                let h = displacement_gradient(&self.nodes, t, displacements);
                 [h[0][0], h[1][1], h[2][2], h[1][2] + h[2][1], h[0][2] + h[2][0], h[0][1] + h[1][0]]
             })
             .collect())
     }
 
-    /// Stress C ε of each tet, Voigt, MPa.
+    /// Stress C ε of each tet (its mean where it varies), with averaged pressure where the element has it;
+    /// Voigt, MPa.
     pub fn stress(&self, displacements: &[[f64; 3]]) -> Result<Vec<[f64; 6]>> {
         let mut rows = self.strain(displacements)?;
+        let averages = self.patches.as_ref().map(|patches| {
+            let volumetric: Vec<f64> = rows.iter().map(|e| e[0] + e[1] + e[2]).collect();
+            patches.averages(self.mesh(), &volumetric)
+        });
         rows.par_iter_mut().enumerate().for_each(|(t, row)| {
-            let c = self.tissue.of_tet(t).voigt();
+            let material = self.tissue.of_tet(t);
+            let c = match &averages {
+                Some(_) => split(&material).rest.material().voigt(),
+                None => material.voigt(),
+            };
             let strain = *row;
             *row = [0, 1, 2, 3, 4, 5].map(|i| (0..6).map(|j| c[i][j] * strain[j]).sum());
+            if let (Some(patches), Some(averages)) = (&self.patches, &averages) {
+                let pressure = patches.pressure(t, averages);
+                for value in row.iter_mut().take(3) {
+                    *value += pressure;
+                }
+            }
         });
         Ok(rows)
     }
 
-    /// Relative volume change det(I + ∇u) − 1 of each tet; −1 or less is a collapsed or inverted tet.
+    /// Relative volume change det(I + ∇u) − 1 of each tet, at its middle; −1 or less is a collapsed or
+    /// inverted tet.
     pub fn volume_change(&self, displacements: &[[f64; 3]]) -> Result<Vec<f64>> {
         self.check_displacements(displacements)?;
-        Ok((0..self.mesh.n_tets())
+        Ok((0..self.mesh().n_tets())
             .into_par_iter()
             .map(|t| {
-                let h = displacement_gradient(&self.mesh, t, displacements);
+                let h = displacement_gradient(&self.nodes, t, displacements);
                 nalgebra::Matrix3::from_fn(|i, j| h[i][j] + f64::from(u8::from(i == j)))
                     .determinant()
                     - 1.0
@@ -151,14 +206,14 @@ impl MassTensors {
             .collect())
     }
 
-    fn check_displacements(&self, displacements: &[[f64; 3]]) -> Result<()> {
+    pub(crate) fn check_displacements(&self, displacements: &[[f64; 3]]) -> Result<()> {
         let kind = ErrorKind::Mesh;
-        if displacements.len() != self.mesh.n_nodes() {
+        if displacements.len() != self.nodes.n_nodes() {
             return Err(MtmError::Length {
                 what: "displacements".into(),
                 found: displacements.len(),
-                expected: self.mesh.n_nodes(),
-                why: "one row per node",
+                expected: self.nodes.n_nodes(),
+                why: "one row per node, mid-edge nodes included",
                 kind,
             });
         }
@@ -166,32 +221,39 @@ impl MassTensors {
     }
 }
 
-/// ∂u_i/∂x_j of tet `t`.
-fn displacement_gradient(mesh: &TetMesh, t: usize, u: &[[f64; 3]]) -> [[f64; 3]; 3] {
-    let geometry = mesh.geometry(t);
+/// Mean ∂u_i/∂x_j of tet `t`.
+fn displacement_gradient(nodes: &ElementNodes, t: usize, u: &[[f64; 3]]) -> [[f64; 3]; 3] {
+    let geometry = nodes.mesh().geometry(t);
+    let share = 1.0 / nodes.n_points() as f64;
     let mut h = [[0.0; 3]; 3];
-    for (&node, g) in mesh.tets()[t].iter().zip(&geometry.gradients) {
-        let v = u[node as usize];
-        for i in 0..3 {
-            for j in 0..3 {
-                h[i][j] += v[i] * g[j];
+    for point in 0..nodes.n_points() {
+        let (gradients, _) = nodes.gradients(&geometry, point);
+        for (&node, g) in nodes.of_tet(t).iter().zip(&gradients) {
+            let v = u[node as usize];
+            for i in 0..3 {
+                for j in 0..3 {
+                    h[i][j] += share * (v[i] * g[j]);
+                }
             }
         }
     }
     h
 }
 
-/// Block rows of the node graph, with blocks still zero.
-fn pattern(mesh: &TetMesh) -> BlockMatrix {
-    let n = mesh.n_nodes();
+/// Block rows of the graph of nodes that share a tet or a patch, with blocks still zero.
+fn pattern(nodes: &ElementNodes, patches: Option<&Patches>) -> BlockMatrix {
+    let n = nodes.n_nodes();
     let rows: Vec<(Vec<u32>, Vec<u32>)> = (0..n.div_ceil(NODES_PER_TASK))
         .into_par_iter()
         .map(|task| {
             let (mut lengths, mut columns, mut row) = (Vec::new(), Vec::new(), Vec::new());
             for j in task * NODES_PER_TASK..n.min((task + 1) * NODES_PER_TASK) {
                 row.clear();
-                for &t in mesh.tets_of_node(j) {
-                    row.extend_from_slice(&mesh.tets()[t as usize]);
+                for &t in nodes.tets_of_node(j) {
+                    row.extend_from_slice(nodes.of_tet(t as usize));
+                }
+                if let Some(patches) = patches {
+                    patches.neighbours(nodes.mesh(), j, &mut row);
                 }
                 row.sort_unstable();
                 row.dedup();
@@ -213,11 +275,22 @@ fn pattern(mesh: &TetMesh) -> BlockMatrix {
     BlockMatrix::from_pattern(row_start, columns)
 }
 
-fn assemble_row(mesh: &TetMesh, tissue: &Tissue, j: usize, columns: &[u32], blocks: &mut [Block]) {
-    for &t in mesh.tets_of_node(j) {
-        let tet = &mesh.tets()[t as usize];
-        let geometry = mesh.geometry(t as usize);
+fn assemble_row(
+    nodes: &ElementNodes,
+    tissue: &Tissue,
+    j: usize,
+    columns: &[u32],
+    blocks: &mut [Block],
+) {
+    for &t in nodes.tets_of_node(j) {
+        let tet = nodes.of_tet(t as usize);
+        let geometry = nodes.mesh().geometry(t as usize);
         let material = tissue.of_tet(t as usize);
+        let rest = (nodes.element() == Element::NodalPressure).then(|| split(&material).rest);
+        let material = rest.as_ref().map_or(material, |r| r.material());
+        let corners = (nodes.element() == Element::Quadratic).then(|| {
+            [0, 1, 2, 3].map(|p| [0, 1, 2, 3].map(|q| tet_tensor(&geometry, &material, p, q)))
+        });
         let Some(a) = tet.iter().position(|&v| v as usize == j) else { continue };
         for (b, &k) in tet.iter().enumerate() {
             let Ok(at) = columns.binary_search(&k) else { continue };
@@ -225,7 +298,10 @@ fn assemble_row(mesh: &TetMesh, tissue: &Tissue, j: usize, columns: &[u32], bloc
             // transposes to the last bit.
             let transposed = k < tet[a];
             let (lo, hi) = if transposed { (b, a) } else { (a, b) };
-            let tensor = tet_tensor(&geometry, &material, lo, hi);
+            let tensor = match &corners {
+                Some(corners) => quadratic_tensor(corners, lo, hi),
+                None => tet_tensor(&geometry, &material, lo, hi),
+            };
             let out = &mut blocks[at];
             for r in 0..3 {
                 for c in 0..3 {

@@ -1,0 +1,428 @@
+//! Equilibrium of a body that rotates and stretches: Newton's method on its energy, with line search.
+//!
+//! Each step solves with the exact tangent, or, where that is not positive definite, with the tangent
+//! whose points have lost their negative curvature; so every step goes downhill. Sliding constraints n·u = g
+//! are kept by projection, as in the linear system.
+
+use std::sync::Arc;
+
+use crate::blocks::BlockMatrix;
+use crate::boundary::Motion;
+use crate::cholesky::Symbolic;
+use crate::constraints::{
+    Constraint, add_offsets, along_normals, orthonormal, projected, projected_rhs,
+};
+use crate::contact::{Constraints, ContactState, Response, Sliding};
+use crate::error::{ErrorKind, MtmError, Result};
+use crate::krylov::{PcgOptions, Preconditioner, pcg};
+use crate::mesh::{add, dot, norm, scaled, sub};
+use crate::method::{Interrupt, Method, StaticOptions};
+use crate::multigrid::{Multigrid, MultigridOptions};
+use crate::reduction::Reduction;
+use crate::solution::Clock;
+use crate::strain_energy::{StrainEnergy, TangentKind};
+use crate::system::{AUTO_DIRECT_UNKNOWNS, Effort};
+use crate::tensors::MassTensors;
+
+/// Newton steps after which a share of the plan counts as too large.
+const MAX_STEPS: usize = 40;
+/// Smallest share of the plan that is tried.
+const LEAST_SHARE: f64 = 1.0 / 64.0;
+/// Share of the slope that a step must bring the energy down by (Armijo 1966).
+const DESCENT: f64 = 1e-4;
+/// Shortest step of the line search over the full one.
+const SHORTEST: f64 = 1.0 / 1024.0;
+/// Rounding of the energy over its parts, which a descent below it does not show through.
+const ENERGY_ROUNDING: f64 = 1e-12;
+/// Error that conjugate gradients may leave in a step, over the tolerance of the solution.
+const STEP_TOLERANCE: f64 = 0.1;
+
+/// How tangent systems are solved.
+enum TangentSolver {
+    Cholesky(Symbolic),
+    Pcg,
+}
+
+/// A body with its unknowns, ready for any state of its boundary.
+pub(crate) struct Equilibrium {
+    energy: StrainEnergy,
+    tensors: Arc<MassTensors>,
+    solver: TangentSolver,
+    options: StaticOptions,
+}
+
+/// What the boundary asks for.
+struct Target<'a> {
+    /// Displacement of every node; those of unknowns are not read.
+    prescribed: &'a [[f64; 3]],
+    /// Forces on every node, N.
+    loads: Option<&'a [[f64; 3]]>,
+    /// Orthonormal on each row.
+    constraints: Vec<Constraint>,
+    springs: Vec<RowSpring>,
+    /// Length that the tolerance refers to, mm.
+    scale: f64,
+}
+
+/// A spring on one row of the system.
+struct RowSpring {
+    row: usize,
+    axis: [f64; 3],
+    stiffness: f64,
+    goal: f64,
+}
+
+/// A state with what the next step starts from.
+struct Pose {
+    u: Vec<[f64; 3]>,
+    /// Energy less the work of loads, with springs, N mm.
+    merit: f64,
+    /// Sum of the sizes of its parts.
+    size: f64,
+    /// Its slope by each row.
+    slope: Vec<[f64; 3]>,
+}
+
+impl Equilibrium {
+    /// The body of `tensors` with the unknowns of `reduction`, and the method used.
+    ///
+    /// `matrix`: the reduced stiffness at rest. Errors name rows.
+    pub fn new(
+        tensors: Arc<MassTensors>,
+        matrix: &BlockMatrix,
+        options: &StaticOptions,
+        clock: &mut Clock,
+    ) -> Result<(Self, Method)> {
+        let method = match options.method {
+            Method::Relaxation => {
+                return Err(MtmError::UnknownName {
+                    what: "method with large rotations",
+                    found: options.method.name().into(),
+                    known: "auto, cholesky, pcg (relaxation is of linear kinematics)",
+                    kind: ErrorKind::Solver,
+                });
+            }
+            Method::Auto if 3 * matrix.n_rows() > AUTO_DIRECT_UNKNOWNS => Method::Pcg,
+            Method::Auto => Method::Cholesky,
+            named => named,
+        };
+        let solver = if method == Method::Cholesky {
+            let symbolic = Symbolic::new(matrix, &[])?;
+            if let Some(limit) = options.memory_limit
+                && symbolic.factor_bytes() > limit
+            {
+                return Err(MtmError::OutOfMemory {
+                    what: "the Cholesky factor",
+                    needed_mb: symbolic.factor_bytes() >> 20,
+                    limit_mb: Some(limit >> 20),
+                    advice: "use method=\"pcg\"",
+                });
+            }
+            TangentSolver::Cholesky(symbolic)
+        } else {
+            TangentSolver::Pcg
+        };
+        clock.lap("ordering", method == Method::Cholesky);
+        let energy = StrainEnergy::new(tensors.clone(), options.kinematics);
+        Ok((Self { energy, tensors, solver, options: *options }, method))
+    }
+
+    /// Bytes of a factor; 0 for conjugate gradients, which keep nothing from one tangent to the next.
+    pub fn bytes(&self) -> usize {
+        match &self.solver {
+            TangentSolver::Cholesky(symbolic) => symbolic.factor_bytes(),
+            TangentSolver::Pcg => 0,
+        }
+    }
+
+    /// Internal forces under displacements of all nodes, N.
+    pub fn forces(&self, u: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
+        Ok(self.energy.state(u)?.forces)
+    }
+
+    /// Displacements of the unknown rows with contact settled, the contact, and the seconds that it took.
+    pub fn solve(
+        &self,
+        reduction: &Reduction,
+        prescribed: &[[f64; 3]],
+        loads: Option<&[[f64; 3]]>,
+        sliding: Option<(&Sliding, &[&Motion])>,
+        scale: f64,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<(Vec<[f64; 3]>, Option<ContactState>, f64)> {
+        let clock = Clock::new();
+        let target =
+            |constraints, springs| Target { prescribed, loads, constraints, springs, scale };
+        let mut u = vec![[0.0; 3]; prescribed.len()];
+        let Some((sliding, motions)) = sliding else {
+            u = self.follow(reduction, u, &target(vec![], vec![]), effort, interrupted)?;
+            return Ok((reduction.rows(&u), None, 0.0));
+        };
+        let state = sliding.settle(motions, &self.options.contact, interrupted, |c| {
+            let (asked, springs) = on_rows(sliding, c);
+            let target = target(orthonormal(&asked), springs);
+            let begin = std::mem::take(&mut u);
+            u = self.follow(reduction, begin, &target, effort, interrupted)?;
+            let forces = self.forces(&u)?;
+            let reaction = |row: usize| {
+                let j = reduction.unknowns[row] as usize;
+                loads.map_or(forces[j], |l| sub(forces[j], l[j]))
+            };
+            let forces = along_normals(&asked, reaction);
+            let displacement = |node: u32| u[node as usize];
+            let displacements = sliding.nodes().iter().map(|n| displacement(n.node)).collect();
+            Ok(Response { displacements, forces })
+        })?;
+        Ok((reduction.rows(&u), Some(state), clock.total()))
+    }
+
+    /// The state that `target` asks for, from the state `u`: at once, or by shares of the way where Newton's
+    /// method loses it.
+    fn follow(
+        &self,
+        reduction: &Reduction,
+        u: Vec<[f64; 3]>,
+        target: &Target<'_>,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        let (mut here, mut done, mut share) = (u, 0.0, 1.0_f64);
+        while done < 1.0 {
+            // Of the way that is left.
+            let part = (share / (1.0 - done)).min(1.0);
+            match self.advance(reduction, &here, target, part, effort, interrupted) {
+                Ok(next) => {
+                    here = next;
+                    done = if part == 1.0 { 1.0 } else { done + share };
+                }
+                Err(MtmError::NotConverged { .. } | MtmError::NotPositiveDefinite { .. })
+                    if share > LEAST_SHARE =>
+                {
+                    share *= 0.5;
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(here)
+    }
+
+    /// Equilibrium at `part` of the way from the boundary of `u` to that of `target`.
+    fn advance(
+        &self,
+        reduction: &Reduction,
+        u: &[[f64; 3]],
+        target: &Target<'_>,
+        part: f64,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        // The boundary moves; the unknowns follow as the tangent says.
+        let mut moved = target.prescribed.to_vec();
+        for &j in &reduction.unknowns {
+            moved[j as usize] = u[j as usize];
+        }
+        let change: Vec<[f64; 3]> =
+            moved.iter().zip(u).map(|(a, b)| scaled(sub(*a, *b), part)).collect();
+        let start = self.pose(reduction, u.to_vec(), target)?;
+        let along = |c: &Constraint| dot(c.normal, u[reduction.unknowns[c.row] as usize]);
+        let constraints: Vec<Constraint> = target
+            .constraints
+            .iter()
+            .map(|c| Constraint { offset: part * (c.offset - along(c)), ..*c })
+            .collect();
+        let (step, _) =
+            self.step(reduction, &start, target, &constraints, Some(&change), interrupted)?;
+        let mut ahead = start.u;
+        for (value, d) in ahead.iter_mut().zip(&change) {
+            *value = add(*value, *d);
+        }
+        let mut pose = self.pose(reduction, moved_by(reduction, &ahead, &step, 1.0), target)?;
+        effort.iterations += 1;
+
+        let still: Vec<Constraint> =
+            constraints.iter().map(|c| Constraint { offset: 0.0, ..*c }).collect();
+        let mut length = f64::INFINITY;
+        for _ in 0..MAX_STEPS {
+            if interrupted() {
+                return Err(MtmError::Interrupted);
+            }
+            let (step, slope) = self.step(reduction, &pose, target, &still, None, interrupted)?;
+            effort.iterations += 1;
+            length = step.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
+            effort.history.push(length);
+            let reach = pose.u.iter().fold(target.scale, |m, v| m.max(norm(*v)));
+            if length <= self.options.tolerance * reach {
+                effort.error_bound = length;
+                return Ok(moved_by(reduction, &pose.u, &step, 1.0));
+            }
+            pose = self.search(reduction, pose, target, &step, slope)?;
+        }
+        Err(self.lost(length, target.scale))
+    }
+
+    /// The state at the end of `step`, shortened until it lies downhill.
+    fn search(
+        &self,
+        reduction: &Reduction,
+        pose: Pose,
+        target: &Target<'_>,
+        step: &[[f64; 3]],
+        slope: f64,
+    ) -> Result<Pose> {
+        let mut share = 1.0;
+        while share >= SHORTEST {
+            let next = self.pose(reduction, moved_by(reduction, &pose.u, step, share), target)?;
+            let rounding = ENERGY_ROUNDING * pose.size.max(next.size);
+            if next.merit <= pose.merit + DESCENT * share * slope + rounding {
+                return Ok(next);
+            }
+            share *= 0.5;
+        }
+        Err(self.lost(step.iter().fold(0.0_f64, |m, v| m.max(norm(*v))), target.scale))
+    }
+
+    fn lost(&self, length: f64, scale: f64) -> MtmError {
+        MtmError::NotConverged {
+            method: "newton",
+            iterations: MAX_STEPS,
+            error: length,
+            tolerance: self.options.tolerance * scale,
+            advice: "divide the plan into smaller moves, mend flat tets, or use kinematics=\"linear\"",
+        }
+    }
+
+    /// Merit and slope at displacements `u`.
+    fn pose(&self, reduction: &Reduction, u: Vec<[f64; 3]>, target: &Target<'_>) -> Result<Pose> {
+        let state = self.energy.state(&u)?;
+        let mut slope = reduction.rows(&state.forces);
+        let (mut merit, mut size) = (state.energy, state.energy.abs());
+        if let Some(loads) = target.loads {
+            for (s, &j) in slope.iter_mut().zip(&reduction.unknowns) {
+                *s = sub(*s, loads[j as usize]);
+                let work = dot(loads[j as usize], u[j as usize]);
+                merit -= work;
+                size += work.abs();
+            }
+        }
+        for spring in &target.springs {
+            let j = reduction.unknowns[spring.row] as usize;
+            let stretch = dot(spring.axis, u[j]) - spring.goal;
+            slope[spring.row] =
+                add(slope[spring.row], scaled(spring.axis, spring.stiffness * stretch));
+            merit += 0.5 * spring.stiffness * stretch * stretch;
+        }
+        if !merit.is_finite() {
+            return Err(self.lost(f64::INFINITY, target.scale));
+        }
+        Ok(Pose { u, merit, size, slope })
+    }
+
+    /// Newton step from `pose` on the rows and the slope of the merit along it.
+    ///
+    /// `constraints` say how far each constrained row goes along its normal, `change` how far the other
+    /// nodes go.
+    fn step(
+        &self,
+        reduction: &Reduction,
+        pose: &Pose,
+        target: &Target<'_>,
+        constraints: &[Constraint],
+        change: Option<&[[f64; 3]]>,
+        interrupted: Interrupt<'_>,
+    ) -> Result<(Vec<[f64; 3]>, f64)> {
+        let solve = |kind: TangentKind| {
+            let full = self.energy.stiffness(&pose.u, kind)?;
+            let mut b: Vec<[f64; 3]> = pose.slope.iter().map(|&s| scaled(s, -1.0)).collect();
+            if let Some(change) = change {
+                for (b, f) in b.iter_mut().zip(reduction.rows(&full.multiply(change))) {
+                    *b = sub(*b, f);
+                }
+            }
+            let mut matrix = reduction.matrix(&full);
+            drop(full);
+            for spring in &target.springs {
+                matrix.add_to_diagonal(spring.row, spring.axis, spring.stiffness);
+            }
+            let rhs = projected_rhs(&matrix, &b, constraints);
+            if !constraints.is_empty() {
+                matrix = projected(&matrix, constraints);
+            }
+            let mut x =
+                self.solve_rows(reduction, &matrix, &rhs, constraints, pose, target, interrupted)?;
+            add_offsets(&mut x, constraints);
+            Ok(x)
+        };
+        // Conjugate gradients would only notice an indefinite matrix by chance.
+        let exact = match self.solver {
+            TangentSolver::Cholesky(_) => solve(TangentKind::Exact),
+            TangentSolver::Pcg => solve(TangentKind::Definite),
+        };
+        let step = match exact {
+            Err(MtmError::NotPositiveDefinite { .. }) => solve(TangentKind::Definite)?,
+            other => other?,
+        };
+        let slope = step.iter().zip(&pose.slope).map(|(&d, &s)| dot(d, s)).sum();
+        Ok((step, slope))
+    }
+
+    fn solve_rows(
+        &self,
+        reduction: &Reduction,
+        matrix: &BlockMatrix,
+        rhs: &[[f64; 3]],
+        constraints: &[Constraint],
+        pose: &Pose,
+        target: &Target<'_>,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        if let TangentSolver::Cholesky(symbolic) = &self.solver {
+            return Ok(symbolic.solve(&symbolic.factor(matrix)?, rhs));
+        }
+        let positions: Vec<[f64; 3]> = reduction.rows(self.tensors.element_nodes().positions());
+        let normals: Vec<(usize, [f64; 3])> =
+            constraints.iter().map(|c| (c.row, c.normal)).collect();
+        let multigrid = Multigrid::new(matrix, &positions, &normals, &MultigridOptions::default())?;
+        // Loads move the body where bone does not: one cycle tells how far, to the order of magnitude.
+        let mut first = vec![[0.0; 3]; rhs.len()];
+        multigrid.apply(rhs, &mut first);
+        let reach = first.iter().chain(&pose.u).fold(target.scale, |m, v| m.max(norm(*v)));
+        if reach == 0.0 {
+            return Ok(first);
+        }
+        let defaults = PcgOptions::default();
+        let options = PcgOptions {
+            tolerance: STEP_TOLERANCE * self.options.tolerance * reach,
+            max_iterations: self.options.max_iterations.unwrap_or(defaults.max_iterations),
+            ..defaults
+        };
+        let start = vec![[0.0; 3]; rhs.len()];
+        Ok(pcg(matrix, rhs, &start, &multigrid, &options, interrupted)?.solution)
+    }
+}
+
+/// Contact constraints and springs on the rows of the system.
+fn on_rows(sliding: &Sliding, c: &Constraints<'_>) -> (Vec<Constraint>, Vec<RowSpring>) {
+    let row = |node: usize| sliding.nodes()[node].row as usize;
+    let asked = c
+        .rows
+        .iter()
+        .zip(c.offsets)
+        .map(|(r, &offset)| Constraint { row: row(r.node), normal: r.normal, offset })
+        .collect();
+    let springs = c
+        .springs
+        .iter()
+        .map(|s| RowSpring { row: row(s.node), axis: s.axis, stiffness: s.stiffness, goal: s.goal })
+        .collect();
+    (asked, springs)
+}
+
+/// `u` with the unknowns moved by `share` of `step`.
+fn moved_by(reduction: &Reduction, u: &[[f64; 3]], step: &[[f64; 3]], share: f64) -> Vec<[f64; 3]> {
+    let mut out = u.to_vec();
+    for (&j, d) in reduction.unknowns.iter().zip(step) {
+        out[j as usize] = add(out[j as usize], scaled(*d, share));
+    }
+    out
+}
