@@ -146,9 +146,10 @@ impl Boundary {
 
     /// The boundary with the nodes in the middle of edges: node `n_corners + i` lies between `edges[i]`.
     ///
-    /// A node is fixed or joined where both ends of its edge are (to one segment). It slides where its edge
-    /// lies on the surface of the body and one end slides, the other on the same segment, joined to it or
-    /// fixed. All others are free. A prescribed gap is the mean of the sliding ends'.
+    /// A node is fixed or joined where both ends of its edge are (to one segment), slides where both slide
+    /// on one segment and its edge lies on the surface of the body, and is free otherwise. (Across the body
+    /// an edge may end at a sliding node and lead away from its contact surface.) A prescribed gap is the
+    /// mean of the ends'.
     ///
     /// # Errors
     /// A node index of `n_corners` or more.
@@ -158,7 +159,6 @@ impl Boundary {
         edges: &[[u32; 2]],
         on_surface: impl Fn([u32; 2]) -> bool,
     ) -> Result<Self> {
-        use NodeKind::{Fixed, Joined, Sliding};
         let kinds = self.kinds(n_corners)?;
         let mut out = self.clone();
         let mut gap_of: HashMap<u32, f64> = HashMap::new();
@@ -169,25 +169,22 @@ impl Boundary {
         }
         for (i, &[a, b]) in edges.iter().enumerate() {
             let node = (n_corners + i) as u32;
-            let slides_on = match (kinds[a as usize], kinds[b as usize]) {
-                (Fixed, Fixed) => {
-                    out.fixed.push(node);
-                    None
-                }
-                (Joined(s), Joined(other)) if s == other => {
+            if kinds[a as usize] != kinds[b as usize] {
+                continue;
+            }
+            match kinds[a as usize] {
+                NodeKind::Fixed => out.fixed.push(node),
+                NodeKind::Joined(s) => {
                     out.segments[s].joined.push(node);
                     out.inherited.insert(node, [a, b]);
-                    None
                 }
-                (Sliding(s), Fixed) | (Fixed, Sliding(s)) => Some(s),
-                (Sliding(s), Joined(o) | Sliding(o)) | (Joined(o), Sliding(s)) if s == o => Some(s),
-                _ => None,
-            };
-            let Some(s) = slides_on.filter(|_| on_surface([a, b])) else { continue };
-            out.segments[s].sliding.push(node);
-            if let Gap::PerNode(values) = &mut out.segments[s].gap {
-                let ends: Vec<f64> = [a, b].iter().filter_map(|j| gap_of.get(j).copied()).collect();
-                values.push(ends.iter().sum::<f64>() / ends.len() as f64);
+                NodeKind::Sliding(s) if on_surface([a, b]) => {
+                    out.segments[s].sliding.push(node);
+                    if let Gap::PerNode(values) = &mut out.segments[s].gap {
+                        values.push(0.5 * (gap_of[&a] + gap_of[&b]));
+                    }
+                }
+                NodeKind::Sliding(_) | NodeKind::Free => {}
             }
         }
         Ok(out)
