@@ -5,6 +5,8 @@ with it needs numpy alone. Research software: it is not a medical device.
 """
 
 from cmfsim._core import (
+    ELEMENTS,
+    KINEMATICS,
     LAWS,
     METHODS,
     PRESETS,
@@ -174,6 +176,8 @@ from cmfsim.template import (
 )
 
 __all__ = [
+    "ELEMENTS",
+    "KINEMATICS",
     "LAWS",
     "METHODS",
     "MODELS",

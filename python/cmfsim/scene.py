@@ -60,6 +60,8 @@ TISSUE_ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = MappingProxyType(
 TISSUE_OPTIONAL = frozenset({("preset", "fibre")})
 
 METHODS = ("auto", "cholesky", "pcg", "relaxation")
+ELEMENTS = ("p1", "anp", "p2")
+KINEMATICS = ("linear", "corotational", "hyperelastic")
 CONTACTS = ("bilateral", "unilateral")
 CONFLICTS = ("error", "resolve")
 PRESETS = ("kim2010", "kim2010-swapped")
@@ -255,7 +257,7 @@ class SegmentData:
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """How a scene is solved; the defaults are those of `cmfsim.StaticSolver`.
+    """How a scene is solved; the defaults are those of `MassTensors` and `StaticSolver`.
 
     Attributes
     ----------
@@ -269,6 +271,10 @@ class SolverOptions:
     contact_tolerance : float, mm
     contact_iterations : int
     memory_limit : float or None, MB
+    element : str
+        "p1", "anp" or "p2", as `cmfsim.MassTensors` takes it.
+    kinematics : str
+        "linear", "corotational" or "hyperelastic".
 
     Examples
     --------
@@ -284,9 +290,13 @@ class SolverOptions:
     contact_tolerance: float = 1e-9
     contact_iterations: int = 100
     memory_limit: float | None = None
+    element: str = "p1"
+    kinematics: str = "linear"
 
     def __post_init__(self) -> None:
         check_one_of("method", self.method, METHODS)
+        check_one_of("element", self.element, ELEMENTS)
+        check_one_of("kinematics", self.kinematics, KINEMATICS)
         check_one_of("contact", self.contact, CONTACTS)
         for name in ("tolerance", "contact_tolerance"):
             as_positive(name, getattr(self, name))
@@ -300,8 +310,16 @@ class SolverOptions:
                 raise CaseInputError(f"{name} is {value!r}: a whole number from 1 on is needed")
 
     def as_dict(self) -> dict[str, Any]:
-        """The options by name, as `StaticSolver` and the scene file take them."""
+        """The options by name, as `MassTensors` (`element`) and `StaticSolver` take them."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def header(self) -> dict[str, Any]:
+        """The options as a scene file holds them: element and kinematics where unusual.
+
+        So a scene that asks for neither has the content, and the hash, that it has always had.
+        """
+        usual = {"element": "p1", "kinematics": "linear"}
+        return {k: v for k, v in self.as_dict().items() if usual.get(k) != v}
 
 
 @dataclass(frozen=True, eq=False)
@@ -447,7 +465,7 @@ class Scene:
             "tissue": tissue,
             "segments": segments,
             "conflicts": self.conflicts,
-            "solver": self.options.as_dict(),
+            "solver": self.options.header(),
         }
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -505,6 +523,7 @@ class SceneResult:
         K u.
     residual_history : (k,) float64
     contact_nodes : (s,) uint32
+        From n on with element "p2": in the middle of an edge.
     contact_points, contact_normals : (s, 3) float64, mm
         On the moved contact surface.
     contact_forces : (s,) float64, N

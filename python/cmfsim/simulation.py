@@ -57,7 +57,8 @@ def scene_solver(scene: Scene) -> StaticSolver:
     """
     mesh = TetMesh(scene.nodes, scene.tets)
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
-    tensors = MassTensors(mesh, _tissue(scene.tissue))
+    options = scene.options.as_dict()
+    tensors = MassTensors(mesh, _tissue(scene.tissue), element=options.pop("element"))
     segments = scene.segments.items()
     sliding = {name: s.sliding for name, s in segments if np.size(s.sliding)}
     boundary = Boundary(
@@ -70,7 +71,6 @@ def scene_solver(scene: Scene) -> StaticSolver:
     )
     if boundary.conflicts:
         _log.warning("%d nodes had two kinds; the stronger one was kept", boundary.conflicts)
-    options = scene.options.as_dict()
     solver = StaticSolver(tensors, boundary, options.pop("method"), **options)
     _log.info("solver: %s, %d unknowns", solver.method, solver.n_unknowns)
     return solver
@@ -147,6 +147,8 @@ def solve_scene(scene: Scene) -> SceneResult:
         "n_tets": scene.n_tets,
         "n_unknowns": solver.n_unknowns,
         "method": solver.method,
+        "element": solver.tensors.element,
+        "kinematics": solver.kinematics,
         "contact": scene.options.contact,
         "conflicts": solver.boundary.conflicts,
         "residual": _finite(solution.residual),

@@ -40,6 +40,8 @@ mod _core {
         crate::errors::register(module)?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))?;
         module.add("METHODS", ("auto", "cholesky", "pcg", "relaxation"))?;
+        module.add("ELEMENTS", ("p1", "anp", "p2"))?;
+        module.add("KINEMATICS", ("linear", "corotational", "hyperelastic"))?;
         module.add("PRESETS", ("kim2010", "kim2010-swapped"))?;
         module.add("LAWS", ("spencer", "picinbono"))
     }

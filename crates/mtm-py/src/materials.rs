@@ -2,8 +2,12 @@
 
 use std::sync::Arc;
 
+use mtm_core::blocks::BlockMatrix;
+use mtm_core::element::Element;
 use mtm_core::error::{ErrorKind, MtmError};
+use mtm_core::kinematics::Kinematics;
 use mtm_core::material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
+use mtm_core::strain_energy::{StrainEnergy, TangentKind};
 use mtm_core::tensors::{EdgeTensors, MassTensors};
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
@@ -215,16 +219,30 @@ fn fibres(value: &Bound<'_, PyAny>) -> PyResult<Vec<[f64; 3]>> {
 /// ----------
 /// mesh : TetMesh
 /// tissue : Tissue
+/// element : {"p1", "anp", "p2"}
+///     Linear tets; linear tets whose volumetric strain is averaged round each corner, which do not lock
+///     near nu = 0.5; or quadratic tets on the same corners with a node in the middle of each edge.
 ///
 /// Raises
 /// ------
 /// MaterialError
 ///     A tissue with another number of rows than the mesh has tets.
+/// MeshError
+///     An unknown element.
 ///
 /// Notes
 /// -----
 /// Cotin, Delingette & Ayache (2000); Picinbono et al. (2003); Mollemans et al. (2007). The tensors are
-/// the linear finite-element stiffness exactly.
+/// the linear finite-element stiffness exactly. "anp": Bonet & Burton (1998); Joldes, Wittek & Miller
+/// (2009). With "p2" every (n, 3) array of these methods has one row per node of `nodes`.
+///
+/// Examples
+/// --------
+/// >>> import cmfsim
+/// >>> mesh = cmfsim.TetMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
+/// >>> tensors = cmfsim.MassTensors(mesh, cmfsim.Tissue.isotropic(0.003, 0.49), element="p2")
+/// >>> tensors.nodes.shape, tensors.mid_edges.shape
+/// ((10, 3), (6, 2))
 #[pyclass(frozen, module = "cmfsim", name = "MassTensors")]
 pub struct PyMassTensors {
     pub core: Arc<MassTensors>,
@@ -234,14 +252,36 @@ pub struct PyMassTensors {
 #[pymethods]
 impl PyMassTensors {
     #[new]
+    #[pyo3(signature = (mesh, tissue, *, element = "p1"))]
     fn new(
         py: Python<'_>,
         mesh: &Bound<'_, PyTetMesh>,
         tissue: &Bound<'_, PyTissue>,
+        element: &str,
     ) -> PyResult<Self> {
         let (mesh, tissue) = (mesh.get().core.clone(), tissue.get().core.clone());
-        let core = py.detach(|| MassTensors::new(mesh, tissue)).map_err(Failure)?;
+        let element = Element::from_name(element).map_err(Failure)?;
+        let core =
+            py.detach(|| MassTensors::with_element(mesh, tissue, element)).map_err(Failure)?;
         Ok(Self::wrap(Arc::new(core)))
+    }
+
+    /// The element: "p1", "anp" or "p2".
+    #[getter]
+    fn element(&self) -> &'static str {
+        self.core.element().name()
+    }
+
+    /// Positions of the nodes, (n, 3) float64, mm: those of the mesh, then the middles of `mid_edges`.
+    #[getter]
+    fn nodes<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+        arrays::rows(py, self.core.element_nodes().positions().to_vec())
+    }
+
+    /// Corners at the ends of the edge of each mid-edge node, (e, 2) uint32; empty unless "p2".
+    #[getter]
+    fn mid_edges<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<u32>> {
+        arrays::table(py, self.core.element_nodes().mid_edges().to_vec())
     }
 
     /// The mesh.
@@ -279,23 +319,64 @@ impl PyMassTensors {
     /// Parameters
     /// ----------
     /// u : (n, 3) array_like, mm
+    /// kinematics : {"linear", "corotational", "hyperelastic"}
+    ///     See `StaticSolver`.
     ///
     /// Returns
     /// -------
     /// (n, 3) float64, N
+    #[pyo3(signature = (u, *, kinematics = "linear"))]
     fn force<'py>(
         &self,
         py: Python<'py>,
         u: &Bound<'py, PyAny>,
+        kinematics: &str,
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let u = arrays::points(u, Named("u", ErrorKind::Mesh))?;
-        Ok(arrays::rows(py, py.detach(|| self.core.internal_force(&u)).map_err(Failure)?))
+        let kinematics = Kinematics::from_name(kinematics).map_err(Failure)?;
+        let core = self.core.clone();
+        let forces = py.detach(move || match kinematics {
+            Kinematics::Linear => core.internal_force(&u),
+            large => Ok(StrainEnergy::new(core, large).state(&u)?.forces),
+        });
+        Ok(arrays::rows(py, forces.map_err(Failure)?))
     }
 
-    /// Elastic energy u.K u / 2 of displacements ((n, 3), mm), N mm.
-    fn energy(&self, py: Python<'_>, u: &Bound<'_, PyAny>) -> PyResult<f64> {
+    /// Elastic energy of displacements ((n, 3), mm), N mm: u.K u / 2 if linear.
+    #[pyo3(signature = (u, *, kinematics = "linear"))]
+    fn energy(&self, py: Python<'_>, u: &Bound<'_, PyAny>, kinematics: &str) -> PyResult<f64> {
         let u = arrays::points(u, Named("u", ErrorKind::Mesh))?;
-        Ok(py.detach(|| self.core.energy(&u)).map_err(Failure)?)
+        let kinematics = Kinematics::from_name(kinematics).map_err(Failure)?;
+        let core = self.core.clone();
+        let energy = py.detach(move || match kinematics {
+            Kinematics::Linear => core.energy(&u),
+            large => Ok(StrainEnergy::new(core, large).state(&u)?.energy),
+        });
+        Ok(energy.map_err(Failure)?)
+    }
+
+    /// Tangent stiffness under displacements, a `scipy.sparse.bsr_matrix`, (3n, 3n), N/mm.
+    ///
+    /// Parameters
+    /// ----------
+    /// u : (n, 3) array_like, mm
+    /// kinematics : {"linear", "corotational", "hyperelastic"}
+    ///     The stiffness of "linear" does not depend on u.
+    #[pyo3(signature = (u, *, kinematics = "linear"))]
+    fn tangent<'py>(
+        &self,
+        py: Python<'py>,
+        u: &Bound<'py, PyAny>,
+        kinematics: &str,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let u = arrays::points(u, Named("u", ErrorKind::Mesh))?;
+        let kinematics = Kinematics::from_name(kinematics).map_err(Failure)?;
+        let core = self.core.clone();
+        let matrix = py.detach(move || match kinematics {
+            Kinematics::Linear => core.internal_force(&u).map(|_| core.matrix().clone()),
+            large => StrainEnergy::new(core, large).stiffness(&u, TangentKind::Exact),
+        });
+        sparse(py, &matrix.map_err(Failure)?)
     }
 
     /// Linear strain of each tet, (m, 6) float64, Voigt with engineering shears.
@@ -329,38 +410,44 @@ impl PyMassTensors {
     }
 
     /// K in block rows: `indptr` (n+1,) int64, `columns` (b,) int32, `blocks` (b, 3, 3) float64, N/mm.
-    #[allow(clippy::type_complexity)]
-    fn block_rows<'py>(
-        &self,
-        py: Python<'py>,
-    ) -> (Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<i64>>, Bound<'py, PyArray3<f64>>) {
-        let matrix = self.core.matrix();
-        let start: Vec<i64> = matrix.row_start.iter().map(|&v| v as i64).collect();
-        let columns: Vec<i64> = matrix.columns.iter().map(|&v| i64::from(v)).collect();
-        (
-            start.into_pyarray(py),
-            columns.into_pyarray(py),
-            arrays::blocks(py, matrix.blocks.clone()),
-        )
+    fn block_rows<'py>(&self, py: Python<'py>) -> BlockRows<'py> {
+        block_rows(py, self.core.matrix())
     }
 
     /// K as a `scipy.sparse.bsr_matrix`, (3n, 3n), N/mm; unknown 3 j + axis.
     fn to_scipy<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let (start, columns, blocks) = self.block_rows(py);
-        let size = 3 * self.core.mesh().n_nodes();
-        let options = pyo3::types::PyDict::new(py);
-        options.set_item("shape", (size, size))?;
-        py.import("scipy.sparse")?.call_method(
-            "bsr_matrix",
-            ((blocks, columns, start),),
-            Some(&options),
-        )
+        sparse(py, self.core.matrix())
     }
 
     fn __repr__(&self) -> String {
         let mesh = self.core.mesh();
-        format!("MassTensors({} nodes, {} tets)", mesh.n_nodes(), mesh.n_tets())
+        let element = match self.core.element() {
+            Element::Linear => String::new(),
+            other => format!(", element=\"{}\"", other.name()),
+        };
+        format!("MassTensors({} nodes, {} tets{element})", mesh.n_nodes(), mesh.n_tets())
     }
+}
+
+type BlockRows<'py> =
+    (Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<i64>>, Bound<'py, PyArray3<f64>>);
+
+fn block_rows<'py>(py: Python<'py>, matrix: &BlockMatrix) -> BlockRows<'py> {
+    let start: Vec<i64> = matrix.row_start.iter().map(|&v| v as i64).collect();
+    let columns: Vec<i64> = matrix.columns.iter().map(|&v| i64::from(v)).collect();
+    (start.into_pyarray(py), columns.into_pyarray(py), arrays::blocks(py, matrix.blocks.clone()))
+}
+
+fn sparse<'py>(py: Python<'py>, matrix: &BlockMatrix) -> PyResult<Bound<'py, PyAny>> {
+    let (start, columns, blocks) = block_rows(py, matrix);
+    let size = 3 * matrix.n_rows();
+    let options = pyo3::types::PyDict::new(py);
+    options.set_item("shape", (size, size))?;
+    py.import("scipy.sparse")?.call_method(
+        "bsr_matrix",
+        ((blocks, columns, start),),
+        Some(&options),
+    )
 }
 
 impl PyMassTensors {

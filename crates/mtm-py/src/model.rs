@@ -5,6 +5,7 @@ use std::sync::Arc;
 use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, Plan, Segment};
 use mtm_core::contact::{ContactMode, ContactOptions};
 use mtm_core::error::{ErrorKind, MtmError};
+use mtm_core::kinematics::Kinematics;
 use mtm_core::method::{Method, StaticOptions};
 use mtm_core::motion::RigidMotion;
 use mtm_core::replan::PlanOperator;
@@ -274,6 +275,10 @@ fn plan(value: &Bound<'_, PyAny>) -> PyResult<Plan> {
 ///     Outer iterations of the contact loop.
 /// memory_limit : float, optional
 ///     MB that a factor may take; 80 % of the free memory by default, where that is known.
+/// kinematics : {"linear", "corotational", "hyperelastic"}
+///     Linear strain (the paper); stretch without rotation, with the constants of the tissue; or stable
+///     neo-Hookean tissue with its fibres (Smith, de Goes & Kim 2018), equal to it for small strain. The
+///     latter two by Newton's method, not with "relaxation".
 ///
 /// Raises
 /// ------
@@ -293,7 +298,8 @@ impl PyStaticSolver {
     #[new]
     #[pyo3(signature = (
         tensors, boundary, method = "auto", *, contact = "bilateral", tolerance = 1e-8,
-        max_iterations = None, contact_tolerance = 1e-9, contact_iterations = 100, memory_limit = None
+        max_iterations = None, contact_tolerance = 1e-9, contact_iterations = 100, memory_limit = None,
+        kinematics = "linear"
     ))]
     fn new(
         py: Python<'_>,
@@ -306,6 +312,7 @@ impl PyStaticSolver {
         contact_tolerance: f64,
         contact_iterations: usize,
         memory_limit: Option<f64>,
+        kinematics: &str,
     ) -> PyResult<Self> {
         let mode = match contact {
             "bilateral" => ContactMode::Bilateral,
@@ -340,6 +347,7 @@ impl PyStaticSolver {
                 ..ContactOptions::default()
             },
             memory_limit,
+            kinematics: Kinematics::from_name(kinematics).map_err(Failure)?,
         };
         let (tensors, boundary) = (tensors.get().core.clone(), boundary.get().core.clone());
         let core =
@@ -355,7 +363,7 @@ impl PyStaticSolver {
     ///     For every segment: (4, 4) rigid transform, (k, 3) displacements of its joined nodes in mm,
     ///     or a SurfaceMotion.
     /// loads : (n, 3) array_like, N, optional
-    ///     Forces on the nodes.
+    ///     Forces on the nodes of the mesh, or on all of `MassTensors.nodes`.
     ///
     /// Returns
     /// -------
@@ -380,7 +388,7 @@ impl PyStaticSolver {
         let loads = loads.map(|l| arrays::points(l, Named("loads", BOUNDARY))).transpose()?;
         let core = self.core.clone();
         let solution = interruptible(py, move |stop| core.solve(&plan, loads.as_deref(), stop))?;
-        PySolution::wrap(py, solution)
+        PySolution::wrap(py, solution, self.core.tensors().mesh().n_nodes())
     }
 
     /// Exact map from rigid plans to the displacements of `nodes` (all by default): 12 columns a segment.
@@ -405,6 +413,12 @@ impl PyStaticSolver {
     #[getter]
     fn method(&self) -> &'static str {
         self.core.method().name()
+    }
+
+    /// The kinematics: "linear", "corotational" or "hyperelastic".
+    #[getter]
+    fn kinematics(&self) -> &'static str {
+        self.core.kinematics().name()
     }
 
     /// The boundary.
@@ -450,20 +464,36 @@ pub struct PySolution {
     n_nodes: usize,
     displacements: Py<PyArray2<f64>>,
     forces: Py<PyArray2<f64>>,
+    all_displacements: Py<PyArray2<f64>>,
+    all_forces: Py<PyArray2<f64>>,
 }
 
 #[pymethods]
 impl PySolution {
-    /// Displacement of every node, (n, 3) float64, mm, read-only.
+    /// Displacement of every node of the mesh, (n, 3) float64, mm, read-only.
     #[getter]
     fn displacements<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
         self.displacements.bind(py).clone()
     }
 
-    /// Internal force K u of every node, (n, 3) float64, N, read-only; zero at free nodes without loads.
+    /// Internal force of every node of the mesh (K u if linear), (n, 3) float64, N, read-only; zero at free
+    /// nodes without loads.
     #[getter]
     fn forces<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
         self.forces.bind(py).clone()
+    }
+
+    /// Displacement of every node of `MassTensors.nodes`, those in the middle of edges included, (n + e, 3)
+    /// float64, mm, read-only.
+    #[getter]
+    fn all_displacements<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+        self.all_displacements.bind(py).clone()
+    }
+
+    /// Internal force of every node of `MassTensors.nodes`, (n + e, 3) float64, N, read-only.
+    #[getter]
+    fn all_forces<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+        self.all_forces.bind(py).clone()
     }
 
     /// Force out of balance over the forces that the plan brings in.
@@ -474,7 +504,7 @@ impl PySolution {
 
     /// Largest nodal error of the linear solve, mm.
     ///
-    /// The bound that stopped an iterative method; for Cholesky ten times the error with which the
+    /// With large rotations the last Newton step, whose error is smaller than itself. Else the bound that stopped an iterative method; for Cholesky ten times the error with which the
     /// factor recovered a known solution. Rounding of the stiffness itself is not in it.
     #[getter]
     fn error_bound(&self) -> f64 {
@@ -505,7 +535,7 @@ impl PySolution {
         self.core.contact_iterations
     }
 
-    /// The sliding nodes, (s,) uint32, segment by segment.
+    /// The sliding nodes, (s,) uint32, segment by segment; with "p2" those in the middle of edges too.
     #[getter]
     fn contact_nodes<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u32>> {
         self.core.contact.nodes.clone().into_pyarray(py)
@@ -559,17 +589,28 @@ impl PySolution {
 }
 
 impl PySolution {
-    fn wrap(py: Python<'_>, mut core: Solution) -> PyResult<Self> {
+    fn wrap(py: Python<'_>, mut core: Solution, n_nodes: usize) -> PyResult<Self> {
         let displacements = std::mem::take(&mut core.displacements);
         let forces = std::mem::take(&mut core.forces);
-        let n_nodes = displacements.len();
-        Ok(Self {
-            core,
-            n_nodes,
-            displacements: arrays::frozen(arrays::rows(py, displacements))?.unbind(),
-            forces: arrays::frozen(arrays::rows(py, forces))?.unbind(),
-        })
+        let (all_displacements, displacements) = of_corners(py, displacements, n_nodes)?;
+        let (all_forces, forces) = of_corners(py, forces, n_nodes)?;
+        Ok(Self { core, n_nodes, displacements, forces, all_displacements, all_forces })
     }
+}
+
+/// Read-only rows of all nodes, and of the first `n`; one array where these are all.
+fn of_corners(
+    py: Python<'_>,
+    rows: Vec<[f64; 3]>,
+    n: usize,
+) -> PyResult<(Py<PyArray2<f64>>, Py<PyArray2<f64>>)> {
+    let corners = (rows.len() > n).then(|| rows[..n].to_vec());
+    let all = arrays::frozen(arrays::rows(py, rows))?.unbind();
+    let corners = match corners {
+        Some(corners) => arrays::frozen(arrays::rows(py, corners))?.unbind(),
+        None => all.clone_ref(py),
+    };
+    Ok((all, corners))
 }
 
 /// Exact map from rigid plans to displacements of chosen nodes; call it with a plan.

@@ -102,7 +102,7 @@ def info(options: argparse.Namespace) -> int:
                     "highest": nodes.max(axis=0).tolist() if len(nodes) else None,
                     "tissue": scene.header()["tissue"],
                     "segments": counts,
-                    "solver": scene.options.as_dict(),
+                    "solver": scene.options.header(),
                 },
                 allow_nan=False,
             )

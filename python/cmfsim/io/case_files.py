@@ -30,7 +30,16 @@ from cmfsim.patient import (
     Region,
 )
 from cmfsim.planning import decompose_motion, rigid_motion
-from cmfsim.scene import CONTACTS, METHODS, MIXINGS, PRESETS, SolverOptions, TissueData
+from cmfsim.scene import (
+    CONTACTS,
+    ELEMENTS,
+    KINEMATICS,
+    METHODS,
+    MIXINGS,
+    PRESETS,
+    SolverOptions,
+    TissueData,
+)
 
 __all__ = ["CASE_FORMAT", "Case"]
 
@@ -413,6 +422,10 @@ def _solver(table: Table) -> SolverOptions:
             given[key] = table.text(key, choices=METHODS)
         elif key == "contact":
             given[key] = table.text(key, choices=CONTACTS)
+        elif key == "element":
+            given[key] = table.text(key, choices=ELEMENTS)
+        elif key == "kinematics":
+            given[key] = table.text(key, choices=KINEMATICS)
         else:
             given[key] = table.plain(key)
             with table.at(key):
