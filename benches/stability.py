@@ -1069,6 +1069,11 @@ tets lock as ν nears 0.5 however exactly their equations are solved.
 - **relaxation**: stiff bodies in soft tissue with a contrast above 1e2, ν above 0.49, slivers: it
   runs out of sweeps and raises `SolverError`. It measures its error by conjugate gradients, so it
   is refused wherever these are.
+- **p1**: bending tissue with ν above 0.45: it locks, silently. `anp` and `p2` do not (theory,
+  *Elements*; `tests/python/test_elements.py`).
+- **relaxation** and **plan_operator** with `corotational` or `hyperelastic`: they are of the linear
+  model, and raise `SolverError`. So does a plan that Newton's method does not bring to rest in 64
+  parts.
 - Nodes that hold a body and lie within about 1e-4 of its size of one line count as in line:
   `BoundaryError`.
 """

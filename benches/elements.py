@@ -1,0 +1,114 @@
+"""What an element and its kinematics cost and buy: error on the outer surface against run time.
+
+    python benches/elements.py [--level 2] [--layers 3] [--json FILE]
+
+A shell of soft tissue (12 mm over a bone of 40 mm) is held over one half of the bone and joined to
+a segment over the other, which advances by 5 mm and turns by 8°, and is solved with every element
+and kinematics. The reference is hyperelastic on quadratic tets of half the edge length. Error: how
+far the nodes on the outer surface are from where the reference puts them; it has every node of the
+coarse mesh. Time: set-up and solve, the best of three, over that of linear tets in linear
+kinematics.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+import cmfsim
+import meshes
+
+BONE, SKIN = 40.0, 52.0  # radii, mm
+YOUNG, POISSON = 0.003, 0.46  # fat (Kim et al. 2010, table 1)
+SHIFT, TURN = (0.0, -5.0, 0.0), 8.0  # mm, degrees
+REPEATS = 3
+
+Floats = NDArray[np.float64]
+
+
+def shell(level: int, layers: int) -> tuple[cmfsim.TetMesh, cmfsim.Boundary, NDArray[np.uint32]]:
+    """Mesh, boundary and the nodes on the outer surface."""
+    nodes, tets, inner, outer = meshes.spherical_shell(level, layers, BONE, SKIN)
+    front = nodes[inner, 1] < -0.1 * BONE
+    boundary = cmfsim.Boundary(fixed=inner[~front], joined={"jaw": inner[front]})
+    return cmfsim.TetMesh(nodes, tets), boundary, outer
+
+
+def solved(
+    mesh: cmfsim.TetMesh, boundary: cmfsim.Boundary, element: str, kinematics: str, poisson: float
+) -> cmfsim.Solution:
+    """The displacements under the plan of the bench."""
+    tissue = cmfsim.Tissue.isotropic(YOUNG, poisson)
+    tensors = cmfsim.MassTensors(mesh, tissue, element=element)
+    solver = cmfsim.StaticSolver(tensors, boundary, "cholesky", kinematics=kinematics)
+    return solver.solve({"jaw": cmfsim.rigid_motion(SHIFT, TURN, (1, 0, 0))})
+
+
+def reference(level: int, layers: int, outer: Floats, poisson: float) -> Floats:
+    """Displacements of the points `outer` by hyperelastic quadratic tets of half the edge."""
+    mesh, boundary, _ = shell(level + 1, 2 * layers)
+    solution = solved(mesh, boundary, "p2", "hyperelastic", poisson)
+    distance, at = cKDTree(mesh.nodes).query(outer)
+    if distance.max() > 1e-9:
+        raise SystemExit("the fine mesh lacks nodes of the coarse one")
+    return solution.displacements[at]
+
+
+def rows(level: int, layers: int, poisson: float) -> list[dict[str, float | str | int]]:
+    """Error and time of each choice."""
+    mesh, boundary, outer = shell(level, layers)
+    exact = reference(level, layers, mesh.nodes[outer], poisson)
+    out: list[dict[str, float | str | int]] = []
+    for element in cmfsim.ELEMENTS:
+        for kinematics in cmfsim.KINEMATICS:
+            seconds = []
+            for _ in range(REPEATS):
+                begun = time.perf_counter()
+                solution = solved(mesh, boundary, element, kinematics, poisson)
+                seconds.append(time.perf_counter() - begun)
+            error = np.linalg.norm(solution.displacements[outer] - exact, axis=1)
+            out.append(
+                {
+                    "poisson": poisson,
+                    "element": element,
+                    "kinematics": kinematics,
+                    "n_tets": mesh.n_tets,
+                    "mean": float(error.mean()),
+                    "p95": float(np.percentile(error, 95)),
+                    "largest": float(error.max()),
+                    "seconds": min(seconds),
+                    "iterations": solution.iterations,
+                }
+            )
+    return out
+
+
+def main() -> None:
+    """Prints the table; writes it as JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--level", type=int, default=2, help="splits of the icosphere")
+    parser.add_argument("--layers", type=int, default=3, help="layers through the tissue")
+    parser.add_argument("--poisson", type=float, nargs="+", default=[POISSON, 0.499])
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    table = [row for nu in options.poisson for row in rows(options.level, options.layers, nu)]
+    print(f"{table[0]['n_tets']} tets; error on the outer surface, mm; time over p1 linear")
+    print("| ν | element | kinematics | mean | P95 | largest | time |")
+    print("|---|---|---|---|---|---|---|")
+    for row in table:
+        first = next(r for r in table if r["poisson"] == row["poisson"])
+        ratio = float(row["seconds"]) / float(first["seconds"])
+        print(
+            f"| {row['poisson']} | {row['element']} | {row['kinematics']} | {row['mean']:.3f} | "
+            f"{row['p95']:.3f} | {row['largest']:.3f} | {ratio:.1f} |"
+        )
+    if options.json:
+        options.json.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
