@@ -424,6 +424,7 @@ def _summary(
     grid = anatomy.skin
     return {
         "case": case.name,
+        "note": case.note,
         "nodes": {name: len(kinds.nodes(name)) for name in NODE_KINDS},
         "segments": {
             name: {kind: len(kinds.nodes(kind, name)) for kind in ("joined", "sliding")}

@@ -7,6 +7,7 @@ from typing import Any
 from cmfsim import __version__
 from cmfsim.cli import (
     case_commands,
+    demo_command,
     phantom_command,
     scene_commands,
     study_commands,
@@ -41,6 +42,23 @@ def make_parser() -> argparse.ArgumentParser:
 def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     named = argparse.ArgumentParser(add_help=False, parents=[common])
     named.add_argument("case", metavar="CASE", type=Path, help="case.toml")
+
+    demo = commands.add_parser(
+        "demo", parents=[common], help="predict the face of an embedded case, and open its report"
+    )
+    demo.add_argument(
+        "folder",
+        metavar="FOLDER",
+        type=Path,
+        nargs="?",
+        default=demo_command.DEMO_FOLDER,
+        help=f"new, empty or an earlier demo's (default {demo_command.DEMO_FOLDER})",
+    )
+    demo.add_argument(
+        "--edge-length", metavar="H", type=float, default=6.0, help="of the tets, mm (default 6)"
+    )
+    demo.add_argument("--no-open", action="store_true", help="do not open the report")
+    demo.set_defaults(run=demo_command.demo, models=demo_command.DEMO_MODELS)
 
     doctor = commands.add_parser(
         "doctor",

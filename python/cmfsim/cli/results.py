@@ -43,9 +43,12 @@ def folder_of(output: Path, model: str, n_models: int) -> Path:
     return output if n_models == 1 else output / model
 
 
-def write_prediction_files(folder: Path, prediction: Prediction) -> list[str]:
+def write_prediction_files(
+    folder: Path, prediction: Prediction, *, pictures: bool = True
+) -> list[str]:
     """The names of the files of a prediction, with its pictures where they can be drawn."""
-    return write_prediction(folder, prediction, partial(_draw, prediction))
+    draw = partial(_draw, prediction) if pictures else None
+    return write_prediction(folder, prediction, draw)
 
 
 def _draw(prediction: Prediction, folder: Path) -> list[str]:

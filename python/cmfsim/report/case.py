@@ -27,6 +27,11 @@ PICTURES: Mapping[str, str] = {
     "blue, free white.",
 }
 
+NO_PICTURES = (
+    "Without pictures: none could be drawn where this was made. PyVista and OpenGL draw them "
+    "(pip install 'cmfsim[view]'; Debian: libgl1, libegl1)."
+)
+
 
 def case_document(
     predictions: Sequence[Values],
@@ -56,6 +61,7 @@ def case_document(
     pictures = pictures or {}
     models = ", ".join(entry["model"] for entry in predictions)
     sections = [
+        *_note_section(first),
         _prediction_section(predictions, pictures),
         _plan_section(first, pictures),
         *_evaluation_sections(evaluation, pictures, figures),
@@ -90,6 +96,12 @@ def _facts(prediction: Values, evaluation: Values | None) -> dict[str, str]:
     return facts
 
 
+def _note_section(prediction: Values) -> list[Section]:
+    """What the case's own note says of it."""
+    note = prediction.get("note")
+    return [Section("About this case", (Note(note, "warning"),))] if note else []
+
+
 def _prediction_section(predictions: Sequence[Values], pictures: Mapping[str, bytes]) -> Section:
     rows = tuple(
         (
@@ -101,7 +113,8 @@ def _prediction_section(predictions: Sequence[Values], pictures: Mapping[str, by
         for entry in predictions
     )
     table = Table(("model", "mean", "95 %", "largest"), rows, "How far the skin moves, mm.")
-    return Section("Prediction", (*_picture("prediction", pictures), table))
+    drawn = _picture("prediction", pictures)
+    return Section("Prediction", (*(drawn or [Note(NO_PICTURES, "warning")]), table))
 
 
 def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
