@@ -161,7 +161,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "evaluation": "case checks errors registration scene topology _core",
         "build": (
             "case checks doctor equivalent errors imaging io meshing model musculature "
-            "node_kinds osteotomy patient phantom pictures scene surface_repair template "
+            "node_kinds osteotomy patient phantom pictures scene surface_repair template topology "
             "_core"
         ),
         "demo": "case checks errors io osteotomy phantom scene",

@@ -22,6 +22,7 @@ from cmfsim.build.inputs import (
     read_motion,
 )
 from cmfsim.build.muscles import with_muscles
+from cmfsim.build.skin_part import on_skin
 from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.checks import Floats
 from cmfsim.doctor import diagnose
@@ -216,7 +217,7 @@ def build_model(
     motions = {name: read_motion(case, motion) for name, motion in case.plan.items()}
     scene = _scene(case, mesh, kinds, cut.segments, motions)
     boundary = np.asarray(mesh.boundary_triangles())
-    skin = _on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)
+    skin = on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)
     stages.end()
     patient = PatientModel(
         name=case.name,
@@ -396,20 +397,6 @@ def _scene(
         fixed=kinds.nodes("fixed"),
         options=case.solver,
     )
-
-
-def _on_skin(
-    nodes: Floats, triangles: NDArray[np.uint32], anatomy: Anatomy, level: ImageData
-) -> NDArray[np.bool_]:
-    """Which boundary triangles are skin: their centroids lie nearer to it than to anything else."""
-    centroids = nodes[triangles].mean(axis=1)
-    others = [*anatomy.bones.values(), *([] if anatomy.air is None else [anatomy.air])]
-    from_skin = np.abs(anatomy.skin.sample(centroids))
-    near = np.ones(len(centroids), dtype=bool)
-    for other in others:
-        near &= from_skin < np.abs(other.sample(centroids))
-    # On a plane that bounds the region, the level is zero well inside the skin.
-    return near & (from_skin <= np.abs(level.sample(centroids)) + 0.25)
 
 
 def _summary(

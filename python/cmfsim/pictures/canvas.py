@@ -75,8 +75,9 @@ def draw(
     size: tuple[int, int],
     paint: Callable[[Any, View], None],
     legend: Sequence[tuple[str, str]],
+    columns: int | None = None,
 ) -> None:
-    """Writes the views side by side, under a temporary name first."""
+    """Writes the views side by side, in rows of `columns`, under a temporary name first."""
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise CaseInputError(f"{path.name}: a picture is written as .png, not {path.suffix!r}")
@@ -87,18 +88,20 @@ def draw(
             f"{path.name}: the picture cannot be drawn (OpenGL does not work); {NO_OPENGL}"
         )
     # One scale for all views.
-    half = max(_half_height(view, corners, width / len(views), height) for view in views)
+    columns = columns or len(views)
+    rows = -(-len(views) // columns)
+    half = max(_half_height(view, corners, width / columns, height / rows) for view in views)
     try:
         # PyVista and VTK warn of missing screens; whether the picture was made decides here.
         with _silent_vtk(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             plotter = pv.Plotter(
-                off_screen=True, shape=(1, len(views)), window_size=[width, height], border=False
+                off_screen=True, shape=(rows, columns), window_size=[width, height], border=False
             )
             try:
                 plotter.enable_anti_aliasing("ssaa")
-                for column, view in enumerate(views):
-                    plotter.subplot(0, column)
+                for place, view in enumerate(views):
+                    plotter.subplot(*divmod(place, columns))
                     plotter.set_background("white")
                     _place_camera(plotter, view, corners, half)
                     paint(plotter, view)

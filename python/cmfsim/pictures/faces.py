@@ -14,8 +14,12 @@ from cmfsim.scene import MovedSurface, SurfaceData
 
 __all__ = ["picture_plan", "picture_prediction"]
 
-# Of pictures with six views, pixels.
-WIDE = (2400, 700)
+# Of six views in two rows, pixels.
+TWO_ROWS = (1650, 1240)
+# What is left off at the back and below, in edges: the mesh ends there, in ragged triangles.
+RIM = 2.0
+# Skin shines a little.
+SKIN_SHADING = {"smooth_shading": True, "ambient": 0.12, "specular": 0.12, "specular_power": 12}
 # Movement that fills the colour scale at least, mm.
 LEAST_SCALE = 0.01
 # Of bone where it was before the operation.
@@ -26,7 +30,7 @@ def picture_prediction(
     path: str | os.PathLike[str],
     prediction: Prediction,
     *,
-    size: tuple[int, int] = WIDE,
+    size: tuple[int, int] = TWO_ROWS,
 ) -> None:
     """Writes a picture of a face before and after, and how far each point of it moves.
 
@@ -50,28 +54,56 @@ def picture_prediction(
     before, after = prediction.skin_before, prediction.skin
     moved = np.linalg.norm(prediction.skin_displacements, axis=1)
     largest = max(float(moved.max()), LEAST_SCALE)
+    back, below = _ends(before)
 
     def paint(plotter: Any, view: View) -> None:
         surface = before if view.caption.startswith("before") else after
         shape = polydata(surface.vertices, surface.triangles)
+        shape.point_data["movement"] = moved
+        shape = shape.clip("y", origin=(0, back, 0)).clip("-z", origin=(0, 0, below))
         if not view.caption.startswith("movement"):
-            plotter.add_mesh(shape, color=SKIN_COLOUR, smooth_shading=True)
+            plotter.add_mesh(shape, color=SKIN_COLOUR, **SKIN_SHADING)
             return
-        shape.point_data["movement, mm"] = moved
         plotter.add_mesh(
             shape,
-            scalars="movement, mm",
+            scalars="movement",
             clim=(0.0, largest),
             cmap="viridis",
             smooth_shading=True,
-            show_scalar_bar=view.direction == "front",
-            scalar_bar_args={"n_labels": 4, "fmt": "%.1f", "color": "black"},
+            ambient=0.3,
+            show_scalar_bar=False,
         )
+        if view.direction == "front":
+            bar = plotter.add_scalar_bar(
+                title="mm",
+                n_labels=4,
+                fmt="%.1f",
+                vertical=True,
+                position_x=0.88,
+                position_y=0.25,
+                width=0.09,
+                height=0.5,
+                color="black",
+                title_font_size=16,
+                label_font_size=14,
+            )
+            bar.SetUnconstrainedFontSize(True)  # noqa: FBT003 (VTK's own signature)
 
     names = ("before", "after", "movement")
     views = tuple(View(d, f"{name}, {d}") for d in ("front", "left") for name in names)
     corners = bounds([before.vertices, after.vertices])
-    draw(path, views, corners, size, paint, [])
+    corners[1, 1], corners[0, 2] = back, below
+    draw(path, views, corners, size, paint, [], columns=len(names))
+
+
+def _ends(skin: SurfaceData) -> tuple[float, float]:
+    """How far back and how far down a skin is drawn: short of its ragged end there, P and S, mm."""
+    vertices, triangles = np.asarray(skin.vertices), np.asarray(skin.triangles)
+    edge = float(np.median(np.linalg.norm(np.diff(vertices[triangles[:, :2]], axis=1), axis=2)))
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    back, below = float(high[1]) - RIM * edge, float(low[2]) + RIM * edge
+    # Of a skin a few edges across nothing is left off.
+    return max(back, float(low[1] + high[1]) / 2), min(below, float(low[2] + high[2]) / 2)
 
 
 def picture_plan(
