@@ -55,7 +55,7 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         help=f"new, empty or an earlier demo's (default {demo_command.DEMO_FOLDER})",
     )
     demo.add_argument(
-        "--edge-length", metavar="H", type=float, default=6.0, help="of the tets, mm (default 6)"
+        "--edge-length", metavar="H", type=float, default=7.0, help="of the tets, mm (default 7)"
     )
     demo.add_argument("--no-open", action="store_true", help="do not open the report")
     demo.set_defaults(run=demo_command.demo, models=demo_command.DEMO_MODELS)

@@ -117,7 +117,7 @@ class DemoCase:
 
 
 def write_demo_case(
-    folder: str | os.PathLike[str], *, edge_length: float = 6.0, truth: Path | None = None
+    folder: str | os.PathLike[str], *, edge_length: float = 7.0, truth: Path | None = None
 ) -> DemoCase:
     """The embedded case, written as `case.toml` with surfaces and landmarks.
 

@@ -17,7 +17,9 @@ from cmfsim.prediction import Prediction
 
 __all__ = ["is_prediction_file", "write_prediction"]
 
-PREDICTION_FILES = re.compile(r"prediction\.(vtp|stl|vtu|npz|png|json)|plan\.png|timings\.json")
+PREDICTION_FILES = re.compile(
+    r"prediction\.(vtp|stl|vtu|npz|png|json)|(bones|muscles)\.vtp|(plan|muscles)\.png|timings\.json"
+)
 
 
 def is_prediction_file(name: str) -> bool:
@@ -34,8 +36,10 @@ def write_prediction(
 
     `prediction.vtp` (the skin at rest with its `displacement`), `prediction.stl` (the predicted
     skin), `prediction.vtu` (tissue with `displacement`, `force`, muscle `fraction` and `fibre`),
-    `prediction.npz` (everything, for `read_result`), `timings.json`, and `prediction.json` (counts,
-    parameters, findings, versions, hashes). All take their places together, or none does.
+    `prediction.npz` (everything, for `read_result`), `bones.vtp` (segments before the operation,
+    with their `displacement`) and `muscles.vtp`, each vertex with the number of its `part` (the
+    summary lists their names), `timings.json`, and `prediction.json` (counts, parameters, findings,
+    versions, hashes). All take their places together, or none does.
 
     Parameters
     ----------
@@ -73,14 +77,41 @@ def write_prediction(
             points = {"displacement": result.displacements, "force": result.forces}
             write_tets(file, result.nodes, result.tets, points, _muscle_data(prediction))
         write_result(fresh / names[3], result)
+        parts = _write_parts(fresh, prediction)
+        names.extend(f"{name}.vtp" for name in parts)
         if draw is not None:
             names.extend(draw(fresh))
         names += ["timings.json", "prediction.json"]
         _write_json(fresh / "timings.json", prediction.summary["timings"])
-        _write_json(fresh / "prediction.json", {**prediction.summary, "files": names})
+        _write_json(
+            fresh / "prediction.json", {**prediction.summary, "parts": parts, "files": names}
+        )
         return names
 
     return replacing_files(Path(folder), "prediction.json", is_prediction_file, fill)
+
+
+def _write_parts(folder: Path, prediction: Prediction) -> dict[str, list[str]]:
+    """The names of the parts in the file of each kind: bones, and muscles where there are any."""
+    parts = {"bones": prediction.bones}
+    if prediction.muscles is not None:
+        still = {m.name: (m.surface, np.asarray(m.surface.vertices)) for m in prediction.muscles}
+        parts["muscles"] = still
+    for kind, surfaces in parts.items():
+        before = [np.asarray(surface.vertices) for surface, _ in surfaces.values()]
+        counts = [len(vertices) for vertices in before]
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        triangles = [
+            np.asarray(surface.triangles, dtype=np.int64) + start
+            for (surface, _), start in zip(surfaces.values(), starts, strict=False)
+        ]
+        moved = [after - at for (_, after), at in zip(surfaces.values(), before, strict=True)]
+        with replacing(folder / f"{kind}.vtp") as file:
+            data = {"part": np.repeat(np.arange(len(counts)), counts)}
+            if kind == "bones":
+                data["displacement"] = np.concatenate(moved)
+            write_triangles(file, np.concatenate(before), np.concatenate(triangles), data)
+    return {kind: list(surfaces) for kind, surfaces in parts.items()}
 
 
 def _muscle_data(prediction: Prediction) -> dict[str, np.ndarray]:

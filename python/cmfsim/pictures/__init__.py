@@ -10,7 +10,7 @@ from cmfsim.pictures.anatomy import (
 from cmfsim.pictures.charts import MODEL_COLOURS, chart_errors
 from cmfsim.pictures.distances import DISTANCE_LIMIT, distance_colour, picture_distances
 from cmfsim.pictures.faces import picture_plan, picture_prediction
-from cmfsim.pictures.muscles import picture_muscle_names, picture_muscles
+from cmfsim.pictures.muscles import picture_muscles
 
 __all__ = [
     "DISTANCE_LIMIT",
@@ -21,7 +21,6 @@ __all__ = [
     "distance_colour",
     "picture_anatomy",
     "picture_distances",
-    "picture_muscle_names",
     "picture_muscles",
     "picture_node_kinds",
     "picture_plan",

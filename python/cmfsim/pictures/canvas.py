@@ -27,7 +27,7 @@ from cmfsim.errors import CaseInputError
 
 __all__ = ["LEGEND_ROW", "SIZE", "View", "bounds", "draw", "polydata"]
 
-SIZE = (1600, 900)
+SIZE = (1650, 820)
 # Where the camera stands, as a direction from the head, in LPS.
 DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
     {

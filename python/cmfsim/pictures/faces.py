@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.case import BoneSegment
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
 from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
 from cmfsim.prediction import Prediction
-from cmfsim.scene import MovedSurface, SurfaceData
+from cmfsim.scene import SurfaceData
 
 __all__ = ["picture_plan", "picture_prediction"]
 
@@ -131,30 +130,22 @@ def picture_plan(
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_plan("plan.png", prediction)  # doctest: +SKIP
     """
-    segments = prediction.patient.segments
-    moved = [replace(s, surface=_moved(s, prediction.scene.plan.get(s.name))) for s in segments]
+    segments, after = prediction.patient.segments, prediction.bones
+    moved = [
+        replace(s, surface=SurfaceData(after[s.name][1], after[s.name][0].triangles))
+        for s in segments
+    ]
+    still = {name for name, (surface, v) in after.items() if np.array_equal(v, surface.vertices)}
     colours = segment_colours([s.name for s in segments])
     corners = bounds([np.asarray(s.surface.vertices) for s in (*segments, *moved)])
 
     def paint(plotter: Any, view: View) -> None:
         del view
-        for before, after in zip(segments, moved, strict=True):
-            add_bone(plotter, after, colours[after.name])
-            if before.surface is not after.surface:
+        for before, now in zip(segments, moved, strict=True):
+            add_bone(plotter, now, colours[now.name])
+            if now.name not in still:
                 shape = polydata(before.surface.vertices, before.surface.triangles)
                 plotter.add_mesh(shape, color=GHOST_COLOUR, opacity=0.3, smooth_shading=True)
 
     views = tuple(View(name, name) for name in ("right", "front", "left"))
     draw(path, views, corners, size, paint, [*colours.items(), ("before", GHOST_COLOUR)])
-
-
-def _moved(segment: BoneSegment, motion: object) -> SurfaceData:
-    """A segment's surface where its motion takes it; the same surface where it stays."""
-    surface = segment.surface
-    if isinstance(motion, MovedSurface):
-        return SurfaceData(motion.moved_vertices, motion.surface.triangles)
-    matrix = np.eye(4) if motion is None else np.asarray(motion, dtype=np.float64)
-    if matrix.shape != (4, 4) or np.array_equal(matrix, np.eye(4)):
-        return surface
-    vertices = np.asarray(surface.vertices) @ matrix[:3, :3].T + matrix[:3, 3]
-    return SurfaceData(vertices, surface.triangles, surface.crease_angle)

@@ -113,8 +113,8 @@ def _prediction_section(predictions: Sequence[Values], pictures: Mapping[str, by
         for entry in predictions
     )
     table = Table(("model", "mean", "95 %", "largest"), rows, "How far the skin moves, mm.")
-    drawn = _picture("prediction", pictures)
-    return Section("Prediction", (*(drawn or [Note(NO_PICTURES, "warning")]), table))
+    drawn: Sequence[Figure | Note] = _picture("prediction", pictures)
+    return Section("Prediction", (*(drawn or (Note(NO_PICTURES, "warning"),)), table))
 
 
 def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
