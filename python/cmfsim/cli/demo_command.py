@@ -18,6 +18,7 @@ from cmfsim.cli.results import (
 )
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.demo import DemoCase, write_demo_case
+from cmfsim.pictures import has_screen
 from cmfsim.prediction import Prediction
 from cmfsim.study import evaluate, predict_models
 
@@ -49,7 +50,7 @@ def demo(options: argparse.Namespace) -> int:
     print(f"case    {escaped(str(made.case.file))}")
     print(f"report  {escaped(str(page))}")
     print(f"time    {seconds:.0f} s")
-    if not options.no_open and _has_screen():
+    if not options.no_open and _someone_looks():
         webbrowser.open(page.resolve().as_uri())
     return DONE
 
@@ -76,10 +77,6 @@ def _work(made: DemoCase, models: tuple[str, ...], progress: StageProgress) -> N
         write_evaluation(case.output, found)
 
 
-def _has_screen() -> bool:
+def _someone_looks() -> bool:
     """Whether someone sits in front of this: not in a pipe, not in CI, not without a display."""
-    if not sys.stdout.isatty() or os.environ.get("CI"):
-        return False
-    if sys.platform.startswith(("win", "darwin")):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    return sys.stdout.isatty() and not os.environ.get("CI") and has_screen()

@@ -144,7 +144,8 @@ def write_case_report(folder: Path, models: Sequence[str]) -> str | None:
     }
     figures = []
     if evaluation is not None:
-        for name in evaluation["files"]:
+        # The box plot first: it shows all models together.
+        for name in sorted(evaluation["files"], key=lambda name: name != "errors.png"):
             if not name.endswith(".png"):
                 continue
             model = name.removeprefix("error-").removesuffix(".png")

@@ -31,6 +31,8 @@ DEMO_PARAMETERS = HeadParameters(
 MAXILLA_MOVE, MAXILLA_TURN, MAXILLA_CENTRE = (0.0, -5.0, 0.5), 2.0, "supradentale"
 # Sagittal split: the mandible back and up with the maxilla. All mm, LPS.
 MANDIBLE_MOVE = (0.0, 3.5, 0.5)
+# Height up to which there is tissue, mm: the scalp above takes two fifths of the tets and stays.
+TISSUE_TOP = 75.0
 # The head's voxels, in edges of the tets, and their bounds, mm: finer ones cost time and change
 # nothing, on coarser ones teeth and lips melt.
 VOXELS_PER_EDGE = 4.0
@@ -84,6 +86,10 @@ translation = {mandible}
 
 [muscles]
 template = "default"
+samples = 32
+
+[region]                          # the vault above the forehead does not move
+upper = {upper}
 
 [mesh]
 edge_length = {edge_length}
@@ -117,7 +123,7 @@ class DemoCase:
 
 
 def write_demo_case(
-    folder: str | os.PathLike[str], *, edge_length: float = 7.0, truth: Path | None = None
+    folder: str | os.PathLike[str], *, edge_length: float = 6.0, truth: Path | None = None
 ) -> DemoCase:
     """The embedded case, written as `case.toml` with surfaces and landmarks.
 
@@ -192,6 +198,7 @@ def _case_text(head: PhantomHead, edge_length: float, after: DemoTruth | None) -
         turn=MAXILLA_TURN,
         centre=centre,
         mandible=list(MANDIBLE_MOVE),
+        upper=TISSUE_TOP,
         edge_length=edge_length,
         after="" if after is None else AFTER,
     )

@@ -3,19 +3,23 @@
 import json
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from cmfsim.errors import CaseInputError
 from cmfsim.io.files import replacing
 from cmfsim.io.folders import replacing_files
+from cmfsim.io.meshes import read_mesh
 from cmfsim.io.results import write_result
 from cmfsim.io.surfaces import write_surface
 from cmfsim.io.vtk import write_tets, write_triangles
 from cmfsim.prediction import Prediction
+from cmfsim.scene import SurfaceData
 
-__all__ = ["is_prediction_file", "write_prediction"]
+__all__ = ["is_prediction_file", "read_parts", "write_prediction"]
 
 PREDICTION_FILES = re.compile(
     r"prediction\.(vtp|stl|vtu|npz|png|json)|(bones|muscles)\.vtp|(plan|muscles)\.png|timings\.json"
@@ -112,6 +116,60 @@ def _write_parts(folder: Path, prediction: Prediction) -> dict[str, list[str]]:
                 data["displacement"] = np.concatenate(moved)
             write_triangles(file, np.concatenate(before), np.concatenate(triangles), data)
     return {kind: list(surfaces) for kind, surfaces in parts.items()}
+
+
+def read_parts(
+    folder: str | os.PathLike[str],
+) -> dict[str, dict[str, tuple[SurfaceData, NDArray[np.float64]]]]:
+    """The surfaces of a prediction that was written, with their vertices after the operation.
+
+    Parameters
+    ----------
+    folder : path
+        That `write_prediction` filled.
+
+    Returns
+    -------
+    dict of str to dict of str to (SurfaceData, (v, 3) float64)
+        "skin", "bones" and, in models with muscles, "muscles"; then by name. Muscles stay.
+
+    Raises
+    ------
+    FileNotFoundError
+        A file is missing: another program's folder, or an older version's.
+    CaseError
+        (also `ValueError`) A file that cannot be read; PyVista is missing.
+    """
+    folder = Path(folder)
+    text = (folder / "prediction.json").read_text(encoding="utf-8")
+    try:
+        listed = {kind: [*names] for kind, names in json.loads(text).get("parts", {}).items()}
+    except (ValueError, AttributeError, TypeError) as error:
+        raise CaseInputError(f"{folder}: prediction.json cannot be read ({error})") from error
+    found = {"skin": _read_part_file(folder / "prediction.vtp", ["skin"])}
+    for kind in ("bones", "muscles"):
+        if kind in listed:
+            found[kind] = _read_part_file(folder / f"{kind}.vtp", listed[kind])
+    return found
+
+
+def _read_part_file(
+    path: Path, names: Sequence[str]
+) -> dict[str, tuple[SurfaceData, NDArray[np.float64]]]:
+    mesh = read_mesh(path)
+    points = np.asarray(mesh.points, dtype=np.float64)
+    triangles = np.asarray(mesh.cells_dict["triangle"], dtype=np.int64)
+    number = np.asarray(mesh.point_data.get("part", np.zeros(len(points), dtype=np.int64)))
+    moved = points + np.asarray(mesh.point_data.get("displacement", 0.0))
+    found = {}
+    for part, name in enumerate(names):
+        mine = np.flatnonzero(number == part)
+        corners = triangles[(number[triangles] == part).all(axis=1)]
+        if not len(mine) or not len(corners):
+            raise CaseInputError(f"{path.name}: part {part} ({name}) has no triangles")
+        surface = SurfaceData(points[mine], np.searchsorted(mine, corners))
+        found[name] = (surface, moved[mine])
+    return found
 
 
 def _muscle_data(prediction: Prediction) -> dict[str, np.ndarray]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
 from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
+from cmfsim.pictures.skin_ends import skin_ends, trimmed
 from cmfsim.prediction import Prediction
 from cmfsim.scene import SurfaceData
 
@@ -15,8 +16,6 @@ __all__ = ["picture_plan", "picture_prediction"]
 
 # Of six views in two rows, pixels.
 TWO_ROWS = (1650, 1240)
-# What is left off at the back and below, in edges: the mesh ends there, in ragged triangles.
-RIM = 2.0
 # Skin shines a little.
 SKIN_SHADING = {"smooth_shading": True, "ambient": 0.12, "specular": 0.12, "specular_power": 12}
 # Movement that fills the colour scale at least, mm.
@@ -53,13 +52,13 @@ def picture_prediction(
     before, after = prediction.skin_before, prediction.skin
     moved = np.linalg.norm(prediction.skin_displacements, axis=1)
     largest = max(float(moved.max()), LEAST_SCALE)
-    back, below = _ends(before)
+    ends = skin_ends(before)
 
     def paint(plotter: Any, view: View) -> None:
         surface = before if view.caption.startswith("before") else after
         shape = polydata(surface.vertices, surface.triangles)
         shape.point_data["movement"] = moved
-        shape = shape.clip("y", origin=(0, back, 0)).clip("-z", origin=(0, 0, below))
+        shape = trimmed(shape, ends)
         if not view.caption.startswith("movement"):
             plotter.add_mesh(shape, color=SKIN_COLOUR, **SKIN_SHADING)
             return
@@ -72,13 +71,13 @@ def picture_prediction(
             ambient=0.3,
             show_scalar_bar=False,
         )
-        if view.direction == "front":
+        if view.direction == "left":
             bar = plotter.add_scalar_bar(
                 title="mm",
                 n_labels=4,
                 fmt="%.1f",
                 vertical=True,
-                position_x=0.88,
+                position_x=0.89,
                 position_y=0.25,
                 width=0.09,
                 height=0.5,
@@ -91,18 +90,8 @@ def picture_prediction(
     names = ("before", "after", "movement")
     views = tuple(View(d, f"{name}, {d}") for d in ("front", "left") for name in names)
     corners = bounds([before.vertices, after.vertices])
-    corners[1, 1], corners[0, 2] = back, below
+    corners = ends.within(corners)
     draw(path, views, corners, size, paint, [], columns=len(names))
-
-
-def _ends(skin: SurfaceData) -> tuple[float, float]:
-    """How far back and how far down a skin is drawn: short of its ragged end there, P and S, mm."""
-    vertices, triangles = np.asarray(skin.vertices), np.asarray(skin.triangles)
-    edge = float(np.median(np.linalg.norm(np.diff(vertices[triangles[:, :2]], axis=1), axis=2)))
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    back, below = float(high[1]) - RIM * edge, float(low[2]) + RIM * edge
-    # Of a skin a few edges across nothing is left off.
-    return max(back, float(low[1] + high[1]) / 2), min(below, float(low[2] + high[2]) / 2)
 
 
 def picture_plan(

@@ -20,8 +20,6 @@ PICTURES: Mapping[str, str] = {
     "prediction": "The face before the operation and as predicted after it, and how far it moves.",
     "plan": "The plan: bone segments where they are moved to, and before as outlines.",
     "muscles": "The muscles, carried from the template to the skull by its landmarks.",
-    "error": "Signed distance of the prediction from the face after the operation, −5 to 5 mm: "
-    "blue where the prediction lies behind it.",
     "anatomy": "Skin and bone segments.",
     "node_kinds": "Kinds of node (Kim et al. 2010, Figure 4): fixed pink, joined orange, sliding "
     "blue, free white.",
@@ -64,7 +62,7 @@ def case_document(
         *_note_section(first),
         _prediction_section(predictions, pictures),
         _plan_section(first, pictures),
-        *_evaluation_sections(evaluation, pictures, figures),
+        *_evaluation_sections(evaluation, figures),
         *_muscle_section(predictions, pictures),
         _model_section(predictions, pictures),
         _time_section(predictions),
@@ -135,12 +133,10 @@ def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
     return Section("Plan", (*_picture("plan", pictures), table))
 
 
-def _evaluation_sections(
-    evaluation: Values | None, pictures: Mapping[str, bytes], figures: Sequence[Figure]
-) -> list[Section]:
+def _evaluation_sections(evaluation: Values | None, figures: Sequence[Figure]) -> list[Section]:
     if evaluation is None:
         return []
-    blocks: list[Note | Table | Figure] = [*_picture("error", pictures)]
+    blocks: list[Note | Table | Figure] = [_mean_table(evaluation), *figures]
     for model, entry in evaluation["models"].items():
         blocks.append(
             statistics_table(
@@ -155,9 +151,28 @@ def _evaluation_sections(
                 "For comparison, the face before the operation taken as the prediction, mm.",
             )
         )
-    blocks += figures
     blocks += [Note(text) for text in evaluation.get("notes", ())]
     return [Section("Error", tuple(blocks))]
+
+
+def _mean_table(evaluation: Values) -> Table:
+    """Mean errors of every model by region."""
+    entries = dict(evaluation["models"])
+    if "no_change" in evaluation:
+        entries["no change"] = evaluation["no_change"]
+    regions = list(dict.fromkeys(r for entry in entries.values() for r in entry["regions"]))
+    rows = tuple(
+        (
+            region,
+            *(
+                number(entry["regions"].get(region, {}).get("mean_mm"))
+                for entry in entries.values()
+            ),
+        )
+        for region in regions
+    )
+    caption = "Mean distance from the face after the operation, mm, by region and model."
+    return Table(("region", *entries), rows, caption)
 
 
 def statistics_table(regions: Mapping[str, Values], caption: str) -> Table:
@@ -175,7 +190,7 @@ def statistics_table(regions: Mapping[str, Values], caption: str) -> Table:
         (
             name,
             *(number(values[key]) for key in keys),
-            number(values["signed_mean_mm"]),
+            f"{values['signed_mean_mm']:+.2f}",
             f"{100 * values['within']['2 mm']:.0f} %",
         )
         for name, values in regions.items()
