@@ -94,7 +94,7 @@ def view_parts(
         raise CaseInputError(f"{path.name}: a picture is written as .png, not {path.suffix!r}")
     if path is None and not has_screen():
         raise CaseInputError(
-            "there is no screen to open a window on; write a picture instead (--screenshot FILE.png)"
+            "there is no screen to open a window on: write a picture (--screenshot FILE.png)"
         )
     width, height = (int(as_positive("window size", n)) for n in size)
     pv = pyvista_module()
@@ -107,14 +107,22 @@ def view_parts(
             plotter.set_background("white")
             plotter.enable_anti_aliasing("ssaa")
             look_at(plotter, View("left front", ""), corners, width / height)
-            for row, part in enumerate(parts):
+            # A picture names what it shows; a window has a box for every part.
+            named = [part for part in parts if part.shown or path is None]
+            for part in parts:
                 _add(plotter, part, unit)
-                _add_switch(plotter, part, row, height, interactive=path is None)
+            for row, part in enumerate(named):
+                _add_name(plotter, part, height - (row + 1) * ROW - LEFT, switch=path is None)
             plotter.reset_camera_clipping_range()
             if path is None:
                 plotter.show()
             else:
-                write_picture(path, np.array(plotter.screenshot(return_img=True))[:, :, :3])
+                image = np.array(plotter.screenshot(return_img=True))[:, :, :3]
+                for row, part in enumerate(named):
+                    top = (row + 1) * ROW + LEFT - ROW + 4
+                    colour = [int(part.colour[k : k + 2], 16) for k in (1, 3, 5)]
+                    image[top : top + ROW - 10, LEFT : LEFT + ROW - 10] = colour
+                write_picture(path, image)
         finally:
             plotter.close()
 
@@ -147,18 +155,14 @@ def _add(plotter: Any, part: ViewPart, unit: str) -> None:
     plotter.renderer.actors[part.name].SetVisibility(part.shown)
 
 
-def _add_switch(plotter: Any, part: ViewPart, row: int, height: int, *, interactive: bool) -> None:
+def _add_name(plotter: Any, part: ViewPart, low: int, *, switch: bool) -> None:
     """The name of a part; in a window with a box that shows and hides it."""
-    low = height - (row + 1) * ROW - LEFT
-    actor = plotter.renderer.actors[part.name]
-    if interactive:
+    plotter.add_text(part.name, position=(LEFT + ROW, low), font_size=9, color="black")
+    if switch:
         plotter.add_checkbox_button_widget(
-            actor.SetVisibility,
+            plotter.renderer.actors[part.name].SetVisibility,
             value=part.shown,
             position=(LEFT, low),
             size=ROW - 8,
             color_on=part.colour,
         )
-    elif not part.shown:
-        return
-    plotter.add_text(part.name, position=(LEFT + ROW, low), font_size=9, color="black")
