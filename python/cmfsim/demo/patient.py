@@ -44,7 +44,7 @@ MARK = "# cmfsim demo: written by this command, and overwritten by it."
 NOTE = (
     "No patient: a head made by code (class III), and an operation of ordinary size. Skin, bones "
     "and airway come straight from the formulas that draw the head, so that nothing was scanned or "
-    "segmented; `cmfsim phantom` writes a head with its CT. Tets are coarse to be fast."
+    "segmented (cmfsim phantom writes a head with its CT). Tets are coarse to be fast."
 )
 IN_SILICO = (
     " The face after the operation is computed, too, by other equations on a finer mesh with other "

@@ -187,8 +187,9 @@ def _place_camera(plotter: Any, view: View, corners: Floats, half_height: float)
 def _png(image: NDArray[np.uint8]) -> bytes:
     """The bytes of a PNG file of an (h, w, 3) image, the same for the same image."""
     height, width, _ = image.shape
-    rows = np.zeros((height, 1 + 3 * width), dtype=np.uint8)
-    rows[:, 1:] = image.reshape(height, -1)
+    # Each row as its difference from the one above (filter 2): shaded surfaces shrink by half.
+    rows = np.full((height, 1 + 3 * width), 2, dtype=np.uint8)
+    rows[:, 1:] = np.diff(image.reshape(height, -1), axis=0, prepend=np.uint8(0))
 
     def chunk(name: bytes, data: bytes) -> bytes:
         check = zlib.crc32(name + data)

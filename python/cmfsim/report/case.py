@@ -111,7 +111,10 @@ def _prediction_section(predictions: Sequence[Values], pictures: Mapping[str, by
         for entry in predictions
     )
     table = Table(("model", "mean", "95 %", "largest"), rows, "How far the skin moves, mm.")
-    drawn: Sequence[Figure | Note] = _picture("prediction", pictures)
+    drawn: Sequence[Figure | Note] = [
+        Figure(figure.image, f"{figure.caption} Model {predictions[-1]['model']}.")
+        for figure in _picture("prediction", pictures)
+    ]
     return Section("Prediction", (*(drawn or (Note(NO_PICTURES, "warning"),)), table))
 
 
