@@ -1,15 +1,14 @@
 """Makes the pictures of the README from a demo: cmfsim demo, then make_figures.py cmfsim-demo.
 
-Pictures of the demo's report, made smaller and reduced to a palette, so that the repository stays
-light.
+Pictures of the demo's report, made smaller so that the repository stays light.
 """
 
 import sys
 from pathlib import Path
 
-# Width of a README's column, twice for dense screens, pixels; and colours that shading needs.
-WIDTH, COLOURS = 1200, 160
-FIGURES = {"prediction": "demo_prediction", "plan": "demo_plan"}
+# Of a README's column, pixels.
+WIDTH = 840
+FIGURES = {"prediction": "demo_prediction"}
 
 
 def main(demo: Path, docs: Path) -> int:
@@ -25,7 +24,7 @@ def main(demo: Path, docs: Path) -> int:
     for name, target in FIGURES.items():
         picture = Image.open(folder / f"{name}.png").convert("RGB")
         height = round(picture.height * WIDTH / picture.width)
-        small = picture.resize((WIDTH, height), Image.Resampling.LANCZOS).quantize(COLOURS)
+        small = picture.resize((WIDTH, height), Image.Resampling.LANCZOS)
         small.save(figures / f"{target}.png", optimize=True)
         print(figures / f"{target}.png")
     return 0
