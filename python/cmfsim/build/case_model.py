@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import TetMesh, __version__
+from cmfsim.build.clefts import without_clefts
 from cmfsim.build.held import held_part
 from cmfsim.build.inputs import (
     check_output,
@@ -37,6 +38,7 @@ from cmfsim.meshing import (
     mesh_report,
     near_skin,
     part_mesh,
+    report_of_part,
     tissue_level,
 )
 from cmfsim.model import PatientModel
@@ -206,10 +208,14 @@ def build_model(
         options=KindOptions(**case.node_kinds),
     )
     findings += classified.findings
-    mesh, kinds, noticed = held_part(mesh, classified.kinds)
-    if noticed:
-        report = mesh_report(mesh)
+    kinds, whole = classified.kinds, mesh.n_tets
+    if case.mesh.file is None:
+        mesh, kinds, noticed = without_clefts(mesh, kinds, cut.segments, moved, case.mesh.cleft)
+        findings += noticed
+    mesh, kinds, noticed = held_part(mesh, kinds)
     findings += noticed
+    if mesh.n_tets < whole:
+        report = report_of_part(mesh, report)
     findings += _untouched(case, kinds)
     findings = [*dict.fromkeys(findings)]
 
