@@ -5,6 +5,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,10 +112,14 @@ def _write_parts(folder: Path, prediction: Prediction) -> dict[str, list[str]]:
         ]
         moved = [after - at for (_, after), at in zip(surfaces.values(), before, strict=True)]
         with replacing(folder / f"{kind}.vtp") as file:
-            data = {"part": np.repeat(np.arange(len(counts)), counts)}
+            data: dict[str, NDArray[Any]] = {
+                "part": np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
+            }
             if kind == "bones":
                 data["displacement"] = np.concatenate(moved)
-            write_triangles(file, np.concatenate(before), np.concatenate(triangles), data)
+            # To be looked at: single precision, 10 nm on a head, halves the largest of the files.
+            points = np.concatenate(before).astype(np.float32)
+            write_triangles(file, points, np.concatenate(triangles), data)
     return {kind: list(surfaces) for kind, surfaces in parts.items()}
 
 

@@ -264,12 +264,18 @@ def _finding_section(prediction: Values) -> Section:
     kinds = {"error": "error", "warning": "warning"}
     blocks = [
         Note(
-            f"{f['severity']}: {f['what']} ({f['where']}). {f['why']}; {f['mend']}.",
+            f"{f['severity']}: {f['what']} ({f['where']}). {_reason(f)}".rstrip(),
             kinds.get(f["severity"], "plain"),
         )
         for f in found
     ]
     return Section("Findings", tuple(blocks or [Note("Nothing was noticed.")]))
+
+
+def _reason(finding: Values) -> str:
+    """Why a finding matters and what mends it, as far as it says so."""
+    said = "; ".join(text for text in (finding["why"], finding["mend"]) if text)
+    return f"{said}." if said else ""
 
 
 def _input_section(prediction: Values) -> Section:
