@@ -161,9 +161,10 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "evaluation": "case checks errors registration scene topology _core",
         "build": (
             "case checks doctor equivalent errors imaging io meshing model musculature "
-            "node_kinds osteotomy patient phantom pictures scene surface_repair template "
+            "node_kinds osteotomy patient phantom pictures scene surface_repair template topology "
             "_core"
         ),
+        "demo": "case checks errors io osteotomy phantom scene",
         "study": (
             "build case checks errors evaluation io model musculature patient prediction "
             "scene simulation template _core"
@@ -180,7 +181,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "surface_checks surface_repair template _core"
         ),
         "cli": (
-            "build case checks cmfsim doctor errors evaluation io meshing musculature phantom "
+            "build case checks cmfsim demo doctor errors evaluation io meshing musculature phantom "
             "pictures prediction report scene simulation study template"
         ),
         "__init__": (

@@ -13,7 +13,7 @@ from cmfsim.case import Finding
 from cmfsim.checks import Floats, as_rows, check_one_of
 from cmfsim.model import PatientModel
 from cmfsim.musculature import Musculature
-from cmfsim.scene import Scene, SceneResult, SurfaceData
+from cmfsim.scene import MovedSurface, Scene, SceneResult, SurfaceData
 
 __all__ = ["MODELS", "Prediction"]
 
@@ -111,6 +111,27 @@ class Prediction:
         before = self.face_before
         vertices = np.asarray(before.vertices)
         return SurfaceData(vertices + self.carried(vertices), before.triangles)
+
+    @property
+    def bones(self) -> dict[str, tuple[SurfaceData, Floats]]:
+        """Each bone segment with its vertices after the operation, (v, 3) mm, by name.
+
+        A segment whose motion is known vertex by vertex has the surface that it is known on; one
+        whose joined nodes alone have motions stays where it was.
+        """
+        found = {}
+        for segment in self.patient.segments:
+            surface, motion = segment.surface, self.scene.plan.get(segment.name)
+            vertices = np.asarray(surface.vertices, dtype=np.float64)
+            if isinstance(motion, MovedSurface):
+                surface = motion.surface
+                vertices = np.asarray(motion.moved_vertices, dtype=np.float64)
+            elif motion is not None and np.shape(motion) == (4, 4):
+                matrix = np.asarray(motion, dtype=np.float64)
+                if not np.array_equal(matrix, np.eye(4)):
+                    vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+            found[segment.name] = (surface, vertices)
+        return found
 
     @property
     def muscles(self) -> Musculature | None:

@@ -24,6 +24,7 @@ from cmfsim.build.inputs import (
     read_motion,
 )
 from cmfsim.build.muscles import with_muscles
+from cmfsim.build.skin_part import on_skin
 from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.checks import Floats
 from cmfsim.doctor import diagnose
@@ -134,6 +135,7 @@ def build_model(
     progress: Progress | None = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
+    anatomy: Anatomy | None = None,
 ) -> PatientModel:
     """The model of a case: read, segmented, cut, meshed and classified; nothing is written.
 
@@ -144,6 +146,8 @@ def build_model(
     check : bool
     findings : iterable of Finding
         As for `build_case`.
+    anatomy : Anatomy, optional
+        The head, where it is known; the image or surfaces of the case are then not read.
 
     Returns
     -------
@@ -167,8 +171,9 @@ def build_model(
     landmarks, noticed = read_case_landmarks(case)
     findings += noticed
     skull = landmarks.get("skull", {})
-    anatomy, noticed = read_anatomy(case, skull, stages.begin)
-    findings += noticed
+    if anatomy is None:
+        anatomy, noticed = read_anatomy(case, skull, stages.begin)
+        findings += noticed
 
     stages.begin("cutting the bones")
     cut = cut_bones(anatomy.bones, _procedures(case, skull))
@@ -219,7 +224,7 @@ def build_model(
     motions = {name: read_motion(case, motion) for name, motion in case.plan.items()}
     scene = _scene(case, mesh, kinds, cut.segments, motions)
     boundary = np.asarray(mesh.boundary_triangles())
-    skin = boundary[_on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)]
+    skin = boundary[on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)]
     stages.begin("drawing the face")
     face = detailed_face(anatomy)
     stages.end()
@@ -404,20 +409,6 @@ def _scene(
     )
 
 
-def _on_skin(
-    nodes: Floats, triangles: NDArray[np.uint32], anatomy: Anatomy, level: ImageData
-) -> NDArray[np.bool_]:
-    """Which boundary triangles are skin: their centroids lie nearer to it than to anything else."""
-    centroids = nodes[triangles].mean(axis=1)
-    others = [*anatomy.bones.values(), *([] if anatomy.air is None else [anatomy.air])]
-    from_skin = np.abs(anatomy.skin.sample(centroids))
-    near = np.ones(len(centroids), dtype=bool)
-    for other in others:
-        near &= from_skin < np.abs(other.sample(centroids))
-    # On a plane that bounds the region, the level is zero well inside the skin.
-    return near & (from_skin <= np.abs(level.sample(centroids)) + 0.25)
-
-
 def _summary(
     case: Case,
     kinds: NodeKinds,
@@ -430,6 +421,7 @@ def _summary(
     grid = anatomy.skin
     return {
         "case": case.name,
+        "note": case.note,
         "nodes": {name: len(kinds.nodes(name)) for name in NODE_KINDS},
         "segments": {
             name: {kind: len(kinds.nodes(kind, name)) for kind in ("joined", "sliding")}

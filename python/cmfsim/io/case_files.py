@@ -39,6 +39,7 @@ TABLES = (
     "format",
     "version",
     "name",
+    "note",
     "image",
     "surfaces",
     "landmarks",
@@ -91,6 +92,8 @@ class Case:
         None leaves them out of what `cmfsim build` makes.
     solver : SolverOptions
     postoperative : CasePostoperative or None
+    note : str
+        What readers of its report should know, such as that the patient is made by code.
     lines : mapping of str to int
         The line of each dotted key in the case file, for findings.
 
@@ -115,6 +118,7 @@ class Case:
     muscles: CaseMuscles | None = None
     solver: SolverOptions = field(default_factory=SolverOptions)
     postoperative: CasePostoperative | None = None
+    note: str = ""
     lines: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -191,6 +195,7 @@ def _read(path: Path) -> Case:
             if "postoperative" in document
             else None
         ),
+        note=document.text("note") if "note" in document else "",
         lines=document.all_lines(),
     )
 
