@@ -184,6 +184,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "build case checks cmfsim demo doctor errors evaluation io meshing musculature phantom "
             "pictures prediction report scene simulation study template"
         ),
+        "__main__": "cli",
         "__init__": (
             "achieved build case doctor equivalent errors evaluation imaging io "
             "landmark_sites meshing model musculature node_kinds osteotomy patient phantom "
