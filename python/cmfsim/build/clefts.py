@@ -87,27 +87,36 @@ def cleft_tets(
     least = np.where(owner < 0, most[:, None], owner).min(axis=1)
     inside |= (most != least) & (moves[most] | moves[least])
 
-    centroids = nodes[tets].mean(axis=1)
+    corners = nodes[tets]
+    centroids = corners.mean(axis=1)
+    # A point is at most so much nearer to anything than the nearest corner of its tet.
+    radius = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
+    reach = width + float(radius.max())
     surfaces = [Surface(s.surface.vertices, s.surface.triangles) for s in segments]
+    about = [_least_at_corners(nodes, tets, surface, reach) - radius for surface in surfaces]
     names = [segment.name for segment in segments]
     for one in (i for i, name in enumerate(names) if name in moved):
-        near = _within(centroids, surfaces[one], width)
-        distance = _distances(centroids[near], surfaces[one])
-        near, distance = near[distance < width], distance[distance < width]
         for other in range(len(surfaces)):
             if other == one or (other < one and names[other] in moved):
                 continue
-            both = np.isin(near, _within(centroids, surfaces[other], width), assume_unique=True)
-            far = _distances(centroids[near[both]], surfaces[other])
-            inside[near[both][distance[both] + far < width]] = True
+            ids = np.flatnonzero(
+                np.maximum(about[one], 0.0) + np.maximum(about[other], 0.0) < width
+            )
+            both = [_distances(centroids[ids], surfaces[each]) for each in (one, other)]
+            inside[ids[both[0] + both[1] < width]] = True
     return inside
 
 
-def _within(points: Floats, surface: Surface, reach: float) -> NDArray[np.intp]:
-    """The points in the box of a surface, widened."""
+def _least_at_corners(
+    nodes: Floats, tets: NDArray[np.uint32], surface: Surface, reach: float
+) -> Floats:
+    """The distance of each tet's nearest corner from a surface; infinity beyond its box."""
     vertices = np.asarray(surface.vertices)
     low, high = vertices.min(axis=0) - reach, vertices.max(axis=0) + reach
-    return np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    near = np.flatnonzero(((nodes >= low) & (nodes <= high)).all(axis=1))
+    distance = np.full(len(nodes), np.inf)
+    distance[near] = _distances(nodes[near], surface)
+    return np.asarray(distance[tets].min(axis=1))
 
 
 def _distances(points: Floats, surface: Surface) -> Floats:
