@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import TetMesh, __version__
 from cmfsim.build.clefts import without_clefts
+from cmfsim.build.face import detailed_face
 from cmfsim.build.held import held_part
 from cmfsim.build.inputs import (
     check_output,
@@ -223,18 +224,21 @@ def build_model(
     motions = {name: read_motion(case, motion) for name, motion in case.plan.items()}
     scene = _scene(case, mesh, kinds, cut.segments, motions)
     boundary = np.asarray(mesh.boundary_triangles())
-    skin = on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)
+    skin = boundary[on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)]
+    stages.begin("drawing the face")
+    face = detailed_face(anatomy)
     stages.end()
     patient = PatientModel(
         name=case.name,
         scene=scene,
         kinds=kinds,
         boundary_triangles=boundary,
-        skin_triangles=boundary[skin],
+        skin_triangles=skin,
         segments=cut.segments,
         anatomy=anatomy,
         fat=case.tissue,
         landmarks=landmarks,
+        face=face,
         findings=tuple(findings),
         summary=_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
     )

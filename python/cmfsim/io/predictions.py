@@ -23,7 +23,8 @@ from cmfsim.scene import SurfaceData
 __all__ = ["is_prediction_file", "read_parts", "write_prediction"]
 
 PREDICTION_FILES = re.compile(
-    r"prediction\.(vtp|stl|vtu|npz|png|json)|(bones|muscles)\.vtp|(plan|muscles)\.png|timings\.json"
+    r"prediction\.(vtp|stl|vtu|npz|png|json)|face\.(vtp|stl)|(bones|muscles)\.vtp"
+    r"|(plan|muscles)\.png|timings\.json"
 )
 
 
@@ -39,8 +40,9 @@ def write_prediction(
 ) -> list[str]:
     """The names of the files that a prediction is written as, in a folder that is made if need be.
 
-    `prediction.vtp` (the skin at rest with its `displacement`), `prediction.stl` (the predicted
-    skin), `prediction.vtu` (tissue with `displacement`, `force`, muscle `fraction` and `fibre`),
+    `prediction.vtp` (the mesh's skin at rest with its `displacement`), `prediction.stl` (the same
+    where it goes), `face.vtp` and `face.stl` (likewise the whole skin in full detail),
+    `prediction.vtu` (tissue with `displacement`, `force`, muscle `fraction` and `fibre`),
     `prediction.npz` (everything, for `read_result`), `bones.vtp` (segments before the operation,
     with their `displacement`) and `muscles.vtp`, each vertex with the number of its `part` (the
     summary lists their names), `timings.json`, and `prediction.json` (counts, parameters, findings,
@@ -70,6 +72,7 @@ def write_prediction(
 
     def fill(fresh: Path) -> list[str]:
         names = [f"prediction.{ending}" for ending in ("vtp", "stl", "vtu", "npz")]
+        names += ["face.vtp", "face.stl"]
         result, skin = prediction.result, prediction.skin_before
         with replacing(fresh / names[0]) as file:
             moved = {
@@ -78,6 +81,11 @@ def write_prediction(
             }
             write_triangles(file, skin.vertices, skin.triangles, moved)
         write_surface(fresh / names[1], prediction.skin)
+        face, before = prediction.face, prediction.face_before
+        with replacing(fresh / names[4]) as file:
+            carried = np.asarray(face.vertices) - np.asarray(before.vertices)
+            write_triangles(file, before.vertices, before.triangles, {"displacement": carried})
+        write_surface(fresh / names[5], face)
         with replacing(fresh / names[2]) as file:
             points = {"displacement": result.displacements, "force": result.forces}
             write_tets(file, result.nodes, result.tets, points, _muscle_data(prediction))
@@ -151,7 +159,7 @@ def read_parts(
         listed = {kind: [*names] for kind, names in json.loads(text).get("parts", {}).items()}
     except (ValueError, AttributeError, TypeError) as error:
         raise CaseInputError(f"{folder}: prediction.json cannot be read ({error})") from error
-    found = {"skin": _read_part_file(folder / "prediction.vtp", ["skin"])}
+    found = {"skin": _read_part_file(folder / "face.vtp", ["skin"])}
     for kind in ("bones", "muscles"):
         if kind in listed:
             found[kind] = _read_part_file(folder / f"{kind}.vtp", listed[kind])

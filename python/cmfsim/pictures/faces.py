@@ -49,10 +49,10 @@ def picture_prediction(
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_prediction("prediction.png", prediction)  # doctest: +SKIP
     """
-    before, after = prediction.skin_before, prediction.skin
-    moved = np.linalg.norm(prediction.skin_displacements, axis=1)
+    before, after = prediction.face_before, prediction.face
+    moved = np.linalg.norm(np.asarray(after.vertices) - np.asarray(before.vertices), axis=1)
     largest = max(float(moved.max()), LEAST_SCALE)
-    ends = skin_ends(before)
+    ends = skin_ends(prediction.skin_before)
 
     def paint(plotter: Any, view: View) -> None:
         surface = before if view.caption.startswith("before") else after
