@@ -57,3 +57,15 @@ def test_bone_that_bounds_half_of_the_tissue_stays_bone(ball):
     chosen = found(ball, lambda x: bone(x) + 0.05)
     assert chosen[height > 0.0].all()
     assert not chosen[height < -6.0].any()
+
+
+def test_the_wall_of_a_small_cavity_is_no_skin(ball):
+    vertices, triangles, skin = ball
+    wall, corners = meshes.icosphere(1, 2.0)
+    nodes = np.concatenate([vertices, np.asarray(wall)])
+    both = np.concatenate([triangles, np.asarray(corners)[:, ::-1] + len(vertices)])
+    cavity = level(lambda x: 2.0 - np.linalg.norm(x, axis=-1))
+    anatomy = cmfsim.Anatomy(skin=skin, bones={"cranium": cavity})
+    chosen = skin_part.on_skin(nodes, both.astype(np.uint32), anatomy, skin)
+    assert chosen[: len(triangles)].all()
+    assert not chosen[len(triangles) :].any()

@@ -51,5 +51,8 @@ def _without_specks(
     patch = connected_labels(edges.pairs[alike], len(triangles))
     a, b, c = (nodes[triangles[:, k]] for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    small = np.bincount(patch, weights=area)[patch] < LEAST_PATCH
-    return chosen ^ small
+    small = np.bincount(patch, weights=area) < LEAST_PATCH
+    # A closed surface of its own, round a small cavity, is surrounded by nothing.
+    bordered = np.zeros(len(small), dtype=bool)
+    bordered[patch[edges.pairs[~alike]]] = True
+    return chosen ^ (small & bordered)[patch]
