@@ -180,7 +180,7 @@ def _read(path: Path) -> Case:
         region=_region(document.table("region")),
         mesh=_mesh(document.table("mesh"), folder),
         osteotomies=_osteotomies(document),
-        plan=_plan(document.table("plan"), folder),
+        plan=_plan(document, folder),
         node_kinds=_plain(document.table("node_kinds")),
         tissue=_tissue(document.table("tissue")),
         muscles=_muscles(document.table("muscles"), folder) if "muscles" in document else None,
@@ -320,8 +320,30 @@ def _osteotomies(document: Table) -> tuple[CaseOsteotomy, ...]:
     return tuple(cuts)
 
 
-def _plan(table: Table, folder: Path) -> dict[str, CaseMotion]:
-    return {_name(table, name, name): _motion(table.table(name), folder) for name in table}
+def _plan(document: Table, folder: Path) -> dict[str, CaseMotion]:
+    table = document.table("plan")
+    motions = {}
+    for name in table:
+        motion = table.table(name)
+        if "moved" in motion:
+            motions[_name(table, name, name)] = _moved(document, motion, name, folder)
+        else:
+            motions[_name(table, name, name)] = _motion(motion, folder)
+    return motions
+
+
+def _moved(document: Table, motion: Table, name: str, folder: Path) -> CaseMotion:
+    """The motion of a bone of the case, given by the same surface after it moved."""
+    bones = document.table("surfaces").table("bones") if "surfaces" in document else ()
+    if name not in bones:
+        known = f"one of {', '.join(bones)}" if bones else "no bone, for there is no [surfaces]"
+        motion.fail(
+            "moved",
+            f"is for bones that [surfaces.bones] names ({known}), not for {name!r}: give surface "
+            "and moved_surface, the piece before and after",
+        )
+    before = _file(document.table("surfaces").table("bones"), name, folder)
+    return CaseMotion(surface=before, moved_surface=_file(motion.only("moved"), "moved", folder))
 
 
 def _motion(table: Table, folder: Path) -> CaseMotion:
@@ -336,7 +358,7 @@ def _motion(table: Table, folder: Path) -> CaseMotion:
         table.only("surface", "moved_surface")
         surface = _file(table, "surface", folder)
         return CaseMotion(surface=surface, moved_surface=_file(table, "moved_surface", folder))
-    table.only("translation", "angle", "axis", "centre", "matrix", "transform", "surface")
+    table.only("translation", "angle", "axis", "centre", "matrix", "transform", "moved", "surface")
     given: dict[str, Any] = {
         key: vector
         for key in ("translation", "axis", "centre")
