@@ -21,10 +21,10 @@ from cmfsim.topology import connected_labels, edges_of
 __all__ = ["moves_as_one", "smooth_motion", "sound_motion", "torn_pieces"]
 
 # An edge is torn if its ends move apart by more than this, mm, and by more than this share of its
-# length: noise of 0.3 mm per vertex does the first to one edge in 10 000, and a turn of 10° the
+# length: noise of 0.3 mm per vertex does the first to one edge in 10 000, and a turn of 15° the
 # second to none.
 TEAR = 2.0
-TEAR_SHARE = 0.5
+TEAR_SHARE = 0.3
 # A piece with less of the area than this, mm², is a crumb of a tear, not a segment of bone.
 LEAST_AREA = 150.0
 # Two pieces moved as one if the motion of either takes the other's vertices this near, rms mm.
@@ -99,10 +99,8 @@ def torn_pieces(motion: MovedSurface) -> tuple[MovedSurface, ...]:
     large = [int(n) for n in order if areas[n] >= LEAST_AREA] or [int(order[0])]
     parts = [_part(motion, sound[piece == number]) for number in large]
     groups: list[list[int]] = []
-    for number, part in zip(large, range(len(large)), strict=True):
-        alike = next(
-            (g for g in groups if moves_as_one(parts[large.index(g[0])], parts[part])), None
-        )
+    for number, part in enumerate(parts):
+        alike = next((group for group in groups if moves_as_one(parts[group[0]], part)), None)
         if alike is None:
             groups.append([number])
         else:
@@ -110,7 +108,9 @@ def torn_pieces(motion: MovedSurface) -> tuple[MovedSurface, ...]:
     if len(groups) == 1:
         # Crumbs and torn triangles of a bone that moved as one are not what it was cut into.
         return (motion,)
-    return tuple(_part(motion, sound[np.isin(piece, group)]) for group in groups)
+    return tuple(
+        _part(motion, sound[np.isin(piece, [large[n] for n in group])]) for group in groups
+    )
 
 
 def moves_as_one(one: MovedSurface, other: MovedSurface) -> bool:

@@ -19,8 +19,8 @@ from cmfsim.build.inputs import (
     input_hashes,
     read_anatomy,
     read_case_landmarks,
-    read_motion,
 )
+from cmfsim.build.motions import planned_bones
 from cmfsim.build.muscles import with_muscles
 from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.checks import Floats
@@ -170,14 +170,9 @@ def build_model(
     stages.begin("cutting the bones")
     cut = cut_bones(anatomy.bones, _procedures(case, skull))
     findings += cut.findings
-    moved = [*dict.fromkeys([*_cut_segments(case), *case.plan])]
-    known = [segment.name for segment in cut.segments]
-    for name in moved:
-        if name not in known:
-            raise CaseInputError(
-                f"{case.where(f'plan.{name}')}: there is no segment {name!r}; segments are: "
-                f"{', '.join(known)}; an osteotomy makes others"
-            )
+    bones = planned_bones(case, cut.segments)
+    findings += bones.findings
+    moved = [*dict.fromkeys([*_cut_segments(case), *bones.motions])]
 
     stages.begin("finding the soft tissue")
     region = _region(case, anatomy, skull)
@@ -194,7 +189,7 @@ def build_model(
         mesh.nodes,
         mesh.boundary_triangles(),
         anatomy,
-        cut.segments,
+        bones.segments,
         moved=moved,
         landmarks=skull,
         fixed_planes=_planes(region),
@@ -205,12 +200,11 @@ def build_model(
     if noticed:
         report = mesh_report(mesh)
     findings += noticed
-    findings += _untouched(case, kinds)
+    findings += _untouched(case, kinds, bones.motions)
     findings = [*dict.fromkeys(findings)]
 
     stages.begin("assembling the scene")
-    motions = {name: read_motion(case, motion) for name, motion in case.plan.items()}
-    scene = _scene(case, mesh, kinds, cut.segments, motions)
+    scene = _scene(case, mesh, kinds, bones.segments, bones.motions)
     boundary = np.asarray(mesh.boundary_triangles())
     skin = _on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)
     stages.end()
@@ -220,7 +214,7 @@ def build_model(
         kinds=kinds,
         boundary_triangles=boundary,
         skin_triangles=boundary[skin],
-        segments=cut.segments,
+        segments=bones.segments,
         anatomy=anatomy,
         fat=case.tissue,
         landmarks=landmarks,
@@ -354,7 +348,7 @@ def _mesh(
     return parted, replace(made.report, n_nodes=parted.n_nodes), made.findings
 
 
-def _untouched(case: Case, kinds: NodeKinds) -> list[Finding]:
+def _untouched(case: Case, kinds: NodeKinds, motions: Iterable[str]) -> list[Finding]:
     return [
         Finding(
             "warning",
@@ -364,7 +358,7 @@ def _untouched(case: Case, kinds: NodeKinds) -> list[Finding]:
             "its motion does not reach the face",
             "check the cut that makes it, bone_distance in [node_kinds], and the posterior plane",
         )
-        for name in case.plan
+        for name in motions
         if not len(kinds.nodes("joined", name)) and not len(kinds.nodes("sliding", name))
     ]
 

@@ -20,6 +20,8 @@ WIDE = (2400, 700)
 LEAST_SCALE = 0.01
 # Of bone where it was before the operation.
 GHOST_COLOUR = "#7f8c9a"
+# A segment that moves less than this, mm, is drawn where it was: two surfaces in one place flicker.
+STAYS = 0.5
 
 
 def picture_prediction(
@@ -120,6 +122,9 @@ def _moved(segment: BoneSegment, motion: object) -> SurfaceData:
     """A segment's surface where its motion takes it; the same surface where it stays."""
     surface = segment.surface
     if isinstance(motion, MovedSurface):
+        shift = np.asarray(motion.moved_vertices) - np.asarray(motion.surface.vertices)
+        if np.quantile(np.linalg.norm(shift, axis=1), 0.99) < STAYS:
+            return surface
         return SurfaceData(motion.moved_vertices, motion.surface.triangles)
     matrix = np.eye(4) if motion is None else np.asarray(motion, dtype=np.float64)
     if matrix.shape != (4, 4) or np.array_equal(matrix, np.eye(4)):
