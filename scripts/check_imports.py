@@ -161,8 +161,9 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "simulation": "checks errors model planning prediction scene _core",
         "evaluation": "case checks errors registration scene topology _core",
         "build": (
-            "bone_motion case checks doctor equivalent errors imaging io meshing model musculature "
-            "node_kinds osteotomy patient phantom pictures scene surface_repair template "
+            "achieved bone_motion case checks doctor equivalent errors imaging io meshing model "
+            "musculature node_kinds osteotomy patient phantom pictures registration scene "
+            "surface_repair template "
             "_core"
         ),
         "study": (

@@ -22,6 +22,7 @@ from cmfsim.build.inputs import (
 )
 from cmfsim.build.motions import planned_bones
 from cmfsim.build.muscles import with_muscles
+from cmfsim.build.postoperative import Postoperative
 from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.checks import Floats
 from cmfsim.doctor import diagnose
@@ -131,6 +132,7 @@ def build_model(
     progress: Progress | None = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
+    after: Postoperative | None = None,
 ) -> PatientModel:
     """The model of a case: read, segmented, cut, meshed and classified; nothing is written.
 
@@ -141,6 +143,8 @@ def build_model(
     check : bool
     findings : iterable of Finding
         As for `build_case`.
+    after : Postoperative, optional
+        What `read_postoperative` gives, where it is known already; an achieved plan is read off it.
 
     Returns
     -------
@@ -170,7 +174,9 @@ def build_model(
     stages.begin("cutting the bones")
     cut = cut_bones(anatomy.bones, _procedures(case, skull))
     findings += cut.findings
-    bones = planned_bones(case, cut.segments)
+    if case.achieved:
+        stages.begin("reading the achieved plan")
+    bones = planned_bones(case, cut.segments, after)
     findings += bones.findings
     moved = [*dict.fromkeys([*_cut_segments(case), *bones.motions])]
 
@@ -219,7 +225,10 @@ def build_model(
         fat=case.tissue,
         landmarks=landmarks,
         findings=tuple(findings),
-        summary=_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
+        summary={
+            **_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
+            **({} if bones.achieved is None else {"achieved": bones.achieved.as_dict()}),
+        },
     )
     if case.muscles is None:
         return patient

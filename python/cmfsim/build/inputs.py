@@ -25,7 +25,14 @@ from cmfsim.patient import CaseMotion
 from cmfsim.scene import MovedSurface
 from cmfsim.surface_repair import repair_surface
 
-__all__ = ["check_output", "input_hashes", "read_anatomy", "read_case_landmarks", "read_motion"]
+__all__ = [
+    "check_output",
+    "input_hashes",
+    "read_anatomy",
+    "read_case_landmarks",
+    "read_motion",
+    "segment_options",
+]
 
 Progress = Callable[[str], None]
 
@@ -56,14 +63,9 @@ def read_anatomy(
     if case.image is not None:
         progress("reading the image")
         read = read_image_file(case.image.file)
-        given = {
-            name: getattr(case.image, name)
-            for name in ("skin_threshold", "bone_threshold", "working_spacing")
-            if getattr(case.image, name) is not None
-        }
         anatomy = segment_head(
             read.image,
-            SegmentOptions(**given),
+            segment_options(case),
             landmarks=landmarks or None,
             progress=lambda stage: progress(f"segmenting the head: {stage}"),
         )
@@ -84,6 +86,18 @@ def read_anatomy(
     skin = surfaces.pop("skin")
     anatomy = anatomy_from_surfaces(skin, surfaces, spacing=spacing)
     return anatomy, (*findings, *anatomy.findings)
+
+
+def segment_options(case: Case) -> SegmentOptions:
+    """How tissue is read from a CT of the case, before the operation or after it."""
+    if case.image is None:
+        return SegmentOptions()
+    given = {
+        name: getattr(case.image, name)
+        for name in ("skin_threshold", "bone_threshold", "working_spacing")
+        if getattr(case.image, name) is not None
+    }
+    return SegmentOptions(**given)
 
 
 def read_motion(case: Case, motion: CaseMotion) -> Floats | MovedSurface:
