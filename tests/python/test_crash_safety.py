@@ -5,6 +5,7 @@ import hashlib
 import os
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -128,7 +129,7 @@ def test_one_file_that_was_being_written_is_swept_by_the_next_writer(tmp_path):
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory):
-    """The ellipsoids, coarse, with a face after the operation: two seconds from files to figures."""
+    """The ellipsoids, coarse, with a face after the operation: seconds from files to figures."""
     folder = tmp_path_factory.mktemp("head")
     head = HeadCase(rounds=2)
     head.toml = head.toml.replace("edge_length = 4.0", "edge_length = 16.0")
@@ -139,8 +140,18 @@ def case(tmp_path_factory):
 
 
 def command(case, words, **options):
-    line = [sys.executable, "-m", "cmfsim.cli", *words, str(case), "-q", "--no-doctor"]
-    return subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
+    """A command in a process of its own; without pictures, which take most of the time."""
+    code = f"import sys; sys.modules['pyvista'] = None; {RUN}"
+    line = [sys.executable, "-c", code, *words, str(case), "-q", "--no-doctor"]
+    return subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **options)
+
+
+def succeed(process):
+    _, err = process.communicate()
+    assert process.returncode == 0, err
+
+
+RUN = "from cmfsim.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
 @pytest.mark.parametrize("words", [["build"], ["evaluate", "--model", "H"]])
@@ -149,13 +160,12 @@ def test_a_killed_command_leaves_the_results_of_the_one_before(words, case, tmp_
     out = tmp_path / "out"
     words = [*words, "-o", str(out)]
     begun = time.perf_counter()
-    first = command(case, words)
-    assert first.wait() == 0, first.stderr.read()
+    succeed(command(case, words))
     seconds = time.perf_counter() - begun
     names = set(contents(out))
     steady = {n for n in names if n.endswith((".ply", ".stl", ".vtu", ".vtp"))}
     before = contents(out)
-    for share in (0.3, 0.6, 0.8, 0.9, 0.97):
+    for share in (0.6, 0.9):
         killed = command(case, words)
         time.sleep(share * seconds)
         killed.kill()
@@ -164,9 +174,7 @@ def test_a_killed_command_leaves_the_results_of_the_one_before(words, case, tmp_
         whole = {n: h for n, h in now.items() if ".writing-" not in n and not n.endswith(".part")}
         assert set(whole) == names
         assert {n: whole[n] for n in steady} == {n: before[n] for n in steady}
-    again = command(case, words)
-    assert again.wait() == 0, again.stderr.read()
-    again.communicate()
+    succeed(command(case, words))
     assert set(contents(out)) == names
     assert not leftovers(out)
 
@@ -175,8 +183,7 @@ def test_a_killed_command_leaves_the_results_of_the_one_before(words, case, tmp_
 def test_a_disk_that_fills_up_is_an_error_and_changes_nothing(limit, case, tmp_path):
     """At the first, a middle and a late file: exit 1, the folder named, the old files whole."""
     out = tmp_path / "out"
-    first = command(case, ["predict", "--model", "H", "-o", str(out)])
-    assert first.wait() == 0, first.stderr.read()
+    succeed(command(case, ["predict", "--model", "H", "-o", str(out)]))
     before = contents(out)
     largest = max(path.stat().st_size for path in out.iterdir())
     if limit > largest:
@@ -196,15 +203,14 @@ def small_disk(tmp_path):
     """A disk of 300 kB; skips where none can be mounted."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(disk)]
-    try:
-        made = subprocess.run(mount, check=False, capture_output=True)
-    except FileNotFoundError:
+    mount, unmount = shutil.which("mount"), shutil.which("umount")
+    if mount is None or unmount is None:
         pytest.skip("there is no mount command")
-    if made.returncode:
+    words = [mount, "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(disk)]
+    if subprocess.run(words, check=False, capture_output=True).returncode:
         pytest.skip("a small disk cannot be mounted here")
     yield disk
-    subprocess.run(["umount", str(disk)], check=True)
+    subprocess.run([unmount, str(disk)], check=True)
 
 
 def test_a_full_disk_is_named_and_left_clean(small_disk, case, capsys):
@@ -217,7 +223,7 @@ def test_a_full_disk_is_named_and_left_clean(small_disk, case, capsys):
 
 
 def test_a_disk_that_is_read_only_is_said_before_the_work(small_disk, case, capsys):
-    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    subprocess.run([shutil.which("mount"), "-o", "remount,ro", str(small_disk)], check=True)
     for name in ("build", "predict", "evaluate"):
         assert main([name, str(case), "-q", "-o", str(small_disk / "out")]) == 2
         assert "output-not-writable" in capsys.readouterr().err
@@ -292,5 +298,5 @@ def test_a_study_on_a_dask_cluster_gives_what_one_machine_gives(case, tmp_path):
 
 def test_a_cluster_that_does_not_answer_is_bad_input(case, tmp_path):
     pytest.importorskip("distributed")
-    with pytest.raises(cmfsim.CaseError, match="no Dask scheduler answers at 'tcp://127.0.0.1:9'"):
+    with pytest.raises(cmfsim.CaseError, match="no Dask scheduler answers at"):
         cmfsim.run_study(cohort_of(tmp_path, case), scheduler="tcp://127.0.0.1:9")
