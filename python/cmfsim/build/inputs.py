@@ -127,8 +127,14 @@ def _path_from(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
 
 
-def check_output(case: Case) -> None:
-    """Finds before the work what would keep the model from being written, or spoil an input.
+def check_output(case: Case, is_written: Callable[[str], bool] = is_model_file) -> None:
+    """Finds before the work what would keep results from being written, or spoil an input.
+
+    Parameters
+    ----------
+    case : Case
+    is_written : callable
+        Whether a file of a name is written: of a model where left out.
 
     Raises
     ------
@@ -146,11 +152,11 @@ def check_output(case: Case) -> None:
         raise PermissionError(f"{there}: the output cannot be written there")
     for path in _files(case):
         written = folder / path.name
-        if not is_model_file(path.name) or not path.exists() or not written.exists():
+        if not is_written(path.name) or not path.exists() or not written.exists():
             continue
         if path.samefile(written):
             raise CaseInputError(
-                f"{path}: the model would replace this input; give another output folder"
+                f"{path}: the results would replace this input; give another output folder"
             )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cmfsim.build import check_output
 from cmfsim.cli.case_commands import case_of, checked
 from cmfsim.cli.exit_codes import BAD_INPUT, DONE, FAILED
 from cmfsim.cli.results import (
@@ -20,6 +21,7 @@ from cmfsim.cli.results import (
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Cohort, read_landmarks, replacing
+from cmfsim.io.predictions import is_prediction_file
 from cmfsim.prediction import MODELS, Prediction
 from cmfsim.study import CaseOutcome, StudyReport, predict_models, run_study
 from cmfsim.study import evaluate as evaluate_case
@@ -41,6 +43,7 @@ def predict(options: argparse.Namespace) -> int:
     findings = () if options.no_doctor else checked(case, quiet=options.quiet)
     if findings is None:
         return BAD_INPUT
+    check_output(case, is_prediction_file)
     written: list[dict[str, Any]] = []
     failed: dict[str, CmfsimError] = {}
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
@@ -78,6 +81,7 @@ def evaluate(options: argparse.Namespace) -> int:
     findings = () if options.no_doctor else checked(case, quiet=options.quiet)
     if findings is None:
         return BAD_INPUT
+    check_output(case, is_prediction_file)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         found = evaluate_case(case, models, progress=progress.stage, check=False, findings=findings)
         for prediction in found.predictions:
