@@ -147,7 +147,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "equivalent": "case checks errors musculature scene _core",
         "landmark_sites": "",
         "template_data": "case checks errors musculature scene",
-        "prediction": "case checks model musculature scene",
+        "prediction": "case checks model musculature scene _core",
         "template": (
             "case checks errors io landmark_sites musculature phantom registration scene "
             "surface_checks surface_repair template_data _core"

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import TetMesh, __version__
+from cmfsim.build.clefts import without_clefts
+from cmfsim.build.face import detailed_face
 from cmfsim.build.held import held_part
 from cmfsim.build.inputs import (
     check_output,
@@ -37,6 +39,7 @@ from cmfsim.meshing import (
     mesh_report,
     near_skin,
     part_mesh,
+    report_of_part,
     tissue_level,
 )
 from cmfsim.model import PatientModel
@@ -202,28 +205,35 @@ def build_model(
         options=KindOptions(**case.node_kinds),
     )
     findings += classified.findings
-    mesh, kinds, noticed = held_part(mesh, classified.kinds)
-    if noticed:
-        report = mesh_report(mesh)
+    kinds, whole = classified.kinds, mesh.n_tets
+    if case.mesh.file is None:
+        mesh, kinds, noticed = without_clefts(mesh, kinds, bones.segments, moved, case.mesh.cleft)
+        findings += noticed
+    mesh, kinds, noticed = held_part(mesh, kinds)
     findings += noticed
+    if mesh.n_tets < whole:
+        report = report_of_part(mesh, report)
     findings += _untouched(case, kinds, bones.motions)
     findings = [*dict.fromkeys(findings)]
 
     stages.begin("assembling the scene")
     scene = _scene(case, mesh, kinds, bones.segments, bones.motions)
     boundary = np.asarray(mesh.boundary_triangles())
-    skin = _on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)
+    skin = boundary[_on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)]
+    stages.begin("drawing the face")
+    face = detailed_face(anatomy)
     stages.end()
     patient = PatientModel(
         name=case.name,
         scene=scene,
         kinds=kinds,
         boundary_triangles=boundary,
-        skin_triangles=boundary[skin],
+        skin_triangles=skin,
         segments=bones.segments,
         anatomy=anatomy,
         fat=case.tissue,
         landmarks=landmarks,
+        face=face,
         findings=tuple(findings),
         summary={
             **_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),

@@ -59,6 +59,7 @@ TABLES = (
 SAMPLES = (1, 100_000)
 # Edge lengths that make a mesh of a head, mm: below, more tets than any memory; above, no face.
 EDGE_LENGTHS = (0.3, 30.0)
+MOST_CLEFT = 20.0
 # Grid spacings that a head can be worked on at, mm.
 WORKING_SPACINGS = (0.2, 5.0)
 
@@ -292,14 +293,16 @@ def _region(table: Table) -> Region:
 
 
 def _mesh(table: Table, folder: Path) -> CaseMesh:
-    table.only("edge_length", "refine", "parting", "file")
+    table.only("edge_length", "refine", "cleft", "parting", "file")
     low, high = EDGE_LENGTHS
     edge_length = table.number("edge_length", "mm", low=low, high=high)
+    cleft = table.number("cleft", "mm", low=0.0, high=MOST_CLEFT)
     parting = table.table("parting").only("surface") if "parting" in table else None
     default = CaseMesh()
     return CaseMesh(
         default.edge_length if edge_length is None else edge_length,
         table.flag("refine", default=default.refine),
+        default.cleft if cleft is None else cleft,
         None if parting is None else _file(parting, "surface", folder),
         _file_or_none(table, "file", folder),
     )

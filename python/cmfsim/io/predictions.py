@@ -17,7 +17,9 @@ from cmfsim.prediction import Prediction
 
 __all__ = ["is_prediction_file", "write_prediction"]
 
-PREDICTION_FILES = re.compile(r"prediction\.(vtp|stl|vtu|npz|png|json)|plan\.png|timings\.json")
+PREDICTION_FILES = re.compile(
+    r"prediction\.(vtp|stl|vtu|npz|png|json)|face\.(vtp|stl)|plan\.png|timings\.json"
+)
 
 
 def is_prediction_file(name: str) -> bool:
@@ -32,8 +34,9 @@ def write_prediction(
 ) -> list[str]:
     """The names of the files that a prediction is written as, in a folder that is made if need be.
 
-    `prediction.vtp` (the skin at rest with its `displacement`), `prediction.stl` (the predicted
-    skin), `prediction.vtu` (tissue with `displacement`, `force`, muscle `fraction` and `fibre`),
+    `prediction.vtp` (the mesh's skin at rest with its `displacement`), `prediction.stl` (the same
+    where it goes), `face.vtp` and `face.stl` (likewise the whole skin in full detail),
+    `prediction.vtu` (tissue with `displacement`, `force`, muscle `fraction` and `fibre`),
     `prediction.npz` (everything, for `read_result`), `timings.json`, and `prediction.json` (counts,
     parameters, findings, versions, hashes). All take their places together, or none does.
 
@@ -61,6 +64,7 @@ def write_prediction(
 
     def fill(fresh: Path) -> list[str]:
         names = [f"prediction.{ending}" for ending in ("vtp", "stl", "vtu", "npz")]
+        names += ["face.vtp", "face.stl"]
         result, skin = prediction.result, prediction.skin_before
         with replacing(fresh / names[0]) as file:
             moved = {
@@ -69,6 +73,11 @@ def write_prediction(
             }
             write_triangles(file, skin.vertices, skin.triangles, moved)
         write_surface(fresh / names[1], prediction.skin)
+        face, before = prediction.face, prediction.face_before
+        with replacing(fresh / names[4]) as file:
+            carried = np.asarray(face.vertices) - np.asarray(before.vertices)
+            write_triangles(file, before.vertices, before.triangles, {"displacement": carried})
+        write_surface(fresh / names[5], face)
         with replacing(fresh / names[2]) as file:
             points = {"displacement": result.displacements, "force": result.forces}
             write_tets(file, result.nodes, result.tets, points, _muscle_data(prediction))

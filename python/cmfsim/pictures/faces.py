@@ -49,8 +49,8 @@ def picture_prediction(
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_prediction("prediction.png", prediction)  # doctest: +SKIP
     """
-    before, after = prediction.skin_before, prediction.skin
-    moved = np.linalg.norm(prediction.skin_displacements, axis=1)
+    before, after = prediction.face_before, prediction.face
+    moved = np.linalg.norm(np.asarray(after.vertices) - np.asarray(before.vertices), axis=1)
     largest = max(float(moved.max()), LEAST_SCALE)
 
     def paint(plotter: Any, view: View) -> None:

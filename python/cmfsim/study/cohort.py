@@ -21,6 +21,8 @@ __all__ = ["CaseJob", "CaseOutcome", "StudyReport", "run_study"]
 # Lines of a failed case's log that are shown.
 SHOWN_LINES = 12
 LOG_FILE = "log.txt"
+# In which a Dask scheduler must answer, s.
+ANSWER_TIME = 10.0
 
 
 @dataclass(frozen=True)
@@ -208,7 +210,7 @@ def _on_dask(jobs: list[CaseJob], scheduler: str) -> Iterator[CaseOutcome]:
             f"a study on a cluster needs Dask ({error}): pip install 'cmfsim[study]'"
         ) from error
     try:
-        client = distributed.Client(scheduler)
+        client = distributed.Client(scheduler, timeout=ANSWER_TIME)
     except (OSError, ValueError) as error:
         raise CaseInputError(f"no Dask scheduler answers at {scheduler!r}: {error}") from error
     with client:
