@@ -155,13 +155,15 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "phantom": "case checks errors scene",
         "planning": "errors",
         "achieved": "case checks errors planning registration scene _core",
+        "bone_motion": "checks errors scene surface_checks topology _core",
         "osteotomy": "case checks errors planning scene _core",
         "node_kinds": "case checks errors scene _core",
         "simulation": "checks errors model planning prediction scene _core",
         "evaluation": "case checks errors registration scene topology _core",
         "build": (
-            "case checks doctor equivalent errors imaging io meshing model musculature "
-            "node_kinds osteotomy patient phantom pictures scene surface_repair template topology "
+            "achieved bone_motion case checks doctor equivalent errors imaging io meshing model "
+            "musculature node_kinds osteotomy patient phantom pictures registration scene "
+            "surface_repair template topology "
             "_core"
         ),
         "demo": "case checks errors io osteotomy phantom scene",
@@ -178,7 +180,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "surface_repair": "capping case checks errors scene surface_checks topology _core",
         "doctor": (
             "case checks errors io osteotomy patient planning registration scene "
-            "surface_checks surface_repair template _core"
+            "surface_checks surface_repair template topology _core"
         ),
         "cli": (
             "build case checks cmfsim demo doctor errors evaluation io meshing musculature phantom "

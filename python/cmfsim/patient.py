@@ -340,13 +340,13 @@ class CasePostoperative:
     Attributes
     ----------
     skin : Path or None
-        Surface of the skin after the operation; this or `image` is given.
+        Surface of the skin after the operation.
     image : Path or None
-        CT after the operation.
+        CT after the operation, instead of skin and bones.
     landmarks : Path or None
         Skin landmarks on it, for correspondences.
     bones : mapping of str to Path
-        Surfaces of the moved segments, by name, for the achieved plan.
+        Surfaces of bones or segments, by name, for the achieved plan.
     aligned : bool
         Whether it lies in the frame of the data before the operation already.
     units, frame : str
@@ -362,8 +362,10 @@ class CasePostoperative:
     frame: str = "LPS"
 
     def __post_init__(self) -> None:
-        if (self.skin is None) == (self.image is None):
-            raise CaseInputError("after the operation there is either a skin or an image")
+        if self.image is not None and (self.skin is not None or self.bones):
+            raise CaseInputError("after the operation there are surfaces or an image, not both")
+        if self.image is None and self.skin is None and not self.bones:
+            raise CaseInputError("after the operation there is a skin, an image, or a bone")
         check_one_of("units", self.units, tuple(UNITS))
         check_one_of("frame", self.frame, FRAMES)
         object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))

@@ -21,9 +21,10 @@ from cmfsim.build.inputs import (
     input_hashes,
     read_anatomy,
     read_case_landmarks,
-    read_motion,
 )
+from cmfsim.build.motions import planned_bones
 from cmfsim.build.muscles import with_muscles
+from cmfsim.build.postoperative import Postoperative
 from cmfsim.build.skin_part import on_skin
 from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.checks import Floats
@@ -136,6 +137,7 @@ def build_model(
     check: bool = True,
     findings: Iterable[Finding] = (),
     anatomy: Anatomy | None = None,
+    after: Postoperative | None = None,
 ) -> PatientModel:
     """The model of a case: read, segmented, cut, meshed and classified; nothing is written.
 
@@ -148,6 +150,8 @@ def build_model(
         As for `build_case`.
     anatomy : Anatomy, optional
         The head, where it is known; the image or surfaces of the case are then not read.
+    after : Postoperative, optional
+        What `read_postoperative` gives, where it is known already; an achieved plan is read off it.
 
     Returns
     -------
@@ -178,14 +182,11 @@ def build_model(
     stages.begin("cutting the bones")
     cut = cut_bones(anatomy.bones, _procedures(case, skull))
     findings += cut.findings
-    moved = [*dict.fromkeys([*_cut_segments(case), *case.plan])]
-    known = [segment.name for segment in cut.segments]
-    for name in moved:
-        if name not in known:
-            raise CaseInputError(
-                f"{case.where(f'plan.{name}')}: there is no segment {name!r}; segments are: "
-                f"{', '.join(known)}; an osteotomy makes others"
-            )
+    if case.achieved:
+        stages.begin("reading the achieved plan")
+    bones = planned_bones(case, cut.segments, after)
+    findings += bones.findings
+    moved = [*dict.fromkeys([*_cut_segments(case), *bones.motions])]
 
     stages.begin("finding the soft tissue")
     region = _region(case, anatomy, skull)
@@ -202,7 +203,7 @@ def build_model(
         mesh.nodes,
         mesh.boundary_triangles(),
         anatomy,
-        cut.segments,
+        bones.segments,
         moved=moved,
         landmarks=skull,
         fixed_planes=_planes(region),
@@ -211,18 +212,17 @@ def build_model(
     findings += classified.findings
     kinds, whole = classified.kinds, mesh.n_tets
     if case.mesh.file is None:
-        mesh, kinds, noticed = without_clefts(mesh, kinds, cut.segments, moved, case.mesh.cleft)
+        mesh, kinds, noticed = without_clefts(mesh, kinds, bones.segments, moved, case.mesh.cleft)
         findings += noticed
     mesh, kinds, noticed = held_part(mesh, kinds)
     findings += noticed
     if mesh.n_tets < whole:
         report = report_of_part(mesh, report)
-    findings += _untouched(case, kinds)
+    findings += _untouched(case, kinds, bones.motions)
     findings = [*dict.fromkeys(findings)]
 
     stages.begin("assembling the scene")
-    motions = {name: read_motion(case, motion) for name, motion in case.plan.items()}
-    scene = _scene(case, mesh, kinds, cut.segments, motions)
+    scene = _scene(case, mesh, kinds, bones.segments, bones.motions)
     boundary = np.asarray(mesh.boundary_triangles())
     skin = boundary[on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)]
     stages.begin("drawing the face")
@@ -234,13 +234,16 @@ def build_model(
         kinds=kinds,
         boundary_triangles=boundary,
         skin_triangles=skin,
-        segments=cut.segments,
+        segments=bones.segments,
         anatomy=anatomy,
         fat=case.tissue,
         landmarks=landmarks,
         face=face,
         findings=tuple(findings),
-        summary=_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
+        summary={
+            **_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
+            **({} if bones.achieved is None else {"achieved": bones.achieved.as_dict()}),
+        },
     )
     if case.muscles is None:
         return patient
@@ -369,7 +372,7 @@ def _mesh(
     return parted, replace(made.report, n_nodes=parted.n_nodes), made.findings
 
 
-def _untouched(case: Case, kinds: NodeKinds) -> list[Finding]:
+def _untouched(case: Case, kinds: NodeKinds, motions: Iterable[str]) -> list[Finding]:
     return [
         Finding(
             "warning",
@@ -379,7 +382,7 @@ def _untouched(case: Case, kinds: NodeKinds) -> list[Finding]:
             "its motion does not reach the face",
             "check the cut that makes it, bone_distance in [node_kinds], and the posterior plane",
         )
-        for name in case.plan
+        for name in motions
         if not len(kinds.nodes("joined", name)) and not len(kinds.nodes("sliding", name))
     ]
 

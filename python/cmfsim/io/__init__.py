@@ -2,7 +2,8 @@
 
 from cmfsim.io.case_files import Case
 from cmfsim.io.cohorts import Cohort
-from cmfsim.io.folders import replacing_files
+from cmfsim.io.files import replacing
+from cmfsim.io.folders import finish_writing, replacing_files
 from cmfsim.io.images import read_image, write_image
 from cmfsim.io.landmarks import LandmarkFile, read_landmark_file, read_landmarks, write_landmarks
 from cmfsim.io.meshes import read_tet_mesh
@@ -18,6 +19,7 @@ __all__ = [
     "Case",
     "Cohort",
     "LandmarkFile",
+    "finish_writing",
     "read_image",
     "read_landmark_file",
     "read_landmarks",
@@ -29,6 +31,7 @@ __all__ = [
     "read_surface",
     "read_tet_mesh",
     "read_transform",
+    "replacing",
     "replacing_files",
     "result_suffixes",
     "write_image",

@@ -35,6 +35,8 @@ from cmfsim.scene import CONTACTS, METHODS, MIXINGS, PRESETS, SolverOptions, Tis
 __all__ = ["CASE_FORMAT", "Case"]
 
 CASE_FORMAT = "cmfsim-case"
+# What stands for the plan where it is read off the bones after the operation.
+ACHIEVED = "achieved"
 TABLES = (
     "format",
     "version",
@@ -84,6 +86,8 @@ class Case:
         In the order in which they are made.
     plan : mapping of str to CaseMotion
         Segments that it does not name stay.
+    achieved : bool
+        The plan is what the operation achieved, read off the bones after it; `plan` is empty.
     node_kinds : mapping of str to plain values
         Options of the stage that classifies nodes.
     tissue : TissueData
@@ -113,6 +117,7 @@ class Case:
     mesh: CaseMesh = field(default_factory=CaseMesh)
     osteotomies: tuple[CaseOsteotomy, ...] = ()
     plan: Mapping[str, CaseMotion] = field(default_factory=dict)
+    achieved: bool = False
     node_kinds: Mapping[str, Any] = field(default_factory=dict)
     tissue: TissueData = field(default_factory=lambda: TissueData("preset", fraction=0.0))
     muscles: CaseMuscles | None = None
@@ -125,6 +130,8 @@ class Case:
         as_text("case name", self.name)
         if (self.image is None) == (self.surfaces is None):
             raise CaseInputError("a case has either an image or surfaces")
+        if self.achieved and self.plan:
+            raise CaseInputError("a plan is given or achieved, not both")
         for name in ("plan", "node_kinds", "lines"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
@@ -185,7 +192,8 @@ def _read(path: Path) -> Case:
         region=_region(document.table("region")),
         mesh=_mesh(document.table("mesh"), folder),
         osteotomies=_osteotomies(document),
-        plan=_plan(document.table("plan"), folder),
+        plan={} if _is_achieved(document) else _plan(document, folder),
+        achieved=_is_achieved(document),
         node_kinds=_plain(document.table("node_kinds")),
         tissue=_tissue(document.table("tissue")),
         muscles=_muscles(document.table("muscles"), folder) if "muscles" in document else None,
@@ -328,8 +336,48 @@ def _osteotomies(document: Table) -> tuple[CaseOsteotomy, ...]:
     return tuple(cuts)
 
 
-def _plan(table: Table, folder: Path) -> dict[str, CaseMotion]:
-    return {_name(table, name, name): _motion(table.table(name), folder) for name in table}
+def _is_achieved(document: Table) -> bool:
+    """Whether the case asks for the plan that the operation achieved."""
+    if "plan" not in document or isinstance(document.need("plan"), dict):
+        return False
+    if document.need("plan") != ACHIEVED:
+        document.fail(
+            "plan", f'is {document.need("plan")!r}: tables [plan.SEGMENT] are needed, or "achieved"'
+        )
+    after = document.table("postoperative")
+    if "image" not in after and "bones" not in after:
+        document.fail(
+            "plan",
+            "is achieved, and there is no bone after the operation to read it off: add "
+            "[postoperative] image, or [postoperative.bones]",
+        )
+    return True
+
+
+def _plan(document: Table, folder: Path) -> dict[str, CaseMotion]:
+    table = document.table("plan")
+    motions = {}
+    for name in table:
+        motion = table.table(name)
+        if "moved" in motion:
+            motions[_name(table, name, name)] = _moved(document, motion, name, folder)
+        else:
+            motions[_name(table, name, name)] = _motion(motion, folder)
+    return motions
+
+
+def _moved(document: Table, motion: Table, name: str, folder: Path) -> CaseMotion:
+    """The motion of a bone of the case, given by the same surface after it moved."""
+    bones = document.table("surfaces").table("bones") if "surfaces" in document else ()
+    if name not in bones:
+        known = f"one of {', '.join(bones)}" if bones else "no bone, for there is no [surfaces]"
+        motion.fail(
+            "moved",
+            f"is for bones that [surfaces.bones] names ({known}), not for {name!r}: give surface "
+            "and moved_surface, the piece before and after",
+        )
+    before = _file(document.table("surfaces").table("bones"), name, folder)
+    return CaseMotion(surface=before, moved_surface=_file(motion.only("moved"), "moved", folder))
 
 
 def _motion(table: Table, folder: Path) -> CaseMotion:
@@ -344,7 +392,7 @@ def _motion(table: Table, folder: Path) -> CaseMotion:
         table.only("surface", "moved_surface")
         surface = _file(table, "surface", folder)
         return CaseMotion(surface=surface, moved_surface=_file(table, "moved_surface", folder))
-    table.only("translation", "angle", "axis", "centre", "matrix", "transform", "surface")
+    table.only("translation", "angle", "axis", "centre", "matrix", "transform", "moved", "surface")
     given: dict[str, Any] = {
         key: vector
         for key in ("translation", "axis", "centre")
@@ -395,12 +443,13 @@ def _muscles(table: Table, folder: Path) -> CaseMuscles:
 
 def _postoperative(table: Table, folder: Path) -> CasePostoperative:
     table.only("skin", "image", "landmarks", "bones", "aligned", "units", "frame")
-    if ("skin" in table) == ("image" in table):
-        table.fail(
-            "image" if "image" in table else None,
-            "stands beside skin: give one of them" if "image" in table else "lacks skin or image",
-        )
     bones = table.table("bones")
+    if "skin" in table and "image" in table:
+        table.fail("image", "stands beside skin: give one of them")
+    if "image" in table and "bones" in table:
+        table.fail("bones", "stands beside image, from which bones are read: give one of them")
+    if "skin" not in table and "image" not in table and not list(bones):
+        table.fail(None, "lacks skin, image or bones")
     return CasePostoperative(
         _file_or_none(table, "skin", folder),
         _file_or_none(table, "image", folder),

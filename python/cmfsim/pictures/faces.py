@@ -22,6 +22,8 @@ SKIN_SHADING = {"smooth_shading": True, "ambient": 0.12, "specular": 0.12, "spec
 LEAST_SCALE = 0.01
 # Of bone where it was before the operation.
 GHOST_COLOUR = "#7f8c9a"
+# A segment that moves less than this, mm, is drawn where it was: two surfaces in one place flicker.
+STAYS = 0.5
 
 
 def picture_prediction(
@@ -124,7 +126,11 @@ def picture_plan(
         replace(s, surface=SurfaceData(after[s.name][1], after[s.name][0].triangles))
         for s in segments
     ]
-    still = {name for name, (surface, v) in after.items() if np.array_equal(v, surface.vertices)}
+    shifts = {
+        name: np.linalg.norm(vertices - np.asarray(surface.vertices), axis=1)
+        for name, (surface, vertices) in after.items()
+    }
+    still = {name for name, shift in shifts.items() if np.quantile(shift, 0.99) < STAYS}
     colours = segment_colours([s.name for s in segments])
     corners = bounds([np.asarray(s.surface.vertices) for s in (*segments, *moved)])
 

@@ -119,7 +119,7 @@ def _prediction_section(predictions: Sequence[Values], pictures: Mapping[str, by
 
 
 def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
-    rows = []
+    rows, bent = [], []
     for name, motion in prediction["plan"].items():
         if "translation" in motion:
             cells = [*motion["translation"], motion["angle"]]
@@ -128,12 +128,39 @@ def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
             rows.append((name, *(number(value) for value in cells), axis))
         else:
             rows.append((name, "surface", "", "", "", f"mean {number(motion['mean'])} mm"))
+        if "bending" in motion:
+            bent.append(f"{name} ({number(motion['bending'])} mm rms)")
     table = Table(
         ("segment", "L", "P", "S", "turn, °", "axis (L, P, S)"),
         tuple(rows),
         "Motion of each bone segment: that of its centre, mm, and the turn about it.",
     )
-    return Section("Plan", (*_picture("plan", pictures), table))
+    notes = []
+    if bent:
+        notes.append(
+            Note(
+                "Moved vertex by vertex, with the nearest rigid motion in the table and what it "
+                f"leaves: {', '.join(bent)}."
+            )
+        )
+    return Section(
+        "Plan", (*_picture("plan", pictures), table, *notes, *_achieved(prediction.get("achieved")))
+    )
+
+
+def _achieved(achieved: Values | None) -> list[Note | Table | Figure]:
+    """How well each segment was laid on the bone after the operation."""
+    if achieved is None:
+        return []
+    rows = tuple(
+        (name, number(found["rms_mm"]), number(found["worst_mm"]), f"{found['share']:.0%}")
+        for name, found in achieved["segments"].items()
+    )
+    caption = (
+        "The plan was read off the bones after the operation: what is left between each segment "
+        "and that bone, mm, and the share of its vertices that lie on it."
+    )
+    return [Table(("segment", "RMS", "largest", "share"), rows, caption)]
 
 
 def _evaluation_sections(evaluation: Values | None, figures: Sequence[Figure]) -> list[Section]:
