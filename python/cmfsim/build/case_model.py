@@ -130,6 +130,7 @@ def build_model(
     progress: Progress | None = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
+    anatomy: Anatomy | None = None,
 ) -> PatientModel:
     """The model of a case: read, segmented, cut, meshed and classified; nothing is written.
 
@@ -140,6 +141,8 @@ def build_model(
     check : bool
     findings : iterable of Finding
         As for `build_case`.
+    anatomy : Anatomy, optional
+        The head, where it is known; the image or surfaces of the case are then not read.
 
     Returns
     -------
@@ -163,8 +166,9 @@ def build_model(
     landmarks, noticed = read_case_landmarks(case)
     findings += noticed
     skull = landmarks.get("skull", {})
-    anatomy, noticed = read_anatomy(case, skull, stages.begin)
-    findings += noticed
+    if anatomy is None:
+        anatomy, noticed = read_anatomy(case, skull, stages.begin)
+        findings += noticed
 
     stages.begin("cutting the bones")
     cut = cut_bones(anatomy.bones, _procedures(case, skull))
