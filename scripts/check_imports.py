@@ -125,6 +125,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "case checks doctor errors imaging io meshing model node_kinds osteotomy patient "
             "phantom pictures scene surface_repair _core"
         ),
+        "insilico": "build case checks errors io phantom planning scene _core",
         "study": "build case errors template simulation evaluation scene",
         "pictures": "case checks errors scene",
         "report": "case errors scene",
@@ -138,12 +139,12 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "_core"
         ),
         "cli": (
-            "cmfsim build case checks doctor errors io meshing phantom pictures report scene "
-            "simulation study"
+            "cmfsim build case checks doctor errors insilico io meshing phantom pictures report "
+            "scene simulation study"
         ),
         "__init__": (
-            "_core build case doctor equivalent errors evaluation imaging io meshing model "
-            "musculature node_kinds osteotomy patient phantom planning registration scene "
+            "_core build case doctor equivalent errors evaluation imaging insilico io meshing "
+            "model musculature node_kinds osteotomy patient phantom planning registration scene "
             "simulation study surface_checks surface_repair template"
         ),
     }.items()

@@ -36,6 +36,7 @@ from cmfsim.errors import (
     SolverError,
 )
 from cmfsim.imaging import SegmentOptions, segment_head
+from cmfsim.insilico import virtual_patients, write_virtual_patient
 from cmfsim.io import (
     Case,
     read_image,
@@ -201,6 +202,7 @@ __all__ = [
     "signed_level",
     "solve_scene",
     "tissue_level",
+    "virtual_patients",
     "write_image",
     "write_landmarks",
     "write_model",
@@ -209,4 +211,5 @@ __all__ = [
     "write_scene",
     "write_surface",
     "write_transform",
+    "write_virtual_patient",
 ]

@@ -1,0 +1,147 @@
+"""Tissue that slides on moving bones and teeth, may lift off, and is pushed back where it enters.
+
+This is the truth's contact: a penalty on smooth distances, without the surfaces, constraints and
+active sets of the tested models.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.case import ImageData
+from cmfsim.checks import Floats, as_positive
+from cmfsim.errors import CaseInputError
+
+__all__ = ["BoneContact", "SmoothDistance"]
+
+# Pressure per depth of penetration, MPa/mm: pressures of soft tissue (some kPa) stay within a
+# tenth of a mm.
+STIFFNESS = 0.1
+# Standard deviation of the blur that rounds gaps between teeth, mm: half an edge of the mesh.
+RELIEF = 1.0
+# Step of the central differences, mm: the splines are smooth over a voxel.
+DIFFERENCE = 1e-2
+
+
+class SmoothDistance:
+    """The distance outside a bone, negative inside, twice continuously differentiable near it.
+
+    Parameters
+    ----------
+    level : ImageData
+        Positive inside, about a distance near the surface.
+    relief : float, mm
+        Standard deviation of the Gaussian that the level is blurred with.
+    """
+
+    def __init__(self, level: ImageData, relief: float = RELIEF) -> None:
+        ndimage = _module("scipy.ndimage")
+        spacing = np.asarray(level.spacing)
+        blurred = ndimage.gaussian_filter(
+            np.asarray(level.values, dtype=np.float64), as_positive("relief", relief) / spacing
+        )
+        self._spline = ndimage.spline_filter(-blurred, order=3, mode="mirror")
+        self._origin, self._spacing = level.lowest, spacing
+        self._sample = ndimage.map_coordinates
+
+    def __call__(self, points: Floats) -> Floats:
+        """The distances of points (k, 3), mm."""
+        place = ((points - self._origin) / self._spacing).T
+        found = self._sample(self._spline, place, order=3, mode="mirror", prefilter=False)
+        return np.asarray(found)
+
+    def slope(self, points: Floats) -> Floats:
+        """The gradients at points, (k, 3)."""
+        columns = []
+        for axis in range(3):
+            step = np.zeros(3)
+            step[axis] = DIFFERENCE
+            columns.append((self(points + step) - self(points - step)) / (2.0 * DIFFERENCE))
+        return np.column_stack(columns)
+
+
+@dataclass(frozen=True, eq=False)
+class BoneContact:
+    """Nodes that moving bones push, without friction and without pull.
+
+    A node that starts inside the blurred bone may stay as deep as it started.
+
+    Attributes
+    ----------
+    points : (n, 3) float64, mm
+        All nodes at rest.
+    nodes : (k,) whole numbers
+        Those that touch.
+    area : (k,) float64, mm²
+        Of the boundary about each.
+    bones : mapping of str to SmoothDistance
+        At rest.
+    motion : mapping of str to callable
+        The rigid motion (4, 4) of each bone after a part of its motion, 0 to 1.
+    stiffness : float, MPa/mm
+    """
+
+    points: Floats
+    nodes: NDArray[Any]
+    area: Floats
+    bones: Mapping[str, SmoothDistance]
+    motion: Mapping[str, Callable[[float], Floats]]
+    stiffness: float = STIFFNESS
+
+    def __post_init__(self) -> None:
+        rest = {name: np.minimum(b(self.points[self.nodes]), 0.0) for name, b in self.bones.items()}
+        object.__setattr__(self, "_rest", rest)
+        for name in self.bones:
+            if name not in self.motion:
+                raise CaseInputError(f"contact with {name!r}, whose motion is not given")
+
+    def depths(self, displacements: Floats, part: float) -> dict[str, Floats]:
+        """How deep each touching node lies in each bone, (k,) mm; 0 outside."""
+        rest: Mapping[str, Floats] = self.__dict__["_rest"]
+        return {
+            name: np.maximum(rest[name] - bone(self._seen(name, displacements, part)), 0.0)
+            for name, bone in self.bones.items()
+        }
+
+    def _seen(self, name: str, displacements: Floats, part: float) -> Floats:
+        """The moved nodes in the frame of a bone that has moved by a part of its motion."""
+        matrix = self.motion[name](part)
+        moved = (self.points + displacements)[self.nodes]
+        return np.asarray((moved - matrix[:3, 3]) @ matrix[:3, :3])
+
+    def energy(self, displacements: Floats, part: float) -> float:
+        """½ ∫ k depth², N·mm."""
+        total = sum(float(self.area @ d**2) for d in self.depths(displacements, part).values())
+        return 0.5 * self.stiffness * total
+
+    def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
+        """The gradient of the energy, (n, 3) N, and the stiffness of each node, (n, 3, 3) N/mm.
+
+        The curvature of the bone is left out of the stiffness: it may be negative.
+        """
+        force = np.zeros_like(self.points)
+        blocks = np.zeros((len(self.points), 3, 3))
+        for name, depth in self.depths(displacements, part).items():
+            touching = np.flatnonzero(depth > 0.0)
+            if not len(touching):
+                continue
+            seen = self._seen(name, displacements, part)[touching]
+            normal = self.bones[name].slope(seen) @ self.motion[name](part)[:3, :3].T
+            weight = self.stiffness * self.area[touching]
+            at = self.nodes[touching]
+            force[at] -= (weight * depth[touching])[:, None] * normal
+            blocks[at] += weight[:, None, None] * normal[:, :, None] * normal[:, None, :]
+        return force, blocks
+
+
+def _module(name: str) -> Any:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        raise CaseInputError(
+            "contact of virtual patients is found with scipy: pip install 'cmfsim[study]'"
+        ) from error
