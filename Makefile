@@ -34,7 +34,7 @@ $(ENV_STAMP): pyproject.toml scripts/make_venv.sh
 	@touch $@
 
 $(BUILD_STAMP): $(ENV_STAMP) $(RUST_SOURCES)
-	VIRTUAL_ENV="$(VENV_PATH)" "$(BIN)/maturin" develop --release $(CARGO_FLAGS) --extras imaging,mesh,test,lint
+	VIRTUAL_ENV="$(VENV_PATH)" "$(BIN)/maturin" develop --release $(CARGO_FLAGS) --extras imaging,mesh,report,test,lint
 	@touch $@
 
 build: $(BUILD_STAMP) ## create .venv, compile the core and install cmfsim into it

@@ -34,15 +34,44 @@ CORE: Mapping[str, frozenset[str]] = {
         "parting": "mesh stuffing/cut surface",
         "signed_distance": "mesh stuffing/level surface winding",
         "material": "mesh",
-        "fibre": "surface mesh",
-        "equivalent": "fibre mesh surface winding material",
+        "fibre/region": "surface triangle",
+        "fibre/centre_line": "triangle fibre/region",
+        "fibre/parts": "triangle fibre/centre_line fibre/region",
+        "fibre/course": "triangle",
+        "fibre": "surface triangle",
+        "equivalent/aligned_box": "triangle",
+        "equivalent/tet_tree": "equivalent/aligned_box triangle",
+        "equivalent/border": "surface triangle",
+        "equivalent/shape": "equivalent/aligned_box equivalent/border surface triangle winding",
+        "equivalent/crossing": (
+            "equivalent/aligned_box equivalent/shape equivalent/tet_tree mesh triangle"
+        ),
+        "equivalent/sequence": "triangle",
+        "equivalent/packet": "equivalent/sequence equivalent/shape triangle",
+        "equivalent/direction": "triangle",
+        "equivalent/shares": (
+            "equivalent equivalent/crossing equivalent/direction equivalent/packet "
+            "equivalent/sequence equivalent/shape mesh triangle"
+        ),
+        "equivalent/stiffness": "equivalent/shares material",
+        "equivalent": "fibre material mesh surface triangle winding",
         "tensors": "blocks mesh material",
         "motion": "surface mesh triangle",
-        "registration": "surface motion mesh",
+        "registration/spread": "triangle",
+        "registration/thin_plate": "registration/spread triangle",
+        "registration/rigid": "registration/spread triangle",
+        "registration/nearest": "registration/spread",
+        "registration/icp": (
+            "motion registration/nearest registration/rigid registration/spread surface triangle"
+        ),
+        "registration": "",
         "boundary": "surface motion mesh",
         "restraint": "mesh",
-        "crease": "mesh motion surface",
+        "curvature": "mesh surface triangle",
+        "crease": "curvature mesh motion surface",
         "contact": "boundary crease mesh motion surface",
+        "acceleration": "mesh",
+        "settling": "acceleration boundary contact crease mesh",
         "constraints": "blocks mesh",
         "cholesky/workspace": "",
         "cholesky/structure": "blocks ordering cholesky/workspace",
@@ -107,45 +136,59 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "scene": "checks errors",
         "case": "checks errors scene",
         "patient": "checks errors",
-        "model": "case checks scene",
-        "io": "case checks errors model patient planning scene",
+        "model": "case checks musculature scene",
+        "io": (
+            "case checks errors model musculature patient planning prediction scene template_data"
+        ),
         "imaging": "case checks errors scene _core",
         "meshing": "case checks errors scene _core",
         "musculature": "case checks errors scene",
         "registration": "case checks errors scene _core",
         "equivalent": "case checks errors musculature scene _core",
-        "template": "case checks errors io musculature registration scene _core",
+        "landmark_sites": "",
+        "template_data": "case checks errors musculature scene",
+        "prediction": "case checks model musculature scene",
+        "template": (
+            "case checks errors io landmark_sites musculature phantom registration scene "
+            "surface_checks surface_repair template_data _core"
+        ),
         "phantom": "case checks errors scene",
         "planning": "errors",
+        "achieved": "case checks errors planning registration scene _core",
         "osteotomy": "case checks errors planning scene _core",
         "node_kinds": "case checks errors scene _core",
-        "simulation": "scene errors _core",
-        "evaluation": "case checks errors scene _core",
+        "simulation": "checks errors model planning prediction scene _core",
+        "evaluation": "case checks errors registration scene topology _core",
         "build": (
-            "case checks doctor errors imaging io meshing model node_kinds osteotomy patient "
-            "phantom pictures scene surface_repair _core"
+            "case checks doctor equivalent errors imaging io meshing model musculature "
+            "node_kinds osteotomy patient phantom pictures scene surface_repair template "
+            "_core"
         ),
+        "study": (
+            "build case checks errors evaluation io model musculature patient prediction "
+            "scene simulation template _core"
+        ),
+        "pictures": "case checks errors musculature prediction scene _core",
+        "report": "case errors io scene",
         "insilico": "build case checks errors io phantom planning scene _core",
-        "study": "build case errors template simulation evaluation scene",
-        "pictures": "case checks errors scene",
-        "report": "case errors scene",
         "topology": "",
         "crossings": "checks",
         "capping": "checks",
         "surface_checks": "checks crossings scene topology",
         "surface_repair": "capping case checks errors scene surface_checks topology _core",
         "doctor": (
-            "case checks errors io osteotomy patient planning scene surface_checks surface_repair "
-            "_core"
+            "case checks errors io osteotomy patient planning registration scene "
+            "surface_checks surface_repair template _core"
         ),
         "cli": (
-            "cmfsim build case checks doctor errors insilico io meshing phantom pictures report "
-            "scene simulation study"
+            "build case checks cmfsim doctor errors evaluation insilico io meshing musculature "
+            "phantom pictures prediction report scene simulation study template"
         ),
         "__init__": (
-            "_core build case doctor equivalent errors evaluation imaging insilico io meshing "
-            "model musculature node_kinds osteotomy patient phantom planning registration scene "
-            "simulation study surface_checks surface_repair template"
+            "achieved build case doctor equivalent errors evaluation imaging insilico io "
+            "landmark_sites meshing model musculature node_kinds osteotomy patient phantom "
+            "planning prediction registration scene simulation study surface_checks "
+            "surface_repair template _core"
         ),
     }.items()
 }

@@ -1,4 +1,4 @@
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeAlias, final
 
 import numpy as np
@@ -13,24 +13,33 @@ __all__ = [
     "CaseError",
     "CmfsimError",
     "ContactError",
+    "Folds",
+    "IcpFit",
     "ImageError",
     "LandmarkError",
     "MassTensors",
     "MaterialError",
     "MeshError",
     "MeshQuality",
+    "MuscleFibres",
+    "MuscleShares",
     "PlanOperator",
     "RegistrationError",
+    "RigidFit",
     "Solution",
     "SolverError",
     "StaticSolver",
     "Surface",
     "SurfaceMotion",
     "TetMesh",
+    "ThinPlateSpline",
     "Tissue",
     "__version__",
     "distance_image",
+    "icp",
     "part_mesh",
+    "rigid_fit",
+    "sample_muscles",
     "signed_distance_image",
     "stuff_image",
 ]
@@ -94,6 +103,8 @@ class Surface:
     @property
     def triangles(self) -> _Indices: ...
     @property
+    def vertex_normals(self) -> _Floats: ...
+    @property
     def is_closed(self) -> bool: ...
     @property
     def area(self) -> float: ...
@@ -105,6 +116,29 @@ class Surface:
     def winding_number(self, points: ArrayLike) -> _Floats: ...
     def moved(self, vertices: ArrayLike) -> Surface: ...
     def transformed(self, matrix: ArrayLike) -> Surface: ...
+
+@final
+class MuscleFibres:
+    def __new__(
+        cls,
+        surface: Surface,
+        kind: str = "strap",
+        boxes: int | None = None,
+        course: Sequence[ArrayLike] = ...,
+    ) -> MuscleFibres: ...
+    def directions(self, points: ArrayLike) -> _Floats: ...
+    @property
+    def boxes(self) -> tuple[_Floats, _Floats, _Floats]: ...
+    @property
+    def course(self) -> list[_Floats]: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def extents(self) -> _Floats: ...
+    @property
+    def sheet_ratio(self) -> float: ...
+    @property
+    def is_sheet(self) -> bool: ...
 
 @final
 class SurfaceMotion:
@@ -266,6 +300,121 @@ class PlanOperator:
     def matrix(self) -> _Floats: ...
     def __call__(self, plan: _Plan) -> _Floats: ...
 
+@final
+class ThinPlateSpline:
+    def __new__(
+        cls, source: ArrayLike, target: ArrayLike, smoothing: float = 0.0
+    ) -> ThinPlateSpline: ...
+    @property
+    def source(self) -> _Floats: ...
+    @property
+    def target(self) -> _Floats: ...
+    @property
+    def smoothing(self) -> float: ...
+    @property
+    def residuals(self) -> _Floats: ...
+    @property
+    def bending_energy(self) -> float: ...
+    @property
+    def weights(self) -> _Floats: ...
+    @property
+    def affine(self) -> _Floats: ...
+    def __call__(self, points: ArrayLike) -> _Floats: ...
+    def jacobian(self, points: ArrayLike) -> _Floats: ...
+    def folds(self, points: ArrayLike) -> Folds: ...
+    def landmark_folds(self) -> Folds: ...
+
+@final
+class Folds:
+    @property
+    def determinants(self) -> _Floats: ...
+    @property
+    def count(self) -> int: ...
+    @property
+    def worst(self) -> int | None: ...
+    @property
+    def smallest(self) -> float | None: ...
+
+@final
+class RigidFit:
+    @property
+    def matrix(self) -> _Floats: ...
+    @property
+    def scale(self) -> float: ...
+    @property
+    def residuals(self) -> _Floats: ...
+    @property
+    def rms(self) -> float: ...
+
+@final
+class IcpFit:
+    @property
+    def matrix(self) -> _Floats: ...
+    @property
+    def rms(self) -> float: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def converged(self) -> bool: ...
+    @property
+    def kept(self) -> NDArray[np.bool_]: ...
+    @property
+    def kept_fraction(self) -> float: ...
+    @property
+    def distances(self) -> _Floats: ...
+    @property
+    def rms_history(self) -> _Floats: ...
+
+def rigid_fit(
+    moving: ArrayLike,
+    fixed: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    scale: bool = False,
+) -> RigidFit: ...
+def icp(
+    moving: ArrayLike,
+    fixed: Surface | ArrayLike,
+    *,
+    initial: ArrayLike | None,
+    trim: float,
+    method: str | None,
+    max_iterations: int,
+    tolerance: float,
+    max_distance: float | None,
+    max_angle: float | None,
+    keep_border: bool,
+    normals: ArrayLike | None,
+) -> IcpFit: ...
+
+@final
+class MuscleShares:
+    @property
+    def fraction(self) -> _Floats: ...
+    @property
+    def error(self) -> _Floats: ...
+    @property
+    def fibre(self) -> _Floats: ...
+    @property
+    def coherence(self) -> _Floats: ...
+    @property
+    def volumes(self) -> dict[str, Any]: ...
+    @property
+    def shares(self) -> tuple[_Indices, _Indices, _Floats, _Floats, _Floats]: ...
+    @property
+    def counts(self) -> dict[str, int]: ...
+    @property
+    def timings(self) -> dict[str, float]: ...
+    def tissue(self, preset: str, *, mixing: str) -> Tissue: ...
+
+def sample_muscles(
+    mesh: TetMesh,
+    muscles: Sequence[tuple[Surface, MuscleFibres]],
+    *,
+    samples: int,
+    seed: int,
+    inside: str,
+) -> MuscleShares: ...
 def stuff_image(
     values: ArrayLike,
     spacing: tuple[float, float, float],

@@ -29,9 +29,11 @@ __all__ = [
     "LandmarkError",
     "LandmarkInputError",
     "MaterialError",
+    "MaterialInputError",
     "MeshError",
     "MeshInputError",
     "RegistrationError",
+    "RegistrationInputError",
     "SolverError",
 ]
 
@@ -44,6 +46,10 @@ class CaseInputError(CaseError, ValueError):
     """A scene or case, in memory or on disk, that cannot be meant."""
 
 
+class MaterialInputError(MaterialError, ValueError):
+    """Options of a tissue that cannot be meant."""
+
+
 class MeshInputError(MeshError, ValueError):
     """Labels, levels or surfaces that cannot be meshed."""
 
@@ -54,3 +60,7 @@ class LandmarkInputError(LandmarkError, ValueError):
 
 class ImageInputError(ImageError, ValueError):
     """An image that cannot be meant: not three axes, no CT, damaged, no head in it."""
+
+
+class RegistrationInputError(RegistrationError, ValueError):
+    """Points, surfaces or volumes that cannot be brought together as they are."""

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from cmfsim.case import Anatomy, BoneSegment, Finding, NodeKinds
 from cmfsim.checks import Floats, Indices
-from cmfsim.scene import Scene, SurfaceData
+from cmfsim.musculature import Musculature
+from cmfsim.scene import Scene, SurfaceData, TissueData
 
 __all__ = ["PatientModel"]
 
@@ -31,6 +32,14 @@ class PatientModel:
     segments : tuple of BoneSegment
         All pieces of bone, those that stay included.
     anatomy : Anatomy
+    fat : TissueData
+        The tissue of a homogeneous model; `scene.tissue` where there are no muscles.
+    muscles : Musculature or None
+        In the patient's place; None where the case has none.
+    fraction : (m,) float64 or None
+        Share of muscle in each tet.
+    fibre : (m, 3) float64 or None
+        Unit direction of the fibres of each tet; zero where there is no muscle.
     landmarks : mapping of str to mapping of str to (3,) float64, mm
         "skull" and "skin", where given.
     findings : tuple of Finding
@@ -46,6 +55,10 @@ class PatientModel:
     skin_triangles: Indices
     segments: tuple[BoneSegment, ...]
     anatomy: Anatomy
+    fat: TissueData
+    muscles: Musculature | None = None
+    fraction: Floats | None = None
+    fibre: Floats | None = None
     landmarks: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)

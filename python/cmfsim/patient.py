@@ -24,7 +24,9 @@ __all__ = [
     "CaseLandmarks",
     "CaseMesh",
     "CaseMotion",
+    "CaseMuscles",
     "CaseOsteotomy",
+    "CasePostoperative",
     "CaseSurfaces",
     "Plane",
     "Region",
@@ -290,3 +292,72 @@ class CaseMotion:
     surface: Path | None = None
     moved_surface: Path | None = None
     centre: Floats | None = None
+
+
+@dataclass(frozen=True)
+class CaseMuscles:
+    """Where the muscles come from, and how the material of the tets is sampled from them.
+
+    Attributes
+    ----------
+    template : Path or str
+        The folder of a template, or the name of one that comes with the package.
+    smoothing : float
+        Of the thin-plate spline that carries the template to the patient; 0 meets every landmark.
+    preset : str
+        Constants of fat and muscle.
+    mixing : str
+        "moduli" (the paper) or "stiffness".
+    samples : int
+        Points in a tet that a muscle's surface crosses.
+    seed : int
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.CaseMuscles(samples=16).template
+    'default'
+    """
+
+    template: Path | str = "default"
+    smoothing: float = 0.0
+    preset: str = "kim2010"
+    mixing: str = "moduli"
+    samples: int = 64
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class CasePostoperative:
+    """What is known after the operation.
+
+    Attributes
+    ----------
+    skin : Path or None
+        Surface of the skin after the operation; this or `image` is given.
+    image : Path or None
+        CT after the operation.
+    landmarks : Path or None
+        Skin landmarks on it, for correspondences.
+    bones : mapping of str to Path
+        Surfaces of the moved segments, by name, for the achieved plan.
+    aligned : bool
+        Whether it lies in the frame of the data before the operation already.
+    units, frame : str
+        Of the surface files.
+    """
+
+    skin: Path | None = None
+    image: Path | None = None
+    landmarks: Path | None = None
+    bones: Mapping[str, Path] = field(default_factory=dict)
+    aligned: bool = True
+    units: str = "mm"
+    frame: str = "LPS"
+
+    def __post_init__(self) -> None:
+        if (self.skin is None) == (self.image is None):
+            raise CaseInputError("after the operation there is either a skin or an image")
+        check_one_of("units", self.units, tuple(UNITS))
+        check_one_of("frame", self.frame, FRAMES)
+        object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))

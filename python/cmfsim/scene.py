@@ -62,6 +62,8 @@ TISSUE_OPTIONAL = frozenset({("preset", "fibre")})
 METHODS = ("auto", "cholesky", "pcg", "relaxation")
 CONTACTS = ("bilateral", "unilateral")
 CONFLICTS = ("error", "resolve")
+PRESETS = ("kim2010", "kim2010-swapped")
+MIXINGS = ("moduli", "stiffness")
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,8 +220,8 @@ class SegmentData:
     contact : SurfaceData or None
         Contact surface (teeth, mucosa) at rest; it moves with the segment.
     gap : (s,) float64, mm, or float, or "rest"
-        Distance that each sliding node keeps from the surface, along its normal; "rest" keeps the
-        distance of the undeformed tissue.
+        Distance that each sliding node keeps from the surface, negative behind it; "rest" keeps its
+        place over the surface: the offset from it in the undeformed tissue, carried by the segment.
 
     Examples
     --------

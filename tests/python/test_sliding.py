@@ -136,7 +136,7 @@ def test_block_on_a_carried_floor_moves_with_it():
 
 
 def test_prescribed_gap_is_kept():
-    """n·(x + u − c) = g for a gap of one number, of one per node, and of the rest distance."""
+    """|x + u − c| = g for a gap of one number, of one per node, and of the place at rest."""
     plan = {"top": np.eye(4), "floor": cmfsim.rigid_motion((0.0, 0.0, 0.3))}
     wanted = np.linspace(-0.2, 0.4, 20)
     for gap, height, expected in (

@@ -75,6 +75,16 @@ impl BlockMatrix {
         &self.blocks[self.diagonal[j]]
     }
 
+    /// Adds `stiffness` n⊗n to the diagonal block of row `j`.
+    pub fn add_to_diagonal(&mut self, j: usize, n: [f64; 3], stiffness: f64) {
+        let block = &mut self.blocks[self.diagonal[j]];
+        for r in 0..3 {
+            for c in 0..3 {
+                block[3 * r + c] += stiffness * n[r] * n[c];
+            }
+        }
+    }
+
     /// `y = A x`, parallel over rows; each row sums in column order, so the bits do not depend on threads.
     pub fn multiply_into(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
         y.par_chunks_mut(ROWS_PER_TASK).enumerate().for_each(|(chunk, rows)| {

@@ -7,7 +7,7 @@ use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
 use crate::motion::{RigidMotion, SurfaceMotion};
 use crate::surface::Surface;
 
-/// Prescribed distance of sliding nodes from their contact surface along its normal, mm.
+/// Prescribed distance of sliding nodes from their contact surface, negative behind it, mm.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum Gap {
@@ -15,7 +15,7 @@ pub enum Gap {
     Uniform(f64),
     /// One per sliding node, in the order they were given.
     PerNode(Vec<f64>),
-    /// The distance each node has at rest.
+    /// The offset each node has from its closest point at rest, carried by the segment.
     Rest,
 }
 

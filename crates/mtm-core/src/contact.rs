@@ -1,25 +1,17 @@
 //! Sliding contact: nodes stay on the moved surface of their bone segment and feel no force along it.
 //!
-//! A sliding node x keeps n·(x + u − c) = g, with c the closest point of the moved contact surface and
-//! n its continuous unit normal there (Kim et al. 2010, section 2.5 and eq. 2: forces act in the tangent
-//! plane). The outer loop alternates closest point and constrained solve until both settle.
+//! A sliding node x keeps its distance from the moved contact surface, |x + u − c| = g with c the closest
+//! point, and its force follows the continuous unit normal n there (Kim et al. 2010, section 2.5 and eq. 2:
+//! forces act in the tangent plane). What the outer loop needs is here; the loop is in `settling`.
 
 use std::sync::Arc;
 
-use rayon::prelude::*;
-
 use crate::boundary::{Boundary, Gap, Motion};
-use crate::crease::{ContactRow, Foot, MovedSurface, Push, Walls};
+use crate::crease::{ContactRow, MovedSurface, Seat};
 use crate::error::{MtmError, Result};
 use crate::mesh::{TetMesh, add, dot, norm, scaled, sub};
-use crate::surface::Surface;
+use crate::surface::{Closest, Surface};
 
-/// Smallest step of a damped node towards its new position.
-const LEAST_STEP: f64 = 1.0 / 64.0;
-/// A node whose step reverses and keeps more than this share of its length is damped.
-const REVERSAL: f64 = 0.5;
-/// Most nodes an error names.
-const NAMED_NODES: usize = 10;
 /// Share of sliding nodes that may face away from the contact surface before it counts as inverted.
 const MOSTLY: f64 = 0.5;
 /// Rounding of the area vector round a node, relative to the areas summed: less has no direction.
@@ -67,19 +59,22 @@ pub struct SlidingNode {
     pub row: u32,
     /// Its segment.
     pub segment: usize,
-    /// Distance it keeps along the normal, mm.
-    pub gap: f64,
 }
 
 /// The sliding nodes of a scene with their contact surfaces at rest.
 #[derive(Debug)]
 pub struct Sliding {
-    nodes: Vec<SlidingNode>,
-    positions: Vec<[f64; 3]>,
+    pub(crate) nodes: Vec<SlidingNode>,
+    pub(crate) positions: Vec<[f64; 3]>,
+    rest: Vec<Closest>,
     rest_normals: Vec<[f64; 3]>,
+    /// Prescribed distance of each node, mm; none where it keeps its place at rest.
+    gaps: Vec<Option<f64>>,
+    /// Stiffness of each node by itself, N/mm.
+    pub(crate) stiffness: Vec<f64>,
     surfaces: Vec<Option<Arc<Surface>>>,
-    names: Vec<String>,
-    diagonal: f64,
+    pub(crate) names: Vec<String>,
+    pub(crate) diagonal: f64,
 }
 
 /// Where the sliding nodes ended.
@@ -98,7 +93,7 @@ pub struct ContactState {
     pub walls: Vec<u8>,
     /// Normal and closest point of each of these walls, node by node.
     pub rows: Vec<ContactRow>,
-    /// n·(x + u − c) − g at the end, mm.
+    /// Distance of each node from its surface at the end, out of the bone, mm.
     pub gaps: Vec<f64>,
     /// Whether the node is held to the surface.
     pub active: Vec<bool>,
@@ -112,6 +107,21 @@ pub struct Constraints<'a> {
     pub rows: &'a [ContactRow],
     /// Offset of every row, mm.
     pub offsets: &'a [f64],
+    /// Springs across the normals of nodes with one row.
+    pub springs: &'a [Spring],
+}
+
+/// A spring on one sliding node along an axis of its tangent plane.
+#[derive(Debug, Clone, Copy)]
+pub struct Spring {
+    /// Index among the sliding nodes.
+    pub node: usize,
+    /// Unit vector.
+    pub axis: [f64; 3],
+    /// N/mm.
+    pub stiffness: f64,
+    /// Displacement along the axis at which it is slack, mm.
+    pub goal: f64,
 }
 
 /// Displacements (mm) of all sliding nodes and contact forces (N) along the rows.
@@ -125,7 +135,7 @@ pub struct Response {
 impl Sliding {
     /// The sliding nodes of `boundary`, or nothing where no node slides.
     ///
-    /// `row_of`: row of each node among the unknowns.
+    /// `row_of`: row of each node among the unknowns. `stiffness`: of each node by itself, N/mm.
     ///
     /// # Errors
     /// A contact surface that faces away from the tissue where that matters.
@@ -133,6 +143,7 @@ impl Sliding {
         boundary: &Boundary,
         mesh: &TetMesh,
         row_of: &[u32],
+        stiffness: impl Fn(usize) -> f64,
         mode: ContactMode,
     ) -> Result<Option<Self>> {
         if !boundary.has_sliding() {
@@ -141,7 +152,10 @@ impl Sliding {
         let mut sliding = Self {
             nodes: Vec::new(),
             positions: Vec::new(),
+            rest: Vec::new(),
             rest_normals: Vec::new(),
+            gaps: Vec::new(),
+            stiffness: Vec::new(),
             surfaces: Vec::new(),
             names: Vec::new(),
             diagonal: mesh.diagonal(),
@@ -158,14 +172,16 @@ impl Sliding {
             let normals: Vec<[f64; 3]> = closest.iter().map(|c| c.normal).collect();
             check_facing(mesh, &segment.name, &segment.sliding, surface, &normals, mode)?;
             for (i, &node) in segment.sliding.iter().enumerate() {
-                let gap = match &segment.gap {
-                    Gap::Uniform(value) => *value,
-                    Gap::PerNode(values) => values[i],
-                    Gap::Rest => dot(normals[i], sub(positions[i], closest[i].point)),
-                };
+                sliding.gaps.push(match &segment.gap {
+                    Gap::Uniform(value) => Some(*value),
+                    Gap::PerNode(values) => Some(values[i]),
+                    Gap::Rest => None,
+                });
+                sliding.stiffness.push(stiffness(node as usize));
                 let row = row_of[node as usize];
-                sliding.nodes.push(SlidingNode { node, row, segment: s, gap });
+                sliding.nodes.push(SlidingNode { node, row, segment: s });
             }
+            sliding.rest.extend(closest);
             sliding.positions.extend(positions);
             sliding.rest_normals.extend(normals);
             sliding.surfaces.push(Some(surface.clone()));
@@ -183,148 +199,16 @@ impl Sliding {
         &self.rest_normals
     }
 
-    /// Runs the outer loop for `motions` (one per segment), solving with `solve`.
+    /// Where the sliding nodes would be if they clung to their segment, and where their surfaces lie.
     ///
-    /// # Errors
-    /// `ContactCycle` where closest points or the set of held nodes do not settle, `ContactSurface`
-    /// where a node ends past the border of its surface, whatever `solve` reports.
-    pub fn settle(
+    /// A node without a prescribed gap slides on the contact surface shifted to where it lies itself: by
+    /// its offset at rest, carried with the segment. However far off the contact surface it lies, its
+    /// own surface is as smooth; the surface at its distance may fold.
+    pub(crate) fn carried(
         &self,
         motions: &[&Motion],
-        options: &ContactOptions,
-        interrupted: &(dyn Fn() -> bool + Sync),
-        mut solve: impl FnMut(&Constraints<'_>) -> Result<Response>,
-    ) -> Result<ContactState> {
-        let surfaces = self.moved_surfaces(motions)?;
-        let n = self.nodes.len();
-        let gap_limit = options.tolerance * self.diagonal;
-        let mut at: Vec<[f64; 3]> = self.carried(motions);
-        let mut walls: Vec<Walls> = self.feet(&surfaces, &at).into_iter().map(Walls::new).collect();
-        let mut held = Held::new(n, options.mode);
-        let (mut step, mut damping) = (vec![[0.0; 3]; n], vec![1.0_f64; n]);
-        let mut state = None;
-        for iteration in 1..=options.max_iterations {
-            if interrupted() {
-                return Err(MtmError::Interrupted);
-            }
-            let mut rows: Vec<ContactRow> = (0..n)
-                .filter(|&i| held.active[i])
-                .flat_map(|i| {
-                    let row = |f: &Foot| ContactRow { node: i, normal: f.normal, point: f.point };
-                    walls[i].feet.iter().map(row).collect::<Vec<_>>()
-                })
-                .collect();
-            let offsets: Vec<f64> = rows
-                .iter()
-                .map(|r| {
-                    dot(r.normal, sub(r.point, self.positions[r.node])) + self.nodes[r.node].gap
-                })
-                .collect();
-            let response = solve(&Constraints { rows: &rows, offsets: &offsets })?;
-
-            let reached: Vec<[f64; 3]> =
-                (0..n).map(|i| add(self.positions[i], response.displacements[i])).collect();
-            let nearest = self.feet(&surfaces, &reached);
-            let gaps: Vec<f64> =
-                (0..n).map(|i| nearest[i].height(reached[i]) - self.nodes[i].gap).collect();
-            let surface = |i: usize| &surfaces[self.nodes[i].segment];
-            let new_feet: Vec<Vec<Foot>> =
-                (0..n).map(|i| walls[i].feet_at(surface(i), reached[i], nearest[i])).collect();
-            let largest_force = response.forces.iter().fold(0.0_f64, |m, f| m.max(f.abs()));
-            let mut gap =
-                (0..n).filter(|&i| held.active[i]).fold(0.0_f64, |m, i| m.max(gaps[i].abs()));
-            let mut turned = 0.0_f64;
-            let mut pushes = vec![Push::default(); n];
-            for (row, &force) in rows.iter_mut().zip(&response.forces) {
-                let i = row.node;
-                let foot = &new_feet[i][pushes[i].forces.len()];
-                gap = gap.max((foot.height(reached[i]) - self.nodes[i].gap).abs());
-                turned = turned.max(force.abs() * norm(sub(foot.normal, row.normal)));
-                row.point = foot.point;
-                pushes[i].add(row.normal, force);
-            }
-            let (normals, forces): (Vec<[f64; 3]>, Vec<f64>) =
-                pushes.iter().zip(&walls).map(|(p, w)| p.along(w.feet[0].normal)).unzip();
-            let mut rebuilt = false;
-            for i in (0..n).filter(|&i| held.active[i]) {
-                let let_go = held.unilateral && walls[i].let_go(&pushes[i].forces);
-                let left = !let_go
-                    && gaps[i].abs() > gap_limit
-                    && nearest[i].triangle != walls[i].feet[0].triangle
-                    && walls[i].leave(surface(i), reached[i], nearest[i]);
-                if left || let_go {
-                    (damping[i], rebuilt) = (1.0, true);
-                }
-            }
-            let active = held.active.clone();
-            let changed = held.update(&forces, &gaps, gap_limit) || rebuilt;
-            let settled =
-                !changed && gap <= gap_limit && turned <= options.tolerance * largest_force;
-            let last = ContactState {
-                displacements: response.displacements,
-                points: nearest.iter().map(|f| f.point).collect(),
-                normals,
-                forces,
-                walls: pushes.iter().map(|p| p.forces.len() as u8).collect(),
-                rows,
-                gaps,
-                active,
-                iterations: iteration,
-            };
-            if settled {
-                self.check_border(&nearest, &reached, &surfaces, options)?;
-                return Ok(last);
-            }
-            if held.cycled {
-                return Err(self.cycle(&last, &nearest, &walls, iteration));
-            }
-            // Nodes that swing back and forth between triangles approach their new place in part.
-            let mut moved = at.clone();
-            for i in 0..n {
-                let new_step = sub(reached[i], at[i]);
-                let reversed = dot(new_step, step[i]) < 0.0
-                    && norm(new_step) > REVERSAL * norm(step[i])
-                    && norm(new_step) > gap_limit;
-                damping[i] = if reversed {
-                    (0.5 * damping[i]).max(LEAST_STEP)
-                } else {
-                    (1.5 * damping[i]).min(1.0)
-                };
-                step[i] = new_step;
-                moved[i] = add(at[i], scaled(new_step, damping[i]));
-            }
-            for i in (0..n).filter(|&i| !held.active[i]) {
-                walls[i] = Walls::new(nearest[i]);
-            }
-            let next = if damping.iter().all(|&d| d == 1.0) {
-                nearest
-            } else {
-                self.feet(&surfaces, &moved)
-            };
-            at = moved;
-            let previous = walls.clone();
-            for i in 0..n {
-                let feet = walls[i].feet_at(surface(i), at[i], next[i]);
-                walls[i].follow(&feet);
-            }
-            state = Some((last, next, previous));
-        }
-        match state {
-            Some((last, new, previous)) => {
-                Err(self.cycle(&last, &new, &previous, options.max_iterations))
-            }
-            None => Err(MtmError::OutOfRange {
-                what: "contact_iterations".into(),
-                index: 0,
-                value: 0.0,
-                allowed: "1 or more",
-                kind: crate::error::ErrorKind::Solver,
-            }),
-        }
-    }
-
-    /// Where the sliding nodes would be if they clung to their segment.
-    fn carried(&self, motions: &[&Motion]) -> Vec<[f64; 3]> {
+        surfaces: &[MovedSurface],
+    ) -> (Vec<[f64; 3]>, Vec<Seat>) {
         let mut out = self.positions.clone();
         for (s, motion) in motions.iter().enumerate() {
             let members: Vec<usize> =
@@ -346,10 +230,19 @@ impl Sliding {
                 Motion::Nodes(_) => {}
             }
         }
-        out
+        let seats = (0..self.nodes.len())
+            .map(|i| match self.gaps[i] {
+                Some(gap) => Seat { offset: [0.0; 3], gap },
+                None => {
+                    let foot = surfaces[self.nodes[i].segment].carried(&self.rest[i]);
+                    Seat { offset: sub(out[i], foot), gap: 0.0 }
+                }
+            })
+            .collect();
+        (out, seats)
     }
 
-    fn moved_surfaces(&self, motions: &[&Motion]) -> Result<Vec<MovedSurface>> {
+    pub(crate) fn moved_surfaces(&self, motions: &[&Motion]) -> Result<Vec<MovedSurface>> {
         self.surfaces
             .iter()
             .zip(motions)
@@ -366,129 +259,6 @@ impl Sliding {
                 })
             })
             .collect()
-    }
-
-    fn feet(&self, surfaces: &[MovedSurface], at: &[[f64; 3]]) -> Vec<Foot> {
-        (0..at.len())
-            .into_par_iter()
-            .with_min_len(64)
-            .map(|i| surfaces[self.nodes[i].segment].foot(at[i]))
-            .collect()
-    }
-
-    /// Refuses nodes that slid past the border of an open surface by more than the options allow.
-    fn check_border(
-        &self,
-        feet: &[Foot],
-        reached: &[[f64; 3]],
-        surfaces: &[MovedSurface],
-        options: &ContactOptions,
-    ) -> Result<()> {
-        for (i, foot) in feet.iter().enumerate().filter(|(_, f)| f.on_border) {
-            let away = sub(reached[i], foot.point);
-            let past = norm(sub(away, scaled(foot.normal, dot(foot.normal, away))));
-            let s = self.nodes[i].segment;
-            let reach = options.border_reach * surfaces[s].mean_edge();
-            if past > reach {
-                return Err(MtmError::ContactSurface {
-                    segment: self.names[s].clone(),
-                    problem: format!(
-                        "is open and node {} ends {past:.4} mm past its border, near ({:.3}, {:.3}, \
-                         {:.3}) (allowed {reach:.4} mm): extend or close the surface there, or let \
-                         the node be free",
-                        self.nodes[i].node, foot.point[0], foot.point[1], foot.point[2]
-                    ),
-                });
-            }
-        }
-        Ok(())
-    }
-
-    fn cycle(
-        &self,
-        last: &ContactState,
-        new: &[Foot],
-        old: &[Walls],
-        iterations: usize,
-    ) -> MtmError {
-        let mut order: Vec<usize> = (0..self.nodes.len()).collect();
-        let badness = |i: usize| {
-            let old = &old[i].feet[0];
-            let turned = last.forces[i].abs() * norm(sub(new[i].normal, old.normal));
-            let jumped = if new[i].triangle == old.triangle { 0.0 } else { f64::MIN_POSITIVE };
-            let gap = if last.active[i] { last.gaps[i].abs() } else { 0.0 };
-            gap / self.diagonal + turned + jumped
-        };
-        order.sort_by(|&a, &b| badness(b).total_cmp(&badness(a)).then(a.cmp(&b)));
-        let gap = (0..order.len())
-            .filter(|&i| last.active[i])
-            .fold(0.0_f64, |m, i| m.max(last.gaps[i].abs()));
-        let nodes = order.iter().take(NAMED_NODES).map(|&i| self.nodes[i].node as usize).collect();
-        MtmError::ContactCycle { iterations, nodes, gap }
-    }
-}
-
-/// Which sliding nodes are held, and the guard against cycling.
-struct Held {
-    active: Vec<bool>,
-    unilateral: bool,
-    /// Sets seen before; a repeated one means that changing many nodes at once goes in circles.
-    seen: std::collections::HashSet<Vec<bool>>,
-    one_at_a_time: bool,
-    cycled: bool,
-}
-
-impl Held {
-    fn new(n: usize, mode: ContactMode) -> Self {
-        Self {
-            active: vec![true; n],
-            unilateral: mode == ContactMode::Unilateral,
-            seen: std::collections::HashSet::new(),
-            one_at_a_time: false,
-            cycled: false,
-        }
-    }
-
-    /// Lets go of nodes that are pulled and holds those that penetrate; whether any changed.
-    ///
-    /// Primal-dual active set (Hintermüller, Ito & Kunisch 2002); where a set comes back, only the
-    /// worst node changes at a time, which cannot cycle while closest points stay put.
-    fn update(&mut self, forces: &[f64], gaps: &[f64], gap_limit: f64) -> bool {
-        if !self.unilateral {
-            return false;
-        }
-        let largest = forces.iter().fold(0.0_f64, |m, f| m.max(f.abs())).max(f64::MIN_POSITIVE);
-        let deepest = gaps.iter().fold(0.0_f64, |m, g| m.max(-g)).max(f64::MIN_POSITIVE);
-        let wrong = |i: usize| {
-            if self.active[i] {
-                (forces[i] < 0.0).then(|| -forces[i] / largest)
-            } else {
-                (gaps[i] < -gap_limit).then(|| -gaps[i] / deepest)
-            }
-        };
-        let list: Vec<(usize, f64)> =
-            (0..self.active.len()).filter_map(|i| wrong(i).map(|w| (i, w))).collect();
-        if list.is_empty() {
-            return false;
-        }
-        let before = self.active.clone();
-        if self.one_at_a_time {
-            if let Some(&(i, _)) =
-                list.iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)))
-            {
-                self.active[i] = !self.active[i];
-            }
-        } else {
-            for (i, _) in list {
-                self.active[i] = !self.active[i];
-            }
-        }
-        if !self.seen.insert(before) {
-            self.cycled = self.one_at_a_time;
-            self.one_at_a_time = true;
-            self.seen.clear();
-        }
-        true
     }
 }
 

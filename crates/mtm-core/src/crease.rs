@@ -7,6 +7,7 @@
 
 use std::sync::Arc;
 
+use crate::curvature::curvatures;
 use crate::mesh::{add, dot, norm, scaled, sub};
 use crate::motion::RigidMotion;
 use crate::surface::{Closest, Surface};
@@ -17,6 +18,8 @@ const JUMPS: u8 = 3;
 /// Share of a wall's normal that no other wall has, below which it is the same wall (12°): the crease of
 /// flatter walls is ill placed, and their normals turn little enough to follow.
 const SAME_WALL: f64 = 0.2;
+/// Cosine between a wall's normal and the way to a node from which that way leads along the wall.
+const FACING: f64 = 0.5;
 /// Most walls of a node: a third leaves it no freedom.
 const MOST_WALLS: usize = 3;
 
@@ -31,13 +34,26 @@ pub struct ContactRow {
     pub point: [f64; 3],
 }
 
-/// Closest point of one node.
+/// Where the surface that one node slides on lies: the contact surface, shifted and thickened.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Seat {
+    /// Shift of the node's surface from the contact surface, mm.
+    pub offset: [f64; 3],
+    /// Distance that the node keeps from it, out of the bone, mm.
+    pub gap: f64,
+}
+
+/// Closest point of the surface that one node slides on.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Foot {
     pub point: [f64; 3],
     pub normal: [f64; 3],
     pub triangle: u32,
+    /// Weights of the triangle's corners.
+    pub barycentric: [f64; 3],
     pub on_border: bool,
+    /// Distance of the node from its surface, negative behind it, mm.
+    pub gap: f64,
 }
 
 impl Foot {
@@ -58,34 +74,77 @@ pub(crate) enum MovedSurface {
 }
 
 impl MovedSurface {
-    /// Closest point of the surface.
-    pub fn foot(&self, at: [f64; 3]) -> Foot {
-        self.ask(at, Surface::closest_one)
+    /// Closest point to a node at `at`; on a crease, with the normal of the wall that faces it most.
+    pub fn foot(&self, seat: &Seat, at: [f64; 3]) -> Foot {
+        self.ask(seat, at, |surface, at| surface.facing(at, &surface.closest_one(at)))
     }
 
     /// Closest point of the wall that `triangle` belongs to.
-    pub fn foot_from(&self, at: [f64; 3], triangle: u32) -> Foot {
-        self.ask(at, |surface, at| surface.closest_from(at, triangle))
+    pub fn foot_from(&self, seat: &Seat, at: [f64; 3], triangle: u32) -> Foot {
+        self.ask(seat, at, |surface, at| surface.closest_from(at, triangle))
     }
 
-    fn ask(&self, at: [f64; 3], closest: impl Fn(&Surface, [f64; 3]) -> Closest) -> Foot {
-        let foot = |c: Closest| Foot {
-            point: c.point,
-            normal: c.normal,
-            triangle: c.triangle,
-            on_border: c.on_border,
-        };
-        match self {
+    fn ask(
+        &self,
+        seat: &Seat,
+        at: [f64; 3],
+        closest: impl Fn(&Surface, [f64; 3]) -> Closest,
+    ) -> Foot {
+        let own = sub(at, seat.offset);
+        let (found, point, normal) = match self {
             Self::Rigid(rest, rigid) => {
-                let at_rest = foot(closest(rest, rigid.apply_inverse(at)));
-                Foot {
-                    point: rigid.apply(at_rest.point),
-                    normal: rigid.rotate(at_rest.normal),
-                    ..at_rest
-                }
+                let found = closest(rest, rigid.apply_inverse(own));
+                (found, rigid.apply(found.point), rigid.rotate(found.normal))
             }
-            Self::Moved(surface) => foot(closest(surface, at)),
-            Self::Unused => Foot { point: at, normal: [0.0; 3], triangle: 0, on_border: false },
+            Self::Moved(surface) => {
+                let found = closest(surface, own);
+                (found, found.point, found.normal)
+            }
+            Self::Unused => {
+                let found = Foot {
+                    point: at,
+                    normal: [0.0; 3],
+                    triangle: 0,
+                    barycentric: [0.0; 3],
+                    on_border: false,
+                    gap: 0.0,
+                };
+                return found;
+            }
+        };
+        let away = sub(own, point);
+        let distance = if found.on_border { dot(normal, away) } else { found.signed_distance };
+        // Out of the bone: along the closest distance; the normal stands in past a border, on the
+        // surface itself, and over a crease, where that way leads along the wall.
+        let straight = scaled(away, 1.0 / distance);
+        let faces = !found.on_border && dot(straight, normal) > FACING;
+        let outward = if faces { straight } else { normal };
+        Foot {
+            point: add(add(point, seat.offset), scaled(outward, seat.gap)),
+            normal,
+            triangle: found.triangle,
+            barycentric: found.barycentric,
+            on_border: found.on_border,
+            gap: distance - seat.gap,
+        }
+    }
+
+    /// Principal curvatures of the normal field at a foot, 1/mm, with their directions.
+    pub fn curvatures(&self, foot: &Foot) -> [(f64, [f64; 3]); 2] {
+        match self {
+            Self::Rigid(rest, rigid) => curvatures(rest, foot.triangle, foot.barycentric)
+                .map(|(curvature, axis)| (curvature, rigid.rotate(axis))),
+            Self::Moved(surface) => curvatures(surface, foot.triangle, foot.barycentric),
+            Self::Unused => [(0.0, [0.0; 3]); 2],
+        }
+    }
+
+    /// Where a closest point of the surface at rest lies now.
+    pub fn carried(&self, rest: &Closest) -> [f64; 3] {
+        match self {
+            Self::Rigid(_, rigid) => rigid.apply(rest.point),
+            Self::Moved(surface) => surface.point_at(rest.triangle, rest.barycentric),
+            Self::Unused => rest.point,
         }
     }
 
@@ -113,10 +172,16 @@ impl Walls {
     }
 
     /// Feet on the same walls for a node at `at`, whose closest point is `nearest`.
-    pub fn feet_at(&self, surface: &MovedSurface, at: [f64; 3], nearest: Foot) -> Vec<Foot> {
+    pub fn feet_at(
+        &self,
+        surface: &MovedSurface,
+        seat: &Seat,
+        at: [f64; 3],
+        nearest: Foot,
+    ) -> Vec<Foot> {
         match self.feet.as_slice() {
             [_] => vec![nearest],
-            several => several.iter().map(|f| surface.foot_from(at, f.triangle)).collect(),
+            several => several.iter().map(|f| surface.foot_from(seat, at, f.triangle)).collect(),
         }
     }
 
@@ -143,8 +208,15 @@ impl Walls {
 
     /// Notes that the node, now at `at` with closest point `nearest` off its gap by more than the
     /// limit, may have left its walls; whether the wall it found was taken on.
-    pub fn leave(&mut self, surface: &MovedSurface, at: [f64; 3], nearest: Foot) -> bool {
-        let feet: Vec<Foot> = self.feet.iter().map(|f| surface.foot_from(at, f.triangle)).collect();
+    pub fn leave(
+        &mut self,
+        surface: &MovedSurface,
+        seat: &Seat,
+        at: [f64; 3],
+        nearest: Foot,
+    ) -> bool {
+        let feet: Vec<Foot> =
+            self.feet.iter().map(|f| surface.foot_from(seat, at, f.triangle)).collect();
         if feet.iter().any(|f| norm(sub(f.normal, nearest.normal)) <= SAME_WALL) {
             return false;
         }

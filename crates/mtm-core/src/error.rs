@@ -287,6 +287,78 @@ pub enum MtmError {
         /// What to try.
         advice: &'static str,
     },
+    /// Fewer points than a registration needs.
+    #[error("{what} needs {needed} {shape} at least, and there are {found}")]
+    TooFewPoints {
+        /// What needs them.
+        what: &'static str,
+        /// How many there are.
+        found: usize,
+        /// How many are needed.
+        needed: usize,
+        /// What they must be, in words.
+        shape: &'static str,
+    },
+    /// Two points of a registration are one.
+    #[error(
+        "{what} {first} and {second} coincide: {distance:.3e} mm apart; remove one of them or place it again"
+    )]
+    CoincidentPoints {
+        /// The points.
+        what: &'static str,
+        /// First of the pair.
+        first: usize,
+        /// Second of the pair.
+        second: usize,
+        /// Their distance, mm.
+        distance: f64,
+    },
+    /// The points of a registration do not span the space that it needs.
+    #[error(
+        "{what} lie in one {shape}: {thickness:.3e} mm across for an extent of {size:.3e} mm, where more than {limit:.0e} of it is needed; add a point away from it"
+    )]
+    FlatPoints {
+        /// The points.
+        what: &'static str,
+        /// "plane" or "line".
+        shape: &'static str,
+        /// Their extent across it, mm.
+        thickness: f64,
+        /// Their longest extent, mm.
+        size: f64,
+        /// Allowed ratio of both.
+        limit: f64,
+    },
+    /// The points of a registration leave its motion open.
+    #[error("{what} is not determined: {reason}")]
+    NotDetermined {
+        /// What is sought.
+        what: &'static str,
+        /// Why, and what to do.
+        reason: String,
+    },
+    /// A matrix that a registration begins with is no rigid motion.
+    #[error("{what}: {problem}")]
+    NotRigid {
+        /// The matrix.
+        what: &'static str,
+        /// What is wrong with it, and the mend.
+        problem: String,
+    },
+    /// Iterative closest points were still moving at the last step.
+    #[error(
+        "icp did not converge: in step {iterations} the points still moved by {motion:.3e} mm where {tolerance:.3e} mm counts as rest, rms distance {:.4e} mm after {:.4e} mm at first; begin nearer (initial), leave out pairs that have no partner (trim, max_distance), or allow more steps", .history.last().copied().unwrap_or(f64::NAN), .history.first().copied().unwrap_or(f64::NAN)
+    )]
+    IcpNotConverged {
+        /// Steps done.
+        iterations: usize,
+        /// Largest motion of a point in the last step, mm.
+        motion: f64,
+        /// Motion that counts as rest, mm.
+        tolerance: f64,
+        /// Root mean square distance before the first step and after each, mm.
+        history: Vec<f64>,
+    },
     /// The caller asked to stop.
     #[error("interrupted by the caller")]
     Interrupted,
@@ -318,6 +390,8 @@ pub enum ErrorKind {
     Contact,
     /// Solver options and outcomes.
     Solver,
+    /// Landmarks and points that are to be brought together.
+    Registration,
     /// The caller asked to stop.
     Interrupted,
 }
@@ -349,6 +423,12 @@ impl MtmError {
             Self::NotPositiveDefinite { .. }
             | Self::NotConverged { .. }
             | Self::OutOfMemory { .. } => ErrorKind::Solver,
+            Self::TooFewPoints { .. }
+            | Self::CoincidentPoints { .. }
+            | Self::FlatPoints { .. }
+            | Self::NotDetermined { .. }
+            | Self::NotRigid { .. }
+            | Self::IcpNotConverged { .. } => ErrorKind::Registration,
             Self::Interrupted => ErrorKind::Interrupted,
         }
     }
@@ -360,6 +440,7 @@ impl MtmError {
             Self::ContactCycle { .. }
                 | Self::NotPositiveDefinite { .. }
                 | Self::NotConverged { .. }
+                | Self::IcpNotConverged { .. }
                 | Self::OutOfMemory { .. }
                 | Self::Interrupted
         )

@@ -50,12 +50,15 @@
 //! # }
 //! ```
 
+mod acceleration;
 pub mod blocks;
 pub mod boundary;
 pub mod cholesky;
 pub mod constraints;
 pub mod contact;
 pub mod crease;
+mod curvature;
+pub mod equivalent;
 pub mod error;
 mod error_bound;
 pub mod fibre;
@@ -68,10 +71,12 @@ pub mod motion;
 pub mod multigrid;
 pub mod ordering;
 pub mod parting;
+pub mod registration;
 pub mod relaxation;
 pub mod replan;
 pub mod restraint;
 mod row_sums;
+mod settling;
 pub mod signed_distance;
 pub mod solution;
 pub mod statics;
@@ -85,12 +90,16 @@ pub mod winding;
 
 pub use boundary::{Boundary, Conflicts, Gap, Motion, NodeKind, Plan, Segment};
 pub use contact::{ContactMode, ContactOptions};
+pub use equivalent::{Muscle, MuscleShares, SamplingOptions, sample_muscles};
 pub use error::{ErrorKind, MtmError, Result};
-pub use fibre::MuscleFibres;
+pub use fibre::{MuscleFibres, MuscleKind, OrientedBox};
 pub use material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
 pub use mesh::{MeshQuality, TetMesh};
 pub use method::{Interrupt, Method, StaticOptions};
 pub use motion::{RigidMotion, SurfaceMotion};
+pub use registration::icp::{IcpFit, IcpOptions};
+pub use registration::rigid::{RigidFit, RigidFitOptions};
+pub use registration::thin_plate::ThinPlateSpline;
 pub use replan::PlanOperator;
 pub use solution::{ContactResult, Solution, Timings};
 pub use statics::StaticSolver;

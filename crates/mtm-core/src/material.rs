@@ -108,9 +108,21 @@ pub struct Tissue {
 #[derive(Debug, Clone)]
 enum Law {
     Isotropic(Vec<Lame>),
-    Spencer { constants: Vec<Spencer>, fibre: Vec<[f64; 3]> },
+    Spencer {
+        constants: Vec<Spencer>,
+        fibre: Vec<[f64; 3]>,
+    },
     General(Vec<Voigt>),
+    /// `base` where the row of a tet is [`NO_ROW`].
+    Composite {
+        base: Lame,
+        rows: Vec<Voigt>,
+        row_of: Vec<u32>,
+    },
 }
+
+/// Stands for the base material of a composite tissue.
+const NO_ROW: u32 = u32::MAX;
 
 /// Constants of one tet, as the tensor formulas take them.
 #[derive(Debug, Clone, Copy)]
@@ -324,6 +336,35 @@ impl Tissue {
         }
     }
 
+    /// Isotropic tissue of `n_tets` tets but for some: `rows[i]` is the stiffness of tet `tets[i]`.
+    ///
+    /// # Errors
+    /// Those of [`Tissue::isotropic`] and [`Tissue::from_stiffness`], with the tet;
+    /// [`MtmError::IndexOutOfRange`] for a tet that is not there.
+    pub fn composite(base: Elastic, n_tets: usize, tets: &[u32], rows: Vec<Voigt>) -> Result<Self> {
+        Self::isotropic(&[base])?;
+        check_rows(n_tets)?;
+        let mut row_of = vec![NO_ROW; n_tets];
+        for (row, &tet) in tets.iter().enumerate() {
+            *row_of.get_mut(tet as usize).ok_or_else(|| MtmError::IndexOutOfRange {
+                what: "tets".into(),
+                row,
+                item: "tet",
+                index: tet as usize,
+                count: n_tets,
+                kind: ErrorKind::Material,
+            })? = row as u32;
+        }
+        let failure = tets
+            .par_iter()
+            .zip(&rows)
+            .find_map_first(|(&tet, c)| check_voigt(tet as usize, c).err());
+        match failure {
+            Some(error) => Err(error),
+            None => Ok(Self { law: Law::Composite { base: base.into(), rows, row_of } }),
+        }
+    }
+
     /// Equivalent tissue of tets with muscle fraction `fraction` and unit `fibre` (ignored where the
     /// fraction is 0), from the constants of `preset` (Kim et al. 2010, section 2.3; Uesu et al. 2005).
     pub fn mixture(
@@ -380,6 +421,7 @@ impl Tissue {
             Law::Isotropic(c) => c.len(),
             Law::Spencer { constants, fibre } => constants.len().max(fibre.len()),
             Law::General(c) => c.len(),
+            Law::Composite { row_of, .. } => row_of.len(),
         }
     }
 
@@ -413,6 +455,10 @@ impl Tissue {
                 }
             }
             Law::General(c) => TetMaterial::General(row(c, t)),
+            Law::Composite { base, rows, row_of } => match row_of[t] {
+                NO_ROW => TetMaterial::Isotropic(*base),
+                row => TetMaterial::General(&rows[row as usize]),
+            },
         }
     }
 

@@ -85,7 +85,7 @@ impl RigidMotion {
 }
 
 /// What keeps a matrix from being a rigid motion, with the mend.
-fn rigid_problem(matrix: &[[f64; 4]; 4]) -> Option<String> {
+pub(crate) fn rigid_problem(matrix: &[[f64; 4]; 4]) -> Option<String> {
     for (i, row) in matrix.iter().enumerate() {
         if let Some(j) = row.iter().position(|value| !value.is_finite()) {
             let value = row[j];

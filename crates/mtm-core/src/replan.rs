@@ -120,7 +120,7 @@ impl StaticSolver {
             fields.push(vec![[0.0; 3]; self.unknowns.len()]);
             let rest = |(row, &foot): (&ContactRow, &[f64; 3])| {
                 let node = &sliding[row.node];
-                dot(row.normal, sub(foot, mesh.nodes()[node.node as usize])) + node.gap
+                dot(row.normal, sub(foot, mesh.nodes()[node.node as usize]))
             };
             offsets.push(rows.iter().zip(&feet).map(rest).collect());
         }

@@ -16,7 +16,8 @@ pub struct ContactResult {
     pub normals: Vec<[f64; 3]>,
     /// Contact force along the normal, N; positive pushes the tissue away from the bone.
     pub forces: Vec<f64>,
-    /// Distance along the normal less the prescribed gap, mm.
+    /// Distance from the surface less the prescribed gap, mm; for nodes that keep their offset at rest,
+    /// distance from the surface shifted by it.
     pub gaps: Vec<f64>,
     /// Whether the node is held to the surface.
     pub active: Vec<bool>,

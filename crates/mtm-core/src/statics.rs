@@ -60,7 +60,8 @@ impl StaticSolver {
                 unknowns.push(j as u32);
             }
         }
-        let sliding = Sliding::new(&boundary, &mesh, &row_of, options.contact.mode)?;
+        let stiffness = |j: usize| own_stiffness(tensors.matrix(), j);
+        let sliding = Sliding::new(&boundary, &mesh, &row_of, stiffness, options.contact.mode)?;
         clock.lap("contact_setup", sliding.is_some());
         let normals: Vec<(u32, [f64; 3])> = sliding
             .iter()
@@ -322,6 +323,12 @@ impl StaticSolver {
             .solve_columns(columns, scales, self.sliding.as_ref().zip(frozen), interrupted)
             .map_err(|e| by_node(e, &self.unknowns))
     }
+}
+
+/// Mean stiffness of node `j` by itself, a third of the trace of K_jj, N/mm.
+fn own_stiffness(matrix: &BlockMatrix, j: usize) -> f64 {
+    let own = matrix.diagonal_block(j);
+    (own[0] + own[4] + own[8]) / 3.0
 }
 
 /// Names the node instead of the row of the reduced system.

@@ -4,6 +4,7 @@
 //! distance to a triangle is computed in [`crate::triangle`].
 
 use std::cell::Cell;
+use std::cmp::Ordering;
 use std::f64::consts::PI;
 use std::sync::Arc;
 
@@ -31,6 +32,9 @@ const BOUND_SLACK: f64 = 1.0 - 16.0 * f64::EPSILON;
 
 /// Length of a blended normal below which its direction is lost and the facet normal stands in.
 const NORMAL_CANCELLED: f64 = 1e-6;
+
+/// Relative difference of two distances to one point of a crease, measured on its triangles.
+const SAME_DISTANCE: f64 = 1e-12;
 
 /// Points a thread takes at once: large enough to hide the hand-over.
 const POINTS_PER_TASK: usize = 64;
@@ -264,6 +268,29 @@ impl Surface {
         }
     }
 
+    /// `found`, the closest point to `point`, on the wall that faces it most: on a crease, the triangles
+    /// that meet there differ in their normals, and `closest_one` takes the one that comes first.
+    pub(crate) fn facing(&self, point: [f64; 3], found: &Closest) -> Closest {
+        if found.feature == Feature::Face || found.distance == 0.0 {
+            return *found;
+        }
+        let p = Vec3::from(point);
+        let away = (p - Vec3::from(found.point)) / found.signed_distance;
+        let faces = |c: &Closest| away.dot(&Vec3::from(c.normal));
+        self.topology
+            .all_round(found.triangle, found.feature)
+            .into_iter()
+            .map(|t| self.describe(&p, t, &self.closest_on(&p, t)))
+            .filter(|c| c.distance <= found.distance * (1.0 + SAME_DISTANCE))
+            .fold(*found, |best, c| if faces(&c) > faces(&best) { c } else { best })
+    }
+
+    /// The point of a triangle with the weights `barycentric` of its corners, mm.
+    pub(crate) fn point_at(&self, triangle: u32, barycentric: [f64; 3]) -> [f64; 3] {
+        let [a, b, c] = self.corners(triangle as usize);
+        (a * barycentric[0] + b * barycentric[1] + c * barycentric[2]).into()
+    }
+
     /// Unit normal at a point of a triangle, continuous across all edges but creases.
     ///
     /// `triangle`: its index, below the number of triangles. `barycentric`: weights of its corners.
@@ -344,6 +371,19 @@ impl Surface {
         self.shape.mean_edge
     }
 
+    /// An order of surfaces by their shape alone, so that sums over several of them do not depend on the
+    /// order in which they are listed; only equal shapes tie.
+    pub(crate) fn order(&self, other: &Self) -> Ordering {
+        let coordinates = |s: &Self| s.shape.vertices.as_flattened().to_vec();
+        let by_area = self.area().total_cmp(&other.area());
+        by_area
+            .then_with(|| {
+                let pairs = coordinates(self).into_iter().zip(coordinates(other));
+                pairs.map(|(a, b)| a.total_cmp(&b)).find(|o| o.is_ne()).unwrap_or(Ordering::Equal)
+            })
+            .then_with(|| self.triangles().cmp(other.triangles()))
+    }
+
     pub(crate) fn corners(&self, triangle: usize) -> [Vec3; 3] {
         triangle::corners(&self.shape.vertices, self.topology.triangles[triangle])
     }
@@ -352,13 +392,18 @@ impl Surface {
         self.shape.facet_normals[triangle]
     }
 
+    /// Unit normals at the corners of a triangle, from which normals on it are blended.
+    pub(crate) fn corner_normals(&self, triangle: usize) -> [Vec3; 3] {
+        self.topology.groups[triangle].map(|g| self.shape.group_normals[g as usize])
+    }
+
     fn closest_on(&self, p: &Vec3, t: u32) -> TrianglePoint {
         let t = t as usize;
         triangle::closest_point(p, &self.corners(t), self.topology.triangles[t])
     }
 
     fn blended_normal(&self, t: usize, barycentric: [f64; 3]) -> Vec3 {
-        let [a, b, c] = self.topology.groups[t].map(|g| self.shape.group_normals[g as usize]);
+        let [a, b, c] = self.corner_normals(t);
         let blend = a * barycentric[0] + b * barycentric[1] + c * barycentric[2];
         let length = blend.norm();
         if length > NORMAL_CANCELLED { blend / length } else { self.shape.facet_normals[t] }

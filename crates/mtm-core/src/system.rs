@@ -7,7 +7,7 @@ use crate::cholesky::{Factor, Symbolic, TailFactor};
 use crate::constraints::{
     Constraint, add_offsets, along_normals, orthonormal, projected, projected_rhs,
 };
-use crate::contact::{Constraints, ContactState, Response, Sliding};
+use crate::contact::{Constraints, ContactState, Response, Sliding, Spring};
 use crate::crease::ContactRow;
 use crate::error::{MtmError, Result};
 use crate::krylov::{PcgOptions, Preconditioner, pcg};
@@ -185,7 +185,8 @@ impl System {
                 Ok(symbolic.solve(&symbolic.factor(matrix)?, b))
             }
             Kept::Pcg { matrix, .. } | Kept::Relaxation { matrix, .. } => {
-                self.iterate(matrix, b, scale, effort, interrupted)
+                let start = vec![[0.0; 3]; b.len()];
+                self.iterate(matrix, b, &start, scale, effort, interrupted)
             }
         }
     }
@@ -217,7 +218,8 @@ impl System {
         }
         let mut last = Vec::new();
         let state = sliding.settle(motions, &options.contact, interrupted, |c| {
-            let (u, response) = self.solve_projected(b, sliding, c, scale, effort, interrupted)?;
+            let (u, response) =
+                self.solve_projected(b, sliding, c, &last, scale, effort, interrupted)?;
             last = u;
             Ok(response)
         })?;
@@ -245,9 +247,10 @@ impl System {
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
-            let c = Constraints { rows: frozen.rows, offsets };
+            let c = Constraints { rows: frozen.rows, offsets, springs: &[] };
             let Kept::Direct { symbolic, factor, tail: Some(tail) } = &self.kept else {
-                let solved = self.solve_projected(b, sliding, &c, scale, &mut effort, interrupted);
+                let solved =
+                    self.solve_projected(b, sliding, &c, &[], scale, &mut effort, interrupted);
                 return Ok(solved?.0);
             };
             let mut x = symbolic.permuted(b);
@@ -262,11 +265,14 @@ impl System {
     }
 
     /// One constrained solve on the projected system P A P + k (I − P), P = I − n⊗n on held nodes.
+    ///
+    /// `near`: displacements that conjugate gradients start from, or nothing.
     fn solve_projected(
         &self,
         b: &[[f64; 3]],
         sliding: &Sliding,
         c: &Constraints<'_>,
+        near: &[[f64; 3]],
         scale: f64,
         effort: &mut Effort,
         interrupted: Interrupt<'_>,
@@ -288,8 +294,9 @@ impl System {
             | Kept::Relaxation { matrix, .. } => matrix,
             Kept::Direct { .. } => unreachable!("the dense flexibility serves contact there"),
         };
-        let system = projected(matrix, &constraints);
-        let rhs = projected_rhs(matrix, b, &constraints);
+        let mut system = projected(matrix, &constraints);
+        let mut rhs = projected_rhs(matrix, b, &constraints);
+        add_springs(&mut system, &mut rhs, sliding, c.springs);
         let mut x = match &self.kept {
             Kept::Refactored { symbolic, .. } => {
                 let factor = symbolic.factor(&system)?;
@@ -299,7 +306,12 @@ impl System {
             }
             _ => {
                 let reach = constraints.iter().fold(scale, |m, c| m.max(c.offset.abs()));
-                self.iterate(&system, &rhs, reach, effort, interrupted)?
+                let mut start = near.to_vec();
+                start.resize(b.len(), [0.0; 3]);
+                for k in &constraints {
+                    start[k.row] = sub(start[k.row], scaled(k.normal, dot(k.normal, start[k.row])));
+                }
+                self.iterate(&system, &rhs, &start, reach, effort, interrupted)?
             }
         };
         add_offsets(&mut x, &constraints);
@@ -308,11 +320,12 @@ impl System {
         Ok((x, Response { displacements, forces }))
     }
 
-    /// Solves with the iterative method, to an error bound of `tolerance × scale`.
+    /// Solves with the iterative method, conjugate gradients from `start`, to an error bound of `tolerance × scale`.
     fn iterate(
         &self,
         matrix: &BlockMatrix,
         b: &[[f64; 3]],
+        start: &[[f64; 3]],
         scale: f64,
         effort: &mut Effort,
         interrupted: Interrupt<'_>,
@@ -320,10 +333,9 @@ impl System {
         if b.iter().flatten().all(|&v| v == 0.0) {
             return Ok(vec![[0.0; 3]; b.len()]);
         }
-        let start = vec![[0.0; 3]; b.len()];
         // Loads move the body where bone does not: one cycle tells how far, to the order of magnitude.
         let tolerance = |multigrid: &Multigrid| {
-            let mut first = start.clone();
+            let mut first = vec![[0.0; 3]; b.len()];
             multigrid.apply(b, &mut first);
             self.tolerance * first.iter().fold(scale, |m, v| m.max(norm(*v)))
         };
@@ -333,7 +345,7 @@ impl System {
                 let defaults = PcgOptions::default();
                 let max_iterations = self.max_iterations.unwrap_or(defaults.max_iterations);
                 let options = PcgOptions { tolerance, max_iterations, ..defaults };
-                let found = pcg(matrix, b, &start, multigrid.as_ref(), &options, interrupted)?;
+                let found = pcg(matrix, b, start, multigrid.as_ref(), &options, interrupted)?;
                 effort.error_bound = found.error_bound_mm;
                 effort.iterations += found.iterations;
                 effort.history.extend(found.residual_history);
@@ -429,23 +441,53 @@ fn gave_up(error: MtmError, sweeps: usize, tolerance: f64) -> MtmError {
 }
 
 /// Contact forces λ from (Nᵀ S⁻¹ N) λ = g − Nᵀ u_free, and the displacements of the sliding nodes.
+///
+/// A spring of stiffness k adds a column along its axis, with 1/k on the diagonal.
 fn respond(tail: &TailFactor, free: &[[f64; 3]], c: &Constraints<'_>) -> Result<Response> {
+    let (rows, goals, softness) = with_springs(c);
     let mut forces: Vec<f64> =
-        c.rows.iter().zip(c.offsets).map(|(r, g)| g - dot(r.normal, free[r.node])).collect();
-    let nodes: Vec<usize> = c.rows.iter().map(|r| r.node).collect();
-    let normals: Vec<[f64; 3]> = c.rows.iter().map(|r| r.normal).collect();
-    let dense = tail.normal_flexibility(&nodes, &normals);
+        rows.iter().zip(&goals).map(|(r, g)| g - dot(r.normal, free[r.node])).collect();
+    let nodes: Vec<usize> = rows.iter().map(|r| r.node).collect();
+    let normals: Vec<[f64; 3]> = rows.iter().map(|r| r.normal).collect();
+    let dense = tail.normal_flexibility(&nodes, &normals, &softness);
     dense.solve(&mut forces).map_err(|at| MtmError::NotPositiveDefinite {
         node: tail.row(nodes[at]),
         detail: "the flexibility of the sliding nodes is singular".into(),
     })?;
     let displacements = tail
-        .respond(&row_pushes(free.len(), c.rows, &forces))
+        .respond(&row_pushes(free.len(), &rows, &forces))
         .iter()
         .zip(free)
         .map(|(r, f)| [0, 1, 2].map(|i| r[i] + f[i]))
         .collect();
+    forces.truncate(c.rows.len());
     Ok(Response { displacements, forces })
+}
+
+/// The rows of `c` and after them one for each spring, with what each asks for and how softly.
+fn with_springs(c: &Constraints<'_>) -> (Vec<ContactRow>, Vec<f64>, Vec<f64>) {
+    let (mut rows, mut goals) = (c.rows.to_vec(), c.offsets.to_vec());
+    let mut softness = vec![0.0; rows.len()];
+    for spring in c.springs {
+        rows.push(ContactRow { node: spring.node, normal: spring.axis, point: [0.0; 3] });
+        goals.push(spring.goal);
+        softness.push(1.0 / spring.stiffness);
+    }
+    (rows, goals, softness)
+}
+
+/// Adds springs to a projected system: k a⊗a on their rows, and k a g to the right-hand side.
+fn add_springs(
+    system: &mut BlockMatrix,
+    rhs: &mut [[f64; 3]],
+    sliding: &Sliding,
+    springs: &[Spring],
+) {
+    for spring in springs {
+        let row = sliding.nodes()[spring.node].row as usize;
+        rhs[row] = add(rhs[row], scaled(spring.axis, spring.stiffness * spring.goal));
+        system.add_to_diagonal(row, spring.axis, spring.stiffness);
+    }
 }
 
 /// Estimate of the largest nodal error of a solution by factor, mm.

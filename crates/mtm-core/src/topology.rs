@@ -53,17 +53,26 @@ impl Topology {
     /// The other triangles at a feature of triangle `t`: across an edge, or round a corner, as far as
     /// normals are continuous.
     pub fn round(&self, t: u32, feature: Feature) -> Vec<u32> {
+        self.walk(t, feature, |at, k| self.smooth_neighbour(at, k))
+    }
+
+    fn walk(
+        &self,
+        t: u32,
+        feature: Feature,
+        across: impl Fn(usize, usize) -> Option<u32>,
+    ) -> Vec<u32> {
         let start = t as usize;
         match feature {
             Feature::Face => Vec::new(),
-            Feature::Edge(k) => self.smooth_neighbour(start, k as usize).into_iter().collect(),
+            Feature::Edge(k) => across(start, k as usize).into_iter().collect(),
             Feature::Vertex(k) => {
                 let vertex = self.triangles[start][k as usize];
                 let mut out = Vec::new();
                 // One way round, and the other way where a crease or border stopped the first.
                 for first in [k as usize, (k as usize + 2) % 3] {
                     let (mut edge, mut at) = (first, start);
-                    while let Some(next) = self.smooth_neighbour(at, edge) {
+                    while let Some(next) = across(at, edge) {
                         if next == t {
                             return out;
                         }
@@ -80,6 +89,13 @@ impl Topology {
                 out
             }
         }
+    }
+
+    /// The other triangles at a feature of triangle `t`, creases or not, as far as edges join two.
+    pub fn all_round(&self, t: u32, feature: Feature) -> Vec<u32> {
+        self.walk(t, feature, |at, k| {
+            Some(self.neighbours[at][k]).filter(|&next| next != NO_TRIANGLE)
+        })
     }
 
     /// Triangle across edge `k` of triangle `t` if normals are continuous there.

@@ -154,9 +154,11 @@ impl WindingTree {
         let mut ranges = Vec::with_capacity(n / 2 + 1);
         split(&mut order, 0, &centroids, &mut ranges);
         let triangles: Vec<Sheet> = order.iter().map(|&t| sheets[t as usize]).collect();
+        let moments = moments(&ranges, &triangles);
         let clusters = ranges
             .par_iter()
-            .map(|range| Cluster::new(range, &triangles[range.start..range.end], beta))
+            .zip(&moments)
+            .map(|(range, moments)| Cluster::new(range, moments, &triangles, beta))
             .collect();
         Self { clusters, triangles }
     }
@@ -205,48 +207,107 @@ fn split(order: &mut [u32], start: usize, centroids: &[Vec3], ranges: &mut Vec<C
     ranges[this].next = ranges.len() as u32;
 }
 
-impl Cluster {
-    fn new(range: &ClusterRange, triangles: &[Sheet], beta: f64) -> Self {
-        let mut centre = Vec3::zeros();
-        let mut area = 0.0;
-        for Sheet { corners: [a, b, c], normal } in triangles {
-            let triangle_area = 0.5 * normal.norm();
-            centre += (a + b + c) * (triangle_area / 3.0);
-            area += triangle_area;
-        }
-        centre /= area;
+/// Moments of each cluster: of a leaf from its triangles, of the others from their two halves.
+fn moments(ranges: &[ClusterRange], triangles: &[Sheet]) -> Vec<Moments> {
+    let mut moments: Vec<Moments> = ranges
+        .par_iter()
+        .map(|range| {
+            let leaf = if range.is_leaf { &triangles[range.start..range.end] } else { &[] };
+            Moments::of(leaf)
+        })
+        .collect();
+    // The halves of a cluster stand behind it.
+    for at in (0..ranges.len()).rev().filter(|&at| !ranges[at].is_leaf) {
+        let halves = [at + 1, ranges[at + 1].next as usize];
+        moments[at] = Moments::joined(halves.map(|half| &moments[half]));
+    }
+    moments
+}
 
-        let mut radius_squared = 0.0_f64;
-        let mut zeroth = Vec3::zeros();
-        let mut m = [[0.0; 3]; 3];
-        let mut t = [[[0.0; 3]; 3]; 3];
+/// Area of a cluster and its moments about its centroid, with n dA the area element and d the way from there.
+#[derive(Debug, Clone, Default)]
+struct Moments {
+    area: f64,
+    centre: Vec3,
+    /// ∫ n dA.
+    zeroth: Vec3,
+    /// ∫ n ⊗ d dA.
+    first: [[f64; 3]; 3],
+    /// ∫ n ⊗ d ⊗ d dA.
+    second: [[[f64; 3]; 3]; 3],
+}
+
+impl Moments {
+    fn of(triangles: &[Sheet]) -> Self {
+        let mut sum = Self::default();
+        for Sheet { corners: [a, b, c], normal } in triangles {
+            let area = 0.5 * normal.norm();
+            sum.centre += (a + b + c) * (area / 3.0);
+            sum.area += area;
+        }
+        if sum.area > 0.0 {
+            sum.centre /= sum.area;
+        }
         for triangle in triangles {
-            let [a, b, c] = triangle.corners.map(|corner| corner - centre);
-            for corner in [&a, &b, &c] {
-                radius_squared = radius_squared.max(corner.norm_squared());
-            }
+            let [a, b, c] = triangle.corners.map(|corner| corner - sum.centre);
             let n = 0.5 * triangle.normal;
-            let sum = a + b + c;
-            zeroth += n;
+            let corners = a + b + c;
+            sum.zeroth += n;
             for i in 0..3 {
                 for j in 0..3 {
                     // ∫ d dA = A (a + b + c) / 3.
-                    m[i][j] += n[i] * sum[j] / 3.0;
+                    sum.first[i][j] += n[i] * corners[j] / 3.0;
                     for k in 0..3 {
                         // ∫ d ⊗ d dA = A (a⊗a + b⊗b + c⊗c + (a+b+c)⊗(a+b+c)) / 12.
-                        let square = a[j] * a[k] + b[j] * b[k] + c[j] * c[k] + sum[j] * sum[k];
-                        t[i][j][k] += n[i] * square / 12.0;
+                        let square =
+                            a[j] * a[k] + b[j] * b[k] + c[j] * c[k] + corners[j] * corners[k];
+                        sum.second[i][j][k] += n[i] * square / 12.0;
                     }
                 }
             }
         }
+        sum
+    }
+
+    /// Moments of two clusters together.
+    fn joined(halves: [&Self; 2]) -> Self {
+        let [a, b] = halves;
+        let area = a.area + b.area;
+        let centre = (a.centre * a.area + b.centre * b.area) / area;
+        let mut sum = Self { area, centre, ..Self::default() };
+        for half in halves {
+            // d about the common centre is d about the half's own and the way between the two.
+            let s = half.centre - centre;
+            let n = half.zeroth;
+            sum.zeroth += n;
+            for i in 0..3 {
+                for j in 0..3 {
+                    sum.first[i][j] += half.first[i][j] + n[i] * s[j];
+                    for k in 0..3 {
+                        sum.second[i][j][k] += half.second[i][j][k]
+                            + half.first[i][j] * s[k]
+                            + half.first[i][k] * s[j]
+                            + n[i] * s[j] * s[k];
+                    }
+                }
+            }
+        }
+        sum
+    }
+}
+
+impl Cluster {
+    fn new(range: &ClusterRange, moments: &Moments, triangles: &[Sheet], beta: f64) -> Self {
+        let corners = triangles[range.start..range.end].iter().flat_map(|t| &t.corners);
+        let radius_squared =
+            corners.map(|c| (c - moments.centre).norm_squared()).fold(0.0, f64::max);
         let is_leaf = range.is_leaf;
         Self {
-            centre,
+            centre: moments.centre,
             far_squared: beta * beta * radius_squared,
-            zeroth,
-            first: traceless_first(&m),
-            second: traceless_second(&t),
+            zeroth: moments.zeroth,
+            first: traceless_first(&moments.first),
+            second: traceless_second(&moments.second),
             next: range.next,
             first_triangle: if is_leaf { range.start as u32 } else { 0 },
             end_triangle: if is_leaf { range.end as u32 } else { 0 },

@@ -287,6 +287,11 @@ pub fn blocks(py: Python<'_>, blocks: Vec<[f64; 9]>) -> Bound<'_, PyArray3<f64>>
     blocks.into_flattened().into_pyarray(py).reshape([k, 3, 3]).expect("k blocks of 9 fill k×3×3")
 }
 
+/// (4, 4) float64, read-only.
+pub fn motion<'py>(py: Python<'py>, matrix: &[[f64; 4]; 4]) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    frozen(table(py, matrix.to_vec()))
+}
+
 /// (m, 6, 6) float64.
 pub fn voigt(py: Python<'_>, rows: Vec<[[f64; 6]; 6]>) -> Bound<'_, PyArray3<f64>> {
     let m = rows.len();

@@ -76,6 +76,7 @@ fn raise(kind: ErrorKind, is_input: bool, message: String) -> PyErr {
         ErrorKind::Boundary => 3,
         ErrorKind::Contact => 4,
         ErrorKind::Solver => 5,
+        ErrorKind::Registration => 6,
         _ => 0,
     };
     Python::attach(|py| match family(py) {
@@ -111,6 +112,12 @@ impl From<Failure> for PyErr {
         if error == MtmError::Interrupted {
             return PyKeyboardInterrupt::new_err("interrupted");
         }
-        raise(error.kind(), error.is_input(), error.to_string())
+        let raised = raise(error.kind(), error.is_input(), error.to_string());
+        if let MtmError::IcpNotConverged { history, .. } = error {
+            // What was reached stays with the error, for a caller who looks at it.
+            let noted = Python::attach(|py| raised.value(py).setattr("rms_history", history));
+            return noted.err().unwrap_or(raised);
+        }
+        raised
     }
 }

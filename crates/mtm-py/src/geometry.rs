@@ -236,6 +236,12 @@ impl PySurface {
         arrays::frozen(arrays::table(py, self.core.triangles().to_vec()))
     }
 
+    /// Unit normal of each vertex, weighted by angles, (v, 3) float64; zero where it has none.
+    #[getter]
+    fn vertex_normals<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        arrays::frozen(arrays::rows(py, self.core.vertex_normals()))
+    }
+
     /// Whether every edge has exactly two triangles, oriented alike.
     #[getter]
     fn is_closed(&self) -> bool {

@@ -1,10 +1,13 @@
 //! `cmfsim._core`: the binding of mtm-core. It converts, detaches and maps errors; it decides nothing.
 
 mod arrays;
+mod equivalent;
 mod errors;
+mod fibres;
 mod geometry;
 mod materials;
 mod model;
+mod registration;
 mod running;
 mod stuffing;
 
@@ -17,11 +20,17 @@ mod _core {
     use pyo3::prelude::*;
 
     #[pymodule_export]
+    use crate::equivalent::{PyMuscleShares, sample};
+    #[pymodule_export]
+    use crate::fibres::PyMuscleFibres;
+    #[pymodule_export]
     use crate::geometry::{PyMeshQuality, PySurface, PySurfaceMotion, PyTetMesh};
     #[pymodule_export]
     use crate::materials::{PyMassTensors, PyTissue};
     #[pymodule_export]
     use crate::model::{PyBoundary, PyPlanOperator, PySolution, PyStaticSolver};
+    #[pymodule_export]
+    use crate::registration::{PyFolds, PyIcpFit, PyRigidFit, PyThinPlateSpline, icp, rigid_fit};
 
     #[pymodule_export]
     use crate::stuffing::{distance_image, part_mesh, signed_distance_image, stuff_image};

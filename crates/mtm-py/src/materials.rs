@@ -191,7 +191,8 @@ impl PyTissue {
 }
 
 impl PyTissue {
-    fn wrap(core: mtm_core::error::Result<Tissue>) -> PyResult<Self> {
+    /// The Python object of a core tissue, or its error.
+    pub fn wrap(core: mtm_core::error::Result<Tissue>) -> PyResult<Self> {
         Ok(Self { core: Arc::new(core.map_err(Failure)?) })
     }
 }

@@ -37,8 +37,8 @@ const MEMORY_SHARE: f64 = 0.8;
 /// contact : dict of str to Surface, optional
 ///     Contact surface of each segment with sliding nodes, at rest, normals out of the bone.
 /// gap : dict of str to float, (k,) array_like or "rest", optional
-///     Distance along the normal that sliding nodes keep, mm; 0 puts them on the surface, "rest"
-///     keeps the distance each has at rest.
+///     Distance that sliding nodes keep from the surface, mm, negative behind it; 0 puts them on it,
+///     "rest" keeps the offset that each has at rest, carried by its segment.
 /// conflicts : {"error", "resolve"}
 ///     A node of two kinds is an error, or fixed wins over joined and joined over sliding.
 ///
@@ -529,7 +529,7 @@ impl PySolution {
         self.core.contact.forces.clone().into_pyarray(py)
     }
 
-    /// Distance along the normal less the prescribed gap, (s,) float64, mm; positive where lifted off.
+    /// Distance from the surface less the prescribed gap, (s,) float64, mm; positive where lifted off.
     #[getter]
     fn contact_gaps<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         self.core.contact.gaps.clone().into_pyarray(py)

@@ -1,6 +1,17 @@
 """From a case to the patient's model: here alone the stages before a solve are strung together."""
 
 from cmfsim.build.case_model import build_case, build_model
+from cmfsim.build.inputs import input_hashes
+from cmfsim.build.muscles import with_muscles
 from cmfsim.build.phantom_case import write_phantom_case
+from cmfsim.build.postoperative import Postoperative, read_postoperative
 
-__all__ = ["build_case", "build_model", "write_phantom_case"]
+__all__ = [
+    "Postoperative",
+    "build_case",
+    "build_model",
+    "input_hashes",
+    "read_postoperative",
+    "with_muscles",
+    "write_phantom_case",
+]

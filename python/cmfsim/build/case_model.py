@@ -21,6 +21,7 @@ from cmfsim.build.inputs import (
     read_case_landmarks,
     read_motion,
 )
+from cmfsim.build.muscles import with_muscles
 from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.checks import Floats
 from cmfsim.doctor import diagnose
@@ -217,7 +218,7 @@ def build_model(
     boundary = np.asarray(mesh.boundary_triangles())
     skin = _on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)
     stages.end()
-    return PatientModel(
+    patient = PatientModel(
         name=case.name,
         scene=scene,
         kinds=kinds,
@@ -225,10 +226,15 @@ def build_model(
         skin_triangles=boundary[skin],
         segments=cut.segments,
         anatomy=anatomy,
+        fat=case.tissue,
         landmarks=landmarks,
         findings=tuple(findings),
         summary=_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
     )
+    if case.muscles is None:
+        return patient
+    stages.begin("placing and sampling the muscles")
+    return with_muscles(patient, case.muscles, mesh=mesh)
 
 
 def _draw(model: PatientModel, folder: Path) -> list[str]:

@@ -148,6 +148,11 @@ def _files(case: Case) -> Iterator[Path]:
         yield case.surfaces.skin
         yield from case.surfaces.bones.values()
     optional = [case.landmarks.skull, case.landmarks.skin, case.mesh.parting, case.mesh.file]
+    if case.muscles is not None and isinstance(case.muscles.template, Path):
+        optional.append(case.muscles.template)
+    after = case.postoperative
+    if after is not None:
+        optional += [after.skin, after.image, after.landmarks, *after.bones.values()]
     for motion in case.plan.values():
         optional += [motion.transform, motion.surface, motion.moved_surface]
     yield from (path for path in optional if path is not None)

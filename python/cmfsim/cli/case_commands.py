@@ -17,7 +17,7 @@ from cmfsim.cli.terminal import StageProgress, columns, escaped, in_colour
 from cmfsim.doctor import diagnose, findings_text
 from cmfsim.io import Case
 
-__all__ = ["build", "doctor"]
+__all__ = ["build", "case_of", "checked", "doctor"]
 
 
 def doctor(options: argparse.Namespace) -> int:
@@ -38,6 +38,28 @@ def doctor(options: argparse.Namespace) -> int:
 
 def build(options: argparse.Namespace) -> int:
     """Builds a case, unless the doctor finds an error in it."""
+    case = case_of(options)
+    begun = time.perf_counter()
+    findings = () if options.no_doctor else checked(case, quiet=options.quiet)
+    if findings is None:
+        return BAD_INPUT
+    seconds = time.perf_counter() - begun
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        build_case = import_module("cmfsim.build").build_case
+        built = build_case(case, progress=progress.stage, check=False, findings=findings)
+    summary = dict(built.summary)
+    if not options.no_doctor:
+        summary["timings"] = {"checking the case": seconds, **summary["timings"]}
+    if options.json:
+        print(json.dumps(summary, allow_nan=False))
+        return DONE
+    width = min(columns(), WIDTH) if sys.stdout.isatty() else WIDTH
+    print(build_text(summary, colour=in_colour(sys.stdout), width=width))
+    return DONE
+
+
+def case_of(options: argparse.Namespace) -> Case:
+    """The case that a command names, with what its words change."""
     case = Case.load(options.case)
     if options.edge_length is not None:
         edge_length = as_positive("--edge-length", options.edge_length)
@@ -46,28 +68,18 @@ def build(options: argparse.Namespace) -> int:
         )
     if options.output is not None:
         case = dataclasses.replace(case, output=options.output)
-    findings: tuple[Finding, ...] = ()
-    begun = time.perf_counter()
-    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
-        if not options.no_doctor:
-            progress.stage("checking the case")
-            findings = diagnose(case)
-        checked = time.perf_counter() - begun
-        if not _has_errors(findings):
-            build_case = import_module("cmfsim.build").build_case
-            built = build_case(case, progress=progress.stage, check=False, findings=findings)
+    return case
+
+
+def checked(case: Case, *, quiet: bool) -> tuple[Finding, ...] | None:
+    """What the doctor finds; none, with the findings printed, if one of them is an error."""
+    with StageProgress(sys.stderr, quiet=quiet) as progress:
+        progress.stage("checking the case")
+        findings = diagnose(case)
     if _has_errors(findings):
         _print_findings(findings, sys.stderr)
-        return BAD_INPUT
-    summary = dict(built.summary)
-    if not options.no_doctor:
-        summary["timings"] = {"checking the case": checked, **summary["timings"]}
-    if options.json:
-        print(json.dumps(summary, allow_nan=False))
-        return DONE
-    width = min(columns(), WIDTH) if sys.stdout.isatty() else WIDTH
-    print(build_text(summary, colour=in_colour(sys.stdout), width=width))
-    return DONE
+        return None
+    return findings
 
 
 def _has_errors(findings: Sequence[Finding]) -> bool:

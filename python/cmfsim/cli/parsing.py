@@ -9,11 +9,15 @@ from cmfsim.cli import (
     case_commands,
     phantom_command,
     scene_commands,
+    study_commands,
+    template_commands,
     virtual_patients_command,
 )
 from cmfsim.insilico import PATIENTS
 from cmfsim.io import result_suffixes
+from cmfsim.prediction import MODELS
 from cmfsim.scene import CONTACTS, METHODS
+from cmfsim.template import WHERE
 
 __all__ = ["make_parser"]
 
@@ -32,6 +36,7 @@ def make_parser() -> argparse.ArgumentParser:
     common.add_argument("-q", "--quiet", action="store_true", help="no progress lines")
     _add_case_commands(commands, common)
     _add_scene_commands(commands, common)
+    _add_template_commands(commands, common)
     return parser
 
 
@@ -47,15 +52,19 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     )
     doctor.set_defaults(run=case_commands.doctor)
 
-    build = commands.add_parser("build", parents=[named], help="build a case: image to scene")
-    build.add_argument(
+    changed = argparse.ArgumentParser(add_help=False, parents=[named])
+    changed.add_argument(
         "-o", "--output", metavar="OUT", type=Path, help="folder instead of the case's own"
     )
-    build.add_argument(
+    changed.add_argument(
         "--edge-length", metavar="H", type=float, help="mm, instead of the case's own"
     )
-    build.add_argument("--no-doctor", action="store_true", help="build without checks before")
+    changed.add_argument("--no-doctor", action="store_true", help="work without checks before")
+
+    build = commands.add_parser("build", parents=[changed], help="build a case: image to scene")
     build.set_defaults(run=case_commands.build)
+
+    _add_study_commands(commands, common, changed)
 
     phantom = commands.add_parser(
         "phantom", parents=[common], help="write the case of a head made by code"
@@ -96,6 +105,59 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     virtual.set_defaults(run=virtual_patients_command.virtual_patients)
 
 
+def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentParser) -> None:
+    models = {"metavar": "MODEL", "choices": (*MODELS, "all"), "action": "append"}
+    predict = commands.add_parser(
+        "predict", parents=[changed], help="predict the face after the operation"
+    )
+    predict.add_argument(
+        "--model",
+        **models,
+        help="H, M, H+S or M+S: homogeneous or with muscles, without or with sliding; or all; may "
+        "be repeated (default M+S)",
+    )
+    predict.set_defaults(run=study_commands.predict)
+
+    evaluate = commands.add_parser(
+        "evaluate", parents=[changed], help="predict, and compare with the face after it"
+    )
+    evaluate.add_argument("--model", **models, help="as in predict (default all)")
+    evaluate.set_defaults(run=study_commands.evaluate)
+
+    sensitivity = commands.add_parser(
+        "sensitivity", parents=[changed], help="what the error of skull landmarks does to the face"
+    )
+    sensitivity.add_argument("--model", choices=("M", "M+S"), default="M+S", help="(default M+S)")
+    sensitivity.add_argument("--trials", metavar="N", type=int, default=3, help="(default 3)")
+    sensitivity.add_argument(
+        "--std", metavar="MM", type=float, default=2.0, help="of a landmark along each axis (2)"
+    )
+    sensitivity.add_argument("--seed", type=int, default=0, help="of the trials (default 0)")
+    sensitivity.add_argument(
+        "--landmarks",
+        metavar="FILE",
+        type=Path,
+        action="append",
+        help="landmarks placed again, one file per trial, instead of drawn ones",
+    )
+    sensitivity.set_defaults(run=study_commands.sensitivity)
+
+    study = commands.add_parser(
+        "study", parents=[common], help="every case of a cohort by every model"
+    )
+    study.add_argument("cohort", metavar="COHORT", type=Path, help="cohort.toml")
+    study.add_argument("--workers", metavar="N", type=int, help="cases at a time")
+    study.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a Dask cluster that sees the same files"
+    )
+    study.add_argument("--fresh", action="store_true", help="work on finished cases again")
+    study.set_defaults(run=study_commands.study)
+
+    report = commands.add_parser("report", help="make the report of a folder of results anew")
+    report.add_argument("folder", metavar="FOLDER", type=Path, help="what predict wrote")
+    report.set_defaults(run=study_commands.report)
+
+
 def _add_scene_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     common = argparse.ArgumentParser(add_help=False, parents=[common])
     common.add_argument("scene", metavar="SCENE", type=Path, help="scene.npz or scene.toml")
@@ -119,3 +181,66 @@ def _add_scene_commands(commands: Any, common: argparse.ArgumentParser) -> None:
 
     info = commands.add_parser("info", parents=[common], help="say what a scene holds")
     info.set_defaults(run=scene_commands.info)
+
+
+def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> None:
+    template = commands.add_parser("template", help="muscle templates: list, check, import, morph")
+    actions = template.add_subparsers(dest="action", metavar="ACTION", required=True)
+    named = argparse.ArgumentParser(add_help=False, parents=[common])
+    named.add_argument(
+        "template", metavar="TEMPLATE", help="folder, archive or name of a built-in template"
+    )
+
+    listing = actions.add_parser("list", parents=[common], help="name the built-in templates")
+    listing.set_defaults(run=template_commands.list_templates)
+
+    check = actions.add_parser(
+        "check",
+        parents=[named],
+        help="say what is wrong with a template, and how to mend it",
+        epilog="Exit codes: 0 no errors found, 2 errors found or there is no such template.",
+    )
+    check.set_defaults(run=template_commands.check)
+
+    imports = actions.add_parser(
+        "import",
+        parents=[common],
+        help="make a template of an atlas's files",
+        epilog=f"BodyParts3D: download the OBJ files from {WHERE}.",
+    )
+    imports.add_argument("atlas", choices=["bodyparts3d"], help="which atlas")
+    imports.add_argument("folder", metavar="FOLDER", type=Path, help="the atlas's files")
+    imports.add_argument(
+        "--landmarks", metavar="FILE", type=Path, required=True, help="on its bones: .mrk.json"
+    )
+    imports.add_argument(
+        "-o", "--output", metavar="OUT", type=Path, required=True, help="folder, or .npz"
+    )
+    imports.add_argument(
+        "--any-files", action="store_true", help="take files with other hashes than the known ones"
+    )
+    imports.set_defaults(run=template_commands.import_atlas)
+
+    morph = actions.add_parser(
+        "morph", parents=[named], help="carry a template's muscles to a patient by landmarks"
+    )
+    morph.add_argument(
+        "landmarks", metavar="LANDMARKS", type=Path, help="the patient's: .mrk.json or .fcsv"
+    )
+    morph.add_argument(
+        "-o", "--output", metavar="OUT", type=Path, required=True, help="folder, or .npz"
+    )
+    morph.add_argument(
+        "--smoothing", metavar="MM", type=float, default=0.0, help="0 (default) meets every one"
+    )
+    morph.set_defaults(run=template_commands.morph)
+
+    show = actions.add_parser("show", parents=[named], help="draw a template's muscles")
+    show.add_argument("-o", "--output", metavar="PNG", type=Path, required=True, help="picture")
+    show.add_argument(
+        "--only", metavar="NAME", nargs="+", help="these muscles; without _L or _R on both sides"
+    )
+    show.add_argument(
+        "--fibres", action="store_true", help="fibre boxes and directions instead of names"
+    )
+    show.set_defaults(run=template_commands.show)

@@ -9,6 +9,7 @@ from cmfsim.case import Finding
 from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Body, Evidence
 from cmfsim.doctor.places import place_text
+from cmfsim.registration import side_vectors, wrong_sides
 
 __all__ = ["check_placement"]
 
@@ -34,8 +35,6 @@ THROUGH_SKIN = 0.1
 # Distance of a landmark from its surface, mm: twice the placing error of an operator, and so far
 # that it lies on something else.
 LANDMARK_WARNING, LANDMARK_ERROR = 5.0, 15.0
-# A landmark off the middle by less than this does not tell left from right, mm.
-SIDE_MARGIN = 3.0
 # Distance of two groups of landmarks below which they give no direction, mm.
 SHORTEST = 5.0
 # Share of the length of a direction that its main axis must have for the head to be upright.
@@ -250,15 +249,6 @@ def _mean(landmarks: Mapping[str, Floats], names: Sequence[str]) -> Floats | Non
     return np.mean(found, axis=0) if found else None
 
 
-def _pairs(landmarks: Mapping[str, Floats]) -> dict[str, Floats]:
-    """The vector from the right to the left landmark of each pair."""
-    return {
-        name[:-2]: point - landmarks[f"{name[:-2]}_R"]
-        for name, point in landmarks.items()
-        if name.endswith("_L") and f"{name[:-2]}_R" in landmarks
-    }
-
-
 def _direction(
     one: Floats | None, other: Floats | None, across: Floats | None = None
 ) -> Floats | None:
@@ -279,7 +269,7 @@ def _check_directions(
     evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
 ) -> Iterator[Finding]:
     """A head that does not look along −P with its left along +L and its crown along +S."""
-    pairs = _pairs(landmarks)
+    pairs = side_vectors(landmarks)
     left = _unit(np.mean(list(pairs.values()), axis=0)) if pairs else None
     up = _direction(_mean(landmarks, ABOVE), _mean(landmarks, BELOW))
     # At right angles to the face, or points that lie behind and above it would point upwards.
@@ -336,8 +326,7 @@ def _check_directions(
 def _check_sides(
     evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
 ) -> Iterator[Finding]:
-    pairs = _pairs(landmarks)
-    wrong = [name for name, vector in pairs.items() if vector[0] < -SIDE_MARGIN]
+    wrong = wrong_sides(landmarks)
     if wrong:
         names = ", ".join(wrong)
         yield Finding(

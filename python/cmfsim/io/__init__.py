@@ -1,10 +1,14 @@
 """Files and values: each format's reader beside its writer, one file per subject."""
 
 from cmfsim.io.case_files import Case
+from cmfsim.io.cohorts import Cohort
+from cmfsim.io.folders import replacing_files
 from cmfsim.io.images import read_image, write_image
 from cmfsim.io.landmarks import LandmarkFile, read_landmark_file, read_landmarks, write_landmarks
 from cmfsim.io.meshes import read_tet_mesh
+from cmfsim.io.metrics import write_metrics
 from cmfsim.io.models import write_model
+from cmfsim.io.predictions import write_prediction
 from cmfsim.io.results import read_result, result_suffixes, write_result
 from cmfsim.io.scenes import read_plan, read_scene, write_scene
 from cmfsim.io.surfaces import read_moved_surface, read_surface, write_surface
@@ -12,6 +16,7 @@ from cmfsim.io.transforms import read_transform, write_transform
 
 __all__ = [
     "Case",
+    "Cohort",
     "LandmarkFile",
     "read_image",
     "read_landmark_file",
@@ -23,10 +28,13 @@ __all__ = [
     "read_surface",
     "read_tet_mesh",
     "read_transform",
+    "replacing_files",
     "result_suffixes",
     "write_image",
     "write_landmarks",
+    "write_metrics",
     "write_model",
+    "write_prediction",
     "write_result",
     "write_scene",
     "write_surface",

@@ -22,13 +22,15 @@ from cmfsim.patient import (
     CaseLandmarks,
     CaseMesh,
     CaseMotion,
+    CaseMuscles,
     CaseOsteotomy,
+    CasePostoperative,
     CaseSurfaces,
     Plane,
     Region,
 )
 from cmfsim.planning import decompose_motion, rigid_motion
-from cmfsim.scene import CONTACTS, METHODS, SolverOptions, TissueData
+from cmfsim.scene import CONTACTS, METHODS, MIXINGS, PRESETS, SolverOptions, TissueData
 
 __all__ = ["CASE_FORMAT", "Case"]
 
@@ -46,9 +48,13 @@ TABLES = (
     "plan",
     "node_kinds",
     "tissue",
+    "muscles",
     "solver",
+    "postoperative",
     "output",
 )
+# Points in a tet that a muscle's surface crosses.
+SAMPLES = (1, 100_000)
 # Edge lengths that make a mesh of a head, mm: below, more tets than any memory; above, no face.
 EDGE_LENGTHS = (0.3, 30.0)
 # Grid spacings that a head can be worked on at, mm.
@@ -79,7 +85,11 @@ class Case:
     node_kinds : mapping of str to plain values
         Options of the stage that classifies nodes.
     tissue : TissueData
+        Everywhere, in a homogeneous model.
+    muscles : CaseMuscles or None
+        None leaves them out of what `cmfsim build` makes.
     solver : SolverOptions
+    postoperative : CasePostoperative or None
     lines : mapping of str to int
         The line of each dotted key in the case file, for findings.
 
@@ -101,7 +111,9 @@ class Case:
     plan: Mapping[str, CaseMotion] = field(default_factory=dict)
     node_kinds: Mapping[str, Any] = field(default_factory=dict)
     tissue: TissueData = field(default_factory=lambda: TissueData("preset", fraction=0.0))
+    muscles: CaseMuscles | None = None
     solver: SolverOptions = field(default_factory=SolverOptions)
+    postoperative: CasePostoperative | None = None
     lines: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -171,7 +183,13 @@ def _read(path: Path) -> Case:
         plan=_plan(document.table("plan"), folder),
         node_kinds=_plain(document.table("node_kinds")),
         tissue=_tissue(document.table("tissue")),
+        muscles=_muscles(document.table("muscles"), folder) if "muscles" in document else None,
         solver=_solver(document.table("solver")),
+        postoperative=(
+            _postoperative(document.table("postoperative"), folder)
+            if "postoperative" in document
+            else None
+        ),
         lines=document.all_lines(),
     )
 
@@ -347,6 +365,43 @@ def _tissue(table: Table) -> TissueData:
     if young is None or poisson is None:
         table.fail(None, "needs both young (MPa) and poisson, or neither")
     return TissueData("isotropic", young=young, poisson=poisson)
+
+
+def _muscles(table: Table, folder: Path) -> CaseMuscles:
+    """A template's name is that of one in the package; a path leads to a folder."""
+    table.only("template", "smoothing", "preset", "mixing", "samples", "seed")
+    default = CaseMuscles()
+    template: Path | str = table.text("template", str(default.template))
+    if template != default.template:
+        template = _file(table, "template", folder)
+    smoothing = table.number("smoothing", low=0.0, high=1e6)
+    return CaseMuscles(
+        template,
+        default.smoothing if smoothing is None else smoothing,
+        table.text("preset", default.preset, PRESETS),
+        table.text("mixing", default.mixing, MIXINGS),
+        table.whole("samples", default.samples, *SAMPLES),
+        table.whole("seed", default.seed, 0, 2**63 - 1),
+    )
+
+
+def _postoperative(table: Table, folder: Path) -> CasePostoperative:
+    table.only("skin", "image", "landmarks", "bones", "aligned", "units", "frame")
+    if ("skin" in table) == ("image" in table):
+        table.fail(
+            "image" if "image" in table else None,
+            "stands beside skin: give one of them" if "image" in table else "lacks skin or image",
+        )
+    bones = table.table("bones")
+    return CasePostoperative(
+        _file_or_none(table, "skin", folder),
+        _file_or_none(table, "image", folder),
+        _file_or_none(table, "landmarks", folder),
+        {_name(bones, name, name): _file(bones, name, folder) for name in bones},
+        table.flag("aligned", default=True),
+        table.text("units", "mm", tuple(UNITS)),
+        table.text("frame", "LPS", FRAMES),
+    )
 
 
 def _solver(table: Table) -> SolverOptions:

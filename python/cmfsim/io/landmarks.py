@@ -5,9 +5,7 @@ and a finding says so.
 """
 
 import csv
-import json
 import logging
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,27 +18,22 @@ from numpy.typing import ArrayLike
 from cmfsim.case import Finding
 from cmfsim.checks import Floats, check_one_of
 from cmfsim.errors import LandmarkInputError
-from cmfsim.io.files import refuse_constant, replacing
+from cmfsim.io.markups import (
+    as_position,
+    frame_name,
+    frame_signs,
+    markup_of,
+    markup_text,
+    markups_of,
+    write_markups,
+)
 
 __all__ = ["LandmarkFile", "read_landmark_file", "read_landmarks", "write_landmarks"]
 
-# A landmark file above this size is not what it says it is, bytes.
-MAX_LANDMARK_TEXT = 16 * 2**20
-# Slicer's names of its two frames; the numbers are those of older versions.
-FRAME_NAMES: Mapping[str, str] = MappingProxyType(
-    {"LPS": "LPS", "1": "LPS", "RAS": "RAS", "0": "RAS"}
-)
 # What each format means where it does not say: Slicer's markups schema, and its fiducial reader.
 UNSTATED: Mapping[str, str] = MappingProxyType({".json": "LPS", ".fcsv": "RAS"})
-UNIT_LENGTHS: Mapping[str, float] = MappingProxyType(
-    {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001}
-)
 # Columns of a `.fcsv` file that does not name them.
 FCSV_COLUMNS = ("id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label")
-SCHEMA = (
-    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/"
-    "Resources/Schema/markups-schema-v1.0.3.json#"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,19 +112,7 @@ def read_landmark_file(path: str | os.PathLike[str], *, frame: str | None = None
         raise LandmarkInputError(
             f"{path.name}: landmarks end in .mrk.json or .fcsv, not {path.suffix!r}"
         )
-    if path.is_dir():
-        raise LandmarkInputError(f"{path.name}: is a folder, not a file of landmarks")
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    size = path.stat().st_size
-    if size > MAX_LANDMARK_TEXT:
-        raise LandmarkInputError(
-            f"{path.name}: has {size} bytes, landmarks {MAX_LANDMARK_TEXT} at most"
-        )
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise LandmarkInputError(f"{path.name}: is not UTF-8 text ({error})") from error
+    text = markup_text(path)
     try:
         return (_from_json if path.suffix == ".json" else _from_fcsv)(text, path, frame)
     except LandmarkInputError as error:
@@ -168,57 +149,24 @@ def write_landmarks(path: str | os.PathLike[str], landmarks: Mapping[str, ArrayL
         raise LandmarkInputError(f"{path.name}: landmarks are written as .mrk.json")
     points = _by_label(
         [
-            _Point(number, label, _position(number, list(np.asarray(value, dtype=object).flat)))
+            _Point(number, label, as_position(number, list(np.asarray(value, dtype=object).flat)))
             for number, (label, value) in enumerate(landmarks.items(), start=1)
         ]
     )
-    markup = {
-        "type": "Fiducial",
-        "coordinateSystem": "LPS",
-        "coordinateUnits": "mm",
-        "controlPoints": [
-            {
-                "id": str(number),
-                "label": label,
-                "position": position.tolist(),
-                "positionStatus": "defined",
-            }
-            for number, (label, position) in enumerate(points.items(), start=1)
-        ],
-    }
-    text = json.dumps({"@schema": SCHEMA, "markups": [markup]}, indent=1, allow_nan=False)
-    with replacing(path) as file:
-        file.write(text.encode())
+    write_markups(path, [markup_of("Fiducial", points.items())])
 
 
 def _from_json(text: str, path: Path, frame: str | None) -> LandmarkFile:
-    try:
-        document = json.loads(text, parse_constant=refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise LandmarkInputError(f"is not JSON ({error})") from error
-    markups = document.get("markups") if isinstance(document, dict) else None
-    if not isinstance(markups, list) or not all(isinstance(m, dict) for m in markups):
-        raise LandmarkInputError("has no list 'markups': it is no markups file of 3D Slicer")
     points: list[_Point] = []
     unset: list[str] = []
     frames: set[str | None] = set()
-    for markup in markups:
-        entries = markup.get("controlPoints", [])
-        if not isinstance(entries, list):
-            raise LandmarkInputError("'controlPoints' is not a list")
-        length = _unit_length(markup.get("coordinateUnits", "mm"))
-        its_frame = _frame_name(markup.get("coordinateSystem"))
-        frames.add(its_frame)
-        sign = _signs(its_frame or frame or UNSTATED[".json"])
-        for entry in entries:
-            number = len(points) + len(unset) + 1
-            if not isinstance(entry, dict):
-                raise LandmarkInputError(f"point {number} is not a table of names and values")
-            if entry.get("positionStatus", "defined") != "defined":
-                unset.append(str(entry.get("label", number)))
-                continue
-            place = _position(number, entry.get("position"))
-            points.append(_Point(number, _label(number, entry.get("label")), sign * length * place))
+    for markup in markups_of(text, UNSTATED[".json"] if frame is None else frame):
+        frames.add(markup.frame)
+        for number, entry in enumerate(markup.entries, start=len(points) + len(unset) + 1):
+            if entry.position is None:
+                unset.append(str(number if entry.label is None else entry.label))
+            else:
+                points.append(_Point(number, _label(number, entry.label), entry.position))
     stated = None not in frames
     chosen = next(iter(sorted(f for f in frames if f)), frame or UNSTATED[".json"])
     return _landmark_file(points, unset, chosen, frame, path, stated=stated)
@@ -235,13 +183,13 @@ def _from_fcsv(text: str, path: Path, frame: str | None) -> LandmarkFile:
             continue
         key, _, value = line.lstrip("# ").partition("=")
         if key.strip() == "CoordinateSystem":
-            its_frame = _frame_name(value.strip())
+            its_frame = frame_name(value.strip())
         elif key.strip() == "columns":
             columns = tuple(name.strip() for name in value.split(","))
     lacking = [name for name in ("x", "y", "z", "label") if name not in columns]
     if lacking:
         raise LandmarkInputError(f"lacks the column {', '.join(lacking)}: it is no .fcsv of Slicer")
-    sign = _signs(its_frame or frame or UNSTATED[".fcsv"])
+    sign = frame_signs(its_frame or frame or UNSTATED[".fcsv"])
     points: list[_Point] = []
     for number, (line_number, line) in enumerate(rows, start=1):
         try:
@@ -260,7 +208,7 @@ def _from_fcsv(text: str, path: Path, frame: str | None) -> LandmarkFile:
             except ValueError:
                 numbers.append(row[name])
         points.append(
-            _Point(number, _label(number, row["label"]), sign * _position(number, numbers))
+            _Point(number, _label(number, row["label"]), sign * as_position(number, numbers))
         )
     chosen = its_frame or frame or UNSTATED[".fcsv"]
     return _landmark_file(points, [], chosen, frame, path, stated=its_frame is not None)
@@ -322,37 +270,3 @@ def _label(number: int, label: object) -> str:
     if not isinstance(label, str) or not label.strip():
         raise LandmarkInputError(f"point {number} has no label")
     return label.strip()
-
-
-def _position(number: int, position: object) -> Floats:
-    if not isinstance(position, list) or len(position) != 3:
-        raise LandmarkInputError(f"point {number} is at {position!r}: three numbers are needed")
-    for value in position:
-        is_number = isinstance(value, int | float | np.integer | np.floating)
-        if isinstance(value, bool) or not is_number:
-            raise LandmarkInputError(f"point {number} has the coordinate {value!r}: no number")
-        if not math.isfinite(value):
-            raise LandmarkInputError(f"point {number} has the coordinate {value}: must be finite")
-    return np.array(position, dtype=np.float64)
-
-
-def _frame_name(value: object) -> str | None:
-    if value is None or value == "":
-        return None
-    name = FRAME_NAMES.get(str(value))
-    if name is None:
-        raise LandmarkInputError(f"is in the frame {value!r}: LPS (or 1) and RAS (or 0) are read")
-    return name
-
-
-def _unit_length(value: object) -> float:
-    """The length of a file's unit in mm; Slicer may write [code, scheme, meaning]."""
-    name = value[0] if isinstance(value, list) and value else value
-    if not isinstance(name, str) or name not in UNIT_LENGTHS:
-        known = ", ".join(UNIT_LENGTHS)
-        raise LandmarkInputError(f"has coordinateUnits {value!r}: {known} are read")
-    return UNIT_LENGTHS[name]
-
-
-def _signs(frame: str) -> Floats:
-    return np.array([-1.0, -1.0, 1.0] if frame == "RAS" else [1.0, 1.0, 1.0])

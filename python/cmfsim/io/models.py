@@ -1,24 +1,22 @@
 """The output folder of `cmfsim build`: scene, tissue, skin, bones and a summary."""
 
-import contextlib
 import json
 import os
 import re
-import shutil
-import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmfsim.case import NodeKinds
 from cmfsim.io.files import replacing
+from cmfsim.io.folders import replacing_files
 from cmfsim.io.scenes import write_scene
 from cmfsim.io.surfaces import write_surface
-from cmfsim.io.vtk import VTK_TETRA, data_array, write_vtk
+from cmfsim.io.vtk import write_tets
 from cmfsim.model import PatientModel
-from cmfsim.scene import Scene
 
 __all__ = ["is_model_file", "write_model"]
 
@@ -26,7 +24,7 @@ __all__ = ["is_model_file", "write_model"]
 # What models are written as: an earlier build's files of these names go when a later lacks them.
 MODEL_FILES = re.compile(
     r"scene\.npz|tissue\.vtu|skin\.ply|segment-[A-Za-z0-9_+-]+\.ply|anatomy\.png|node_kinds\.png|"
-    r"build\.json"
+    r"muscles\.png|build\.json"
 )
 
 
@@ -69,28 +67,12 @@ def write_model(
     >>> import cmfsim
     >>> names = cmfsim.write_model("out", model)  # doctest: +SKIP
     """
-    folder = Path(folder)
-    made = [path for path in (folder, *folder.parents) if not path.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        return _write_into(folder, model, draw)
-    except BaseException:
-        # Folders that were made for nothing; one that holds something stays.
-        with contextlib.suppress(OSError):
-            for path in made:
-                path.rmdir()
-        raise
 
-
-def _write_into(
-    folder: Path, model: PatientModel, draw: Callable[[Path], Iterable[str]] | None
-) -> list[str]:
-    fresh = Path(tempfile.mkdtemp(prefix=".building-", dir=folder))
-    try:
+    def fill(fresh: Path) -> list[str]:
         names = ["scene.npz", "tissue.vtu", "skin.ply"]
         write_scene(fresh / names[0], model.scene)
         with replacing(fresh / names[1]) as file:
-            _write_tissue(file, model.scene, model.kinds)
+            _write_tissue(file, model)
         write_surface(fresh / names[2], model.skin)
         for number, segment in enumerate(model.segments):
             names.append(_segment_file(segment.name, number, names))
@@ -100,51 +82,9 @@ def _write_into(
         names.append("build.json")
         text = json.dumps({**model.summary, "files": names}, indent=1, allow_nan=False)
         (fresh / names[-1]).write_text(text + "\n", encoding="utf-8")
-        _take_places(fresh, folder, names)
         return names
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
 
-
-def _take_places(fresh: Path, folder: Path, names: Sequence[str]) -> None:
-    """Puts new files in the place of old ones: all, or where one cannot be put, none."""
-    gone = [name for name in _listed(folder / "build.json") if name not in names]
-    old = fresh / "old"
-    old.mkdir()
-    for name in (*names, *gone):
-        if (folder / name).exists():
-            _keep(folder / name, old / name)
-    try:
-        for name in gone:
-            (folder / name).unlink(missing_ok=True)
-        for name in names:
-            (fresh / name).replace(folder / name)
-    except BaseException:
-        for name in (*names, *gone):
-            if (old / name).exists():
-                (old / name).replace(folder / name)
-            elif not (fresh / name).exists():
-                (folder / name).unlink(missing_ok=True)
-        raise
-
-
-def _keep(path: Path, copy: Path) -> None:
-    """A second name for a file, or a copy where the file system knows no second names."""
-    if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder, where a file is to be written")
-    try:
-        copy.hardlink_to(path)
-    except OSError:
-        shutil.copy2(path, copy)
-
-
-def _listed(summary: Path) -> list[str]:
-    """The files of a model that an earlier build's summary lists, where there is one."""
-    try:
-        listed = json.loads(summary.read_text(encoding="utf-8"))["files"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return []
-    return [n for n in listed if isinstance(n, str) and is_model_file(n)]
+    return replacing_files(Path(folder), "build.json", is_model_file, fill)
 
 
 def _segment_file(name: str, number: int, taken: Sequence[str]) -> str:
@@ -160,17 +100,13 @@ def _segment_file(name: str, number: int, taken: Sequence[str]) -> str:
     return f"segment-+{number}.ply"
 
 
-def _write_tissue(file: BinaryIO, scene: Scene, kinds: NodeKinds) -> None:
-    nodes, tets = np.asarray(scene.nodes), np.asarray(scene.tets)
-    cells = (
-        data_array("connectivity", tets.reshape(-1).astype(np.int64))
-        + data_array("offsets", 4 * np.arange(1, len(tets) + 1, dtype=np.int64))
-        + data_array("types", np.full(len(tets), VTK_TETRA, dtype=np.uint8))
-    )
-    data = data_array("kind", kinds.kind) + data_array("segment", kinds.segment.astype(np.int64))
-    body = (
-        f'<Piece NumberOfPoints="{len(nodes)}" NumberOfCells="{len(tets)}">'
-        f"<Points>{data_array('points', nodes)}</Points><PointData>{data}</PointData>"
-        f"<Cells>{cells}</Cells></Piece>"
-    )
-    write_vtk(file, "UnstructuredGrid", body)
+def _write_tissue(file: BinaryIO, model: PatientModel) -> None:
+    kinds: NodeKinds = model.kinds
+    points: dict[str, NDArray[Any]] = {
+        "kind": kinds.kind,
+        "segment": kinds.segment.astype(np.int64),
+    }
+    cells: dict[str, NDArray[Any]] = {}
+    if model.fraction is not None and model.fibre is not None:
+        cells = {"fraction": model.fraction, "fibre": model.fibre}
+    write_tets(file, model.scene.nodes, model.scene.tets, points, cells)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.io.archives import member_of, read_archive, write_archive
 from cmfsim.io.files import named, replacing
-from cmfsim.io.vtk import VTK_TETRA, data_array, write_vtk
+from cmfsim.io.vtk import write_tets, write_triangles
 from cmfsim.scene import SceneResult
 
 __all__ = ["read_result", "result_suffixes", "write_result"]
@@ -90,38 +90,15 @@ def result_suffixes() -> tuple[str, ...]:
 
 
 def _write_vtu(file: BinaryIO, result: SceneResult) -> None:
-    n_tets = len(result.tets)
-    head = f'<Piece NumberOfPoints="{len(result.nodes)}" NumberOfCells="{n_tets}">'
-    cells = (
-        data_array("connectivity", result.tets.reshape(-1).astype(np.int64))
-        + data_array("offsets", 4 * np.arange(1, n_tets + 1, dtype=np.int64))
-        + data_array("types", np.full(n_tets, VTK_TETRA, dtype=np.uint8))
-    )
-    body = f"{head}{_points(result.nodes, result)}<Cells>{cells}</Cells></Piece>"
-    write_vtk(file, "UnstructuredGrid", body)
+    write_tets(file, result.nodes, result.tets, _point_data(result), {})
 
 
 def _write_vtp(file: BinaryIO, result: SceneResult) -> None:
     used, triangles = np.unique(result.skin_triangles, return_inverse=True)
-    triangles = triangles.reshape(-1, 3)
-    n = len(triangles)
-    head = (
-        f'<Piece NumberOfPoints="{len(used)}" NumberOfVerts="0" NumberOfLines="0" '
-        f'NumberOfStrips="0" NumberOfPolys="{n}">'
-    )
-    polys = data_array("connectivity", triangles.reshape(-1).astype(np.int64)) + data_array(
-        "offsets", 3 * np.arange(1, n + 1, dtype=np.int64)
-    )
-    body = f"{head}{_points(result.nodes, result, used)}<Polys>{polys}</Polys></Piece>"
-    write_vtk(file, "PolyData", body)
+    data = {name: array[used] for name, array in _point_data(result).items()}
+    data["node"] = used.astype(np.int64)
+    write_triangles(file, result.nodes[used], triangles.reshape(-1, 3), data)
 
 
-def _points(nodes: NDArray[Any], result: SceneResult, used: NDArray[Any] | None = None) -> str:
-    rows = slice(None) if used is None else used
-    data = (
-        data_array("displacement", result.displacements[rows])
-        + data_array("force", result.forces[rows])
-        + ("" if used is None else data_array("node", used.astype(np.int64)))
-    )
-    points = data_array("points", nodes[rows])
-    return f"<Points>{points}</Points><PointData>{data}</PointData>"
+def _point_data(result: SceneResult) -> dict[str, NDArray[Any]]:
+    return {"displacement": result.displacements, "force": result.forces}

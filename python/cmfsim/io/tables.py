@@ -169,6 +169,15 @@ class Table:
             self.fail(key, f"is {value:g}: must be {needed}{' ' + unit if unit else ''}")
         return value
 
+    def whole(self, key: str, default: int, low: int, high: int) -> int:
+        """A whole number from low to high."""
+        value = self._values.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int):
+            self.fail(key, f"is {value!r}: a whole number is needed")
+        if not low <= value <= high:
+            self.fail(key, f"is {value}: must be from {low} to {high}")
+        return value
+
     def vector(self, key: str) -> Floats | None:
         """Three finite numbers; None where they are absent."""
         if key not in self._values:

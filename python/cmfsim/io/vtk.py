@@ -1,19 +1,28 @@
 """VTK's XML files, base64 in one block per array."""
 
 import base64
+from collections.abc import Mapping
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
     "VTK_TETRA",
     "data_array",
+    "write_tets",
+    "write_triangles",
     "write_vtk",
 ]
 
 VTK_TETRA = 10
-VTK_TYPES = {"float64": "Float64", "uint32": "UInt32", "int64": "Int64", "uint8": "UInt8"}
+VTK_TYPES = {
+    "float64": "Float64",
+    "float32": "Float32",
+    "uint32": "UInt32",
+    "int64": "Int64",
+    "uint8": "UInt8",
+}
 
 
 def data_array(name: str, array: NDArray[Any]) -> str:
@@ -34,3 +43,46 @@ def write_vtk(file: BinaryIO, kind: str, body: str) -> None:
         f'<?xml version="1.0"?>\n<VTKFile type="{kind}" version="1.0" byte_order="{order}" '
         f'header_type="UInt64">\n<{kind}>{body}</{kind}>\n</VTKFile>\n'.encode()
     )
+
+
+def write_tets(
+    file: BinaryIO,
+    nodes: ArrayLike,
+    tets: ArrayLike,
+    point_data: Mapping[str, NDArray[Any]],
+    cell_data: Mapping[str, NDArray[Any]],
+) -> None:
+    """Writes tets as a `.vtu` file with named arrays on nodes and tets."""
+    points, cells = np.asarray(nodes), np.asarray(tets)
+    body = (
+        f'<Piece NumberOfPoints="{len(points)}" NumberOfCells="{len(cells)}">'
+        f"<Points>{data_array('points', points)}</Points>"
+        f"<PointData>{_arrays(point_data)}</PointData><CellData>{_arrays(cell_data)}</CellData>"
+        f"<Cells>{data_array('connectivity', cells.reshape(-1).astype(np.int64))}"
+        f"{data_array('offsets', 4 * np.arange(1, len(cells) + 1, dtype=np.int64))}"
+        f"{data_array('types', np.full(len(cells), VTK_TETRA, dtype=np.uint8))}</Cells></Piece>"
+    )
+    write_vtk(file, "UnstructuredGrid", body)
+
+
+def write_triangles(
+    file: BinaryIO,
+    vertices: ArrayLike,
+    triangles: ArrayLike,
+    point_data: Mapping[str, NDArray[Any]],
+) -> None:
+    """Writes triangles as a `.vtp` file with named arrays on vertices."""
+    points, polys = np.asarray(vertices), np.asarray(triangles)
+    body = (
+        f'<Piece NumberOfPoints="{len(points)}" NumberOfVerts="0" NumberOfLines="0" '
+        f'NumberOfStrips="0" NumberOfPolys="{len(polys)}">'
+        f"<Points>{data_array('points', points)}</Points>"
+        f"<PointData>{_arrays(point_data)}</PointData>"
+        f"<Polys>{data_array('connectivity', polys.reshape(-1).astype(np.int64))}"
+        f"{data_array('offsets', 3 * np.arange(1, len(polys) + 1, dtype=np.int64))}</Polys></Piece>"
+    )
+    write_vtk(file, "PolyData", body)
+
+
+def _arrays(named: Mapping[str, NDArray[Any]]) -> str:
+    return "".join(data_array(name, array) for name, array in named.items())

@@ -25,8 +25,8 @@ MELT = 1.5
 STEPS = 5
 # Rows per interval of a course that is put below the skin row by row.
 DENSE_STEPS = 3
-# Step along a fibre for its direction after the warp, mm.
-NUDGE = 1e-3
+# Distance within which a fibre line counts as met, relative to the mean length of the lines.
+SOFTENING = 0.01
 
 
 class Tissue(Protocol):
@@ -129,41 +129,45 @@ class Muscle:
     def fibre(self, points: ArrayLike) -> Floats:
         """The unit directions of the fibres at points, (n, 3), from origin towards insertion.
 
-        Between two fibre lines the direction is their mean, weighted by the inverse fourth power
-        of the distance. Ask it near the muscle: far away it is only defined.
+        By definition the principal axis of the mean of a aᵀ over the fibre lines, a the tangent
+        of a line where it is nearest, weighted by the inverse fourth power of the distance
+        (softened by a hundredth of the mean length): on a line it is its tangent. Ask it near the
+        muscle: far away it is only defined.
 
         Parameters
         ----------
         points : (n, 3) float64, mm
         """
         rows = as_rows("points", points, 3)
-        x, y, z = self.tissue.warp.inverse(*rows.T)
-        drawn = np.column_stack([self._fold(x), y, z])
-        total = np.zeros((len(rows), 3))
-        first: Floats | None = None
+        lengths = [np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in self.course]
+        softening = (SOFTENING * float(np.mean(lengths))) ** 2
+        total = np.zeros((len(rows), 3, 3))
         nearest = np.full(len(rows), np.inf)
-        for tube in self.tubes:
-            distance2, along = _closest_direction(tube.points, drawn)
-            if first is None:
-                first = along
-            sign = np.where((along * first).sum(axis=1) < 0.0, -1.0, 1.0)
-            total += (sign / (distance2 + 0.25) ** 2)[:, None] * along
-            nearest = np.minimum(nearest, distance2)
-        mirrored = (self.side == "R") | ((self.side == "both") & (x < 0.0))
-        total[:, 0] = np.where(mirrored, -total[:, 0], total[:, 0])
-        total /= np.linalg.norm(total, axis=1)[:, None]
-        here = np.column_stack([x, y, z])
-        ahead = self.tissue.warp.forward(here + NUDGE * total)
-        moved = ahead - self.tissue.warp.forward(here - NUDGE * total)
-        return np.asarray(moved / np.linalg.norm(moved, axis=1)[:, None])
+        sense = np.zeros((len(rows), 3))
+        for line in self.course:
+            distance2, along = _closest_direction(line, rows)
+            weight = (distance2 + softening) ** -2.0
+            total += weight[:, None, None] * along[:, :, None] * along[:, None, :]
+            closer = distance2 < nearest
+            nearest[closer], sense[closer] = distance2[closer], along[closer]
+        direction = np.linalg.eigh(total)[1][:, :, 2]
+        back = (direction * sense).sum(axis=1) < 0.0
+        return np.where(back[:, None], -direction, direction)
+
+
+def _tangents(line: Floats) -> Floats:
+    """The unit tangents at the points of a polyline: of the parabola through three of them."""
+    closed = np.allclose(line[0], line[-1])
+    rows = np.vstack([line[-2], line, line[1]]) if closed else line
+    place = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rows, axis=0), axis=1))])
+    slope = np.gradient(rows, place, axis=0, edge_order=2)
+    tangents = slope[1:-1] if closed else slope
+    return np.asarray(tangents / np.linalg.norm(tangents, axis=1)[:, None])
 
 
 def _closest_direction(line: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Squared distance to a polyline and its smoothed unit tangent at the closest point."""
-    tangents = np.gradient(line, axis=0)
-    if np.allclose(line[0], line[-1]):
-        tangents[0] = tangents[-1] = line[1] - line[-2]
-    tangents /= np.linalg.norm(tangents, axis=1)[:, None]
+    """Squared distance to a polyline and its unit tangent at the closest point."""
+    tangents = _tangents(line)
     best = np.full(len(points), np.inf)
     along = np.zeros((len(points), 3))
     for i in range(len(line) - 1):

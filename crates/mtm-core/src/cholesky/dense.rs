@@ -111,8 +111,14 @@ impl TailFactor {
     }
 
     /// Normal flexibility n_rᵀ S⁻¹_ij n_s of constraint rows: row r holds tail node i = `nodes[r]` along
-    /// the unit normal `normals[r]`; a node may have several rows.
-    pub fn normal_flexibility(&self, nodes: &[usize], normals: &[[f64; 3]]) -> DenseSymmetric {
+    /// the unit normal `normals[r]`; a node may have several rows. `softness[r]` (mm/N) is added to the
+    /// diagonal.
+    pub fn normal_flexibility(
+        &self,
+        nodes: &[usize],
+        normals: &[[f64; 3]],
+        softness: &[f64],
+    ) -> DenseSymmetric {
         let k = nodes.len();
         let mut values = vec![0.0; k * k];
         values.par_chunks_mut(k.max(1)).enumerate().for_each(|(c, column)| {
@@ -129,6 +135,7 @@ impl TailFactor {
                     })
                     .sum();
             }
+            column[c] += softness[c];
         });
         DenseSymmetric { size: k, values }
     }

@@ -1,0 +1,242 @@
+"""`cmfsim predict`, `evaluate`, `sensitivity`, `study` and `report`: faces after operations."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from cmfsim.cli.case_commands import case_of, checked
+from cmfsim.cli.exit_codes import BAD_INPUT, DONE, FAILED
+from cmfsim.cli.results import (
+    folder_of,
+    write_case_report,
+    write_evaluation,
+    write_prediction_files,
+    write_study_report,
+)
+from cmfsim.cli.terminal import StageProgress, escaped
+from cmfsim.errors import CaseInputError
+from cmfsim.io import Cohort, read_landmarks
+from cmfsim.prediction import MODELS, Prediction
+from cmfsim.study import CaseOutcome, StudyReport, predict_models, run_study
+from cmfsim.study import evaluate as evaluate_case
+from cmfsim.study import sensitivity as landmark_sensitivity
+
+__all__ = ["evaluate", "models_of", "predict", "report", "sensitivity", "study"]
+
+
+def models_of(given: Sequence[str] | None, default: Sequence[str]) -> tuple[str, ...]:
+    """The models that a command names, in the paper's order."""
+    named = set(given or default)
+    return MODELS if "all" in named else tuple(m for m in MODELS if m in named)
+
+
+def predict(options: argparse.Namespace) -> int:
+    """Predicts the face of a case by one model or by several."""
+    case = case_of(options)
+    models = models_of(options.model, ("M+S",))
+    findings = () if options.no_doctor else checked(case, quiet=options.quiet)
+    if findings is None:
+        return BAD_INPUT
+    written: list[dict[str, Any]] = []
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        predictions = predict_models(
+            case, models, progress=progress.stage, check=False, findings=findings
+        )
+        for prediction in predictions:
+            progress.stage(f"writing {prediction.model}")
+            folder = folder_of(case.output, prediction.model, len(models))
+            names = write_prediction_files(folder, prediction)
+            written.append({**_figures(prediction), "output": str(folder), "files": names})
+        progress.stage("writing the report")
+        made = write_case_report(case.output, models)
+    if options.json:
+        answer = {"case": case.name, "predictions": written, "report": made}
+        print(json.dumps(answer, allow_nan=False))
+        return DONE
+    for entry in written:
+        print(_prediction_text(entry))
+    _print_report(case.output, made)
+    return DONE
+
+
+def evaluate(options: argparse.Namespace) -> int:
+    """Predicts a case and compares it with the face after the operation."""
+    case = case_of(options)
+    models = models_of(options.model, MODELS)
+    findings = () if options.no_doctor else checked(case, quiet=options.quiet)
+    if findings is None:
+        return BAD_INPUT
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        found = evaluate_case(case, models, progress=progress.stage, check=False, findings=findings)
+        for prediction in found.predictions:
+            progress.stage(f"writing {prediction.model}")
+            folder = folder_of(case.output, prediction.model, len(models))
+            write_prediction_files(folder, prediction)
+        progress.stage("writing the comparison")
+        names = write_evaluation(case.output, found)
+        made = write_case_report(case.output, models)
+    values = found.as_dict()
+    if options.json:
+        answer = {**values, "output": str(case.output), "files": names, "report": made}
+        print(json.dumps(answer, allow_nan=False))
+        return DONE
+    print(f"{escaped(case.name)}: distance from the face after the operation, mm")
+    print("  model        mean     SD   95 %    max   < 2 mm")
+    for name, entry in [*values["models"].items(), ("no change", values["no_change"])]:
+        figures = entry["regions"]["whole"]
+        print(
+            f"  {name:<10} {figures['mean_mm']:6.2f} {figures['std_mm']:6.2f} "
+            f"{figures['p95_mm']:6.2f} {figures['max_mm']:6.2f} "
+            f"{100 * figures['within']['2 mm']:6.0f} %"
+        )
+    _print_report(case.output, made)
+    return DONE
+
+
+def sensitivity(options: argparse.Namespace) -> int:
+    """Says what the error of skull landmarks does to muscles and face."""
+    case = case_of(options)
+    findings = () if options.no_doctor else checked(case, quiet=options.quiet)
+    if findings is None:
+        return BAD_INPUT
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        found = landmark_sensitivity(
+            case,
+            trials=_trials(options),
+            std=options.std,
+            seed=options.seed,
+            model=options.model,
+            progress=progress.stage,
+            check=False,
+        )
+    values = found.as_dict()
+    text = json.dumps(values, indent=1, allow_nan=False)
+    case.output.mkdir(parents=True, exist_ok=True)
+    (case.output / "sensitivity.json").write_text(text + "\n", encoding="utf-8")
+    if options.json:
+        print(json.dumps(values, allow_nan=False))
+        return DONE
+    print(f"{escaped(case.name)}, model {options.model}: mean distances from the case's own, mm")
+    print("  trial  landmarks  muscles  masseter    skin  skin 95 %")
+    for number, trial in enumerate(found.trials):
+        masseter = [d for name, d in trial.muscle_deviation.items() if "masseter" in name]
+        muscles = list(trial.muscle_deviation.values())
+        skin = trial.as_dict()["skin"]
+        print(
+            f"  {number + 1:5d}  {trial.landmark_deviation:9.2f}  {_mean(muscles):7.2f}  "
+            f"{_mean(masseter):8.2f}  {skin['mean']:6.3f}  {skin['p95']:9.3f}"
+        )
+    moved = found.skin_deviation(moved=True)
+    print(f"  skin that the operation moves: {moved:.3f} mm on average")
+    return DONE
+
+
+def _trials(options: argparse.Namespace) -> Any:
+    """The number of trials to draw, or the landmarks of each file."""
+    if not options.landmarks:
+        return options.trials
+    return [read_landmarks(path) for path in options.landmarks]
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else float("nan")
+
+
+def study(options: argparse.Namespace) -> int:
+    """Predicts and compares every case of a cohort; failed if a case failed."""
+    cohort = Cohort.load(options.cohort)
+
+    def say(outcome: CaseOutcome) -> None:
+        if not options.quiet:
+            print(f"{outcome.name}: {outcome.status}, {outcome.seconds:.0f} s", file=sys.stderr)
+
+    found = run_study(
+        cohort,
+        workers=options.workers,
+        scheduler=options.scheduler,
+        fresh=options.fresh,
+        progress=say,
+    )
+    names = write_study_report(found)
+    if options.json:
+        print(json.dumps({**found.as_dict(), "files": names}, allow_nan=False))
+    else:
+        print(_study_text(found))
+        print(f"written       {escaped(str(cohort.output))}: {', '.join(names)}")
+    return FAILED if found.failed else DONE
+
+
+def report(options: argparse.Namespace) -> int:
+    """Makes the report of a folder of results anew."""
+    folder: Path = options.folder
+    models = [m for m in MODELS if (folder / m / "prediction.json").exists()]
+    if not models:
+        if not (folder / "prediction.json").exists():
+            raise CaseInputError(
+                f"{folder}: holds no prediction.json: run cmfsim predict or evaluate first"
+            )
+        models = [json.loads((folder / "prediction.json").read_text("utf-8"))["model"]]
+    if write_case_report(folder, models) is None:
+        return FAILED
+    print(folder / "report.html")
+    return DONE
+
+
+def _figures(prediction: Prediction) -> dict[str, Any]:
+    solution = prediction.summary["solution"]
+    return {
+        "model": prediction.model,
+        "n_tets": solution["n_tets"],
+        "residual": solution["residual"],
+        "contact_iterations": solution["contact_iterations"],
+        "contact_gap": solution["contact_gap"],
+        "skin": dict(prediction.summary["skin"]),
+        "timings": dict(prediction.summary["timings"]),
+    }
+
+
+def _prediction_text(entry: dict[str, Any]) -> str:
+    skin = entry["skin"]
+    lines = [
+        f"model {entry['model']}",
+        f"  solved      {entry['n_tets']} tets, residual {entry['residual']:.1e}",
+    ]
+    if entry["contact_iterations"]:
+        lines.append(
+            f"  contact     {entry['contact_iterations']} iterations, largest gap "
+            f"{entry['contact_gap']:.1e} mm"
+        )
+    lines += [
+        f"  skin moves  {skin['mean']:.2f} mm on average, {skin['largest']:.2f} mm at most",
+        f"  time        {sum(entry['timings'].values()):.1f} s from the files to the face",
+        f"  written     {escaped(entry['output'])}: {', '.join(entry['files'])}",
+    ]
+    return "\n".join(lines)
+
+
+def _study_text(found: StudyReport) -> str:
+    models = found.cohort.models
+    lines = [f"{escaped(found.cohort.name)}: mean error over the face, mm"]
+    if found.cohort.note:
+        lines.append(escaped(found.cohort.note))
+    lines.append("  case         " + "".join(f"{m:>8}" for m in (*models, "still")) + "  outcome")
+    for outcome in found.outcomes:
+        cells = ""
+        for model in (*models, None):
+            entry = (
+                outcome.evaluation.get("no_change")
+                if model is None
+                else outcome.evaluation.get("models", {}).get(model)
+            )
+            mean = "–" if entry is None else f"{entry['regions']['whole']['mean_mm']:.2f}"
+            cells += f"{mean:>8}"
+        lines.append(f"  {escaped(outcome.name):<12} {cells}  {outcome.status}")
+    return "\n".join(lines)
+
+
+def _print_report(folder: Path, name: str | None) -> None:
+    if name is not None:
+        print(f"report: {escaped(str(folder / name))}")

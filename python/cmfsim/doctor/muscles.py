@@ -1,0 +1,52 @@
+"""Whether the muscles of a case can be placed: its template, and the landmarks that carry it."""
+
+from collections.abc import Iterator
+
+from cmfsim.case import Finding
+from cmfsim.doctor.evidence import Evidence
+from cmfsim.errors import CmfsimError
+from cmfsim.registration import match_landmarks
+from cmfsim.template import MuscleTemplate
+
+__all__ = ["check_muscles"]
+
+
+def check_muscles(evidence: Evidence) -> Iterator[Finding]:
+    """Findings about the template of a case, and its landmarks beside the patient's."""
+    given = evidence.case.muscles
+    if given is None:
+        return
+    where = evidence.case.where("muscles")
+    try:
+        template = MuscleTemplate.load(given.template)
+    except (CmfsimError, OSError) as error:
+        yield Finding(
+            "error",
+            "template-unreadable",
+            str(error),
+            evidence.case.where("muscles.template"),
+            "there is nothing to take muscles from",
+            'name a folder that "cmfsim template check" passes, or "default"',
+        )
+        return
+    if not evidence.skull_landmarks:
+        yield Finding(
+            "error",
+            "muscles-without-landmarks",
+            "muscles are asked for, and no skull landmarks could be read",
+            where,
+            "they carry the template to the patient",
+            "add [landmarks] skull, or leave out [muscles]",
+        )
+        return
+    try:
+        yield from match_landmarks(template.landmarks, evidence.skull_landmarks).findings
+    except CmfsimError as error:
+        yield Finding(
+            "error",
+            "muscles-landmarks",
+            str(error),
+            where,
+            "the template cannot be carried to the patient by these landmarks",
+            'correct the landmarks; "cmfsim template morph" shows each one\'s error',
+        )

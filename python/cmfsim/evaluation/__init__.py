@@ -1,0 +1,35 @@
+"""Predictions against the post-operative skin: partners, distances, regions, tests (paper 3.2)."""
+
+from cmfsim.evaluation.comparison import MATCHINGS, SkinComparison, compare_skins
+from cmfsim.evaluation.models import (
+    NO_CHANGE,
+    WHOLE,
+    Improvement,
+    ModelComparison,
+    compare_models,
+)
+from cmfsim.evaluation.regions import REGIONS, SKIN_LANDMARKS, skin_regions
+from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
+from cmfsim.evaluation.statistics import LIMITS, DistanceStatistics, distance_statistics
+from cmfsim.evaluation.tables import ErrorTable, error_table
+
+__all__ = [
+    "LIMITS",
+    "MATCHINGS",
+    "NO_CHANGE",
+    "REGIONS",
+    "SKIN_LANDMARKS",
+    "WHOLE",
+    "DistanceStatistics",
+    "ErrorTable",
+    "Improvement",
+    "ModelComparison",
+    "PairedTest",
+    "SkinComparison",
+    "compare_models",
+    "compare_skins",
+    "distance_statistics",
+    "error_table",
+    "skin_regions",
+    "wilcoxon_test",
+]

@@ -1,0 +1,460 @@
+"""A predicted skin against the post-operative one: errors per vertex, figures, regions."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim._core import Surface, ThinPlateSpline
+from cmfsim.case import Finding
+from cmfsim.checks import (
+    Floats,
+    as_indices,
+    as_positive,
+    as_rows,
+    check_one_of,
+    frozen,
+)
+from cmfsim.errors import (
+    CaseInputError,
+    LandmarkError,
+    LandmarkInputError,
+    RegistrationInputError,
+)
+from cmfsim.evaluation.correspondence import Matches, Skin, match_skins
+from cmfsim.evaluation.regions import SKIN_LANDMARKS, skin_regions
+from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
+from cmfsim.registration import match_landmarks
+from cmfsim.scene import SurfaceData
+
+__all__ = ["MATCHINGS", "SkinComparison", "compare_skins"]
+
+MATCHINGS = ("landmarks", "closest")
+# Matches at a border, of the part that was to be evaluated, from which on a finding is made.
+MANY_AT_BORDER = 0.05
+
+Landmarks: TypeAlias = Mapping[str, ArrayLike] | ArrayLike
+Choice: TypeAlias = ArrayLike | str | None
+
+
+@dataclass(frozen=True, eq=False)
+class SkinComparison:
+    """How far a predicted skin lies from the post-operative one.
+
+    Attributes
+    ----------
+    method : str
+        How partners were found: "landmarks" or "closest".
+    vertices : (k,) uint32
+        The vertices of the predicted skin that were evaluated.
+    signed : (k,) float64, mm
+        Distance of each from its partner; negative where the prediction lies behind the
+        post-operative skin.
+    partners : (k, 3) float64, mm
+        On the post-operative skin.
+    statistics : DistanceStatistics
+        From the prediction to the post-operative skin.
+    back_signed : (b,) float64, mm
+        The other way: distance of post-operative vertices from their partners on the prediction,
+        with the same sign: negative where the prediction lies behind.
+    back_vertices : (b,) uint32
+        Those vertices.
+    backward : DistanceStatistics or None
+        Of `back_signed`; None if no post-operative vertex faces the evaluated part.
+    symmetric : DistanceStatistics or None
+        Of both directions, each with half the weight.
+    regions : mapping of str to DistanceStatistics
+        From the prediction to the post-operative skin, by region; regions without an evaluated
+        vertex are left out.
+    region_vertices : mapping of str to (r,) uint32
+        The evaluated vertices in each.
+    share : float
+        Area of the evaluated vertices, of the area of the predicted skin.
+    n_masked : int
+        Vertices of the prediction outside the mask.
+    n_border, n_far : int
+        Left out: partner on the border of the post-operative skin; further away than the limit.
+    back_border, back_far : int
+        The same for the way back.
+    findings : tuple of Finding
+    """
+
+    method: str
+    vertices: NDArray[np.uint32]
+    signed: Floats
+    partners: Floats
+    statistics: DistanceStatistics
+    back_signed: Floats
+    back_vertices: NDArray[np.uint32]
+    backward: DistanceStatistics | None
+    symmetric: DistanceStatistics | None
+    regions: Mapping[str, DistanceStatistics]
+    region_vertices: Mapping[str, NDArray[np.uint32]]
+    share: float
+    n_masked: int
+    n_border: int
+    n_far: int
+    back_border: int
+    back_far: int
+    findings: tuple[Finding, ...]
+
+    @property
+    def mean(self) -> float:
+        """Mean |distance| from the prediction, mm."""
+        return self.statistics.mean
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of |distance|, mm."""
+        return self.statistics.std
+
+    @property
+    def median(self) -> float:
+        """Median |distance|, mm."""
+        return self.statistics.median
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square distance, mm."""
+        return self.statistics.rms
+
+    @property
+    def p90(self) -> float:
+        """|Distance| that nine tenths of the vertices do not pass, mm."""
+        return self.statistics.p90
+
+    @property
+    def p95(self) -> float:
+        """The same for 95 %, mm."""
+        return self.statistics.p95
+
+    @property
+    def max(self) -> float:
+        """Largest |distance|, mm."""
+        return self.statistics.max
+
+    @property
+    def signed_mean(self) -> float:
+        """Mean distance with its sign, mm: negative, the prediction lies behind."""
+        return self.statistics.signed_mean
+
+    @property
+    def within(self) -> Mapping[float, float]:
+        """Share of vertices with |distance| up to 1, 1.5, 2, 3 mm."""
+        return self.statistics.within
+
+    @property
+    def hausdorff(self) -> float:
+        """Largest |distance| of both directions, mm."""
+        return max(self.max, self.backward.max if self.backward is not None else 0.0)
+
+    def field(self, n_vertices: int) -> Any:
+        """The signed distances on all vertices of the predicted skin; masked where not evaluated.
+
+        Parameters
+        ----------
+        n_vertices : int
+            Of the predicted skin.
+
+        Returns
+        -------
+        (n,) numpy masked array, mm
+        """
+        if len(self.vertices) and n_vertices <= int(self.vertices.max()):
+            raise CaseInputError(
+                f"vertex {int(self.vertices.max())} was evaluated, so a skin of {n_vertices} "
+                "vertices is another one"
+            )
+        values, masked = np.zeros(n_vertices), np.ones(n_vertices, dtype=bool)
+        values[self.vertices] = self.signed
+        masked[self.vertices] = False
+        return np.ma.array(values, mask=masked)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values with units in their names, as JSON holds them; no arrays."""
+        return {
+            "method": self.method,
+            "prediction_to_postoperative": self.statistics.as_dict(),
+            "postoperative_to_prediction": self.backward.as_dict() if self.backward else None,
+            "symmetric": self.symmetric.as_dict() if self.symmetric else None,
+            "hausdorff_mm": self.hausdorff,
+            "regions": {name: s.as_dict() for name, s in self.regions.items()},
+            "evaluated_share_of_area": self.share,
+            "excluded": {
+                "masked": self.n_masked,
+                "border": self.n_border,
+                "far": self.n_far,
+                "border_backward": self.back_border,
+                "far_backward": self.back_far,
+            },
+            "findings": [
+                {"severity": f.severity, "code": f.code, "what": f.what} for f in self.findings
+            ],
+        }
+
+
+def compare_skins(
+    simulated: SurfaceData | Surface,
+    postoperative: SurfaceData | Surface,
+    *,
+    landmarks: tuple[Landmarks, Landmarks] | None = None,
+    method: str | None = None,
+    mask: Choice = None,
+    regions: Mapping[str, ArrayLike] | None = None,
+    exclude_borders: bool = True,
+    max_distance: float | None = None,
+) -> SkinComparison:
+    """The distances of a predicted skin from the post-operative one.
+
+    Parameters
+    ----------
+    simulated, postoperative : SurfaceData or Surface
+        Skins in one frame with outward normals; they may be open, at the neck for one.
+    landmarks : (landmarks, landmarks), optional
+        Of the simulated and of the post-operative skin: mappings of name to place, matched by name
+        (`match_landmarks`), or (n, 3) arrays in one order, mm.
+    method : str, optional
+        "landmarks": a thin-plate spline through the landmarks carries the simulated skin near the
+        post-operative one, and the point closest to the carried vertex is its partner (Kim et al.
+        2010, section 3.2). "closest": the point closest to the vertex itself. Default: the first
+        where there are landmarks.
+    mask : (n,) bool, (k,) indices or "face", optional
+        The vertices of the simulated skin to evaluate, such as those that the simulation could
+        move; "face" takes the face by its landmarks. Default: all.
+    regions : mapping of str to (n,) bool or (k,) indices, optional
+        Parts to be told apart. Default: `skin_regions` where the landmarks have their names.
+    exclude_borders : bool
+        Whether to leave out vertices whose partner lies on the border of the other skin: there it
+        ends, and the distance says where the scan was cut.
+    max_distance : float, mm, optional
+        Leaves out, and counts, what is further apart. Default: nothing.
+
+    Returns
+    -------
+    SkinComparison
+
+    Raises
+    ------
+    RegistrationError
+        (also `ValueError`) No vertex is left; landmarks in one plane, coincident, too few.
+    LandmarkError
+        (also `ValueError`) Landmarks are missing, swapped between left and right, or are no face's.
+    CaseError
+        (also `ValueError`) An unknown method, a mask or region of another skin.
+    MeshError
+        (also `ValueError`) A surface with degenerate triangles.
+
+    Notes
+    -----
+    The error is the distance of the *unwarped* vertex from its partner. It is at least the distance
+    to the closest point, and more where skin moved along itself: corners of the mouth, wings of
+    the nose.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> square = [[x, y, 0.0] for y in range(5) for x in range(5)]
+    >>> cells = [5 * j + i for j in range(4) for i in range(4)]
+    >>> triangles = [t for c in cells for t in ([c, c + 1, c + 6], [c, c + 6, c + 5])]
+    >>> after = cmfsim.SurfaceData(square, triangles)
+    >>> predicted = cmfsim.SurfaceData([[x, y, z - 0.5] for x, y, z in square], triangles)
+    >>> report = cmfsim.compare_skins(predicted, after)
+    >>> report.mean, report.signed_mean, report.n_border, report.within[1.0]
+    (0.5, -0.5, 16, 1.0)
+    """
+    if method is None:
+        method = "closest" if landmarks is None else "landmarks"
+    check_one_of("method", method, MATCHINGS)
+    if max_distance is not None:
+        as_positive("max_distance", max_distance)
+    skin, other = Skin(simulated), Skin(postoperative)
+    findings: list[Finding] = []
+    forth = back = None
+    if method == "landmarks":
+        if landmarks is None:
+            raise LandmarkInputError(
+                "method is 'landmarks', but there are none: give landmarks=(of the simulated skin, "
+                "of the post-operative skin), or use method='closest'"
+            )
+        ours, theirs, known = _paired(*landmarks)
+        findings += known
+        forth, back = ThinPlateSpline(ours, theirs), ThinPlateSpline(theirs, ours)
+    names = landmarks[0] if landmarks is not None else None
+    has_names = isinstance(names, Mapping) and all(n in names for n in SKIN_LANDMARKS)
+    parts = _chosen_regions(regions, skin, names if has_names else None)
+    chosen = _chosen_vertices(mask, skin, parts)
+    matches = match_skins(
+        skin,
+        chosen,
+        other,
+        warp=forth,
+        max_distance=max_distance,
+        exclude_borders=exclude_borders,
+    )
+    if not len(matches.vertices):
+        raise RegistrationInputError(
+            f"none of {int(chosen.sum())} vertices has a partner: {matches.n_border} are matched "
+            f"to the border of the post-operative skin and {matches.n_far} are further away than "
+            "the limit; do both lie in one frame, and does the mask lie on the scanned face?"
+        )
+    backward = _backward(
+        skin, chosen, other, warp=back, limit=max_distance, exclude_borders=exclude_borders
+    )
+    findings += _findings(matches, int(chosen.sum()), forth, skin.vertices[chosen])
+    areas = skin.vertex_areas()
+    statistics = distance_statistics(matches.signed)
+    inside = {name: part[matches.vertices] for name, part in parts.items()}
+    # Seen from the post-operative side, behind is in front.
+    back_signed = -backward.signed
+    both = _half_each(matches.signed, back_signed) if len(back_signed) else None
+    return SkinComparison(
+        method=method,
+        vertices=frozen(matches.vertices.astype(np.uint32)),
+        signed=frozen(matches.signed),
+        partners=frozen(matches.partners),
+        statistics=statistics,
+        back_signed=frozen(back_signed),
+        back_vertices=frozen(backward.vertices.astype(np.uint32)),
+        backward=distance_statistics(back_signed) if len(back_signed) else None,
+        symmetric=both,
+        regions=MappingProxyType(
+            {n: distance_statistics(matches.signed[i]) for n, i in inside.items() if i.any()}
+        ),
+        region_vertices=MappingProxyType(
+            {n: frozen(matches.vertices[i].astype(np.uint32)) for n, i in inside.items() if i.any()}
+        ),
+        share=float(areas[matches.vertices].sum() / areas.sum()),
+        n_masked=int(len(chosen) - chosen.sum()),
+        n_border=matches.n_border,
+        n_far=matches.n_far,
+        back_border=backward.n_border,
+        back_far=backward.n_far,
+        findings=tuple(findings),
+    )
+
+
+def _paired(ours: Landmarks, theirs: Landmarks) -> tuple[Floats, Floats, tuple[Finding, ...]]:
+    """Landmarks of two skins in one order, by name or as they stand, and what to know of them."""
+    if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
+        try:
+            # Those that both have are enough; the others are findings.
+            match = match_landmarks(ours, theirs, required=())
+        except LandmarkError as error:
+            raise LandmarkInputError(
+                f"landmarks of the predicted skin (source) and the post-operative one (target): "
+                f"{error}"
+            ) from error
+        return match.source, match.target, match.findings
+    if isinstance(ours, Mapping) or isinstance(theirs, Mapping):
+        raise LandmarkInputError(
+            "one set of landmarks has names and the other has not: give two mappings, or two arrays"
+        )
+    first, second = (as_rows("landmarks", given, 3) for given in (ours, theirs))
+    if len(first) != len(second):
+        raise LandmarkInputError(
+            f"there are {len(first)} landmarks of one skin and {len(second)} of the other: as many "
+            "are needed, in the same order"
+        )
+    return first, second, ()
+
+
+def _chosen_regions(
+    regions: Mapping[str, ArrayLike] | None, skin: Skin, names: Landmarks | None
+) -> dict[str, NDArray[np.bool_]]:
+    if regions is not None:
+        return {n: _as_choice(f"region {n!r}", v, len(skin.vertices)) for n, v in regions.items()}
+    return skin_regions(skin.vertices, names) if isinstance(names, Mapping) else {}
+
+
+def _chosen_vertices(
+    mask: Choice, skin: Skin, parts: Mapping[str, NDArray[np.bool_]]
+) -> NDArray[np.bool_]:
+    if isinstance(mask, str):
+        if mask not in parts:
+            raise LandmarkInputError(
+                f"mask is {mask!r}, but there are regions {', '.join(parts) or 'none'}: give all "
+                "landmarks of the skin by name, or a mask of its vertices"
+            )
+        return parts[mask]
+    if mask is None:
+        return np.ones(len(skin.vertices), dtype=bool)
+    return _as_choice("mask", mask, len(skin.vertices))
+
+
+def _as_choice(name: str, value: ArrayLike, count: int) -> NDArray[np.bool_]:
+    """Chosen vertices as (count,) bool, from bools or indices; at least one."""
+    given = np.asarray(value)
+    if given.dtype.kind == "b":
+        if given.shape != (count,):
+            raise CaseInputError(f"{name} has shape {given.shape}, but the skin {count} vertices")
+        chosen = given.copy()
+    else:
+        chosen = np.zeros(count, dtype=bool)
+        chosen[as_indices(name, value, count)] = True
+    if not chosen.any():
+        raise CaseInputError(f"{name} holds no vertex")
+    return chosen
+
+
+def _backward(
+    skin: Skin,
+    chosen: NDArray[np.bool_],
+    other: Skin,
+    *,
+    warp: ThinPlateSpline | None,
+    limit: float | None,
+    exclude_borders: bool,
+) -> Matches:
+    """Partners of the post-operative vertices on the evaluated part of the simulated skin."""
+    part = skin if chosen.all() else skin.part(chosen)
+    everywhere = np.ones(len(other.vertices), dtype=bool)
+    if part is None:
+        none = np.zeros(0, dtype=np.int64)
+        return Matches(none, np.zeros((0, 3)), np.zeros(0), 0, 0)
+    # The border of a part of the skin is always left out: what lies beyond was masked.
+    return match_skins(
+        other,
+        everywhere,
+        part,
+        warp=warp,
+        max_distance=limit,
+        exclude_borders=exclude_borders or part is not skin,
+    )
+
+
+def _half_each(one: Floats, other: Floats) -> DistanceStatistics:
+    weights = np.concatenate([np.full(len(v), 0.5 / len(v)) for v in (one, other)])
+    return distance_statistics(np.concatenate([one, other]), weights=weights)
+
+
+def _findings(
+    matches: Matches, n_chosen: int, warp: ThinPlateSpline | None, places: Floats
+) -> Sequence[Finding]:
+    found = []
+    if matches.n_border > MANY_AT_BORDER * n_chosen:
+        found.append(
+            Finding(
+                "note",
+                "many-border-matches",
+                f"{matches.n_border} of {n_chosen} vertices are matched to the border of the "
+                "post-operative skin and left out",
+                why="the scan ends there, or the landmarks carry the skin past it",
+                mend="evaluate the face alone with mask='face', or a mask of what was simulated",
+            )
+        )
+    folds = warp.folds(places) if warp is not None else None
+    if folds is not None and folds.count:
+        found.append(
+            Finding(
+                "warning",
+                "correspondence-folds",
+                f"the map between the landmarks folds at {folds.count} of {n_chosen} vertices",
+                why="partners there are not where the anatomy is the same",
+                mend="check the landmarks: one stands in another's place, or on another point of "
+                "the face",
+            )
+        )
+    return found

@@ -1,0 +1,270 @@
+"""Several predictions of one patient beside each other, and beside leaving the face as it was."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim._core import Surface, SurfaceMotion
+from cmfsim.checks import Floats, as_rows, as_text, check_one_of, frozen
+from cmfsim.errors import CaseInputError
+from cmfsim.evaluation.comparison import (
+    Choice,
+    Landmarks,
+    SkinComparison,
+    compare_skins,
+)
+from cmfsim.evaluation.regions import SKIN_LANDMARKS, skin_regions
+from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
+from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
+from cmfsim.scene import SurfaceData
+
+__all__ = ["NO_CHANGE", "WHOLE", "Improvement", "ModelComparison", "compare_models"]
+
+# The pre-operative skin taken as a prediction: what any model must beat.
+NO_CHANGE = "no change"
+# Name of the whole evaluated part beside the names of regions.
+WHOLE = "whole"
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """What a prediction gains over leaving the face as it was, on the same vertices.
+
+    Attributes
+    ----------
+    before, after : float, mm
+        Mean |distance| of the pre-operative skin, and of the prediction.
+    share_better : float
+        Share of vertices at which the prediction is nearer.
+    """
+
+    before: float
+    after: float
+    share_better: float
+
+    @property
+    def gain(self) -> float:
+        """Mean |distance| less than before, mm; negative where the prediction makes it worse."""
+        return self.before - self.after
+
+    def as_dict(self) -> dict[str, float]:
+        """Plain values with their unit in the name."""
+        return {
+            "no_change_mm": self.before,
+            "prediction_mm": self.after,
+            "gain_mm": self.gain,
+            "share_better": self.share_better,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class ModelComparison:
+    """Predictions of one patient by several models, evaluated at the same vertices.
+
+    Attributes
+    ----------
+    comparisons : mapping of str to SkinComparison
+        By model, with "no change" for the pre-operative skin, each with all its own vertices.
+    vertices : (k,) uint32
+        Vertices that were evaluated in every comparison.
+    errors : mapping of str to (k,) float64, mm
+        Signed distances at those vertices, by model.
+    statistics : mapping of str to DistanceStatistics
+        Of `errors`.
+    regions : mapping of str to mapping of str to DistanceStatistics
+        By region, then by model.
+    improvements : mapping of str to mapping of str to Improvement
+        By model, then by region, with "whole" for all vertices.
+    """
+
+    comparisons: Mapping[str, SkinComparison]
+    vertices: NDArray[np.uint32]
+    errors: Mapping[str, Floats]
+    statistics: Mapping[str, DistanceStatistics]
+    regions: Mapping[str, Mapping[str, DistanceStatistics]]
+    improvements: Mapping[str, Mapping[str, Improvement]]
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """The models, without "no change"."""
+        return tuple(name for name in self.errors if name != NO_CHANGE)
+
+    def wilcoxon(self, first: str, second: str) -> PairedTest:
+        """The signed-rank test of two models' |distances|, vertex by vertex.
+
+        Parameters
+        ----------
+        first, second : str
+            Models, or "no change".
+
+        Returns
+        -------
+        PairedTest
+        """
+        for name in (first, second):
+            check_one_of("model", name, tuple(self.errors))
+        return wilcoxon_test(np.abs(self.errors[first]), np.abs(self.errors[second]))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values with units in their names, as JSON holds them; no arrays, no tests."""
+        return {
+            "n_common_vertices": len(self.vertices),
+            "models": {name: s.as_dict() for name, s in self.statistics.items()},
+            "regions": {
+                region: {name: s.as_dict() for name, s in table.items()}
+                for region, table in self.regions.items()
+            },
+            "improvements": {
+                name: {region: i.as_dict() for region, i in table.items()}
+                for name, table in self.improvements.items()
+            },
+            "comparisons": {name: c.as_dict() for name, c in self.comparisons.items()},
+        }
+
+
+def compare_models(
+    preoperative: SurfaceData | Surface,
+    predictions: Mapping[str, ArrayLike],
+    postoperative: SurfaceData | Surface,
+    *,
+    landmarks: tuple[Landmarks, Landmarks] | None = None,
+    method: str | None = None,
+    mask: Choice = None,
+    exclude_borders: bool = True,
+    max_distance: float | None = None,
+) -> ModelComparison:
+    """Predictions of several models against the post-operative skin, and against no change.
+
+    Parameters
+    ----------
+    preoperative : SurfaceData or Surface
+        The skin before the operation.
+    predictions : mapping of str to (v, 3) float64, mm
+        Where each model takes the vertices of that skin: vertices plus displacements.
+    postoperative : SurfaceData or Surface
+    landmarks : (landmarks, landmarks), optional
+        Of the *pre-operative* and of the post-operative skin; the first follow each prediction.
+    method, mask, exclude_borders, max_distance
+        As in `compare_skins`. Regions and the mask "face" are placed on the pre-operative skin, so
+        that they hold the same vertices for every model.
+
+    Returns
+    -------
+    ModelComparison
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) No prediction, another number of vertices, the name "no change".
+    RegistrationError, LandmarkError, MeshError
+        (also `ValueError`) As in `compare_skins`; no vertex that all comparisons share.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> found = cmfsim.compare_models(
+    ...     before, {"H": moved_h, "M+S": moved_ms}, after, landmarks=(marks_before, marks_after)
+    ... )  # doctest: +SKIP
+    >>> found.improvements["M+S"]["upper lip"].gain  # doctest: +SKIP
+    """
+    if not predictions:
+        raise CaseInputError("there is no prediction to compare")
+    skin = preoperative if isinstance(preoperative, Surface) else _core(preoperative)
+    moved = {NO_CHANGE: np.asarray(skin.vertices, dtype=np.float64)}
+    for name, vertices in predictions.items():
+        if as_text("model", name) == NO_CHANGE:
+            raise CaseInputError(f"{NO_CHANGE!r} is the pre-operative skin: rename the model")
+        moved[name] = as_rows(f"prediction {name!r}", vertices, 3)
+        if len(moved[name]) != len(skin.vertices):
+            raise CaseInputError(
+                f"prediction {name!r} has {len(moved[name])} vertices, the pre-operative skin "
+                f"{len(skin.vertices)}: the same are needed, in the same order"
+            )
+    names = landmarks[0] if landmarks is not None else None
+    parts: dict[str, NDArray[np.bool_]] = {}
+    if isinstance(names, Mapping) and all(n in names for n in SKIN_LANDMARKS):
+        parts = skin_regions(skin.vertices, names)
+    chosen = parts[mask] if isinstance(mask, str) and mask in parts else mask
+    after = postoperative if isinstance(postoperative, Surface) else _core(postoperative)
+    comparisons = {
+        name: compare_skins(
+            skin.moved(vertices),
+            after,
+            landmarks=_carried(landmarks, skin, vertices),
+            method=method,
+            mask=chosen,
+            regions=parts,
+            exclude_borders=exclude_borders,
+            max_distance=max_distance,
+        )
+        for name, vertices in moved.items()
+    }
+    return _side_by_side(comparisons, parts)
+
+
+def _side_by_side(
+    comparisons: Mapping[str, SkinComparison], parts: Mapping[str, NDArray[np.bool_]]
+) -> ModelComparison:
+    common = next(iter(comparisons.values())).vertices
+    for comparison in comparisons.values():
+        common = np.intersect1d(common, comparison.vertices)
+    if not len(common):
+        raise CaseInputError("no vertex was evaluated in every comparison: use a smaller mask")
+    errors = {
+        name: frozen(c.signed[np.searchsorted(c.vertices, common)])
+        for name, c in comparisons.items()
+    }
+    inside = {name: part[common] for name, part in parts.items() if part[common].any()}
+    whole = {WHOLE: np.ones(len(common), dtype=bool)}
+
+    def gain(name: str, chosen: NDArray[np.bool_]) -> Improvement:
+        before, after = np.abs(errors[NO_CHANGE][chosen]), np.abs(errors[name][chosen])
+        return Improvement(
+            float(before.mean()), float(after.mean()), float((after < before).mean())
+        )
+
+    return ModelComparison(
+        comparisons=MappingProxyType(dict(comparisons)),
+        vertices=frozen(common),
+        errors=MappingProxyType(errors),
+        statistics=MappingProxyType({n: distance_statistics(e) for n, e in errors.items()}),
+        regions=MappingProxyType(
+            {
+                region: MappingProxyType(
+                    {name: distance_statistics(e[part]) for name, e in errors.items()}
+                )
+                for region, part in inside.items()
+            }
+        ),
+        improvements=MappingProxyType(
+            {
+                name: MappingProxyType({r: gain(name, p) for r, p in (whole | inside).items()})
+                for name in errors
+                if name != NO_CHANGE
+            }
+        ),
+    )
+
+
+def _carried(
+    landmarks: tuple[Landmarks, Landmarks] | None, skin: Surface, moved: Floats
+) -> tuple[Landmarks, Landmarks] | None:
+    """The landmarks of the pre-operative skin where a prediction takes them."""
+    if landmarks is None:
+        return None
+    first, second = landmarks
+    motion = SurfaceMotion(skin, moved)
+    if isinstance(first, Mapping):
+        places = np.array([np.asarray(p, dtype=np.float64) for p in first.values()])
+        there = places + motion.displacement(places)
+        return dict(zip(first, there, strict=True)), second
+    places = as_rows("landmarks", first, 3)
+    return places + motion.displacement(places), second
+
+
+def _core(surface: SurfaceData) -> Surface:
+    return Surface(surface.vertices, surface.triangles, crease_angle=surface.crease_angle)

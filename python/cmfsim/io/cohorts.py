@@ -1,0 +1,111 @@
+"""A cohort and its file, `cohort.toml`: the cases and models of a study (docs/formats.md)."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from cmfsim.checks import as_text, check_one_of
+from cmfsim.errors import CaseInputError
+from cmfsim.io.files import FORMAT_VERSION
+from cmfsim.io.tables import read_tables
+from cmfsim.prediction import MODELS
+
+__all__ = ["COHORT_FORMAT", "Cohort"]
+
+COHORT_FORMAT = "cmfsim-cohort"
+
+
+@dataclass(frozen=True)
+class Cohort:
+    """The cases and models of a study.
+
+    Attributes
+    ----------
+    name : str
+    file : Path
+        The cohort file.
+    cases : mapping of str to Path
+        The case file of each patient, by the patient's name.
+    models : tuple of str
+    output : Path
+        Folder of everything that is written for the study.
+    note : str
+        Printed with every result, such as what the patients are.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cohort = cmfsim.Cohort.load("cohort.toml")  # doctest: +SKIP
+    """
+
+    name: str
+    file: Path
+    cases: dict[str, Path]
+    models: tuple[str, ...]
+    output: Path
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        as_text("cohort name", self.name)
+        if not self.cases:
+            raise CaseInputError("a cohort needs a case")
+        for model in self.models:
+            check_one_of("model", model, MODELS)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "Cohort":
+        """The cohort that a `cohort.toml` describes.
+
+        Parameters
+        ----------
+        path : path
+
+        Returns
+        -------
+        Cohort
+
+        Raises
+        ------
+        FileNotFoundError
+            The file does not exist. Cases that it names are not looked for.
+        CaseError
+            (also `ValueError`) Not TOML, an unknown key, a case twice, an unknown model: with file,
+            line and key.
+        """
+        path = Path(path)
+        document = read_tables(path).only(
+            "format", "version", "name", "note", "models", "cases", "output"
+        )
+        found = document.text("format")
+        if found != COHORT_FORMAT:
+            document.fail("format", f"is {found!r}: {COHORT_FORMAT!r} is needed")
+        version = document.need("version", f": write version = {FORMAT_VERSION}")
+        if isinstance(version, bool) or version != FORMAT_VERSION:
+            document.fail("version", f"is {version!r}: this cmfsim reads {FORMAT_VERSION}")
+        models = document.plain("models") if "models" in document else list(MODELS)
+        if not isinstance(models, list) or not models or set(models) - set(MODELS):
+            document.fail("models", f"is {models!r}: a list of {', '.join(MODELS)} is needed")
+        folder = path.parent
+        output = document.text("output", "study")
+        if Path(output).is_absolute() or ".." in Path(output).parts:
+            document.fail("output", f"is {output!r}: name a folder below the cohort's own")
+        cases: dict[str, Path] = {}
+        for table in document.tables("cases"):
+            table.only("name", "file")
+            file = folder / Path(table.text("file")).expanduser()
+            name = table.text("name", file.parent.name or file.stem)
+            if name in cases:
+                table.fail("name" if "name" in table else "file", f"is a second case {name!r}")
+            if not all(c.isalnum() or c in "_-+" for c in name):
+                table.fail("name" if "name" in table else "file", f"{name!r}: letters, digits, _-+")
+            cases[name] = file
+        if not cases:
+            document.fail(None, 'names no case: [[cases]] with file = "P1/case.toml"')
+        return cls(
+            document.text("name", path.resolve().parent.name or "cohort"),
+            path,
+            cases,
+            tuple(dict.fromkeys(models)),
+            folder / output,
+            document.text("note").strip() if "note" in document else "",
+        )

@@ -1,0 +1,30 @@
+"""Pictures of a case, drawn off screen: anatomy, muscles, segments, node kinds, errors."""
+
+from cmfsim.pictures.anatomy import (
+    KIND_COLOURS,
+    SEGMENT_COLOURS,
+    picture_anatomy,
+    picture_node_kinds,
+    picture_segments,
+)
+from cmfsim.pictures.charts import MODEL_COLOURS, chart_errors
+from cmfsim.pictures.distances import DISTANCE_LIMIT, distance_colour, picture_distances
+from cmfsim.pictures.faces import picture_plan, picture_prediction
+from cmfsim.pictures.muscles import picture_muscle_names, picture_muscles
+
+__all__ = [
+    "DISTANCE_LIMIT",
+    "KIND_COLOURS",
+    "MODEL_COLOURS",
+    "SEGMENT_COLOURS",
+    "chart_errors",
+    "distance_colour",
+    "picture_anatomy",
+    "picture_distances",
+    "picture_muscle_names",
+    "picture_muscles",
+    "picture_node_kinds",
+    "picture_plan",
+    "picture_prediction",
+    "picture_segments",
+]

@@ -1,0 +1,183 @@
+"""Box plots of errors, as Kim et al. (2010) show them in Figure 9. Needs matplotlib."""
+
+import io
+import os
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim.checks import as_floats
+from cmfsim.errors import CaseInputError
+
+__all__ = ["MODEL_COLOURS", "chart_errors"]
+
+# By model, in the order of the paper; told apart in grey too.
+MODEL_COLOURS = {
+    "no change": "#c9c5bd",
+    "H": "#f0c987",
+    "M": "#d98a4b",
+    "H+S": "#b5d3e8",
+    "M+S": "#5b9bc9",
+}
+OTHER_COLOURS = ("#8fae7a", "#b58db6", "#d9798b", "#6f6f6f")
+SUFFIXES = (".png", ".svg", ".pdf")
+# Error that is called acceptable in most of the literature, mm.
+ACCEPTABLE = 2.0
+# Width of a group of boxes, of the distance between groups.
+GROUP = 0.8
+
+
+def chart_errors(
+    path: str | os.PathLike[str],
+    errors: Mapping[str, Mapping[str, ArrayLike]],
+    *,
+    width: float = 8.0,
+    height: float = 4.5,
+) -> None:
+    """Writes a box plot of |distance|: a group for each patient or region, a box for each model.
+
+    A box runs from the lower to the upper quartile with a line at the median and a diamond at the
+    mean; whiskers reach to the last value within 1.5 boxes, and what lies beyond is drawn as dots
+    and, above the box, counted.
+
+    Parameters
+    ----------
+    path : path
+        Ends in `.png`, `.svg` or `.pdf`.
+    errors : mapping of str to mapping of str to (k,) float64, mm
+        By patient (or region), then by model: signed distances or their sizes.
+    width, height : float, inches
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) matplotlib is missing, nothing to draw, NaN, another ending.
+
+    Examples
+    --------
+    >>> import cmfsim.pictures
+    >>> cmfsim.pictures.chart_errors(
+    ...     "errors.svg", {"P1": first.errors, "P2": second.errors}
+    ... )  # doctest: +SKIP
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise CaseInputError(
+            f"{path.name}: a chart is written as {', '.join(SUFFIXES)}, not {path.suffix!r}"
+        )
+    groups = {
+        group: {m: np.abs(as_floats(f"errors of {group}, {m}", v)) for m, v in models.items()}
+        for group, models in errors.items()
+    }
+    models = list(dict.fromkeys(m for by_model in groups.values() for m in by_model))
+    if not models:
+        raise CaseInputError("there are no errors to draw")
+    for group, by_model in groups.items():
+        for model, values in by_model.items():
+            if values.ndim != 1 or not len(values):
+                raise CaseInputError(f"errors of {group}, {model} have shape {values.shape}: (k,)")
+    others = iter(OTHER_COLOURS * (1 + len(models) // len(OTHER_COLOURS)))
+    colours = {m: MODEL_COLOURS[m] if m in MODEL_COLOURS else next(others) for m in models}
+    _write_chart(path, groups, colours, (width, height))
+
+
+def _write_chart(
+    path: Path,
+    groups: Mapping[str, Mapping[str, Any]],
+    colours: Mapping[str, str],
+    size: tuple[float, float],
+) -> None:
+    try:
+        matplotlib = import_module("matplotlib")
+        figures = import_module("matplotlib.figure")
+        patches = import_module("matplotlib.patches")
+    except ImportError as error:
+        raise CaseInputError(
+            f"charts are drawn with matplotlib, which cannot be imported ({error}): "
+            "pip install 'cmfsim[report]'"
+        ) from error
+    # Text stays text in SVG, and ids and dates do not change from run to run.
+    settings = {"svg.fonttype": "none", "svg.hashsalt": "cmfsim", "font.size": 9.0}
+    with matplotlib.rc_context(settings):
+        figure = figures.Figure(figsize=size, layout="constrained")
+        axes = figure.add_subplot()
+        _boxes(axes, groups, colours)
+        handles = [
+            patches.Patch(facecolor=c, edgecolor="black", label=m) for m, c in colours.items()
+        ]
+        axes.legend(
+            handles=handles,
+            loc="upper center",
+            bbox_to_anchor=(0.5, 1.14),
+            ncols=len(handles),
+            frameon=False,
+        )
+        file = io.BytesIO()
+        kind = path.suffix.lower()[1:]
+        metadata = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
+        figure.savefig(file, format=kind, dpi=150, metadata=metadata[kind])
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        temporary.write_bytes(file.getvalue())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _boxes(axes: Any, groups: Mapping[str, Mapping[str, Any]], colours: Mapping[str, str]) -> None:
+    step = GROUP / len(colours)
+    for number, by_model in enumerate(groups.values()):
+        for place, (model, colour) in enumerate(colours.items()):
+            if model not in by_model:
+                continue
+            at = number + (place - 0.5 * (len(colours) - 1)) * step
+            drawn = axes.boxplot(
+                by_model[model],
+                positions=[at],
+                widths=0.8 * step,
+                patch_artist=True,
+                showmeans=True,
+                manage_ticks=False,
+                boxprops={"facecolor": colour, "linewidth": 0.8},
+                medianprops={"color": "black", "linewidth": 1.2},
+                whiskerprops={"linewidth": 0.8},
+                capprops={"linewidth": 0.8},
+                meanprops={
+                    "marker": "D",
+                    "markersize": 3.0,
+                    "markerfacecolor": "white",
+                    "markeredgecolor": "black",
+                    "markeredgewidth": 0.7,
+                },
+                flierprops={
+                    "marker": ".",
+                    "markersize": 1.5,
+                    "markeredgecolor": "#555555",
+                    "alpha": 0.4,
+                    "rasterized": True,
+                },
+            )
+            # As the statistics count them: the low ones are the good ones.
+            fliers = drawn["fliers"][0].get_ydata()
+            outliers = fliers[fliers > np.median(by_model[model])]
+            if len(outliers):
+                axes.annotate(
+                    str(len(outliers)),
+                    (at, max(outliers)),
+                    xytext=(0, 3),
+                    textcoords="offset points",
+                    ha="center",
+                    fontsize=6.5,
+                    color="#555555",
+                )
+    axes.axhline(ACCEPTABLE, color="#999999", linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
+    axes.set_xticks(range(len(groups)), list(groups))
+    axes.set_xlim(-0.5, len(groups) - 0.5)
+    axes.set_ylim(bottom=0.0)
+    axes.margins(y=0.08)
+    axes.set_ylabel("|distance| to the post-operative skin, mm")
+    axes.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,152 @@
+"""Errors painted on the skin, as Kim et al. (2010) show them in Figure 10."""
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim.checks import Floats, as_floats, as_positive
+from cmfsim.errors import CaseInputError
+from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
+from cmfsim.scene import SurfaceData
+
+__all__ = ["DISTANCE_LIMIT", "distance_colour", "picture_distances"]
+
+# Ends of the colour bar, mm (Kim et al. 2010, Figure 10).
+DISTANCE_LIMIT = 5.0
+# From behind (blue) over nothing (near white) to in front (red), at equal steps: dark ends that are
+# told apart without seeing red or green, and no colour between that looks like a border.
+COLOURS = ("#1d3f87", "#3f7fbf", "#92c0df", "#f3f1ec", "#eeb08c", "#d2604d", "#84172a")
+NOT_EVALUATED = "#cfcac2"
+# Left round the evaluated vertices, as a share of their extent.
+MARGIN = 0.12
+STEPS = 256
+
+
+def picture_distances(
+    path: str | os.PathLike[str],
+    skin: SurfaceData,
+    distances: ArrayLike,
+    *,
+    limit: float = DISTANCE_LIMIT,
+    regions: Mapping[str, float] | None = None,
+    size: tuple[int, int] = SIZE,
+) -> None:
+    """Writes a picture of signed distances on a skin: from the right, the front and the left.
+
+    Parameters
+    ----------
+    path : path
+        Ends in `.png`.
+    skin : SurfaceData
+        The predicted skin.
+    distances : (v,) float64, mm
+        At its vertices, negative (blue) where the prediction lies behind the post-operative skin. A
+        masked array leaves the masked vertices grey: `SkinComparison.field`.
+    limit : float, mm
+        Ends of the colour bar; larger distances have the colours of its ends.
+    regions : mapping of str to float, mm, optional
+        Signed means to print, each with its colour.
+    size : (int, int), pixels
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) PyVista or OpenGL is missing, another number of distances, none to show,
+        another ending.
+
+    Examples
+    --------
+    >>> import cmfsim.pictures
+    >>> means = {name: s.signed_mean for name, s in report.regions.items()}  # doctest: +SKIP
+    >>> cmfsim.pictures.picture_distances(
+    ...     "error.png", skin, report.field(len(skin.vertices)), regions=means
+    ... )  # doctest: +SKIP
+    """
+    as_positive("limit", limit)
+    vertices = np.asarray(skin.vertices)
+    values, shown = _values(distances, len(vertices))
+    low, high = bounds([vertices[shown]])
+    corners = np.array([low - MARGIN * (high - low), high + MARGIN * (high - low)])
+    legend = [
+        (f"{name} {mean:+.2f} mm", distance_colour(mean, limit))
+        for name, mean in (regions or {}).items()
+    ]
+    if not shown.all():
+        legend.append(("not evaluated", NOT_EVALUATED))
+    table = np.array([_rgb(x, limit) for x in np.linspace(-limit, limit, STEPS)], dtype=np.uint8)
+
+    def paint(plotter: Any, view: View) -> None:
+        surface = polydata(vertices, skin.triangles)
+        surface["distance"] = np.where(shown, values, np.nan)
+        last = view.direction == "left"
+        plotter.add_mesh(
+            surface,
+            scalars="distance",
+            cmap=_lookup(table, limit),
+            smooth_shading=True,
+            ambient=0.45,
+            diffuse=0.6,
+            specular=0.0,
+            show_scalar_bar=False,
+        )
+        if last:
+            bar = plotter.add_scalar_bar(
+                title="mm",
+                n_labels=5,
+                fmt="%+.1f",
+                vertical=True,
+                position_x=0.84,
+                position_y=0.25,
+                width=0.10,
+                height=0.5,
+                color="black",
+                title_font_size=16,
+                label_font_size=14,
+            )
+            bar.SetUnconstrainedFontSize(True)  # noqa: FBT003 (VTK's own signature)
+
+    views = (
+        View("right", "right"),
+        View("front", "front   blue: prediction behind, red: in front"),
+        View("left", "left"),
+    )
+    draw(path, views, corners, size, paint, legend)
+
+
+def distance_colour(distance: float, limit: float = DISTANCE_LIMIT) -> str:
+    """The colour of a signed distance, as "#rrggbb"."""
+    return "#" + "".join(f"{channel:02x}" for channel in _rgb(distance, limit))
+
+
+def _rgb(distance: float, limit: float) -> tuple[int, int, int]:
+    place = (np.clip(distance / limit, -1.0, 1.0) + 1.0) / 2.0 * (len(COLOURS) - 1)
+    stops = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in COLOURS], dtype=float)
+    channels = [np.interp(place, np.arange(len(COLOURS)), stops[:, k]) for k in range(3)]
+    red, green, blue = (round(float(c)) for c in channels)
+    return red, green, blue
+
+
+def _lookup(table: NDArray[np.uint8], limit: float) -> Any:
+    """VTK's table of the colours."""
+    import pyvista as pv  # noqa: PLC0415 (heavy, and `draw` has found it)
+
+    opaque = np.full((len(table), 1), 255, dtype=np.uint8)
+    lookup = pv.LookupTable(values=np.hstack([table, opaque]))
+    lookup.scalar_range = (-limit, limit)
+    lookup.nan_color = NOT_EVALUATED
+    return lookup
+
+
+def _values(distances: ArrayLike, count: int) -> tuple[Floats, NDArray[np.bool_]]:
+    """The distances at all vertices, and which of them are to be shown."""
+    shown = ~np.ma.getmaskarray(np.ma.asarray(distances))
+    if shown.shape != (count,):
+        raise CaseInputError(
+            f"distances have shape {shown.shape}, but the skin has {count} vertices"
+        )
+    if not shown.any():
+        raise CaseInputError("every distance is masked: there is nothing to show")
+    return as_floats("distances", np.ma.filled(np.ma.asarray(distances, dtype=float), 0.0)), shown

@@ -1,0 +1,188 @@
+"""Pictures of muscles: with their names, or with fibre boxes and directions.
+
+The latter after Kim et al. (2010), Figure 2.
+"""
+
+import colorsys
+import os
+from typing import Any
+
+import numpy as np
+
+from cmfsim._core import MuscleFibres, Surface
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError
+from cmfsim.musculature import MuscleSurface, Musculature
+from cmfsim.pictures.canvas import LEGEND_ROW, SIZE, View, bounds, draw, polydata
+from cmfsim.scene import SurfaceData
+
+__all__ = ["picture_muscle_names", "picture_muscles"]
+
+MUSCLE_COLOUR, BONE_COLOUR = "#b8564b", "#e6dcc3"
+# Boxes whose direction the outline hardly tells are drawn in the second colour.
+BOX_COLOUR, SHEET_COLOUR, LINE_COLOUR = "#1f5fbf", "#e08a00", "#202020"
+# Length of a direction on the surface, as a share of the picture's diagonal.
+STROKE = 0.012
+# About as many directions are drawn on each muscle.
+STROKES = 60
+
+
+def picture_muscles(
+    path: str | os.PathLike[str],
+    musculature: Musculature,
+    skull: SurfaceData | None = None,
+    *,
+    size: tuple[int, int] = SIZE,
+) -> None:
+    """Writes a picture of muscles with boxes and fibre directions: front, left front and left.
+
+    Boxes of muscles whose outline hardly tells the direction are orange, others blue. Where fibre
+    lines are known the directions follow them.
+
+    Parameters
+    ----------
+    path : path
+        Ends in `.png`.
+    musculature : Musculature
+    skull : SurfaceData or None
+        Drawn behind the muscles.
+    size : (int, int), pixels
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) PyVista or OpenGL is missing, no muscle, another ending.
+    MeshError
+        (also `ValueError`) A muscle's surface that cannot be used.
+
+    Examples
+    --------
+    >>> import cmfsim.pictures
+    >>> cmfsim.pictures.picture_muscles("muscles.png", muscles)  # doctest: +SKIP
+    """
+    if not len(musculature):
+        raise CaseInputError("there is no muscle to draw")
+    clouds = [np.asarray(muscle.surface.vertices) for muscle in musculature]
+    if skull is not None:
+        clouds.append(np.asarray(skull.vertices))
+    corners = bounds(clouds)
+    length = STROKE * float(np.linalg.norm(corners[1] - corners[0]))
+    drawn = [(muscle, *_lines(muscle, length)) for muscle in musculature]
+
+    def paint(plotter: Any, view: View) -> None:
+        del view
+        if skull is not None:
+            plotter.add_mesh(polydata(skull.vertices, skull.triangles), color=BONE_COLOUR)
+        for muscle, strokes, edges, colour in drawn:
+            surface = polydata(muscle.surface.vertices, muscle.surface.triangles)
+            plotter.add_mesh(surface, color=MUSCLE_COLOUR, smooth_shading=True, ambient=0.2)
+            plotter.add_lines(strokes, color=LINE_COLOUR, width=2)
+            plotter.add_lines(edges, color=colour, width=1)
+
+    views = tuple(View(name, name) for name in ("front", "left front", "left"))
+    legend = [
+        ("muscle", MUSCLE_COLOUR),
+        ("fibre direction", LINE_COLOUR),
+        ("box", BOX_COLOUR),
+        ("box of a sheet", SHEET_COLOUR),
+    ]
+    draw(path, views, corners, size, paint, legend)
+
+
+def picture_muscle_names(
+    path: str | os.PathLike[str],
+    musculature: Musculature,
+    skull: SurfaceData | None = None,
+    *,
+    size: tuple[int, int] = SIZE,
+) -> None:
+    """Writes a picture of muscles in colours with their names: from the front and the left.
+
+    Muscles of both sides that are called alike have one colour.
+
+    Parameters
+    ----------
+    path : path
+        Ends in `.png`.
+    musculature : Musculature
+    skull : SurfaceData, optional
+        Drawn with them, such as the patient's bones.
+    size : (int, int), pixels
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) PyVista or OpenGL is missing, no muscle, another ending.
+
+    Examples
+    --------
+    >>> import cmfsim, cmfsim.pictures
+    >>> template = cmfsim.MuscleTemplate.load("default")
+    >>> cmfsim.pictures.picture_muscle_names(
+    ...     "muscles.png", template.musculature, template.skull
+    ... )  # doctest: +SKIP
+    """
+    if not len(musculature):
+        raise CaseInputError("there is no muscle to draw")
+    names = list(dict.fromkeys(_without_side(muscle.name) for muscle in musculature))
+    colours = {name: _hue(number) for number, name in enumerate(names)}
+    drawn = [np.asarray(muscle.surface.vertices) for muscle in musculature]
+    corners = bounds(drawn if skull is None else [*drawn, np.asarray(skull.vertices)])
+
+    def paint(plotter: Any, view: View) -> None:
+        if not view.caption:
+            return
+        if skull is not None:
+            shape = polydata(skull.vertices, skull.triangles)
+            plotter.add_mesh(shape, color=BONE_COLOUR, smooth_shading=True)
+        for muscle in musculature:
+            shape = polydata(muscle.surface.vertices, muscle.surface.triangles)
+            colour = colours[_without_side(muscle.name)]
+            plotter.add_mesh(shape, color=colour, smooth_shading=True, ambient=0.15)
+
+    # The legend stands beside the heads, not on them.
+    blank = View("front", "")
+    views = (blank, View("front", "front"), View("left", "left"))
+    rows = int(size[1]) // LEGEND_ROW - 1
+    draw(path, views, corners, size, paint, list(colours.items())[:rows])
+
+
+def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:
+    """Fibre strokes and box edges as pairs of points, and the colour of the boxes."""
+    vertices = np.asarray(muscle.surface.vertices, dtype=np.float64)
+    triangles = np.asarray(muscle.surface.triangles, dtype=np.int64)
+    surface = Surface(vertices, triangles)
+    fibres = MuscleFibres(surface, muscle.kind, muscle.boxes, muscle.course)
+    every = max(1, len(triangles) // STROKES)
+    corners = vertices[triangles[::every]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    # Just above the surface, so that they show.
+    middle = corners.mean(axis=1) + 0.15 * length * normals
+    half = 0.5 * length * fibres.directions(middle)
+    strokes = np.stack([middle - half, middle + half], axis=1).reshape(-1, 3)
+    centres, axes, half_extents = fibres.boxes
+    edges = []
+    for centre, frame, extent in zip(centres, axes, half_extents, strict=True):
+        for axis in range(3):
+            others = [k for k in range(3) if k != axis]
+            for a in (-1.0, 1.0):
+                for b in (-1.0, 1.0):
+                    at = centre + a * extent[others[0]] * frame[others[0]]
+                    at = at + b * extent[others[1]] * frame[others[1]]
+                    along = extent[axis] * frame[axis]
+                    edges += [at - along, at + along]
+    colour = SHEET_COLOUR if fibres.is_sheet else BOX_COLOUR
+    return strokes, np.array(edges), colour
+
+
+def _without_side(name: str) -> str:
+    return name.removesuffix("_L").removesuffix("_R")
+
+
+def _hue(number: int) -> str:
+    """A colour that differs from those of the numbers near it."""
+    # Steps of the golden section spread hues evenly, however many there are.
+    hue = (number * 0.6180339887) % 1.0
+    channels = colorsys.hsv_to_rgb(hue, 0.75, 0.62 + 0.28 * (number % 2))
+    return "#" + "".join(f"{round(255 * channel):02x}" for channel in channels)

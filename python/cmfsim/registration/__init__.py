@@ -1,0 +1,22 @@
+"""Registration: landmarks matched by name and judged, folds of a warp, iterative closest points.
+
+The splines and fits themselves are `cmfsim.ThinPlateSpline` and `cmfsim.rigid_fit` of the core.
+"""
+
+from cmfsim.registration.agreement import LandmarkAgreement, leave_one_out
+from cmfsim.registration.closest import icp
+from cmfsim.registration.folds import FoldReport, fold_report
+from cmfsim.registration.landmarks import LandmarkMatch, match_landmarks
+from cmfsim.registration.sides import side_vectors, wrong_sides
+
+__all__ = [
+    "FoldReport",
+    "LandmarkAgreement",
+    "LandmarkMatch",
+    "fold_report",
+    "icp",
+    "leave_one_out",
+    "match_landmarks",
+    "side_vectors",
+    "wrong_sides",
+]

@@ -1,0 +1,106 @@
+"""Iterative closest points between arrays and surfaces."""
+
+import math
+
+from numpy.typing import ArrayLike
+
+from cmfsim import _core
+from cmfsim._core import IcpFit, Surface
+from cmfsim.scene import SurfaceData
+
+__all__ = ["icp"]
+
+
+def icp(
+    moving: ArrayLike | Surface | SurfaceData,
+    fixed: ArrayLike | Surface | SurfaceData,
+    *,
+    initial: ArrayLike | None = None,
+    trim: float = 0.0,
+    method: str | None = None,
+    max_iterations: int = 200,
+    tolerance: float = 1e-9,
+    max_distance: float | None = None,
+    max_angle: float | None = None,
+    keep_border: bool = False,
+) -> IcpFit:
+    """The rigid motion that brings points closest to a surface or to other points.
+
+    Parameters
+    ----------
+    moving : (n, 3) array_like, Surface or SurfaceData, mm
+        Of a surface, its vertices, each counting alike.
+    fixed : (k, 3) array_like, Surface or SurfaceData, mm
+    initial : (4, 4) array_like, optional
+        Rigid motion to begin with; `matrix` includes it.
+    trim : float
+        Share of the pairs, those farthest apart, that each step leaves out: 0 to below 1. Take a
+        little more than the share of points without a partner.
+    method : str, optional
+        "plane" steps to tangent planes and needs a surface; "point" steps to the closest points.
+        Without it, "plane" for a surface and "point" for points.
+    max_iterations : int
+    tolerance : float
+        The points rest when a step moves none by more than this share of their radius. 0: exactly
+        `max_iterations` steps.
+    max_distance : float, optional, mm
+        Pairs farther apart are left out.
+    max_angle : float, optional, degrees
+        Pairs of surfaces whose normals differ by more are left out.
+    keep_border : bool
+        Whether pairs on the border of an open surface count. Where the moving points reach past it,
+        their closest points there are not their partners.
+
+    Returns
+    -------
+    IcpFit
+        `matrix` (4, 4), `rms` (mm, of the pairs that count), `iterations`, `converged`,
+        `kept` (n,), `kept_fraction`, `distances` (n,), `rms_history`.
+
+    Raises
+    ------
+    RegistrationError
+        Not converged after `max_iterations`, with `rms_history`; too few pairs left; a motion that
+        the surface leaves open; as `ValueError` too: points in one line, options out of range.
+
+    Notes
+    -----
+    Besl & McKay (1992), with trimming (Chetverikov et al. 2002) and steps to tangent planes (Chen &
+    Medioni 1992); one that raises the distances is replaced by a step to the points. It finds the
+    nearest solution, so begin within about 20 mm and 10°.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> corner = [[0, 0, 0], [30, 0, 0], [0, 20, 0], [0, 0, 10]]
+    >>> fixed = cmfsim.Surface(corner, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    >>> points = [[5, 5, 0], [9, 3, 0], [4, 0, 3], [9, 0, 2], [0, 4, 3], [0, 8, 2]]
+    >>> fit = cmfsim.icp([[x + 0.5, y, z - 0.3] for x, y, z in points], fixed)
+    >>> fit.matrix[:3, 3].round(6).tolist()
+    [-0.5, 0.0, 0.3]
+    """
+    fixed = _surface(fixed)
+    moving = _surface(moving)
+    normals = None
+    if isinstance(moving, Surface):
+        normals = moving.vertex_normals if max_angle is not None else None
+        moving = moving.vertices
+    return _core.icp(
+        moving,
+        fixed,
+        initial=initial,
+        trim=trim,
+        method=method,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+        max_distance=max_distance,
+        max_angle=None if max_angle is None else math.radians(max_angle),
+        keep_border=keep_border,
+        normals=normals,
+    )
+
+
+def _surface(value: ArrayLike | Surface | SurfaceData) -> ArrayLike | Surface:
+    if isinstance(value, SurfaceData):
+        return Surface(value.vertices, value.triangles, crease_angle=value.crease_angle)
+    return value

@@ -1,0 +1,18 @@
+"""Reports of results: one self-contained page for a case or a study, on screen and on paper."""
+
+from cmfsim.report.case import case_document
+from cmfsim.report.document import Document, Figure, Note, Section, Table
+from cmfsim.report.page import render_page, write_page
+from cmfsim.report.study import study_document
+
+__all__ = [
+    "Document",
+    "Figure",
+    "Note",
+    "Section",
+    "Table",
+    "case_document",
+    "render_page",
+    "study_document",
+    "write_page",
+]

@@ -1,0 +1,99 @@
+"""What a report says, without its looks: sections of notes, tables and figures."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from cmfsim.errors import CaseInputError
+
+__all__ = ["Document", "Figure", "Note", "Section", "Table", "number"]
+
+# Stands where there is no figure.
+NOTHING = "–"
+
+
+def number(value: object, digits: int = 2) -> str:
+    """A number as a table shows it; a dash where there is none."""
+    if value is None:
+        return NOTHING
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    if isinstance(value, int):
+        return f"{value:,}".replace(",", "\u202f")
+    small = value != 0.0 and abs(value) < 0.5 * 10.0**-digits
+    return f"{value:.1e}" if small else f"{value:.{digits}f}"
+
+
+@dataclass(frozen=True)
+class Note:
+    """Paragraphs of text; `kind` is "plain", "warning" or "error"."""
+
+    text: str
+    kind: str = "plain"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under a heading; columns of numbers are set right.
+
+    Attributes
+    ----------
+    columns : tuple of str
+    rows : tuple of tuple of str
+    caption : str
+    numeric : bool
+        Whether all columns but the first hold numbers.
+    """
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    caption: str = ""
+    numeric: bool = True
+
+    def __post_init__(self) -> None:
+        for i, row in enumerate(self.rows):
+            if len(row) != len(self.columns):
+                raise CaseInputError(
+                    f"row {i} of a table has {len(row)} cells, its head {len(self.columns)}"
+                )
+
+    @classmethod
+    def of_pairs(cls, pairs: Mapping[str, object], caption: str = "") -> "Table":
+        """Names and values in two columns."""
+        rows = tuple((name, number(value)) for name, value in pairs.items())
+        return cls(("", ""), rows, caption, numeric=False)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture with what it shows: the bytes of a PNG, or the text of an SVG."""
+
+    image: bytes | str
+    caption: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a report under its heading."""
+
+    title: str
+    blocks: tuple[Note | Table | Figure, ...]
+
+
+@dataclass(frozen=True)
+class Document:
+    """A whole report.
+
+    Attributes
+    ----------
+    title, subtitle : str
+    facts : mapping of str to str
+        The few figures that a reader looks for first.
+    sections : sequence of Section
+    footer : str
+    """
+
+    title: str
+    subtitle: str
+    facts: Mapping[str, str] = field(default_factory=dict)
+    sections: Sequence[Section] = ()
+    footer: str = ""

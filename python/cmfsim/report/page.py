@@ -1,0 +1,75 @@
+"""A report as one HTML page that needs nothing beside it: for browsers and for paper."""
+
+import base64
+import os
+from importlib import import_module
+from importlib.resources import files
+from pathlib import Path
+
+from cmfsim.errors import CaseInputError
+from cmfsim.io.files import replacing
+from cmfsim.report.document import Document, Figure, Note, Table
+
+__all__ = ["render_page", "write_page"]
+
+DISCLAIMER = "Research software, not a medical device. Not for diagnosis or treatment decisions."
+
+
+def render_page(document: Document) -> str:
+    """The page of a report: all text escaped, pictures inside, no scripts, no addresses.
+
+    Parameters
+    ----------
+    document : Document
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Jinja2, of the extra `report`, is not installed.
+    """
+    try:
+        jinja2 = import_module("jinja2")
+    except ImportError as error:
+        raise CaseInputError(
+            f"reports are made with Jinja2, which cannot be imported ({error}): "
+            "pip install 'cmfsim[report]'"
+        ) from error
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.globals.update(kind_of=_kind, address=_address)
+    text = files("cmfsim.report").joinpath("page.html").read_text(encoding="utf-8")
+    page: str = environment.from_string(text).render(document=document, disclaimer=DISCLAIMER)
+    return page
+
+
+def write_page(path: str | os.PathLike[str], document: Document) -> None:
+    """Writes the page of a report, replacing an older one in one step.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Jinja2, of the extra `report`, is not installed.
+    OSError
+        The folder cannot be written to.
+    """
+    page = render_page(document)
+    with replacing(Path(path)) as file:
+        file.write(page.encode())
+
+
+def _kind(block: Note | Table | Figure) -> str:
+    return type(block).__name__
+
+
+def _address(figure: Figure) -> str:
+    """The picture as a data address."""
+    if isinstance(figure.image, str):
+        data, kind = figure.image.encode(), "svg+xml"
+    else:
+        data, kind = figure.image, "png"
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"

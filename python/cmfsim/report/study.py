@@ -1,0 +1,137 @@
+"""The report of a study: every case by every model, beside the paper's own patients."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from cmfsim.report.document import NOTHING, Document, Figure, Note, Section, Table, number
+
+__all__ = ["PAPER_AVERAGES", "study_document"]
+
+Values = Mapping[str, Any]
+
+# Mean errors over the four patients of Kim et al. (2010), Table 3, mm, and those of model M+S by
+# patient.
+PAPER_AVERAGES: Mapping[str, float] = {"H": 2.75, "M": 2.45, "H+S": 2.09, "M+S": 1.87}
+PAPER_MUSCLES_SLIDING = (1.21, 2.14, 1.58, 2.56)
+
+
+def study_document(study: Values, *, figures: Sequence[Figure] = ()) -> Document:
+    """The report of a study.
+
+    Parameters
+    ----------
+    study : mapping
+        `StudyReport.as_dict()`.
+    figures : sequence of Figure
+
+    Returns
+    -------
+    Document
+    """
+    models = tuple(study["models"])
+    done = [case for case in study["cases"] if case["status"] != "failed"]
+    failed = [case for case in study["cases"] if case["status"] == "failed"]
+    sections = []
+    if study["note"]:
+        sections.append(Section("Patients", (Note(study["note"], "warning"),)))
+    sections.append(Section("Error of each model", _error_blocks(done, models, figures)))
+    sections.append(Section("Regions", _region_blocks(done, models)))
+    sections.append(Section("The paper's patients", (_paper_table(models), Note(PAPER_NOTE))))
+    sections.append(Section("Cases", _case_blocks(study["cases"], failed)))
+    facts = {
+        "cases": f"{len(done)} of {len(study['cases'])}",
+        "models": ", ".join(models),
+        "time": f"{study['seconds']:.0f} s",
+    }
+    subtitle = "Errors are distances of the predicted skin from the skin after the operation, mm."
+    return Document(f"{study['cohort']}: study", subtitle, facts, sections)
+
+
+PAPER_NOTE = (
+    "Kim et al. (2010), Table 3. Other patients, other scans and other landmarks: the two tables "
+    "say whether errors are of one size, not which program is better."
+)
+
+
+def _error_blocks(
+    done: Sequence[Values], models: tuple[str, ...], figures: Sequence[Figure]
+) -> tuple[Note | Table | Figure, ...]:
+    rows = []
+    for case in done:
+        entries = case["evaluation"]["models"]
+        cells = [_mean_sd(entries.get(model)) for model in models]
+        rows.append((case["name"], *cells, _mean_sd(case["evaluation"].get("no_change"))))
+    if done:
+        means = [_average(done, lambda e, m=model: e["models"].get(m)) for model in models]
+        still = _average(done, lambda e: e.get("no_change"))
+        rows.append(("mean", *(number(mean) for mean in means), number(still)))
+    table = Table(
+        ("case", *models, "no change"),
+        tuple(rows),
+        "Mean ± SD over the whole face, mm (as the paper's Table 3); the last column takes the "
+        "face before the operation as the prediction.",
+    )
+    return (table, *figures)
+
+
+def _region_blocks(done: Sequence[Values], models: tuple[str, ...]) -> tuple[Note | Table, ...]:
+    """Where each model is better than no change, and where it makes things worse."""
+    names = list(
+        dict.fromkeys(
+            region
+            for case in done
+            for entry in case["evaluation"]["models"].values()
+            for region in entry["regions"]
+        )
+    )
+    blocks: list[Note | Table] = []
+    for model in models:
+        rows = []
+        for case in done:
+            entry = case["evaluation"]["models"].get(model)
+            still = case["evaluation"].get("no_change")
+            if entry is None:
+                continue
+            rows.append((case["name"], *(_gain(entry, still, name) for name in names)))
+        caption = f"Model {model}: mean error, and in brackets its change against no change, mm."
+        blocks.append(Table(("case", *names), tuple(rows), caption))
+    return tuple(blocks) or (Note("No case was finished."),)
+
+
+def _gain(entry: Values, still: Values | None, region: str) -> str:
+    if region not in entry["regions"]:
+        return NOTHING
+    mean = entry["regions"][region]["mean_mm"]
+    if still is None or region not in still["regions"]:
+        return number(mean)
+    return f"{mean:.2f} ({mean - still['regions'][region]['mean_mm']:+.2f})"
+
+
+def _paper_table(models: tuple[str, ...]) -> Table:
+    rows = [
+        ("mean of four patients", *(number(PAPER_AVERAGES[m]) for m in models)),
+        *(
+            (f"patient {i + 1}", *(number(value) if m == "M+S" else NOTHING for m in models))
+            for i, value in enumerate(PAPER_MUSCLES_SLIDING)
+        ),
+    ]
+    return Table(("", *models), tuple(rows), "Mean error in the paper, mm.")
+
+
+def _case_blocks(cases: Sequence[Values], failed: Sequence[Values]) -> tuple[Note | Table, ...]:
+    rows = tuple((case["name"], case["status"], number(case["seconds"], 0)) for case in cases)
+    table = Table(("case", "outcome", "time, s"), rows)
+    return (table, *(Note(f"{case['name']} failed: {case['error']}", "error") for case in failed))
+
+
+def _mean_sd(entry: Values | None) -> str:
+    if entry is None:
+        return NOTHING
+    face = entry["regions"]["whole"]
+    return f"{face['mean_mm']:.2f} ± {face['std_mm']:.2f}"
+
+
+def _average(done: Sequence[Values], pick: Any) -> float | None:
+    found = [pick(case["evaluation"]) for case in done]
+    means = [entry["regions"]["whole"]["mean_mm"] for entry in found if entry is not None]
+    return sum(means) / len(means) if means else None

@@ -1,0 +1,251 @@
+"""Many cases by several models: each in a process of its own, kept when it was done before."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.io import Case, Cohort
+from cmfsim.study.evaluation import EVALUATION_FILE, evaluation_key
+
+__all__ = ["CaseJob", "CaseOutcome", "StudyReport", "run_study"]
+
+# Lines of a failed case's log that are shown.
+SHOWN_LINES = 12
+LOG_FILE = "log.txt"
+
+
+@dataclass(frozen=True)
+class CaseJob:
+    """One case of a study, as plain values that travel to another process or machine.
+
+    Attributes
+    ----------
+    name, file, output : str
+    models : tuple of str
+    threads : int
+        That the case may use.
+    """
+
+    name: str
+    file: str
+    output: str
+    models: tuple[str, ...]
+    threads: int
+
+
+@dataclass(frozen=True)
+class CaseOutcome:
+    """What became of one case.
+
+    Attributes
+    ----------
+    name : str
+    status : str
+        "done", "kept" (finished by an earlier run, nothing has changed since) or "failed".
+    seconds : float
+    error : str
+        The last lines of its log, where it failed.
+    evaluation : mapping
+        What `cmfsim evaluate` wrote; empty where it failed.
+    """
+
+    name: str
+    status: str
+    seconds: float = 0.0
+    error: str = ""
+    evaluation: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class StudyReport:
+    """The outcome of every case of a cohort, in its order.
+
+    Attributes
+    ----------
+    cohort : Cohort
+    outcomes : tuple of CaseOutcome
+    seconds : float
+    """
+
+    cohort: Cohort
+    outcomes: tuple[CaseOutcome, ...]
+    seconds: float
+
+    @property
+    def failed(self) -> tuple[CaseOutcome, ...]:
+        """The cases that failed."""
+        return tuple(o for o in self.outcomes if o.status == "failed")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return {
+            "cohort": self.cohort.name,
+            "note": self.cohort.note,
+            "models": list(self.cohort.models),
+            "seconds": self.seconds,
+            "cases": [asdict(outcome) for outcome in self.outcomes],
+        }
+
+
+def run_study(
+    cohort: Cohort,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    fresh: bool = False,
+    progress: Callable[[CaseOutcome], None] | None = None,
+) -> StudyReport:
+    """Every case of a cohort, predicted by every model and compared with what came after.
+
+    Each case is worked on by a process of its own, so that one that crashes or fills the memory is
+    reported and does not stop the rest. A case that an earlier run finished is kept as long as its
+    inputs, its models and this version are the same.
+
+    Parameters
+    ----------
+    cohort : Cohort
+    workers : int, optional
+        Cases at a time on this machine; one per two cores if left out, since a case uses several.
+    scheduler : str, optional
+        Address of a Dask cluster that sees the same files; it then decides how many run at a time.
+    fresh : bool
+        Whether finished cases are worked on again.
+    progress : callable, optional
+        Called with each outcome as it comes.
+
+    Returns
+    -------
+    StudyReport
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Less than one worker; no Dask installed, or no cluster at the address.
+    OSError
+        The output folder cannot be made.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> report = cmfsim.run_study(cmfsim.Cohort.load("cohort.toml"))  # doctest: +SKIP
+    >>> [outcome.status for outcome in report.outcomes]  # doctest: +SKIP
+    ['done', 'done', 'kept', 'failed']
+    """
+    cores = os.cpu_count() or 1
+    if workers is not None and workers < 1:
+        raise CaseInputError(f"workers is {workers}: must be 1 or more")
+    workers = max(1, cores // 2) if workers is None else workers
+    begun = time.perf_counter()
+    cohort.output.mkdir(parents=True, exist_ok=True)
+    outcomes: dict[str, CaseOutcome] = {}
+    jobs = []
+    for name, file in cohort.cases.items():
+        output = cohort.output / name
+        kept = None if fresh else _kept(name, file, output, cohort.models)
+        if kept is None:
+            threads = max(1, cores // workers)
+            jobs.append(CaseJob(name, str(file), str(output), cohort.models, threads))
+        else:
+            outcomes[name] = kept
+            if progress is not None:
+                progress(kept)
+    run = _on_this_machine(jobs, workers) if scheduler is None else _on_dask(jobs, scheduler)
+    for outcome in run:
+        outcomes[outcome.name] = outcome
+        if progress is not None:
+            progress(outcome)
+    ordered = tuple(outcomes[name] for name in cohort.cases)
+    return StudyReport(cohort, ordered, time.perf_counter() - begun)
+
+
+def _kept(name: str, file: Path, output: Path, models: tuple[str, ...]) -> CaseOutcome | None:
+    """The outcome of an earlier run, if nothing has changed since."""
+    try:
+        written = json.loads((output / EVALUATION_FILE).read_text(encoding="utf-8"))
+        key = evaluation_key(Case.load(file), models)
+    except (OSError, ValueError, CmfsimError):
+        return None
+    if not isinstance(written, dict) or written.get("key") != key:
+        return None
+    return CaseOutcome(name, "kept", evaluation=written)
+
+
+def _on_this_machine(jobs: list[CaseJob], workers: int) -> Iterator[CaseOutcome]:
+    # Threads that wait for processes: what a case does, happens in its own.
+    with ThreadPoolExecutor(workers) as pool:
+        running: list[Future[CaseOutcome]] = [pool.submit(run_job, job) for job in jobs]
+        try:
+            for future in as_completed(running):
+                yield future.result()
+        except BaseException:
+            for future in running:
+                future.cancel()
+            raise
+
+
+def _on_dask(jobs: list[CaseJob], scheduler: str) -> Iterator[CaseOutcome]:
+    try:
+        distributed = import_module("distributed")
+    except ImportError as error:
+        raise CaseInputError(
+            f"a study on a cluster needs Dask ({error}): pip install 'cmfsim[study]'"
+        ) from error
+    try:
+        client = distributed.Client(scheduler)
+    except (OSError, ValueError) as error:
+        raise CaseInputError(f"no Dask scheduler answers at {scheduler!r}: {error}") from error
+    with client:
+        futures = [
+            client.submit(run_job, job, pure=False, key=f"cmfsim-{job.name}") for job in jobs
+        ]
+        for future in distributed.as_completed(futures):
+            job = jobs[futures.index(future)]
+            try:
+                yield future.result()
+            except Exception as error:  # noqa: BLE001 (a worker that died may raise anything)
+                yield CaseOutcome(job.name, "failed", error=f"the cluster lost the case: {error}")
+
+
+def run_job(job: CaseJob) -> CaseOutcome:
+    """The outcome of one case, worked on by another process."""
+    output = Path(job.output)
+    begun = time.perf_counter()
+    command = [sys.executable, "-m", "cmfsim.cli", "evaluate", job.file, "-o", job.output, "-q"]
+    for model in job.models:
+        command += ["--model", model]
+    environment = {**os.environ, "RAYON_NUM_THREADS": str(job.threads)}
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        with (output / LOG_FILE).open("wb") as log:
+            done = subprocess.run(  # noqa: S603 (this interpreter and our own words)
+                command,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                check=False,
+            )
+        seconds = time.perf_counter() - begun
+        if done.returncode != 0:
+            return CaseOutcome(job.name, "failed", seconds, _reason(done.returncode, output))
+        evaluation = json.loads((output / EVALUATION_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        seconds = time.perf_counter() - begun
+        return CaseOutcome(job.name, "failed", seconds, f"{type(error).__name__}: {error}")
+    return CaseOutcome(job.name, "done", seconds, evaluation=evaluation)
+
+
+def _reason(code: int, output: Path) -> str:
+    """Why a process ended: a signal, or the last lines that it wrote."""
+    lines = (output / LOG_FILE).read_text(encoding="utf-8", errors="replace").splitlines()
+    ended = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
+    return "\n".join([ended, *lines[-SHOWN_LINES:]])

@@ -1,0 +1,164 @@
+"""One case by several models, compared with the face after the operation."""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cmfsim._core import __version__
+from cmfsim.build import Postoperative, input_hashes, read_postoperative
+from cmfsim.case import Finding
+from cmfsim.evaluation import NO_CHANGE, WHOLE, ModelComparison, compare_models
+from cmfsim.io import Case
+from cmfsim.prediction import MODELS, Prediction
+from cmfsim.study.prediction import predict_models
+
+__all__ = ["EVALUATION_FILE", "CaseEvaluation", "evaluate", "evaluation_key"]
+
+Progress = Callable[[str], None]
+# Written last, so that a case that has it is finished.
+EVALUATION_FILE = "metrics.json"
+WILCOXON_NOTE = (
+    "Wilcoxon's signed-rank test vertex by vertex, as the paper has it: neighbouring vertices are "
+    "not independent, so that its p values are far too small; look at the size of the difference."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class CaseEvaluation:
+    """How well models predict one patient.
+
+    Attributes
+    ----------
+    predictions : tuple of Prediction
+    postoperative : Postoperative
+    comparison : ModelComparison
+    key : str
+        Of everything that the result depends on: inputs, models, version.
+    """
+
+    predictions: tuple[Prediction, ...]
+    postoperative: Postoperative
+    comparison: ModelComparison
+    key: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON: errors by model and region, tests, key."""
+        errors = {name: self._of(name) for name in self.comparison.errors}
+        still = errors.pop(NO_CHANGE)
+        names = list(errors)
+        tests = {
+            f"{one}, {other}": self.comparison.wilcoxon(one, other).as_dict()
+            for i, one in enumerate(names)
+            for other in names[i + 1 :]
+        }
+        first = self.predictions[0]
+        timings = {
+            name: sum(p.summary["timings"].values())
+            for name, p in zip(names, self.predictions, strict=True)
+        }
+        return {
+            "case": first.name,
+            "key": self.key,
+            "models": errors,
+            "no_change": still,
+            "wilcoxon": tests,
+            "notes": [WILCOXON_NOTE] if tests else [],
+            "seconds": timings,
+            "findings": [f.what for f in self.postoperative.findings],
+        }
+
+    def _of(self, name: str) -> dict[str, Any]:
+        comparison = self.comparison
+        by_region = {region: table[name] for region, table in comparison.regions.items()}
+        regions = {WHOLE: comparison.statistics[name], **by_region}
+        return {
+            "regions": {region: values.as_dict() for region, values in regions.items()},
+            "comparison": comparison.comparisons[name].as_dict(),
+        }
+
+
+def evaluate(
+    case: Case,
+    models: Sequence[str] = MODELS,
+    *,
+    progress: Progress | None = None,
+    check: bool = True,
+    findings: Iterable[Finding] = (),
+) -> CaseEvaluation:
+    """The predictions of several models for a case, compared with what came after.
+
+    Errors are taken over the face where the case has skin landmarks before and after, else over
+    all of the skin (Kim et al. 2010, section 3.2).
+
+    Parameters
+    ----------
+    case : Case
+        With [postoperative].
+    models : sequence of str
+    progress : callable, optional
+    check : bool
+    findings : iterable of Finding
+        As for `predict_models`.
+
+    Returns
+    -------
+    CaseEvaluation
+
+    Raises
+    ------
+    CmfsimError
+        (also `ValueError` where the input is at fault) What a stage cannot work with.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> found = cmfsim.evaluate(cmfsim.Case.load("case.toml"), ["H", "M+S"])  # doctest: +SKIP
+    >>> found.comparison.statistics["M+S"].mean  # doctest: +SKIP
+    1.21
+    """
+    if progress is not None:
+        progress("reading the face after the operation")
+    # First, for it fails at once where the case has none.
+    postoperative = read_postoperative(case)
+    predictions = tuple(
+        predict_models(case, models, progress=progress, check=check, findings=findings)
+    )
+    if progress is not None:
+        progress("comparing the faces")
+    comparison = _compare(predictions, postoperative)
+    return CaseEvaluation(predictions, postoperative, comparison, evaluation_key(case, models))
+
+
+def _compare(predictions: Sequence[Prediction], after: Postoperative) -> ModelComparison:
+    before = predictions[0].skin_before
+    ours = predictions[0].patient.landmarks.get("skin", {})
+    both = bool(ours) and bool(after.landmarks)
+    moved = {p.model: np.asarray(p.skin.vertices) for p in predictions}
+    return compare_models(
+        before,
+        moved,
+        after.skin,
+        landmarks=(ours, after.landmarks) if both else None,
+        mask="face" if both else None,
+    )
+
+
+def evaluation_key(case: Case, models: Sequence[str]) -> str:
+    """The SHA-256 of everything that an evaluation depends on: inputs, models and version.
+
+    Raises
+    ------
+    OSError
+        A file that the case names cannot be read.
+    """
+    content: Mapping[str, Any] = {
+        "inputs": input_hashes(case),
+        "models": sorted(models),
+        "edge_length": case.mesh.edge_length,
+        "version": __version__,
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,230 @@
+"""The achieved plan: known motions of made and of real bones, by vertices and by closest points."""
+
+import functools
+import json
+
+import numpy as np
+import pytest
+
+import cmfsim
+import meshes
+import real_heads
+
+MOTION = cmfsim.rigid_motion((1.0, -5.0, 2.0), 4.0, (1, 0.2, 0), (0, -30, 0))
+
+
+def pebble(level=4, seed=0, centre=(0.0, 0.0, 0.0)):
+    """A bumpy ball without any symmetry, by a formula, at any fineness."""
+    vertices, triangles = meshes.icosphere(level, 1.0)
+    # Vertices of one fineness that are vertices of the next would sit in the noise of the latter.
+    vertices = vertices @ meshes.rotation((1, 2, 3), 10.0 * level).T
+    rng = np.random.default_rng(seed)
+    radius = np.full(len(vertices), 20.0)
+    axes = rng.normal(size=(7, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    for axis, sharp in zip(axes, rng.uniform(2, 6, 7), strict=True):
+        radius += 4.0 * np.exp(sharp * (vertices @ axis - 1.0))
+    return cmfsim.SurfaceData(
+        vertices * radius[:, None] * [1.3, 1.0, 0.7] + np.asarray(centre), triangles
+    )
+
+
+def moved(surface, matrix):
+    vertices = np.asarray(surface.vertices) @ matrix[:3, :3].T + matrix[:3, 3]
+    return cmfsim.SurfaceData(vertices, surface.triangles)
+
+
+def joined(*surfaces):
+    """One surface of several."""
+    starts = np.cumsum([0] + [len(s.vertices) for s in surfaces])
+    return cmfsim.SurfaceData(
+        np.concatenate([s.vertices for s in surfaces]),
+        np.concatenate(
+            [np.asarray(s.triangles) + n for s, n in zip(surfaces, starts[:-1], strict=True)]
+        ),
+    )
+
+
+def without(surface, keep):
+    """The triangles whose corners are all kept."""
+    kept = np.asarray(surface.triangles)[keep[np.asarray(surface.triangles)].all(axis=1)]
+    used, triangles = np.unique(kept, return_inverse=True)
+    return cmfsim.SurfaceData(np.asarray(surface.vertices)[used], triangles.reshape(-1, 3))
+
+
+def apart(found, true, centre):
+    rest = cmfsim.decompose_motion(found @ np.linalg.inv(true), centre)
+    return float(np.linalg.norm(rest.translation)), rest.angle
+
+
+def test_the_same_triangles_say_a_rigid_motion_at_once():
+    bone = pebble()
+    found = cmfsim.measure_motion(bone, moved(bone, MOTION), centre=(0, -30, 0))
+    np.testing.assert_allclose(found.matrix, MOTION, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(found.motion.translation, [1.0, -5.0, 2.0], rtol=0, atol=1e-9)
+    assert found.motion.angle == pytest.approx(4.0, abs=1e-9)
+    assert found.is_rigid
+    assert found.worst < 1e-9
+    assert found.plan is found.matrix
+
+
+def test_the_same_triangles_say_when_a_motion_is_not_rigid():
+    """A jaw that was bent: the plan is the moved surface, the residual what bending leaves."""
+    bone = pebble()
+    vertices = np.asarray(bone.vertices)
+    bent = vertices + np.outer((vertices[:, 0] / 25.0) ** 2, [0.0, -1.0, 0.0])
+    found = cmfsim.measure_motion(bone, cmfsim.SurfaceData(bent, bone.triangles))
+    assert not found.is_rigid
+    assert isinstance(found.plan, cmfsim.MovedSurface)
+    np.testing.assert_array_equal(found.plan.moved_vertices, bent)
+    rest = np.linalg.norm(vertices @ found.matrix[:3, :3].T + found.matrix[:3, 3] - bent, axis=1)
+    assert found.worst == pytest.approx(rest.max())
+    assert found.rms == pytest.approx(np.sqrt((rest**2).mean()))
+    loose = cmfsim.measure_motion(
+        bone, cmfsim.SurfaceData(bent, bone.triangles), tolerance=2 * rest.max()
+    )
+    assert loose.is_rigid
+
+
+def scene(noise=0.0, hole=False):
+    """Cranium and jaw before, and both as one bone after, of other triangles and in another frame.
+
+    Returns segments before, bone after, and the motion that takes after's frame to before's.
+    """
+    cranium = [pebble(n, 1, (0, 40, 40)) for n in (4, 5)]
+    jaw = [pebble(n, 2, (0, -30, -20)) for n in (4, 5)]
+    after = moved(jaw[1], MOTION)
+    if hole:
+        after = without(after, np.asarray(after.vertices)[:, 0] < 12.0)
+    bone = joined(cranium[1], after)
+    rng = np.random.default_rng(5)
+    bone = cmfsim.SurfaceData(
+        np.asarray(bone.vertices) + rng.normal(0, noise, bone.vertices.shape), bone.triangles
+    )
+    frame = cmfsim.rigid_motion((15, -8, 5), 8, (1, 2, 3))
+    return {"cranium": cranium[0], "jaw": jaw[0]}, moved(bone, np.linalg.inv(frame)), frame
+
+
+@pytest.mark.parametrize(("noise", "hole", "limit"), [(0, False, 0.01), (0.1, True, 0.1)])
+def test_segments_are_found_on_the_bone_of_another_scan(noise, hole, limit):
+    """With noise and a fifth of the jaw gone; vertices of the coarser mesh lie on the finer."""
+    segments, bone, frame = scene(noise, hole)
+    found = cmfsim.achieved_plan(segments, bone, alignment=frame)
+    centre = np.asarray(segments["jaw"].vertices).mean(axis=0)
+    assert max(apart(found.motions["jaw"].matrix, MOTION, centre)) < limit
+    assert max(apart(found.motions["cranium"].matrix, np.eye(4), (0, 40, 40))) < limit
+    # All vertices but those over the hole have their partner.
+    assert found.motions["cranium"].share > 0.9
+    assert found.motions["jaw"].share > 0.5
+    assert "jaw" in found.text()
+    assert json.loads(json.dumps(found.as_dict(), allow_nan=False)) == found.as_dict()
+    assert found.plan["jaw"] is found.motions["jaw"].matrix
+
+
+def test_a_reference_takes_the_error_of_the_alignment_off():
+    """The volumes were laid 1 mm and 1° off: all motions would be, without the cranium's."""
+    segments, bone, frame = scene()
+    off = cmfsim.rigid_motion((0.8, -0.5, 0.3), 1.0, (0, 1, 1)) @ frame
+    centre = np.asarray(segments["jaw"].vertices).mean(axis=0)
+    wrong = cmfsim.achieved_plan(segments, bone, alignment=off)
+    assert max(apart(wrong.motions["jaw"].matrix, MOTION, centre)) > 0.5
+    right = cmfsim.achieved_plan(segments, bone, alignment=off, reference="cranium")
+    assert max(apart(right.motions["jaw"].matrix, MOTION, centre)) < 0.02
+    assert max(apart(right.alignment, frame, centre)) < 0.05
+    assert right.correction.angle == pytest.approx(1.0, abs=0.02)
+    assert wrong.correction is None
+
+
+def test_surfaces_of_the_same_triangles_need_no_search():
+    """Segment by segment, in another frame: exact, whatever the size of the motion."""
+    segments, _, frame = scene()
+    far = cmfsim.rigid_motion((40, 30, -20), 70, (1, 1, 1))
+    true = {"cranium": np.eye(4), "jaw": far}
+    back = np.linalg.inv(frame)
+    after = {n: moved(s, back @ true[n]) for n, s in segments.items()}
+    found = cmfsim.achieved_plan(
+        segments, after, alignment=frame, reference="cranium", centres={"jaw": (0, -30, -20)}
+    )
+    for name, matrix in true.items():
+        assert found.motions[name].method == "vertices"
+        np.testing.assert_allclose(found.motions[name].matrix, matrix, rtol=0, atol=1e-9)
+    assert found.motions["jaw"].motion.centre.tolist() == [0, -30, -20]
+
+
+@functools.cache
+def real_bone():
+    """The atlas' segments after a bimaxillary operation, as one surface of other triangles."""
+    pv = pytest.importorskip("pyvista")
+    names = ("cranium", "mandible")
+    segments = {n: real_heads.read_ply("atlas_head", n) for n in names}
+    surfaces = []
+    for name in names:
+        matrix = MANDIBLE if name == "mandible" else np.eye(4)
+        after = moved(segments[name], matrix)
+        mesh = pv.PolyData.from_regular_faces(
+            np.asarray(after.vertices), np.asarray(after.triangles).astype(np.int64)
+        ).decimate(0.4)
+        surfaces.append(cmfsim.SurfaceData(np.asarray(mesh.points, float), mesh.regular_faces))
+    return segments, joined(*surfaces)
+
+
+MANDIBLE = cmfsim.rigid_motion((1.5, -6.0, 1.0), 3.0, (1, 0, 0.3), (0, -130, 1470))
+
+
+def test_the_real_mandible_is_found_where_it_was_taken():
+    """Table 2's numbers, to 0.1 mm and 0.1°, from a decimated bone that shares no triangle."""
+    segments, bone = real_bone()
+    found = cmfsim.achieved_plan(
+        {"mandible": segments["mandible"]}, bone, centres={"mandible": (0, -130, 1470)}
+    )
+    motion = found.motions["mandible"]
+    assert max(apart(motion.matrix, MANDIBLE, (0, -150, 1460))) < 0.1
+    np.testing.assert_allclose(motion.motion.translation, [1.5, -6.0, 1.0], rtol=0, atol=0.1)
+    assert motion.motion.angle == pytest.approx(3.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "pattern"),
+    [
+        ({"segments": {}}, "no segment"),
+        ({"postoperative": {"cranium": None}}, "no post-operative surface of jaw"),
+        ({"reference": "skull"}, "use one of cranium, jaw"),
+        ({"centres": {"chin": (0, 0, 0)}}, "use one of cranium, jaw"),
+        ({"alignment": np.diag([2.0, 2, 2, 1])}, "not rigid"),
+    ],
+)
+def test_bad_plans_are_named(arguments, pattern):
+    segments = {"cranium": pebble(1, 1), "jaw": pebble(1, 2)}
+    given = {"segments": segments, "postoperative": pebble(2, 1), **arguments}
+    with pytest.raises(cmfsim.CmfsimError, match=pattern) as caught:
+        cmfsim.achieved_plan(given.pop("segments"), given.pop("postoperative"), **given)
+    assert isinstance(caught.value, ValueError)
+
+
+@pytest.mark.parametrize(
+    ("options", "pattern"),
+    [
+        ({"trim": 1.0}, "trim is 1"),
+        ({"reach": -1.0}, "reach is -1"),
+        ({"least_share": 0.0}, "least_share is 0"),
+        ({"max_rms": 0.0}, "max_rms is 0"),
+    ],
+)
+def test_bad_options_are_named(options, pattern):
+    with pytest.raises(cmfsim.CmfsimError, match=pattern):
+        cmfsim.MatchOptions(**options)
+
+
+def test_other_triangles_are_refused():
+    with pytest.raises(cmfsim.RegistrationError, match="other triangles: 80 on 42 vertices before"):
+        cmfsim.measure_motion(pebble(1), pebble(2))
+
+
+def test_a_segment_that_is_not_there_is_an_error():
+    """Another bone in its place fits badly, and says how badly; so does one cut differently."""
+    strict = cmfsim.MatchOptions(max_rms=0.1)
+    with pytest.raises(cmfsim.RegistrationError, match=r"segment 'jaw' does not fit .* mm rms"):
+        cmfsim.achieved_plan({"jaw": pebble(3, 2)}, pebble(4, 1), options=strict)
+    scrap = without(pebble(4, 2), np.asarray(pebble(4, 2).vertices)[:, 0] > 20.0)
+    with pytest.raises(cmfsim.RegistrationError, match="segment 'jaw'"):
+        cmfsim.achieved_plan({"jaw": pebble(3, 2)}, scrap)
