@@ -97,7 +97,7 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         "--seed", metavar="N", type=int, default=0, help="of all noise (default 0)"
     )
     virtual.add_argument(
-        "--edge-length", metavar="H", type=float, default=3.0, help="mm, true mesh (default 3)"
+        "--edge-length", metavar="H", type=float, default=4.0, help="mm, true mesh (default 4)"
     )
     virtual.add_argument(
         "--spacing", metavar="MM", type=float, default=1.0, help="of the CT (default 1)"

@@ -27,4 +27,5 @@ def virtual_patients(options: argparse.Namespace) -> int:
     else:
         for case in cases:
             print(f"wrote {case} (in silico); the truth is in {case.parent / 'truth'}")
+        print(f"next: cmfsim study {options.folder / 'cohort.toml'}")
     return DONE

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim.checks import Floats, as_index_rows, as_rows
 from cmfsim.errors import CaseInputError
-from cmfsim.insilico.hyperelastic import HyperelasticTissue, inverse_transpose
+from cmfsim.insilico.hyperelastic import HyperelasticTissue, cofactor
 
 __all__ = ["HyperelasticBody"]
 
@@ -90,10 +90,10 @@ class HyperelasticBody:
 
     def volume_ratios(self, displacements: Floats) -> Floats:
         """Volume after over before of each tet, det F, (m,)."""
-        return inverse_transpose(self.deformation(displacements))[1]
+        return cofactor(self.deformation(displacements))[1]
 
     def energy(self, displacements: Floats) -> float:
-        """The elastic energy, N·mm; infinite if a tet is inside out."""
+        """The elastic energy, N·mm."""
         density = self.tissue.energy(self.deformation(displacements))
         return float(density @ self.volumes)
 
@@ -114,7 +114,7 @@ class HyperelasticBody:
         added : (n, 3, 3) float64, N/mm, optional
             What else resists at each node, such as contact.
         convex : bool
-            As `HyperelasticTissue.stiffness` takes it: for steps where the true one gives way.
+            Of every tet, as `HyperelasticTissue.tangent` takes it.
         """
         n, m = len(self.nodes), len(self.tets)
         own, shared = np.empty((9, 4, m)), np.empty((9, 6, m))
@@ -123,9 +123,9 @@ class HyperelasticBody:
         for chosen in (np.flatnonzero(~fibrous), np.flatnonzero(fibrous)):
             for start in range(0, len(chosen), TETS_AT_ONCE):
                 part = chosen[start : start + TETS_AT_ONCE]
-                law = self.tissue.of(part)
-                blocks = law.stiffness(gradient[:, :, part], self.shapes[:, :, part], convex=convex)
-                blocks *= self.volumes[part]
+                tangent = self.tissue.of(part).tangent(gradient[:, :, part], convex=convex)
+                shapes = self.shapes[:, :, part].transpose(2, 1, 0)
+                blocks = _between_nodes(tangent, shapes) * self.volumes[part]
                 for corner in range(4):
                     own[:, corner, part] = blocks[corner, corner].reshape(9, -1)
                 for pair, (p, q) in enumerate(PAIRS):
@@ -144,6 +144,15 @@ class HyperelasticBody:
         return sparse.bsr_array(
             (data[self._order], self._columns, self._starts), shape=(3 * n, 3 * n)
         )
+
+
+def _between_nodes(tangent: Floats, shapes: Floats) -> Floats:
+    """∂(P g_p)/∂u_q per volume, (4, 4, 3, 3, m), of ∂P/∂F (m, 9, 9) and g (m, 3, 4)."""
+    m = len(tangent)
+    # (i, j, k·n) · g_jp, then (i·p, k, n) · g_nq.
+    first = np.matmul(shapes.transpose(0, 2, 1)[:, None], tangent.reshape(m, 3, 3, 9))
+    both = np.matmul(first.reshape(m, 36, 3), shapes)
+    return np.ascontiguousarray(both.reshape(m, 3, 4, 3, 4).transpose(2, 4, 1, 3, 0))
 
 
 def _virtual_work(v: Any, w: Any) -> Any:

@@ -21,6 +21,8 @@ __all__ = ["BoneContact", "SmoothDistance"]
 # Pressure per depth of penetration, MPa/mm: pressures of soft tissue (some kPa) stay within a
 # tenth of a mm.
 STIFFNESS = 0.1
+# Depth over which that pressure sets in, mm: nodes that rest on bone would otherwise lie on a kink.
+ONSET = 0.1
 # Standard deviation of the blur that rounds gaps between teeth, mm: half an edge of the mesh.
 RELIEF = 1.0
 # Step of the central differences, mm: the splines are smooth over a voxel.
@@ -114,9 +116,16 @@ class BoneContact:
         return np.asarray((moved - matrix[:3, 3]) @ matrix[:3, :3])
 
     def energy(self, displacements: Floats, part: float) -> float:
-        """½ ∫ k depth², N·mm."""
-        total = sum(float(self.area @ d**2) for d in self.depths(displacements, part).values())
-        return 0.5 * self.stiffness * total
+        """∫ ∫ pressure d(depth) d(area), N·mm.
+
+        The pressure is k d² / 2δ to the depth δ of its onset, from there k (d − δ/2).
+        """
+        total = 0.0
+        for d in self.depths(displacements, part).values():
+            shallow = d**3 / (6.0 * ONSET)
+            deep = 0.5 * (d - 0.5 * ONSET) ** 2 + ONSET**2 / 24.0
+            total += float(self.area @ np.where(d < ONSET, shallow, deep))
+        return self.stiffness * total
 
     def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
         """The gradient of the energy, (n, 3) N, and the stiffness of each node, (n, 3, 3) N/mm.
@@ -131,10 +140,12 @@ class BoneContact:
                 continue
             seen = self._seen(name, displacements, part)[touching]
             normal = self.bones[name].slope(seen) @ self.motion[name](part)[:3, :3].T
-            weight = self.stiffness * self.area[touching]
+            weight, d = self.stiffness * self.area[touching], depth[touching]
+            pressing = np.where(d < ONSET, 0.5 * d**2 / ONSET, d - 0.5 * ONSET)
+            rise = weight * np.minimum(d / ONSET, 1.0)
             at = self.nodes[touching]
-            force[at] -= (weight * depth[touching])[:, None] * normal
-            blocks[at] += weight[:, None, None] * normal[:, :, None] * normal[:, None, :]
+            force[at] -= (weight * pressing)[:, None] * normal
+            blocks[at] += rise[:, None, None] * normal[:, :, None] * normal[:, None, :]
         return force, blocks
 
 

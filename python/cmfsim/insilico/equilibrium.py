@@ -29,6 +29,8 @@ ARMIJO = 1e-4
 # Falls of energy below this part of the shear modulus times volume are lost in rounding: there a
 # full step is taken.
 ROUNDING = 1e-13
+# Where the true stiffness gives way or leads too far, so many steps are taken with a convex one.
+CONVEX_ROUNDS = 4
 # Of the residual, relative, that each linear solve leaves at most; less where Newton's own residual
 # is less, down to the other.
 LOOSEST_SOLVE, TIGHTEST_SOLVE = 0.01, 1e-5
@@ -77,7 +79,7 @@ class EquilibriumOptions:
     """
 
     steps: int = 4
-    tolerance: float = 1e-6
+    tolerance: float = 1e-4
     loose: float = 0.02
     most_rounds: int = 60
 
@@ -101,6 +103,8 @@ class Equilibrium:
         Elastic, and of the contact.
     history : tuple of (float, float)
         Part of the motion and residual of each Newton iteration.
+    last_step : (n, 3) float64, mm
+        What the last Newton iteration changed.
     linear_iterations : int
     seconds : float
     """
@@ -108,7 +112,8 @@ class Equilibrium:
     displacements: Floats
     residual: float
     energy: float
-    history: tuple[tuple[float, float], ...] = ()
+    history: tuple[tuple[float, float], ...]
+    last_step: Floats
     linear_iterations: int = 0
     seconds: float = field(default=0.0, compare=False)
 
@@ -162,6 +167,7 @@ class _Search:
         self.free = np.setdiff1d(np.arange(len(body.nodes)), self.held)
         self.linear = _LinearSolver(body.nodes[self.free])
         self.u: Floats = np.zeros_like(body.nodes)
+        self.last_step: Floats = np.zeros_like(body.nodes)
         self.history: list[tuple[float, float]] = []
         size = float(np.ptp(body.nodes, axis=0).max())
         self.least_fall = ROUNDING * float(body.tissue.mu @ body.volumes)
@@ -181,6 +187,7 @@ class _Search:
             residual,
             self._energy(self.u, 1.0),
             tuple(self.history),
+            self.last_step,
             self.linear.total,
             time.perf_counter() - begun,
         )
@@ -224,7 +231,7 @@ class _Search:
     def _settle(self, part: float, tolerance: float) -> float:
         """Newton's method with line search; the residual reached."""
         energy = self._energy(self.u, part)
-        cut = False
+        convex = 0
         for _ in range(self.options.most_rounds):
             forces, added = self._forces(self.u, part)
             right = -forces[self.free]
@@ -232,23 +239,10 @@ class _Search:
             self.largest_hold = max(self.largest_hold, hold)
             residual = float(np.linalg.norm(right)) / self.largest_hold
             self.history.append((part, residual))
-            _log.debug(
-                "truth: %.3f of the motion, residual %.2e, %d linear iterations",
-                part,
-                residual,
-                self.linear.total,
-            )
             if residual <= tolerance:
                 return residual
             precision = min(LOOSEST_SOLVE, max(residual, TIGHTEST_SOLVE))
-            step = np.zeros_like(self.u)
-            # Where the last step had to be cut, the true stiffness gives way somewhere.
-            for convex in (True,) if cut else (False, True):
-                matrix = self.body.stiffness(self.u, added, convex=convex)
-                self.linear.take(_free_blocks(matrix, self.free))
-                step[self.free], upright = self.linear.solve(right, precision)
-                if upright:
-                    break
+            step, true = self._step(right, added, precision, convex=convex > 0)
             slope = -float((step[self.free] * right).sum())
             share = 1.0
             for _ in range(HALVINGS):
@@ -263,14 +257,35 @@ class _Search:
                     f"Newton's method stalls after {part:.0%} of the motion at a residual of "
                     f"{residual:.1e} ({tolerance:.0e} is needed)"
                 )
-            _log.debug("truth: step of %.3g of Newton's%s", share, ", convex" if convex else "")
-            cut = share < 1.0
-            self.u = self.u + share * step
+            convex = max(convex - 1, 0) if convex or (true and share == 1.0) else CONVEX_ROUNDS
+            self.last_step = share * step
+            self.u = self.u + self.last_step
             energy = there
+            _log.debug(
+                "truth: %.3f of the motion, residual %.2e, step of %.3g Newton's%s: %.2e mm",
+                part,
+                residual,
+                share,
+                "" if true else ", convex",
+                float(np.linalg.norm(self.last_step, axis=1).max()),
+            )
         raise SolverError(
             f"after {self.options.most_rounds} Newton iterations at {part:.0%} of the motion the "
             f"residual is {residual:.1e} ({tolerance:.0e} is needed)"
         )
+
+    def _step(
+        self, right: Floats, added: Floats, precision: float, *, convex: bool
+    ) -> tuple[Floats, bool]:
+        """Newton's step, (n, 3) mm, and whether the true stiffness gave it."""
+        step = np.zeros_like(self.u)
+        for cut in (True,) if convex else (False, True):
+            matrix = self.body.stiffness(self.u, added, convex=cut)
+            self.linear.take(_free_blocks(matrix, self.free))
+            step[self.free], upright = self.linear.solve(right, precision)
+            if upright:
+                break
+        return step, not cut
 
 
 def _free_blocks(matrix: Any, free: NDArray[np.int64]) -> Any:

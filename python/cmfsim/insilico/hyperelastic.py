@@ -11,7 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 
-__all__ = ["FAT", "MUSCLE", "HyperelasticTissue", "Moduli", "inverse_transpose"]
+__all__ = ["FAT", "MUSCLE", "HyperelasticTissue", "Moduli", "cofactor"]
+
+# (i, j, k, ε_ijk) that are not zero.
+PERMUTATIONS = (
+    (0, 1, 2, 1.0),
+    (1, 2, 0, 1.0),
+    (2, 0, 1, 1.0),
+    (0, 2, 1, -1.0),
+    (2, 1, 0, -1.0),
+    (1, 0, 2, -1.0),
+)
 
 
 @dataclass(frozen=True)
@@ -63,14 +73,16 @@ MUSCLE = Moduli(0.79, 0.5, 0.43)
 
 @dataclass(frozen=True, eq=False)
 class HyperelasticTissue:
-    """A neo-Hookean matrix with fibres, after Bonet & Burton (1998), one set of constants per tet.
+    """A neo-Hookean matrix with fibres, one set of constants per tet, finite even in collapse.
 
-    With J = det F, i₄ = |F a|² − 1 and I₅ = |Fᵀ F a|² the energy per undeformed volume is
+    With J = det F, C = Fᵀ F, i₄ = a·C a − 1 and λ̂ = λ + μ the energy per undeformed volume is
 
-        ψ = μ/2 (F:F − 3) − μ ln J + λ/2 (ln J)²
-            + (−d + α/2 ln J + β/8 i₄) i₄ + d/2 (I₅ − 1),
+        ψ = μ/2 (F:F − 3) − μ (J − 1) + λ̂/2 (J − 1)²
+            + α/2 (J − 1) i₄ + β/8 i₄² + d/2 |(C − I) a|².
 
-    whose limit for small strain ε is Spencer's law λ/2 (tr ε)² + μ ε:ε + α tr ε (a·ε a)
+    The first line is the neo-Hookean energy of Smith, de Goes & Kim (2018), a polynomial that
+    turning inside out does not break, the second adds fibres in the invariants of Bonet & Burton
+    (1998). For small strain ε it is Spencer's law λ/2 (tr ε)² + μ ε:ε + α tr ε (a·ε a)
     + 2 d |ε a|² + β/2 (a·ε a)². Energies of fat and muscle in one tet add by volume.
 
     Attributes
@@ -148,24 +160,21 @@ class HyperelasticTissue:
         )
 
     def energy(self, gradient: Floats) -> Floats:
-        """ψ of each tet, (m,) MPa; infinite where a tet is inside out.
+        """ψ of each tet, (m,) MPa.
 
         Parameters
         ----------
         gradient : (3, 3, m) float64
             F.
         """
-        _, det = inverse_transpose(gradient)
-        upright = det > 0.0
-        log = np.log(np.where(upright, det, 1.0))
-        m = np.einsum("ijt,jt->it", gradient, self.fibre)
-        w = np.einsum("ijt,it->jt", gradient, m)
-        i4, i5 = (m * m).sum(axis=0) - 1.0, (w * w).sum(axis=0) - 1.0
-        psi = 0.5 * self.mu * ((gradient * gradient).sum(axis=(0, 1)) - 3.0) - self.mu * log
-        psi += 0.5 * self.lambda_ * log**2
-        psi += (0.5 * self.alpha * log + 0.125 * self.beta * i4 - self.difference) * i4
-        psi += 0.5 * self.difference * i5
-        return np.where(upright, psi, np.inf)
+        _, det = cofactor(gradient)
+        _, c, i4 = self._fibre_strain(gradient)
+        growth = det - 1.0
+        psi = 0.5 * self.mu * ((gradient * gradient).sum(axis=(0, 1)) - 3.0) - self.mu * growth
+        psi += 0.5 * (self.lambda_ + self.mu) * growth**2
+        psi += (0.5 * self.alpha * growth + 0.125 * self.beta * i4) * i4
+        psi += 0.5 * self.difference * (c * c).sum(axis=0)
+        return np.asarray(psi)
 
     def stress(self, gradient: Floats) -> Floats:
         """The first Piola–Kirchhoff stress P = ∂ψ/∂F, (3, 3, m) MPa.
@@ -173,92 +182,103 @@ class HyperelasticTissue:
         Parameters
         ----------
         gradient : (3, 3, m) float64
-            F, with det F > 0.
+            F.
         """
-        turned, det = inverse_transpose(gradient)
-        log = np.log(det)
-        a = self.fibre
-        m = np.einsum("ijt,jt->it", gradient, a)
-        w = np.einsum("ijt,it->jt", gradient, m)
-        i4 = (m * m).sum(axis=0) - 1.0
-        stress = self.mu * gradient
-        stress += (self.lambda_ * log - self.mu + 0.5 * self.alpha * i4) * turned
-        along = self.alpha * log + 0.5 * self.beta * i4 - 2.0 * self.difference
-        fw = np.einsum("ijt,jt->it", gradient, w)
-        stress += (along * m + self.difference * fw)[:, None] * a[None]
-        stress += self.difference * m[:, None] * w[None]
-        return stress
+        cof, det = cofactor(gradient)
+        m, c, i4 = self._fibre_strain(gradient)
+        fc = np.einsum("ijt,jt->it", gradient, c)
+        along = self.alpha * (det - 1.0) + 0.5 * self.beta * i4
+        stress = self.mu * gradient + self._pressure(det, i4) * cof
+        stress += (along * m + self.difference * fc)[:, None] * self.fibre[None]
+        stress += self.difference * m[:, None] * c[None]
+        return np.asarray(stress)
 
-    def stiffness(self, gradient: Floats, shapes: Floats, *, convex: bool = False) -> Floats:
-        """∂(P g_a)/∂u_b of the pairs of nodes of a tet, per volume, (4, 4, 3, 3, m) N/mm⁴.
+    def tangent(self, gradient: Floats, *, convex: bool = False) -> Floats:
+        """∂P/∂F, (m, 9, 9) MPa, symmetric, over the entries of F row by row.
 
         Parameters
         ----------
         gradient : (3, 3, m) float64
             F.
-        shapes : (4, 3, m) float64, 1/mm
-            Undeformed gradients g_a of the shape functions.
         convex : bool
-            Leaves out what the stress takes from the stiffness: μ − λ ln J − α i₄/2 is cut to
-            0…μ J/|F|, where μ outweighs it, and the fibre keeps its pull alone.
-
-        Notes
-        -----
-        With ĝ = F⁻ᵀ g the matrix gives μ (g_a·g_b) I + (μ − λ ln J − α i₄/2) ĝ_b⊗ĝ_a + λ ĝ_a⊗ĝ_b,
-        the fibre what the terms in i₄ and I₅ add (m = F a, w = Fᵀ m, s_a = a·g_a, h_a = F g_a).
+            Sets negative eigenvalues to 0, so that every step along it falls in energy (Teran,
+            Sifakis, Irving & Fedkiw 2005).
         """
-        turned, det = inverse_transpose(gradient)
-        log = np.log(det)
-        a, d = self.fibre, self.difference
-        m = np.einsum("ijt,jt->it", gradient, a)
-        i4 = (m * m).sum(axis=0) - 1.0
-        spatial = np.einsum("ijt,ajt->ait", turned, shapes)
-        opposite = self.mu - self.lambda_ * log - 0.5 * self.alpha * i4
-        if convex:
-            size = np.sqrt((gradient * gradient).sum(axis=(0, 1)))
-            opposite = np.clip(opposite, 0.0, self.mu * det / size)
-        fibrous = bool(self.fibrous.any())
-        if fibrous:
-            w = np.einsum("ijt,it->jt", gradient, m)
-            s = np.einsum("jt,ajt->at", a, shapes)
-            h = np.einsum("ijt,ajt->ait", gradient, shapes)
-            ws = np.einsum("jt,ajt->at", w, shapes)
-            along = self.alpha * log + 0.5 * self.beta * i4 - 2.0 * d
-            if convex:
-                along = np.maximum(along, -2.0 * d)
-            fft = np.einsum("ikt,jkt->ijt", gradient, gradient)
-        blocks = np.empty((4, 4, 3, 3, det.shape[0]))
-        for p in range(4):
-            for q in range(p, 4):
-                block = opposite * spatial[q][:, None] * spatial[p][None]
-                block += self.lambda_ * spatial[p][:, None] * spatial[q][None]
-                dot = np.einsum("jt,jt->t", shapes[p], shapes[q])
-                same = self.mu * dot
-                if fibrous:
-                    same = same + along * s[p] * s[q] + d * (s[q] * ws[p] + ws[q] * s[p])
-                    both = self.beta * s[p] * s[q] + d * dot
-                    block += both * m[:, None] * m[None]
-                    block += (self.alpha * s[p]) * m[:, None] * spatial[q][None]
-                    block += (self.alpha * s[q]) * spatial[p][:, None] * m[None]
-                    block += (d * s[q]) * m[:, None] * h[p][None]
-                    block += (d * s[p]) * h[q][:, None] * m[None]
-                    block += (d * s[p] * s[q]) * fft
-                for i in range(3):
-                    block[i, i] += same
-                blocks[p, q] = block
-                if p != q:
-                    blocks[q, p] = block.transpose(1, 0, 2)
-        return blocks
+        f, a, d = gradient, self.fibre, self.difference
+        cof, det = cofactor(f)
+        size = det.shape[0]
+        tangent = np.zeros((3, 3, 3, 3, size))
+        # ∂cof_ij/∂F_kl = ε_ikp ε_jlq F_pq.
+        pressure = self._pressure(det, self._fibre_strain(f)[2])
+        for i, k, p, sign in PERMUTATIONS:
+            for j, n, q, other in PERMUTATIONS:
+                tangent[i, j, k, n] += (sign * other) * pressure * f[p, q]
+        volume = (self.lambda_ + self.mu) * cof
+        if self.fibrous.any():
+            m, c, i4 = self._fibre_strain(f)
+            ma = m[:, None] * a[None]
+            along = self.alpha * (det - 1.0) + 0.5 * self.beta * i4
+            volume = volume + self.alpha * ma
+            slope = self.alpha * cof + self.beta * ma
+            tangent += ma[:, :, None, None] * slope[None, None]
+            # ∂c = ∂Fᵀ m + Fᵀ ∂F a enters (F c) ⊗ a and m ⊗ c.
+            aa = a[:, None] * a[None]
+            turned = d * m[:, None] * m[None]
+            for i in range(3):
+                tangent[i, :, i] += along * aa + d * (a[:, None] * c[None] + c[:, None] * a[None])
+            for j in range(3):
+                tangent[:, j, :, j] += turned
+            df = d * f
+            tangent += df.transpose(1, 0, 2)[None, :, :, None] * ma[:, None, None, :]
+            tangent += df[:, None, None, :] * ma.transpose(1, 0, 2)[None, :, :, None]
+            stretched = np.einsum("ipt,kpt->ikt", df, f)
+            tangent += stretched[:, None, :, None] * aa[None, :, None, :]
+        tangent += cof[:, :, None, None] * volume[None, None]
+        for i in range(3):
+            for j in range(3):
+                tangent[i, j, i, j] += self.mu
+        square = np.ascontiguousarray(tangent.reshape(9, 9, size).transpose(2, 0, 1))
+        return _raised(square) if convex else square
+
+    def _pressure(self, det: Floats, i4: Floats) -> Floats:
+        """∂ψ/∂J, (m,) MPa."""
+        change = (self.lambda_ + self.mu) * (det - 1.0) - self.mu + 0.5 * self.alpha * i4
+        return np.asarray(change)
+
+    def _fibre_strain(self, gradient: Floats) -> tuple[Floats, Floats, Floats]:
+        """Of the fibre: m = F a and c = (C − I) a, (3, m), and i₄ = a·c, (m,)."""
+        m = np.einsum("ijt,jt->it", gradient, self.fibre)
+        c = np.einsum("ijt,it->jt", gradient, m) - self.fibre
+        return m, c, (self.fibre * c).sum(axis=0)
 
 
-def inverse_transpose(gradient: Floats) -> tuple[Floats, Floats]:
-    """F⁻ᵀ (3, 3, m) and det F (m,) of gradients F (3, 3, m); F⁻ᵀ is NaN-free but void at det 0."""
+def _raised(tangent: Floats) -> Floats:
+    """Symmetric matrices (m, 9, 9) with their negative eigenvalues set to 0."""
+    bent = np.flatnonzero(_bends(tangent))
+    if len(bent):
+        values, vectors = np.linalg.eigh(tangent[bent])
+        tangent[bent] = (vectors * np.maximum(values, 0.0)[:, None]) @ vectors.transpose(0, 2, 1)
+    return tangent
+
+
+def _bends(tangent: Floats) -> NDArray[np.bool_]:
+    """Which symmetric matrices (m, 9, 9) have a pivot that is not positive, (m,)."""
+    rest = np.ascontiguousarray(tangent.transpose(1, 2, 0))
+    found = np.zeros(len(tangent), dtype=bool)
+    for k in range(9):
+        pivot = rest[k, k]
+        found |= ~(pivot > 0.0)
+        row = rest[k, k + 1 :] / np.where(found, 1.0, pivot)
+        rest[k + 1 :, k + 1 :] -= rest[k + 1 :, k, None] * row
+    return found
+
+
+def cofactor(gradient: Floats) -> tuple[Floats, Floats]:
+    """The cofactors ∂J/∂F (3, 3, m) and J = det F (m,) of gradients F (3, 3, m)."""
     f = gradient
-    cofactor = np.empty_like(f)
+    found = np.empty_like(f)
     for i in range(3):
         for j in range(3):
             k, n, p, q = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
-            cofactor[i, j] = f[k, p] * f[n, q] - f[k, q] * f[n, p]
-    det = (f[0] * cofactor[0]).sum(axis=0)
-    tiny = np.finfo(np.float64).tiny
-    return cofactor / np.where(np.abs(det) > tiny, det, 1.0), det
+            found[i, j] = f[k, p] * f[n, q] - f[k, q] * f[n, p]
+    return found, (f[0] * found[0]).sum(axis=0)

@@ -3,28 +3,34 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cmfsim._core import Surface, signed_distance_image
 from cmfsim.case import BoneSegment, ImageData, NodeKinds
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.insilico.bone_contact import BoneContact, SmoothDistance
 from cmfsim.planning import decompose_motion, rigid_motion
 
-__all__ = ["Operation", "operate", "screw", "without_bite"]
+__all__ = ["Operation", "bone_distances", "operate", "screw", "without_bite", "without_gaps"]
 
 # Tissue is stripped off both sides of a cut as a surgeon lifts the periosteum there: by this
 # length, mm, and by this multiple of how far the two sides part.
 STRIPPED, STRIPPED_PER_SHIFT = 5.0, 1.5
 # Shifts below this are none, mm.
 LEAST_SHIFT = 1e-6
+# Between bones that move against each other is no tissue within their shift and this, mm; cosine of
+# the angle between the ways to them from which on they count as one wall.
+BETWEEN, SAME_SIDE = 2.0, 0.5
 # A tet that bones hold at all four nodes may not change its volume to less than this part.
 LEAST_HELD_RATIO = 0.3
-# Room about the nodes that may touch bone, in which its distance is known, mm.
-ROOM = 16.0
+# Up to this far from a bone its distance is known, on a grid of this spacing with this much room
+# about the tissue, mm: more than bones move in a step, or a gap is wide.
+REACH, SPACING, ROOM = 12.0, 1.5, 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +89,31 @@ def screw(matrix: Floats, centre: Floats) -> Callable[[float], Floats]:
     return after
 
 
+def bone_distances(nodes: Floats, segments: Mapping[str, BoneSegment]) -> dict[str, ImageData]:
+    """The depth in each segment, negative outside, mm, in the box of nodes and some room about it.
+
+    Unlike a segment's level, which knows two voxels about its surface, it is a distance up to
+    `REACH`.
+
+    Parameters
+    ----------
+    nodes : (n, 3) float64, mm
+    segments : mapping of str to BoneSegment
+    """
+    lowest = nodes.min(axis=0) - ROOM
+    shape = np.ceil((np.ptp(nodes, axis=0) + 2.0 * ROOM) / SPACING).astype(int) + 1
+    spacing = (SPACING, SPACING, SPACING)
+    found = {}
+    for name, segment in segments.items():
+        surface = Surface(segment.surface.vertices, segment.surface.triangles)
+        x, y, z = lowest.tolist()
+        depth = signed_distance_image(
+            surface, tuple(shape.tolist()), spacing, (x, y, z), band=REACH
+        )
+        found[name] = ImageData(depth, spacing, lowest)
+    return found
+
+
 def without_bite(
     nodes: Floats, tets: NDArray[Any], upper: ImageData, lower: ImageData, gap: float
 ) -> NDArray[np.bool_]:
@@ -92,7 +123,7 @@ def without_bite(
     ----------
     nodes, tets : (n, 3) mm, (m, 4)
     upper, lower : ImageData
-        Levels of the bones that bear the teeth.
+        Depths in the bones that bear the teeth.
     gap : float, mm
         A tet whose middle has both within this, taken together, lies between them.
     """
@@ -100,13 +131,60 @@ def without_bite(
     return np.asarray(-upper.sample(middles) - lower.sample(middles) >= gap)
 
 
+def without_gaps(
+    nodes: Floats,
+    tets: NDArray[Any],
+    distances: Mapping[str, ImageData],
+    motions: Mapping[str, Floats],
+) -> NDArray[np.bool_]:
+    """Which tets are tissue, (m,): not between bones that part or close, where none is left.
+
+    A surgeon opens these gaps, strips what is in them and takes bone away where segments meet. A
+    tet lies between two bones if its middle has both within their shift and `BETWEEN`, taken
+    together, and does not see both on the same side.
+
+    Parameters
+    ----------
+    nodes, tets : (n, 3) mm, (m, 4)
+    distances : mapping of str to ImageData
+        As `bone_distances` gives them.
+    motions : mapping of str to (4, 4) float64, mm
+        Of each of them.
+    """
+    middles = nodes[tets].mean(axis=1)
+    kept = np.ones(len(middles), dtype=bool)
+    outside = {name: -depth.sample(middles) for name, depth in distances.items()}
+    for one, other in combinations(distances, 2):
+        apart = motions[one] - motions[other]
+        shift = np.linalg.norm(middles @ apart[:3, :3].T + apart[:3, 3], axis=1)
+        near = outside[one] + outside[other] < shift + BETWEEN
+        ids = np.flatnonzero(near & (shift > LEAST_SHIFT))
+        facing = [_towards(distances[name], middles[ids]) for name in (one, other)]
+        kept[ids[(facing[0] * facing[1]).sum(axis=1) < SAME_SIDE]] = False
+    return kept
+
+
+def _towards(depth: ImageData, points: Floats) -> Floats:
+    """Unit vectors to a bone, (k, 3)."""
+    columns = []
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = depth.spacing[axis]
+        columns.append(depth.sample(points + step) - depth.sample(points - step))
+    slope = np.column_stack(columns)
+    length = np.linalg.norm(slope, axis=1, keepdims=True)
+    return np.asarray(slope / np.maximum(length, np.finfo(np.float64).tiny))
+
+
 def operate(
     nodes: Floats,
     tets: NDArray[Any],
     boundary: NDArray[Any],
     kinds: NodeKinds,
-    segments: Mapping[str, BoneSegment],
+    distances: Mapping[str, ImageData],
+    centres: Mapping[str, Floats],
     plan: Mapping[str, Floats],
+    bared: NDArray[Any] | None = None,
 ) -> Operation:
     """The operation of a plan on tissue whose nodes have their kinds.
 
@@ -120,9 +198,14 @@ def operate(
     boundary : (t, 3) uint32
         Boundary triangles.
     kinds : NodeKinds
-    segments : mapping of str to BoneSegment
+    distances : mapping of str to ImageData
+        The depth in each segment.
+    centres : mapping of str to (3,) float64, mm
+        About which each turns on its way.
     plan : mapping of str to (4, 4) float64, mm
         Segments that it does not name stay.
+    bared : (k,) whole numbers, optional
+        Free nodes that may touch bone as well: of tissue that was opened.
 
     Raises
     ------
@@ -130,13 +213,12 @@ def operate(
         (also `ValueError`) The plan moves what is no segment; scipy is not installed.
     """
     for name in plan:
-        if name not in segments:
-            raise CaseInputError(f"the plan moves {name!r}; segments are: {', '.join(segments)}")
-    names = list(segments)
+        if name not in distances:
+            raise CaseInputError(f"the plan moves {name!r}; segments are: {', '.join(distances)}")
+    names = list(distances)
     matrices = [np.asarray(plan.get(name, np.eye(4)), dtype=np.float64) for name in names]
     motion = {
-        name: screw(matrix, np.asarray(segments[name].surface.vertices).mean(axis=0))
-        for name, matrix in zip(names, matrices, strict=True)
+        name: screw(matrix, centres[name]) for name, matrix in zip(names, matrices, strict=True)
     }
     kind = np.asarray(kinds.kind)
     owner = np.full(len(nodes), -1, dtype=np.int64)
@@ -150,12 +232,14 @@ def operate(
         targets[mine] = nodes[mine] @ matrix[:3, :3].T + matrix[:3, 3] - nodes[mine]
     loose = _near_cuts(nodes, held, targets) | _crushed(nodes, tets, held, targets)
     held &= ~loose
-    touching = np.flatnonzero(loose | (kind == 3))
+    opened = np.zeros(len(nodes), dtype=bool)
+    opened[bared if bared is not None else []] = True
+    touching = np.flatnonzero(loose | (kind == 3) | (opened & ~held))
     contact = BoneContact(
         nodes,
         touching,
         _node_areas(nodes, boundary)[touching],
-        _distances(nodes[touching], segments),
+        {name: SmoothDistance(depth) for name, depth in distances.items()},
         motion,
     )
     ids = np.flatnonzero(held)
@@ -211,25 +295,6 @@ def _node_areas(nodes: Floats, triangles: NDArray[Any]) -> Floats:
     area = np.linalg.norm(cross, axis=1) / 6.0
     ends = triangles.T.ravel()
     return np.bincount(ends, np.tile(area, 3), len(nodes)).astype(np.float64)
-
-
-def _distances(points: Floats, segments: Mapping[str, BoneSegment]) -> dict[str, SmoothDistance]:
-    """The distances of the segments in the box of the points, and some room about it."""
-    if not len(points):
-        return {}
-    found = {}
-    for name, segment in segments.items():
-        level = segment.level
-        spacing = np.asarray(level.spacing)
-        low = np.floor((points.min(axis=0) - ROOM - level.lowest) / spacing).astype(int)
-        high = np.ceil((points.max(axis=0) + ROOM - level.lowest) / spacing).astype(int) + 1
-        low, high = np.maximum(low, 0), np.minimum(high, level.values.shape)
-        values = np.asarray(level.values)[
-            tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        ]
-        if values.size and (values > 0.0).any():
-            found[name] = SmoothDistance(ImageData(values, spacing, level.lowest + low * spacing))
-    return found
 
 
 def _module(name: str) -> Any:

@@ -21,6 +21,7 @@ from cmfsim.insilico.equilibrium import EquilibriumOptions
 from cmfsim.insilico.people import PATIENTS, Relocation, VirtualPatient, patient_named
 from cmfsim.insilico.truth import PostoperativeTruth, postoperative_truth
 from cmfsim.io import Case, write_image, write_landmarks, write_surface
+from cmfsim.io.cohorts import COHORT_FORMAT
 from cmfsim.io.files import replacing
 from cmfsim.phantom import make_head
 from cmfsim.scene import SurfaceData
@@ -37,8 +38,11 @@ LANDMARK_NOISE = 0.7
 SCAN_WHITE, SCAN_SMOOTH = 0.1, 0.2
 # Numbers that keep the draws of one patient apart, beside the seed and the patient's number.
 CT_DRAW, SKULL_DRAW, SKIN_DRAW, SCAN_DRAW, AFTER_DRAW = range(5)
+# Edge length of the mesh that the case file asks for, mm: coarser than the truth's.
+CASE_EDGE_LENGTH = 5.0
 TRUTH = "truth"
 RECORD = "truth.json"
+COHORT = "cohort.toml"
 
 
 def virtual_patients(
@@ -46,13 +50,14 @@ def virtual_patients(
     numbers: Iterable[int] = tuple(PATIENTS),
     *,
     seed: int = 0,
-    edge_length: float = 3.0,
+    edge_length: float = 4.0,
     spacing: float = 1.0,
     progress: Progress | None = None,
 ) -> list[Path]:
     """The case files of virtual patients, each in a folder of its own with the truth.
 
-    A patient who is there already, made with the same settings, is kept.
+    A patient who is there already, made with the same settings, is kept. `cohort.toml` in the
+    folder lists those who are complete, for `cmfsim study`.
 
     Parameters
     ----------
@@ -109,7 +114,25 @@ def virtual_patients(
                 progress=stage,
             )
         )
+    _write_cohort(Path(folder))
     return paths
+
+
+def _write_cohort(folder: Path) -> None:
+    """The study of every patient who is complete in the folder."""
+    names = [p.name for p in PATIENTS.values() if (folder / p.name / TRUTH / RECORD).exists()]
+    lines = [
+        "# `cmfsim study cohort.toml` predicts every patient by every model.",
+        f'format = "{COHORT_FORMAT}"',
+        "version = 1",
+        'name = "virtual patients"',
+        'note = "in silico: heads made by code and operations computed; no patients"',
+        'output = "study"',
+    ]
+    for name in names:
+        lines += ["", "[[cases]]", f'file = "{name}/case.toml"']
+    with replacing(folder / COHORT) as file:
+        file.write("\n".join([*lines, ""]).encode())
 
 
 def write_virtual_patient(
@@ -117,8 +140,8 @@ def write_virtual_patient(
     number: int,
     *,
     seed: int = 0,
-    edge_length: float = 3.0,
-    refine: bool = True,
+    edge_length: float = 4.0,
+    refine: bool = False,
     spacing: float = 1.0,
     grid: float = 1.0,
     skin_spacing: float = 1.5,
@@ -257,7 +280,7 @@ def _placed(
 def _case_text(patient: VirtualPatient, skull: Mapping[str, Floats]) -> str:
     lines = [
         f"# Virtual patient {patient.name} ({patient.label}), in silico: no patient.",
-        "# `cmfsim build case.toml` makes the model; the truth to compare with is in truth/.",
+        "# `cmfsim evaluate case.toml` predicts the face and compares it with the truth in truth/.",
         'format = "cmfsim-case"',
         "version = 1",
         f'name = "{patient.name}-in-silico"',
@@ -273,7 +296,22 @@ def _case_text(patient: VirtualPatient, skull: Mapping[str, Floats]) -> str:
         lines += ["", "[[osteotomies]]", f'procedure = "{procedure}"']
     for segment, move in patient.plan.items():
         lines += ["", f"[plan.{segment}]", *_motion_lines(move, skull)]
-    lines += ["", "[output]", 'folder = "out"', ""]
+    lines += [
+        "",
+        "[mesh]",
+        f"edge_length = {CASE_EDGE_LENGTH}",
+        "refine = false",
+        "",
+        "[muscles]",
+        "",
+        "[postoperative]",
+        f'skin = "{TRUTH}/skin.ply"',
+        f'landmarks = "{TRUTH}/skin.mrk.json"',
+        "",
+        "[output]",
+        'folder = "out"',
+        "",
+    ]
     return "\n".join(lines)
 
 
@@ -329,6 +367,7 @@ def _measured(truth: PostoperativeTruth) -> dict[str, Any]:
         "solve_seconds": found.seconds,
         "energy_Nmm": found.energy,
         "penetration_mm": truth.penetration,
+        "last_skin_step_mm": truth.last_step,
         "volume_ratio": [float(truth.volume_ratios.min()), float(truth.volume_ratios.max())],
         "largest_skin_move_mm": float(np.linalg.norm(moved, axis=1).max()),
     }

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import TetMesh
 from cmfsim.build import build_model
-from cmfsim.case import BoneSegment, NodeKinds
+from cmfsim.case import BoneSegment, ImageData, NodeKinds
 from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.insilico.body import HyperelasticBody
@@ -18,7 +18,13 @@ from cmfsim.insilico.carried_skin import carried
 from cmfsim.insilico.equilibrium import Equilibrium, EquilibriumOptions, find_equilibrium
 from cmfsim.insilico.hyperelastic import HyperelasticTissue
 from cmfsim.insilico.muscle_field import muscle_field, thickened
-from cmfsim.insilico.operation import Operation, operate, without_bite
+from cmfsim.insilico.operation import (
+    Operation,
+    bone_distances,
+    operate,
+    without_bite,
+    without_gaps,
+)
 from cmfsim.insilico.people import VirtualPatient
 from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
@@ -30,6 +36,8 @@ Progress = Callable[[str], None]
 
 # Tissue of which the tooth rows together are nearer than the bite's own gap and this, mm, is none.
 BEYOND_BITE = 1.5
+# Tissue is held from this height over the nasion on, mm: no operation of the jaws moves skin there.
+ABOVE_NASION = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +63,8 @@ class PostoperativeTruth:
     operation : Operation
     volume_ratios : (m,) float64
         Volume after over before, of each tet.
+    last_step : float, mm
+        The most that the last Newton iteration moved the skin.
     """
 
     nodes: Floats
@@ -71,6 +81,7 @@ class PostoperativeTruth:
     equilibrium: Equilibrium
     operation: Operation
     volume_ratios: Floats
+    last_step: float
 
     @property
     def penetration(self) -> float:
@@ -84,8 +95,8 @@ def postoperative_truth(
     head: PhantomHead,
     case: Case,
     *,
-    edge_length: float = 3.0,
-    refine: bool = True,
+    edge_length: float = 4.0,
+    refine: bool = False,
     grid: float = 1.0,
     skin_spacing: float = 1.5,
     options: EquilibriumOptions | None = None,
@@ -124,22 +135,26 @@ def postoperative_truth(
     """
     stage = progress or _quiet
     length = as_positive("edge_length", edge_length)
-    fine = replace(case, mesh=replace(case.mesh, edge_length=length, refine=refine))
+    region = replace(case.region, upper=float(head.skull_landmarks["nasion"][2]) + ABOVE_NASION)
+    mesh = replace(case.mesh, edge_length=length, refine=refine)
+    fine = replace(case, region=region, mesh=mesh, muscles=None, postoperative=None)
     stage("drawing the true anatomy")
     anatomy = head.anatomy(as_positive("grid", grid))
     model = build_model(fine, progress=progress, check=False, anatomy=anatomy)
     segments = {segment.name: segment for segment in model.segments}
     motions = {name: _motion(case, name) for name in segments}
 
-    stage("opening the bite")
-    nodes, tets, kinds = _open_bite(
+    stage("opening bite and cuts")
+    distances = bone_distances(np.asarray(model.scene.nodes), segments)
+    opened = _opened(
         np.asarray(model.scene.nodes),
         np.asarray(model.scene.tets),
         model.kinds,
-        segments,
+        distances,
+        motions,
         head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE,
     )
-    mesh = TetMesh(nodes, tets)
+    nodes, tets = opened.nodes, opened.tets
 
     stage("laying the true muscles")
     muscles = thickened(head.muscles, patient.muscle_thickness)
@@ -149,7 +164,16 @@ def postoperative_truth(
 
     stage("moving the bones")
     body = HyperelasticBody(nodes, tets, tissue)
-    operation = operate(nodes, tets, mesh.boundary_triangles(), kinds, segments, motions)
+    operation = operate(
+        nodes,
+        tets,
+        TetMesh(nodes, tets).boundary_triangles(),
+        opened.kinds,
+        distances,
+        {name: np.asarray(s.surface.vertices).mean(axis=0) for name, s in segments.items()},
+        motions,
+        opened.bared,
+    )
     found = find_equilibrium(body, operation.held, operation.path, operation.contact, options)
 
     stage("carrying the skin along")
@@ -158,6 +182,7 @@ def postoperative_truth(
     after = places + carried(places, nodes, tets, found.displacements)
     names, points = list(head.skin_landmarks), np.array(list(head.skin_landmarks.values()))
     moved = points + carried(points, nodes, tets, found.displacements)
+    last = carried(places, nodes, tets, found.last_step)
     return PostoperativeTruth(
         nodes=nodes,
         tets=tets,
@@ -173,6 +198,7 @@ def postoperative_truth(
         equilibrium=found,
         operation=operation,
         volume_ratios=body.volume_ratios(found.displacements),
+        last_step=float(np.linalg.norm(last, axis=1).max()),
     )
 
 
@@ -191,30 +217,61 @@ def _motion(case: Case, segment: str) -> Floats:
     return motion.matrix
 
 
-def _open_bite(
+@dataclass(frozen=True, eq=False)
+class _Opened:
+    """The tissue that is left when bite and gaps are open."""
+
+    nodes: Floats
+    tets: NDArray[np.uint32]
+    kinds: NodeKinds
+    bared: NDArray[np.int64]
+
+
+def _opened(
     nodes: Floats,
     tets: NDArray[Any],
     kinds: NodeKinds,
-    segments: Mapping[str, BoneSegment],
+    distances: Mapping[str, ImageData],
+    motions: Mapping[str, Floats],
     gap: float,
-) -> tuple[Floats, NDArray[np.uint32], NodeKinds]:
-    """The largest body of tissue that is left without what lies between the tooth rows."""
-    upper = segments.get("maxilla", segments.get("cranium"))
-    lower = segments.get("mandible_body", segments.get("mandible"))
+) -> _Opened:
+    """The largest body that is left without what lies between tooth rows and parted bones."""
+    kept = without_gaps(nodes, tets, distances, motions)
+    upper = distances.get("maxilla", distances.get("cranium"))
+    lower = distances.get("mandible_body", distances.get("mandible"))
     if upper is not None and lower is not None:
-        tets = tets[without_bite(nodes, tets, upper.level, lower.level, gap)]
-    sparse = import_module("scipy.sparse")
-    graph = import_module("scipy.sparse.csgraph")
-    ends = (np.repeat(tets[:, 0], 3), tets[:, 1:].ravel())
-    ones = np.ones(len(ends[0]), dtype=bool)
-    touching = sparse.coo_array((ones, ends), shape=(len(nodes), len(nodes)))
-    body = graph.connected_components(touching, directed=False)[1][tets[:, 0]]
-    tets = tets[body == np.argmax(np.bincount(body))]
+        kept &= without_bite(nodes, tets, upper, lower, gap)
+    bared = np.zeros(len(nodes), dtype=bool)
+    bared[tets[~kept]] = True
+    tets = tets[kept]
+    tets = tets[_largest_body(tets)]
     used = np.zeros(len(nodes), dtype=bool)
     used[tets] = True
     number = np.cumsum(used) - 1
-    left = NodeKinds(kinds.kind[used], kinds.segment[used], kinds.segments)
-    return nodes[used], number[tets].astype(np.uint32), left
+    return _Opened(
+        nodes[used],
+        number[tets].astype(np.uint32),
+        NodeKinds(kinds.kind[used], kinds.segment[used], kinds.segments),
+        np.flatnonzero(bared[used]),
+    )
+
+
+def _largest_body(tets: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which tets belong to the largest body that holds together by faces, (m,).
+
+    A flap that hangs on an edge or a node would swing without resistance.
+    """
+    sparse = import_module("scipy.sparse")
+    graph = import_module("scipy.sparse.csgraph")
+    m = len(tets)
+    faces = np.concatenate([np.delete(tets, corner, axis=1) for corner in range(4)])
+    faces.sort(axis=1)
+    order = np.lexsort(faces.T)
+    same = np.flatnonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))
+    pairs = (order[same] % m, order[same + 1] % m)
+    touching = sparse.coo_array((np.ones(len(same), dtype=bool), pairs), shape=(m, m))
+    body = graph.connected_components(touching, directed=False)[1]
+    return np.asarray(body == np.argmax(np.bincount(body)))
 
 
 def _moved_sites(
