@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,8 +19,6 @@ __all__ = ["Contact", "Equilibrium", "EquilibriumOptions", "NoContact", "find_eq
 
 _log = logging.getLogger(__name__)
 
-# A tet may lose this part of its volume in one step along the motion, and no more.
-LEAST_LEFT = 0.2
 # Forces below this part of stiffness times the area of the body are rounding.
 LEAST_FORCE = 1e-9
 # Halvings of a step before it is given up.
@@ -68,7 +67,7 @@ class EquilibriumOptions:
     Attributes
     ----------
     steps : int
-        Parts of the motion at least; steps in which a tet would collapse are halved.
+        Parts of the motion.
     tolerance : float
         Of the residual at the end: the norm of the forces on free nodes, in the largest that the
         forces on held nodes had on the way.
@@ -78,7 +77,7 @@ class EquilibriumOptions:
         Newton iterations of one step.
     """
 
-    steps: int = 4
+    steps: int = 3
     tolerance: float = 1e-4
     loose: float = 0.02
     most_rounds: int = 60
@@ -144,7 +143,7 @@ def find_equilibrium(
     Raises
     ------
     SolverError
-        A tet collapses however small the step (names it), or Newton's method does not settle.
+        Newton's method does not settle, or a tet is inside out at the end (names it).
     CaseError
         (also `ValueError`) PyAMG or scikit-fem is not installed.
     """
@@ -175,13 +174,14 @@ class _Search:
 
     def run(self) -> Equilibrium:
         begun = time.perf_counter()
-        part, step = 0.0, 1.0 / self.options.steps
         residual = 0.0
-        while part < 1.0:
-            part = self._advance(part, min(1.0, part + step))
+        parts = np.linspace(0.0, 1.0, self.options.steps + 1)
+        for before, part in pairwise(parts.tolist()):
+            self._advance(before, part)
             last = part >= 1.0
             residual = self._settle(part, self.options.tolerance if last else self.options.loose)
             _log.info("truth: %3.0f %% of the motion, residual %.1e", 100.0 * part, residual)
+        self._check()
         return Equilibrium(
             self.u,
             residual,
@@ -193,40 +193,34 @@ class _Search:
         )
 
     def _energy(self, u: Floats, part: float) -> float:
-        elastic = self.body.energy(u)
-        return elastic + self.contact.energy(u, part) if np.isfinite(elastic) else elastic
+        return self.body.energy(u) + self.contact.energy(u, part)
 
     def _forces(self, u: Floats, part: float) -> tuple[Floats, Floats]:
         force, stiffness = self.contact.forces(u, part)
         return self.body.forces(u) + force, stiffness
 
-    def _advance(self, part: float, target: float) -> float:
-        """Goes along the tangent towards the target as far as no tet collapses."""
+    def _advance(self, part: float, target: float) -> None:
+        """Goes along the tangent to the target."""
         forces, added = self._forces(self.u, part)
-        matrix = self.body.stiffness(self.u, added)
-        start = self.path(part)
+        matrix = self.body.stiffness(self.u, added, convex=True)
         step = np.zeros_like(self.u)
-        step[self.held] = self.path(target) - start
+        step[self.held] = self.path(target) - self.path(part)
         pull = (matrix @ step.ravel()).reshape(-1, 3)
         self.linear.take(_free_blocks(matrix, self.free))
         step[self.free], _ = self.linear.solve(-(forces + pull)[self.free], LOOSEST_SOLVE)
-        before = self.body.volume_ratios(self.u)
-        share = 1.0
-        for _ in range(HALVINGS):
-            reached = part + share * (target - part)
-            u = self.u + share * step
-            u[self.held] = self.path(reached)
-            ratio = self.body.volume_ratios(u)
-            if (ratio > LEAST_LEFT * before).all():
-                self.u = u
-                return target if share == 1.0 else reached
-            share *= 0.5
-        worst = int(np.argmin(ratio / before))
-        x, y, z = self.body.nodes[self.body.tets[worst]].mean(axis=0)
-        raise SolverError(
-            f"tet {worst} at ({x:.0f}, {y:.0f}, {z:.0f}) mm collapses after {part:.0%} of the "
-            "motion: bones close in on tissue there; plan less, or mesh finer"
-        )
+        self.u = self.u + step
+        self.u[self.held] = self.path(target)
+
+    def _check(self) -> None:
+        """Refuses tissue that is inside out."""
+        ratio = self.body.volume_ratios(self.u)
+        worst = int(np.argmin(ratio))
+        if ratio[worst] <= 0.0:
+            x, y, z = self.body.nodes[self.body.tets[worst]].mean(axis=0)
+            raise SolverError(
+                f"tet {worst} at ({x:.0f}, {y:.0f}, {z:.0f}) mm is inside out after the motion: "
+                "bones close in on tissue there; plan less, or mesh finer"
+            )
 
     def _settle(self, part: float, tolerance: float) -> float:
         """Newton's method with line search; the residual reached."""

@@ -26,7 +26,7 @@ from cmfsim.io.files import replacing
 from cmfsim.phantom import make_head
 from cmfsim.scene import SurfaceData
 
-__all__ = ["virtual_patients", "write_virtual_patient"]
+__all__ = ["case_text", "virtual_patients", "write_virtual_patient"]
 
 _log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ SCAN_WHITE, SCAN_SMOOTH = 0.1, 0.2
 # Numbers that keep the draws of one patient apart, beside the seed and the patient's number.
 CT_DRAW, SKULL_DRAW, SKIN_DRAW, SCAN_DRAW, AFTER_DRAW = range(5)
 # Edge length of the mesh that the case file asks for, mm: coarser than the truth's.
-CASE_EDGE_LENGTH = 5.0
+CASE_EDGE_LENGTH = 6.0
 TRUTH = "truth"
 RECORD = "truth.json"
 COHORT = "cohort.toml"
@@ -50,8 +50,8 @@ def virtual_patients(
     numbers: Iterable[int] = tuple(PATIENTS),
     *,
     seed: int = 0,
-    edge_length: float = 4.0,
-    spacing: float = 1.0,
+    edge_length: float = 5.0,
+    spacing: float = 1.5,
     progress: Progress | None = None,
 ) -> list[Path]:
     """The case files of virtual patients, each in a folder of its own with the truth.
@@ -140,10 +140,10 @@ def write_virtual_patient(
     number: int,
     *,
     seed: int = 0,
-    edge_length: float = 4.0,
+    edge_length: float = 5.0,
     refine: bool = False,
-    spacing: float = 1.0,
-    grid: float = 1.0,
+    spacing: float = 1.5,
+    grid: float = 1.5,
     skin_spacing: float = 1.5,
     options: EquilibriumOptions | None = None,
     progress: Progress | None = None,
@@ -212,7 +212,7 @@ def write_virtual_patient(
     skin = _placed(head.skin_landmarks, seed, patient, SKIN_DRAW)
     write_landmarks(folder / "skin.mrk.json", skin)
     with replacing(folder / "case.toml") as file:
-        file.write(_case_text(patient, skull).encode())
+        file.write(case_text(patient, skull).encode())
     case = Case.load(folder / "case.toml")
     truth = postoperative_truth(
         patient,
@@ -277,7 +277,8 @@ def _placed(
     }
 
 
-def _case_text(patient: VirtualPatient, skull: Mapping[str, Floats]) -> str:
+def case_text(patient: VirtualPatient, skull: Mapping[str, Floats]) -> str:
+    """The text of `case.toml`; turns are about the skull landmarks that are given."""
     lines = [
         f"# Virtual patient {patient.name} ({patient.label}), in silico: no patient.",
         "# `cmfsim evaluate case.toml` predicts the face and compares it with the truth in truth/.",
