@@ -13,7 +13,9 @@ from cmfsim.errors import CaseInputError
 from cmfsim.insilico import PATIENTS, EquilibriumOptions
 from cmfsim.insilico.carried_skin import carried, scanned
 from cmfsim.insilico.muscle_field import muscle_field, thickened
-from cmfsim.insilico.operation import screw
+from cmfsim.insilico.operation import bone_distances, screw, without_bite, without_gaps
+from cmfsim.insilico.patient_folder import virtual_patients
+from cmfsim.insilico.truth import largest_body
 
 # A twin that a test can afford: 8 mm tets, 3 mm voxels.
 COARSE = {"edge_length": 8.0, "spacing": 3.0, "grid": 3.0, "skin_spacing": 5.0}
@@ -117,6 +119,65 @@ def test_a_patient_made_with_the_same_settings_is_kept(twin, monkeypatch):
     assert kept == [twin / "case.toml"]
     with pytest.raises(AssertionError, match="made again"):
         cmfsim.virtual_patients(folder, [1], **{**settings, "seed": 1})
+
+
+def test_the_cohort_lists_the_patients_who_are_complete(twin):
+    """`cohort.toml` beside P1 loads, and names P1 alone though a broken P2 lies there."""
+    record = json.loads((twin / "truth/truth.json").read_text())["settings"]
+    (twin.parent / "P2").mkdir(exist_ok=True)
+    virtual_patients(
+        twin.parent, [1], **{key: record[key] for key in ("seed", "edge_length", "spacing")}
+    )
+    cohort = cmfsim.Cohort.load(twin.parent / "cohort.toml")
+    assert cohort.cases == {"P1": twin / "case.toml"}
+    assert cohort.note.startswith("in silico")
+    assert cohort.models == ("H", "M", "H+S", "M+S")
+
+
+def blocks(gap: float):
+    """Two bones of 10 mm with a gap along x, and tissue all round."""
+    segments = {}
+    for name, low in (("front", -10.0), ("back", gap)):
+        vertices, triangles = meshes.icosphere(2, 1.0)
+        top = np.abs(vertices).max(axis=1, keepdims=True)
+        box = 5.0 * vertices / top + np.array([low + 5.0, 0.0, 0.0])
+        surface = cmfsim.SurfaceData(box, triangles)
+        level = cmfsim.ImageData(np.zeros((2, 2, 2), dtype=np.float32), (1.0,) * 3, (0.0,) * 3)
+        segments[name] = cmfsim.BoneSegment(name, level, surface)
+    nodes, tets = meshes.box((20, 12, 12), (30.0, 18.0, 18.0))
+    return nodes - [14.0, 9.0, 9.0], tets, segments
+
+
+def test_tissue_between_bones_that_part_is_none():
+    """A slit of 1 mm that opens by 4 mm: all tets in it go, none outside, none if nothing moves."""
+    nodes, tets, segments = blocks(1.0)
+    depth = bone_distances(nodes, segments)
+    motions = {"front": cmfsim.rigid_motion((-4.0, 0.0, 0.0)), "back": np.eye(4)}
+    kept = without_gaps(nodes, tets, depth, motions)
+    x, y, z = nodes[tets].mean(axis=1).T
+    slit = (x > 0.0) & (x < 1.0) & (np.abs(y) < 4.0) & (np.abs(z) < 4.0)
+    assert slit.sum() > 20
+    assert not kept[slit].any()
+    beside = (np.abs(y) > 8.0) | (np.abs(z) > 8.0)
+    assert kept[beside].all()
+    assert without_gaps(nodes, tets, depth, dict.fromkeys(motions, np.eye(4))).all()
+    assert (without_bite(nodes, tets, depth["front"], depth["back"], 2.0) <= ~slit).all()
+
+
+def test_distances_of_bones_reach_far():
+    """Against the exact distance from a sphere, 10 mm outside and 5 mm inside."""
+    vertices, triangles = meshes.icosphere(4, 12.0)
+    level = cmfsim.ImageData(np.zeros((2, 2, 2), dtype=np.float32), (1.0,) * 3, (0.0,) * 3)
+    ball = cmfsim.BoneSegment("ball", level, cmfsim.SurfaceData(vertices, triangles))
+    points = np.vstack([r * meshes.unit_vectors(50, 1) for r in (7.0, 14.0, 22.0)])
+    depth = bone_distances(points, {"ball": ball})["ball"].sample(points)
+    assert np.abs(depth - (12.0 - np.linalg.norm(points, axis=1))).max() < 0.15
+
+
+def test_a_flap_on_an_edge_is_left_out():
+    """Two tets that share a face, and two more that hang on an edge and on a node of them."""
+    tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4], [0, 1, 5, 6], [4, 7, 8, 9]])
+    assert largest_body(tets).tolist() == [True, True, False, False]
 
 
 def test_muscle_fractions_are_those_of_random_points():

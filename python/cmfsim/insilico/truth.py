@@ -30,7 +30,7 @@ from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
 from cmfsim.scene import SurfaceData
 
-__all__ = ["PostoperativeTruth", "postoperative_truth"]
+__all__ = ["PostoperativeTruth", "largest_body", "postoperative_truth"]
 
 Progress = Callable[[str], None]
 
@@ -244,7 +244,7 @@ def _opened(
     bared = np.zeros(len(nodes), dtype=bool)
     bared[tets[~kept]] = True
     tets = tets[kept]
-    tets = tets[_largest_body(tets)]
+    tets = tets[largest_body(tets)]
     used = np.zeros(len(nodes), dtype=bool)
     used[tets] = True
     number = np.cumsum(used) - 1
@@ -256,10 +256,14 @@ def _opened(
     )
 
 
-def _largest_body(tets: NDArray[Any]) -> NDArray[np.bool_]:
+def largest_body(tets: NDArray[Any]) -> NDArray[np.bool_]:
     """Which tets belong to the largest body that holds together by faces, (m,).
 
     A flap that hangs on an edge or a node would swing without resistance.
+
+    Parameters
+    ----------
+    tets : (m, 4)
     """
     sparse = import_module("scipy.sparse")
     graph = import_module("scipy.sparse.csgraph")
