@@ -377,3 +377,25 @@ def test_bones_that_close_on_tissue_are_an_error_that_says_where():
     move[:, 2] = -1.2 * nodes[:, 2]
     with pytest.raises(SolverError, match=r"tet \d+ at .* mm is inside out"):
         find_equilibrium(body, held[:-1], lambda part: part * move[:-1])
+
+
+def test_contact_stiffness_is_the_derivative_of_its_forces_in_a_hollow():
+    """Nodes pressed on the inside of a hollow ball, where no direction gives way."""
+    axis = 0.5 * np.arange(-24, 25)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    hollow = cmfsim.ImageData(
+        (np.sqrt(x**2 + y**2 + z**2) - 6.0).astype(np.float32), (0.5,) * 3, (-12.0,) * 3
+    )
+    nodes = 5.6 * meshes.unit_vectors(40, 1)
+    motion = {"bone": screw(np.eye(4), np.zeros(3))}
+    contact = BoneContact(
+        nodes, np.arange(40), np.full(40, 2.0), {"bone": SmoothDistance(hollow)}, motion
+    )
+    u = 0.1 * nodes
+    assert (contact.depths(u, 1.0)["bone"] > ONSET).all()
+    way = np.random.default_rng(0).normal(size=(40, 3))
+    step = 1e-5
+    rise = contact.forces(u + step * way, 1.0)[0] - contact.forces(u - step * way, 1.0)[0]
+    expected = rise / (2.0 * step)
+    found = np.einsum("kij,kj->ki", contact.forces(u, 1.0)[1], way)
+    assert np.abs(found - expected).max() < 1e-3 * np.abs(expected).max()

@@ -65,6 +65,16 @@ class SmoothDistance:
             columns.append((self(points + step) - self(points - step)) / (2.0 * DIFFERENCE))
         return np.column_stack(columns)
 
+    def curvature(self, points: Floats) -> Floats:
+        """The second derivatives at points, (k, 3, 3), symmetric."""
+        columns = []
+        for axis in range(3):
+            step = np.zeros(3)
+            step[axis] = DIFFERENCE
+            columns.append((self.slope(points + step) - self.slope(points - step)) / 2.0)
+        found = np.stack(columns, axis=2) / DIFFERENCE
+        return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
+
 
 @dataclass(frozen=True, eq=False)
 class BoneContact:
@@ -130,7 +140,7 @@ class BoneContact:
     def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
         """The gradient of the energy, (n, 3) N, and the stiffness of each node, (n, 3, 3) N/mm.
 
-        The curvature of the bone is left out of the stiffness: it may be negative.
+        Where the bone's curvature makes the stiffness negative in a direction, it counts as 0.
         """
         force = np.zeros_like(self.points)
         blocks = np.zeros((len(self.points), 3, 3))
@@ -139,13 +149,18 @@ class BoneContact:
             if not len(touching):
                 continue
             seen = self._seen(name, displacements, part)[touching]
-            normal = self.bones[name].slope(seen) @ self.motion[name](part)[:3, :3].T
+            turn = self.motion[name](part)[:3, :3]
+            normal = self.bones[name].slope(seen) @ turn.T
+            bend = turn @ self.bones[name].curvature(seen) @ turn.T
             weight, d = self.stiffness * self.area[touching], depth[touching]
             pressing = np.where(d < ONSET, 0.5 * d**2 / ONSET, d - 0.5 * ONSET)
             rise = weight * np.minimum(d / ONSET, 1.0)
             at = self.nodes[touching]
             force[at] -= (weight * pressing)[:, None] * normal
-            blocks[at] += rise[:, None, None] * normal[:, :, None] * normal[:, None, :]
+            block = rise[:, None, None] * normal[:, :, None] * normal[:, None, :]
+            values, axes = np.linalg.eigh(block - (weight * pressing)[:, None, None] * bend)
+            upright = axes * np.maximum(values, 0.0)[:, None]
+            blocks[at] += upright @ axes.transpose(0, 2, 1)
         return force, blocks
 
 
