@@ -73,7 +73,8 @@ def _case(folder: Path, head: PhantomHead) -> Case:
     write_landmarks(folder / "skull.mrk.json", head.skull_landmarks)
     write_landmarks(folder / "skin.mrk.json", head.skin_landmarks)
     (folder / "ct.nrrd").touch()
-    (folder / "case.toml").write_text(case_text(PATIENT, head.skull_landmarks), encoding="utf-8")
+    text = case_text(PATIENT, head.skull_landmarks, EDGE_LENGTH)
+    (folder / "case.toml").write_text(text, encoding="utf-8")
     case = Case.load(folder / "case.toml")
     return replace(case, postoperative=None)
 

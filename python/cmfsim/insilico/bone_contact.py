@@ -140,7 +140,7 @@ class BoneContact:
     def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
         """The gradient of the energy, (n, 3) N, and the stiffness of each node, (n, 3, 3) N/mm.
 
-        Where the bone's curvature makes the stiffness negative in a direction, it counts as 0.
+        Of the bone's curvature, that of hollows counts, which stiffens; that of edges does not.
         """
         force = np.zeros_like(self.points)
         blocks = np.zeros((len(self.points), 3, 3))
@@ -157,10 +157,9 @@ class BoneContact:
             rise = weight * np.minimum(d / ONSET, 1.0)
             at = self.nodes[touching]
             force[at] -= (weight * pressing)[:, None] * normal
-            block = rise[:, None, None] * normal[:, :, None] * normal[:, None, :]
-            values, axes = np.linalg.eigh(block - (weight * pressing)[:, None, None] * bend)
-            upright = axes * np.maximum(values, 0.0)[:, None]
-            blocks[at] += upright @ axes.transpose(0, 2, 1)
+            blocks[at] += rise[:, None, None] * normal[:, :, None] * normal[:, None, :]
+            values, axes = np.linalg.eigh(-(weight * pressing)[:, None, None] * bend)
+            blocks[at] += (axes * np.maximum(values, 0.0)[:, None]) @ axes.transpose(0, 2, 1)
         return force, blocks
 
 

@@ -77,9 +77,9 @@ class EquilibriumOptions:
         Newton iterations of one step.
     """
 
-    steps: int = 3
-    tolerance: float = 1e-4
-    loose: float = 0.02
+    steps: int = 2
+    tolerance: float = 5e-4
+    loose: float = 0.03
     most_rounds: int = 60
 
     def __post_init__(self) -> None:

@@ -38,8 +38,8 @@ LANDMARK_NOISE = 0.7
 SCAN_WHITE, SCAN_SMOOTH = 0.1, 0.2
 # Numbers that keep the draws of one patient apart, beside the seed and the patient's number.
 CT_DRAW, SKULL_DRAW, SKIN_DRAW, SCAN_DRAW, AFTER_DRAW = range(5)
-# Edge length of the mesh that the case file asks for, mm: coarser than the truth's.
-CASE_EDGE_LENGTH = 6.0
+# Edge length of the mesh that the case file asks for, in that of the truth.
+COARSER = 1.25
 TRUTH = "truth"
 RECORD = "truth.json"
 COHORT = "cohort.toml"
@@ -212,7 +212,7 @@ def write_virtual_patient(
     skin = _placed(head.skin_landmarks, seed, patient, SKIN_DRAW)
     write_landmarks(folder / "skin.mrk.json", skin)
     with replacing(folder / "case.toml") as file:
-        file.write(case_text(patient, skull).encode())
+        file.write(case_text(patient, skull, COARSER * edge_length).encode())
     case = Case.load(folder / "case.toml")
     truth = postoperative_truth(
         patient,
@@ -277,8 +277,8 @@ def _placed(
     }
 
 
-def case_text(patient: VirtualPatient, skull: Mapping[str, Floats]) -> str:
-    """The text of `case.toml`; turns are about the skull landmarks that are given."""
+def case_text(patient: VirtualPatient, skull: Mapping[str, Floats], edge_length: float) -> str:
+    """The text of `case.toml`: turns are about the skull landmarks, the mesh has this edge, mm."""
     lines = [
         f"# Virtual patient {patient.name} ({patient.label}), in silico: no patient.",
         "# `cmfsim evaluate case.toml` predicts the face and compares it with the truth in truth/.",
@@ -300,7 +300,7 @@ def case_text(patient: VirtualPatient, skull: Mapping[str, Floats]) -> str:
     lines += [
         "",
         "[mesh]",
-        f"edge_length = {CASE_EDGE_LENGTH}",
+        f"edge_length = {edge_length:g}",
         "refine = false",
         "",
         "[muscles]",
