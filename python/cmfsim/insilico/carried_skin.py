@@ -52,14 +52,17 @@ def carried(
     best = np.full(len(places), -np.inf)
     weights = np.zeros((len(places), 4))
     home = np.zeros(len(places), dtype=np.int64)
-    for tet in near.T:
+    for tets_tried in near.T:
+        lost = np.flatnonzero(best < 0.0)
+        tet = tets_tried[lost]
         base = corners[rows[tet]]
-        edges = base[:, 1:] - base[:, :1]
-        rest = np.linalg.solve(edges.transpose(0, 2, 1), (places - base[:, 0])[..., None])[..., 0]
+        edges = (base[:, 1:] - base[:, :1]).transpose(0, 2, 1)
+        rest = np.linalg.solve(edges, (places[lost] - base[:, 0])[..., None])[..., 0]
         inside = np.column_stack([1.0 - rest.sum(axis=1), rest])
         least = inside.min(axis=1)
-        better = least > best
-        best[better], weights[better], home[better] = least[better], inside[better], tet[better]
+        better = least > best[lost]
+        at = lost[better]
+        best[at], weights[at], home[at] = least[better], inside[better], tet[better]
     weights = np.clip(weights, 0.0, None)
     weights /= weights.sum(axis=1, keepdims=True)
     return np.asarray(np.einsum("kc,kci->ki", weights, moves[rows[home]]))

@@ -144,7 +144,7 @@ def write_virtual_patient(
     refine: bool = False,
     spacing: float = 1.5,
     grid: float = 1.5,
-    skin_spacing: float = 1.5,
+    skin_spacing: float = 2.0,
     options: EquilibriumOptions | None = None,
     progress: Progress | None = None,
 ) -> Path:

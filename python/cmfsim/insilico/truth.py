@@ -38,6 +38,8 @@ Progress = Callable[[str], None]
 BEYOND_BITE = 1.5
 # Tissue is held from this height over the nasion on, mm: no operation of the jaws moves skin there.
 ABOVE_NASION = 20.0
+# Nodes within this distance from the skin lie on it, mm.
+NEAR_SKIN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +100,7 @@ def postoperative_truth(
     edge_length: float = 5.0,
     refine: bool = False,
     grid: float = 1.5,
-    skin_spacing: float = 1.5,
+    skin_spacing: float = 2.0,
     options: EquilibriumOptions | None = None,
     progress: Progress | None = None,
 ) -> PostoperativeTruth:
@@ -182,7 +184,7 @@ def postoperative_truth(
     after = places + carried(places, nodes, tets, found.displacements)
     names, points = list(head.skin_landmarks), np.array(list(head.skin_landmarks.values()))
     moved = points + carried(points, nodes, tets, found.displacements)
-    last = carried(places, nodes, tets, found.last_step)
+    on_skin = np.abs(anatomy.skin.sample(nodes)) < NEAR_SKIN
     return PostoperativeTruth(
         nodes=nodes,
         tets=tets,
@@ -198,7 +200,7 @@ def postoperative_truth(
         equilibrium=found,
         operation=operation,
         volume_ratios=body.volume_ratios(found.displacements),
-        last_step=float(np.linalg.norm(last, axis=1).max()),
+        last_step=float(np.linalg.norm(found.last_step[on_skin], axis=1).max()),
     )
 
 
