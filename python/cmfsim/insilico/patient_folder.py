@@ -301,7 +301,6 @@ def case_text(patient: VirtualPatient, skull: Mapping[str, Floats], edge_length:
         "",
         "[mesh]",
         f"edge_length = {edge_length:g}",
-        "refine = false",
         "",
         "[muscles]",
         "",
