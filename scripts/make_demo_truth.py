@@ -27,7 +27,7 @@ from cmfsim.io.files import replacing
 from cmfsim.phantom import PhantomHead
 
 PATIENT = PATIENTS[1]
-EDGE_LENGTH = 4.0
+EDGE_LENGTH = 6.0
 # Triangles of the face, and how far behind the roots of the zygomatic arches and over the nasion it
 # ends, mm.
 TRIANGLES = 14_000

@@ -97,10 +97,10 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         "--seed", metavar="N", type=int, default=0, help="of all noise (default 0)"
     )
     virtual.add_argument(
-        "--edge-length", metavar="H", type=float, default=5.0, help="mm, true mesh (default 5)"
+        "--edge-length", metavar="H", type=float, default=6.0, help="mm, true mesh (default 6)"
     )
     virtual.add_argument(
-        "--spacing", metavar="MM", type=float, default=1.5, help="of the CT (default 1.5)"
+        "--spacing", metavar="MM", type=float, default=2.0, help="of the CT (default 2)"
     )
     virtual.set_defaults(run=virtual_patients_command.virtual_patients)
 

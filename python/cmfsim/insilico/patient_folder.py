@@ -32,9 +32,10 @@ _log = logging.getLogger(__name__)
 
 Progress = Callable[[str], None]
 
-# Standard deviations, mm: of a landmark's place along each axis, as one operator repeats it; of the
-# noise of a surface scanner at a point, and of its waves.
-LANDMARK_NOISE = 0.7
+# Standard deviations, mm: of a landmark's place along each axis, on the skull as one operator
+# repeats it, on the skin as the mean of several is; of the noise of a surface scanner at a point,
+# and of its waves.
+SKULL_NOISE, SKIN_NOISE = 0.7, 0.3
 SCAN_WHITE, SCAN_SMOOTH = 0.1, 0.2
 # Numbers that keep the draws of one patient apart, beside the seed and the patient's number.
 CT_DRAW, SKULL_DRAW, SKIN_DRAW, SCAN_DRAW, AFTER_DRAW = range(5)
@@ -50,8 +51,8 @@ def virtual_patients(
     numbers: Iterable[int] = tuple(PATIENTS),
     *,
     seed: int = 0,
-    edge_length: float = 5.0,
-    spacing: float = 1.5,
+    edge_length: float = 6.0,
+    spacing: float = 2.0,
     progress: Progress | None = None,
 ) -> list[Path]:
     """The case files of virtual patients, each in a folder of its own with the truth.
@@ -140,9 +141,9 @@ def write_virtual_patient(
     number: int,
     *,
     seed: int = 0,
-    edge_length: float = 5.0,
+    edge_length: float = 6.0,
     refine: bool = False,
-    spacing: float = 1.5,
+    spacing: float = 2.0,
     grid: float = 1.5,
     skin_spacing: float = 2.0,
     options: EquilibriumOptions | None = None,
@@ -207,9 +208,9 @@ def write_virtual_patient(
     stage("imaging the head")
     ct = head.ct((spacing, spacing, spacing), seed=_draw(seed, patient, CT_DRAW))
     write_image(ct, folder / "ct.nrrd")
-    skull = _placed(head.skull_landmarks, seed, patient, SKULL_DRAW)
+    skull = _placed(head.skull_landmarks, SKULL_NOISE, [seed, patient.number, SKULL_DRAW])
     write_landmarks(folder / "skull.mrk.json", skull)
-    skin = _placed(head.skin_landmarks, seed, patient, SKIN_DRAW)
+    skin = _placed(head.skin_landmarks, SKIN_NOISE, [seed, patient.number, SKIN_DRAW])
     write_landmarks(folder / "skin.mrk.json", skin)
     with replacing(folder / "case.toml") as file:
         file.write(case_text(patient, skull, COARSER * edge_length).encode())
@@ -226,7 +227,7 @@ def write_virtual_patient(
         progress=progress,
     )
     stage("writing the truth")
-    after = _placed(truth.skin_landmarks, seed, patient, AFTER_DRAW)
+    after = _placed(truth.skin_landmarks, SKIN_NOISE, [seed, patient.number, AFTER_DRAW])
     scan = scanned(
         truth.skin,
         white=SCAN_WHITE,
@@ -242,7 +243,8 @@ def write_virtual_patient(
         "patient": _described(patient),
         "motions": {name: matrix.tolist() for name, matrix in truth.motions.items()},
         "noise_mm": {
-            "landmarks": LANDMARK_NOISE,
+            "skull_landmarks": SKULL_NOISE,
+            "skin_landmarks": SKIN_NOISE,
             "scan_white": SCAN_WHITE,
             "scan_smooth": SCAN_SMOOTH,
         },
@@ -266,13 +268,11 @@ def _draw(seed: int, patient: VirtualPatient, draw: int) -> int:
     return int(np.random.SeedSequence([seed, patient.number, draw]).generate_state(1)[0])
 
 
-def _placed(
-    landmarks: Mapping[str, Floats], seed: int, patient: VirtualPatient, draw: int
-) -> dict[str, Floats]:
-    """Landmarks as an operator places them."""
-    generator = np.random.default_rng([seed, patient.number, draw])
+def _placed(landmarks: Mapping[str, Floats], noise: float, seed: list[int]) -> dict[str, Floats]:
+    """Landmarks as they are placed, off by noise along each axis."""
+    generator = np.random.default_rng(seed)
     return {
-        label: np.asarray(point) + LANDMARK_NOISE * generator.standard_normal(3)
+        label: np.asarray(point) + noise * generator.standard_normal(3)
         for label, point in landmarks.items()
     }
 

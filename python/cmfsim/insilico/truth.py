@@ -97,7 +97,7 @@ def postoperative_truth(
     head: PhantomHead,
     case: Case,
     *,
-    edge_length: float = 5.0,
+    edge_length: float = 6.0,
     refine: bool = False,
     grid: float = 1.5,
     skin_spacing: float = 2.0,
