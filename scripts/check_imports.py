@@ -147,7 +147,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "equivalent": "case checks errors musculature scene _core",
         "landmark_sites": "",
         "template_data": "case checks errors musculature scene",
-        "prediction": "case checks model musculature scene",
+        "prediction": "case checks model musculature scene _core",
         "template": (
             "case checks errors io landmark_sites musculature phantom registration scene "
             "surface_checks surface_repair template_data _core"
@@ -161,9 +161,10 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "evaluation": "case checks errors registration scene topology _core",
         "build": (
             "case checks doctor equivalent errors imaging io meshing model musculature "
-            "node_kinds osteotomy patient phantom pictures scene surface_repair template "
+            "node_kinds osteotomy patient phantom pictures scene surface_repair template topology "
             "_core"
         ),
+        "demo": "case checks errors io osteotomy phantom scene",
         "study": (
             "build case checks errors evaluation io model musculature patient prediction "
             "scene simulation template _core"
@@ -181,9 +182,10 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "surface_checks surface_repair template _core"
         ),
         "cli": (
-            "build case checks cmfsim doctor errors evaluation insilico io meshing musculature "
-            "phantom pictures prediction report scene simulation study template"
+            "build case checks cmfsim demo doctor errors evaluation insilico io meshing "
+            "musculature phantom pictures prediction report scene simulation study template"
         ),
+        "__main__": "cli",
         "__init__": (
             "achieved build case doctor equivalent errors evaluation imaging insilico io "
             "landmark_sites meshing model musculature node_kinds osteotomy patient phantom "

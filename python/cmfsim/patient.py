@@ -57,6 +57,8 @@ POSTERIOR_LANDMARKS = ("supraglenoid_L", "supraglenoid_R")
 # Edge length of the mesh where a case states none, mm: some 400 000 tets of a face with its neck,
 # whose edges are 2.9 mm long on average, half of an edge where tissue is thin.
 EDGE_LENGTH = 4.0
+# Tooth rows rest 2 to 4 mm apart, and a mucoperiosteal flap is lifted about as far at a cut, mm.
+CLEFT = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,12 +222,16 @@ class CaseMesh:
         Smaller tets where tissue is thin.
     parting : Path or None
         A surface that parts the lips where the image or skin shows them as one.
+    cleft : float, mm
+        Tissue of which two segments that part are less than this away, taken together, is left out:
+        between tooth rows and at cuts. 0: none.
     file : Path or None
-        Tets from elsewhere; edge length and refinement are then not used.
+        Tets from elsewhere; edge length, refinement and cleft are then not used.
     """
 
     edge_length: float = EDGE_LENGTH
     refine: bool = True
+    cleft: float = CLEFT
     parting: Path | None = None
     file: Path | None = None
 

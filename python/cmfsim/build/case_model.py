@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import TetMesh, __version__
+from cmfsim.build.clefts import without_clefts
+from cmfsim.build.face import detailed_face
 from cmfsim.build.held import held_part
 from cmfsim.build.inputs import (
     check_output,
@@ -22,6 +24,7 @@ from cmfsim.build.inputs import (
     read_motion,
 )
 from cmfsim.build.muscles import with_muscles
+from cmfsim.build.skin_part import on_skin
 from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.checks import Floats
 from cmfsim.doctor import diagnose
@@ -36,6 +39,7 @@ from cmfsim.meshing import (
     mesh_report,
     near_skin,
     part_mesh,
+    report_of_part,
     tissue_level,
 )
 from cmfsim.model import PatientModel
@@ -205,10 +209,14 @@ def build_model(
         options=KindOptions(**case.node_kinds),
     )
     findings += classified.findings
-    mesh, kinds, noticed = held_part(mesh, classified.kinds)
-    if noticed:
-        report = mesh_report(mesh)
+    kinds, whole = classified.kinds, mesh.n_tets
+    if case.mesh.file is None:
+        mesh, kinds, noticed = without_clefts(mesh, kinds, cut.segments, moved, case.mesh.cleft)
+        findings += noticed
+    mesh, kinds, noticed = held_part(mesh, kinds)
     findings += noticed
+    if mesh.n_tets < whole:
+        report = report_of_part(mesh, report)
     findings += _untouched(case, kinds)
     findings = [*dict.fromkeys(findings)]
 
@@ -216,18 +224,21 @@ def build_model(
     motions = {name: read_motion(case, motion) for name, motion in case.plan.items()}
     scene = _scene(case, mesh, kinds, cut.segments, motions)
     boundary = np.asarray(mesh.boundary_triangles())
-    skin = _on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)
+    skin = boundary[on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)]
+    stages.begin("drawing the face")
+    face = detailed_face(anatomy)
     stages.end()
     patient = PatientModel(
         name=case.name,
         scene=scene,
         kinds=kinds,
         boundary_triangles=boundary,
-        skin_triangles=boundary[skin],
+        skin_triangles=skin,
         segments=cut.segments,
         anatomy=anatomy,
         fat=case.tissue,
         landmarks=landmarks,
+        face=face,
         findings=tuple(findings),
         summary=_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
     )
@@ -398,20 +409,6 @@ def _scene(
     )
 
 
-def _on_skin(
-    nodes: Floats, triangles: NDArray[np.uint32], anatomy: Anatomy, level: ImageData
-) -> NDArray[np.bool_]:
-    """Which boundary triangles are skin: their centroids lie nearer to it than to anything else."""
-    centroids = nodes[triangles].mean(axis=1)
-    others = [*anatomy.bones.values(), *([] if anatomy.air is None else [anatomy.air])]
-    from_skin = np.abs(anatomy.skin.sample(centroids))
-    near = np.ones(len(centroids), dtype=bool)
-    for other in others:
-        near &= from_skin < np.abs(other.sample(centroids))
-    # On a plane that bounds the region, the level is zero well inside the skin.
-    return near & (from_skin <= np.abs(level.sample(centroids)) + 0.25)
-
-
 def _summary(
     case: Case,
     kinds: NodeKinds,
@@ -424,6 +421,7 @@ def _summary(
     grid = anatomy.skin
     return {
         "case": case.name,
+        "note": case.note,
         "nodes": {name: len(kinds.nodes(name)) for name in NODE_KINDS},
         "segments": {
             name: {kind: len(kinds.nodes(kind, name)) for kind in ("joined", "sliding")}

@@ -43,9 +43,12 @@ def folder_of(output: Path, model: str, n_models: int) -> Path:
     return output if n_models == 1 else output / model
 
 
-def write_prediction_files(folder: Path, prediction: Prediction) -> list[str]:
+def write_prediction_files(
+    folder: Path, prediction: Prediction, *, pictures: bool = True
+) -> list[str]:
     """The names of the files of a prediction, with its pictures where they can be drawn."""
-    return write_prediction(folder, prediction, partial(_draw, prediction))
+    draw = partial(_draw, prediction) if pictures else None
+    return write_prediction(folder, prediction, draw)
 
 
 def _draw(prediction: Prediction, folder: Path) -> list[str]:
@@ -141,7 +144,8 @@ def write_case_report(folder: Path, models: Sequence[str]) -> str | None:
     }
     figures = []
     if evaluation is not None:
-        for name in evaluation["files"]:
+        # The box plot first: it shows all models together.
+        for name in sorted(evaluation["files"], key=lambda name: name != "errors.png"):
             if not name.endswith(".png"):
                 continue
             model = name.removeprefix("error-").removesuffix(".png")

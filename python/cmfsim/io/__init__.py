@@ -8,7 +8,7 @@ from cmfsim.io.landmarks import LandmarkFile, read_landmark_file, read_landmarks
 from cmfsim.io.meshes import read_tet_mesh
 from cmfsim.io.metrics import write_metrics
 from cmfsim.io.models import write_model
-from cmfsim.io.predictions import write_prediction
+from cmfsim.io.predictions import read_parts, write_prediction
 from cmfsim.io.results import read_result, result_suffixes, write_result
 from cmfsim.io.scenes import read_plan, read_scene, write_scene
 from cmfsim.io.surfaces import read_moved_surface, read_surface, write_surface
@@ -22,6 +22,7 @@ __all__ = [
     "read_landmark_file",
     "read_landmarks",
     "read_moved_surface",
+    "read_parts",
     "read_plan",
     "read_result",
     "read_scene",

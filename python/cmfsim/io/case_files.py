@@ -39,6 +39,7 @@ TABLES = (
     "format",
     "version",
     "name",
+    "note",
     "image",
     "surfaces",
     "landmarks",
@@ -57,6 +58,7 @@ TABLES = (
 SAMPLES = (1, 100_000)
 # Edge lengths that make a mesh of a head, mm: below, more tets than any memory; above, no face.
 EDGE_LENGTHS = (0.3, 30.0)
+MOST_CLEFT = 20.0
 # Grid spacings that a head can be worked on at, mm.
 WORKING_SPACINGS = (0.2, 5.0)
 
@@ -90,6 +92,8 @@ class Case:
         None leaves them out of what `cmfsim build` makes.
     solver : SolverOptions
     postoperative : CasePostoperative or None
+    note : str
+        What readers of its report should know, such as that the patient is made by code.
     lines : mapping of str to int
         The line of each dotted key in the case file, for findings.
 
@@ -114,6 +118,7 @@ class Case:
     muscles: CaseMuscles | None = None
     solver: SolverOptions = field(default_factory=SolverOptions)
     postoperative: CasePostoperative | None = None
+    note: str = ""
     lines: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -190,6 +195,7 @@ def _read(path: Path) -> Case:
             if "postoperative" in document
             else None
         ),
+        note=document.text("note") if "note" in document else "",
         lines=document.all_lines(),
     )
 
@@ -284,14 +290,16 @@ def _region(table: Table) -> Region:
 
 
 def _mesh(table: Table, folder: Path) -> CaseMesh:
-    table.only("edge_length", "refine", "parting", "file")
+    table.only("edge_length", "refine", "cleft", "parting", "file")
     low, high = EDGE_LENGTHS
     edge_length = table.number("edge_length", "mm", low=low, high=high)
+    cleft = table.number("cleft", "mm", low=0.0, high=MOST_CLEFT)
     parting = table.table("parting").only("surface") if "parting" in table else None
     default = CaseMesh()
     return CaseMesh(
         default.edge_length if edge_length is None else edge_length,
         table.flag("refine", default=default.refine),
+        default.cleft if cleft is None else cleft,
         None if parting is None else _file(parting, "surface", folder),
         _file_or_none(table, "file", folder),
     )

@@ -20,12 +20,15 @@ PICTURES: Mapping[str, str] = {
     "prediction": "The face before the operation and as predicted after it, and how far it moves.",
     "plan": "The plan: bone segments where they are moved to, and before as outlines.",
     "muscles": "The muscles, carried from the template to the skull by its landmarks.",
-    "error": "Signed distance of the prediction from the face after the operation, −5 to 5 mm: "
-    "blue where the prediction lies behind it.",
     "anatomy": "Skin and bone segments.",
     "node_kinds": "Kinds of node (Kim et al. 2010, Figure 4): fixed pink, joined orange, sliding "
     "blue, free white.",
 }
+
+NO_PICTURES = (
+    "Without pictures: none could be drawn where this was made. PyVista and OpenGL draw them "
+    "(pip install 'cmfsim[view]'; Debian: libgl1, libegl1)."
+)
 
 
 def case_document(
@@ -56,9 +59,10 @@ def case_document(
     pictures = pictures or {}
     models = ", ".join(entry["model"] for entry in predictions)
     sections = [
+        *_note_section(first),
         _prediction_section(predictions, pictures),
         _plan_section(first, pictures),
-        *_evaluation_sections(evaluation, pictures, figures),
+        *_evaluation_sections(evaluation, figures),
         *_muscle_section(predictions, pictures),
         _model_section(predictions, pictures),
         _time_section(predictions),
@@ -90,6 +94,12 @@ def _facts(prediction: Values, evaluation: Values | None) -> dict[str, str]:
     return facts
 
 
+def _note_section(prediction: Values) -> list[Section]:
+    """What the case's own note says of it."""
+    note = prediction.get("note")
+    return [Section("About this case", (Note(note, "warning"),))] if note else []
+
+
 def _prediction_section(predictions: Sequence[Values], pictures: Mapping[str, bytes]) -> Section:
     rows = tuple(
         (
@@ -101,7 +111,11 @@ def _prediction_section(predictions: Sequence[Values], pictures: Mapping[str, by
         for entry in predictions
     )
     table = Table(("model", "mean", "95 %", "largest"), rows, "How far the skin moves, mm.")
-    return Section("Prediction", (*_picture("prediction", pictures), table))
+    drawn: Sequence[Figure | Note] = [
+        Figure(figure.image, f"{figure.caption} Model {predictions[-1]['model']}.")
+        for figure in _picture("prediction", pictures)
+    ]
+    return Section("Prediction", (*(drawn or (Note(NO_PICTURES, "warning"),)), table))
 
 
 def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
@@ -122,12 +136,10 @@ def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
     return Section("Plan", (*_picture("plan", pictures), table))
 
 
-def _evaluation_sections(
-    evaluation: Values | None, pictures: Mapping[str, bytes], figures: Sequence[Figure]
-) -> list[Section]:
+def _evaluation_sections(evaluation: Values | None, figures: Sequence[Figure]) -> list[Section]:
     if evaluation is None:
         return []
-    blocks: list[Note | Table | Figure] = [*_picture("error", pictures)]
+    blocks: list[Note | Table | Figure] = [_mean_table(evaluation), *figures]
     for model, entry in evaluation["models"].items():
         blocks.append(
             statistics_table(
@@ -142,9 +154,28 @@ def _evaluation_sections(
                 "For comparison, the face before the operation taken as the prediction, mm.",
             )
         )
-    blocks += figures
     blocks += [Note(text) for text in evaluation.get("notes", ())]
     return [Section("Error", tuple(blocks))]
+
+
+def _mean_table(evaluation: Values) -> Table:
+    """Mean errors of every model by region."""
+    entries = dict(evaluation["models"])
+    if "no_change" in evaluation:
+        entries["no change"] = evaluation["no_change"]
+    regions = list(dict.fromkeys(r for entry in entries.values() for r in entry["regions"]))
+    rows = tuple(
+        (
+            region,
+            *(
+                number(entry["regions"].get(region, {}).get("mean_mm"))
+                for entry in entries.values()
+            ),
+        )
+        for region in regions
+    )
+    caption = "Mean distance from the face after the operation, mm, by region and model."
+    return Table(("region", *entries), rows, caption)
 
 
 def statistics_table(regions: Mapping[str, Values], caption: str) -> Table:
@@ -162,7 +193,7 @@ def statistics_table(regions: Mapping[str, Values], caption: str) -> Table:
         (
             name,
             *(number(values[key]) for key in keys),
-            number(values["signed_mean_mm"]),
+            f"{values['signed_mean_mm']:+.2f}",
             f"{100 * values['within']['2 mm']:.0f} %",
         )
         for name, values in regions.items()
@@ -233,12 +264,18 @@ def _finding_section(prediction: Values) -> Section:
     kinds = {"error": "error", "warning": "warning"}
     blocks = [
         Note(
-            f"{f['severity']}: {f['what']} ({f['where']}). {f['why']}; {f['mend']}.",
+            f"{f['severity']}: {f['what']} ({f['where']}). {_reason(f)}".rstrip(),
             kinds.get(f["severity"], "plain"),
         )
         for f in found
     ]
     return Section("Findings", tuple(blocks or [Note("Nothing was noticed.")]))
+
+
+def _reason(finding: Values) -> str:
+    """Why a finding matters and what mends it, as far as it says so."""
+    said = "; ".join(text for text in (finding["why"], finding["mend"]) if text)
+    return f"{said}." if said else ""
 
 
 def _input_section(prediction: Values) -> Section:

@@ -10,7 +10,7 @@ import numpy as np
 
 from cmfsim._core import __version__
 from cmfsim.build import Postoperative, input_hashes, read_postoperative
-from cmfsim.case import Finding
+from cmfsim.case import Anatomy, Finding
 from cmfsim.evaluation import NO_CHANGE, WHOLE, ModelComparison, compare_models
 from cmfsim.io import Case
 from cmfsim.prediction import MODELS, Prediction
@@ -88,6 +88,7 @@ def evaluate(
     progress: Progress | None = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
+    anatomy: Anatomy | None = None,
 ) -> CaseEvaluation:
     """The predictions of several models for a case, compared with what came after.
 
@@ -102,6 +103,7 @@ def evaluate(
     progress : callable, optional
     check : bool
     findings : iterable of Finding
+    anatomy : Anatomy, optional
         As for `predict_models`.
 
     Returns
@@ -125,7 +127,9 @@ def evaluate(
     # First, for it fails at once where the case has none.
     postoperative = read_postoperative(case)
     predictions = tuple(
-        predict_models(case, models, progress=progress, check=check, findings=findings)
+        predict_models(
+            case, models, progress=progress, check=check, findings=findings, anatomy=anatomy
+        )
     )
     if progress is not None:
         progress("comparing the faces")

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from cmfsim.build import build_model
-from cmfsim.case import Finding
+from cmfsim.case import Anatomy, Finding
 from cmfsim.checks import check_one_of
 from cmfsim.io import Case
 from cmfsim.model import PatientModel
@@ -62,6 +62,7 @@ def predict_models(
     progress: Progress | None = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
+    anatomy: Anatomy | None = None,
 ) -> Iterator[Prediction]:
     """The predictions of several models for one case, which is built once.
 
@@ -74,6 +75,8 @@ def predict_models(
         As for `predict`.
     findings : iterable of Finding
         What is known of the case already.
+    anatomy : Anatomy, optional
+        The head, where it is known; the image or surfaces of the case are then not read.
 
     Yields
     ------
@@ -93,7 +96,9 @@ def predict_models(
     """
     for model in models:
         check_one_of("model", model, MODELS)
-    patient = build_patient(case, models, progress=progress, check=check, findings=findings)
+    patient = build_patient(
+        case, models, progress=progress, check=check, findings=findings, anatomy=anatomy
+    )
     for model in models:
         if progress is not None:
             progress(f"solving {model}")
@@ -107,6 +112,7 @@ def build_patient(
     progress: Progress | None = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
+    anatomy: Anatomy | None = None,
 ) -> PatientModel:
     """The patient as models need it: muscles are placed if one of them has muscles."""
     wanted = any(model.startswith("M") for model in models)
@@ -114,4 +120,4 @@ def build_patient(
         case = replace(case, muscles=None)
     elif case.muscles is None:
         case = replace(case, muscles=CaseMuscles())
-    return build_model(case, progress=progress, check=check, findings=findings)
+    return build_model(case, progress=progress, check=check, findings=findings, anatomy=anatomy)
