@@ -166,12 +166,8 @@ def without_gaps(
 
 def _towards(depth: ImageData, points: Floats) -> Floats:
     """Unit vectors to a bone, (k, 3)."""
-    columns = []
-    for axis in range(3):
-        step = np.zeros(3)
-        step[axis] = depth.spacing[axis]
-        columns.append(depth.sample(points + step) - depth.sample(points - step))
-    slope = np.column_stack(columns)
+    steps = np.diag(np.asarray(depth.spacing))
+    slope = np.column_stack([depth.sample(points + s) - depth.sample(points - s) for s in steps])
     length = np.linalg.norm(slope, axis=1, keepdims=True)
     return np.asarray(slope / np.maximum(length, np.finfo(np.float64).tiny))
 
