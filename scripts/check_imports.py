@@ -173,6 +173,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         ),
         "pictures": "case checks errors musculature prediction scene _core",
         "report": "case errors io scene",
+        "insilico": "build case checks errors io phantom planning scene _core",
         "topology": "",
         "crossings": "checks",
         "capping": "checks",
@@ -183,12 +184,12 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "surface_checks surface_repair template topology _core"
         ),
         "cli": (
-            "build case checks cmfsim demo doctor errors evaluation io meshing musculature phantom "
-            "pictures prediction report scene simulation study template"
+            "build case checks cmfsim demo doctor errors evaluation insilico io meshing "
+            "musculature phantom pictures prediction report scene simulation study template"
         ),
         "__main__": "cli",
         "__init__": (
-            "achieved build case doctor equivalent errors evaluation imaging io "
+            "achieved build case doctor equivalent errors evaluation imaging insilico io "
             "landmark_sites meshing model musculature node_kinds osteotomy patient phantom "
             "planning prediction registration scene simulation study surface_checks "
             "surface_repair template _core"

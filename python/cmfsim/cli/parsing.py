@@ -13,7 +13,9 @@ from cmfsim.cli import (
     study_commands,
     template_commands,
     view_command,
+    virtual_patients_command,
 )
+from cmfsim.insilico import PATIENTS
 from cmfsim.io import result_suffixes
 from cmfsim.prediction import MODELS
 from cmfsim.scene import CONTACTS, METHODS
@@ -113,6 +115,32 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         "--spacing", metavar="MM", type=float, default=1.0, help="of the CT (default 1)"
     )
     phantom.set_defaults(run=phantom_command.phantom)
+
+    virtual = commands.add_parser(
+        "virtual-patients",
+        parents=[common],
+        help="write virtual patients with the face after their operation (in silico)",
+        epilog="Patients who are there already, made with the same settings, are kept.",
+    )
+    virtual.add_argument("folder", metavar="FOLDER", type=Path, help="made if it is not there")
+    virtual.add_argument(
+        "--patients",
+        metavar="N",
+        type=int,
+        nargs="+",
+        default=sorted(PATIENTS),
+        help="which of them (default all)",
+    )
+    virtual.add_argument(
+        "--seed", metavar="N", type=int, default=0, help="of all noise (default 0)"
+    )
+    virtual.add_argument(
+        "--edge-length", metavar="H", type=float, default=6.0, help="mm, true mesh (default 6)"
+    )
+    virtual.add_argument(
+        "--spacing", metavar="MM", type=float, default=2.0, help="of the CT (default 2)"
+    )
+    virtual.set_defaults(run=virtual_patients_command.virtual_patients)
 
 
 def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentParser) -> None:
