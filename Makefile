@@ -1,4 +1,4 @@
-# What a newcomer types: make test, make lint, make demo, make bench.
+# What a newcomer types: make demo, make test, make lint, make bench, make docs.
 # Everything happens in .venv and target/; a stamp file marks each finished step.
 
 VENV ?= .venv
@@ -17,12 +17,13 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 ENV_STAMP := $(VENV)/.cmfsim-env
 BUILD_STAMP := $(VENV)/.cmfsim-build
+DOCS_STAMP := $(VENV)/.cmfsim-docs
 RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 'Cargo.toml')
 PYTHON_DIRS := python tests/python scripts examples benches
 CORE_FEATURES := --features mtm-core/metis
 
 .DEFAULT_GOAL := help
-.PHONY: help build test test-rust test-python lint format bench peers demo clean
+.PHONY: help build test test-rust test-python lint format bench peers demo docs clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sort | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 16
@@ -35,6 +36,10 @@ $(ENV_STAMP): pyproject.toml scripts/make_venv.sh
 
 $(BUILD_STAMP): $(ENV_STAMP) $(RUST_SOURCES)
 	VIRTUAL_ENV="$(VENV_PATH)" "$(BIN)/maturin" develop --release $(CARGO_FLAGS) --extras imaging,mesh,report,test,lint
+	@touch $@
+
+$(DOCS_STAMP): $(BUILD_STAMP)
+	VIRTUAL_ENV="$(VENV_PATH)" "$(BIN)/maturin" develop --release $(CARGO_FLAGS) --extras docs
 	@touch $@
 
 build: $(BUILD_STAMP) ## create .venv, compile the core and install cmfsim into it
@@ -67,10 +72,13 @@ bench: $(BUILD_STAMP) ## run the benches (minutes; close other programs first)
 peers: $(BUILD_STAMP) ## compare with the peers that are installed (benches/peers/README.md)
 	"$(PY)" benches/peers/run.py --markdown peers.md --out peers.json
 
-demo: $(BUILD_STAMP) ## solve the first example
-	"$(PY)" examples/first_solve.py
+demo: $(BUILD_STAMP) ## predict a face after surgery, and open its report
+	"$(BIN)/cmfsim" demo
+
+docs: $(DOCS_STAMP) ## build the documentation into site/ (runs the tutorials, a minute or two)
+	"$(BIN)/mkdocs" build --strict
 
 clean: ## remove everything that make has made
-	rm -rf "$(VENV)" target .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist
+	rm -rf "$(VENV)" target site .cache cmfsim-demo .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist
 	find python tests scripts examples -name __pycache__ -type d -prune -exec rm -rf {} +
 	rm -f python/cmfsim/_core*.so python/cmfsim/_core*.pyd

@@ -162,7 +162,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "equivalent": "case checks errors musculature scene _core",
         "landmark_sites": "",
         "template_data": "case checks errors musculature scene",
-        "prediction": "case checks model musculature scene",
+        "prediction": "case checks model musculature scene _core",
         "template": (
             "case checks errors io landmark_sites musculature phantom registration scene "
             "surface_checks surface_repair template_data _core"
@@ -170,21 +170,25 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "phantom": "case checks errors scene",
         "planning": "errors",
         "achieved": "case checks errors planning registration scene _core",
+        "bone_motion": "checks errors scene surface_checks topology _core",
         "osteotomy": "case checks errors planning scene _core",
         "node_kinds": "case checks errors scene _core",
         "simulation": "checks errors model planning prediction scene _core",
         "evaluation": "case checks errors registration scene topology _core",
         "build": (
-            "case checks doctor equivalent errors imaging io meshing model musculature "
-            "node_kinds osteotomy patient phantom pictures scene surface_repair template "
+            "achieved bone_motion case checks doctor equivalent errors imaging io meshing model "
+            "musculature node_kinds osteotomy patient phantom pictures registration scene "
+            "surface_repair template topology "
             "_core"
         ),
+        "demo": "case checks errors io osteotomy phantom scene",
         "study": (
             "build case checks errors evaluation io model musculature patient prediction "
             "scene simulation template _core"
         ),
         "pictures": "case checks errors musculature prediction scene _core",
         "report": "case errors io scene",
+        "insilico": "build case checks errors io phantom planning scene _core",
         "topology": "",
         "crossings": "checks",
         "capping": "checks",
@@ -192,14 +196,15 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "surface_repair": "capping case checks errors scene surface_checks topology _core",
         "doctor": (
             "case checks errors io osteotomy patient planning registration scene "
-            "surface_checks surface_repair template _core"
+            "surface_checks surface_repair template topology _core"
         ),
         "cli": (
-            "build case checks cmfsim doctor errors evaluation io meshing musculature phantom "
-            "pictures prediction report scene simulation study template"
+            "build case checks cmfsim demo doctor errors evaluation insilico io meshing "
+            "musculature phantom pictures prediction report scene simulation study template"
         ),
+        "__main__": "cli",
         "__init__": (
-            "achieved build case doctor equivalent errors evaluation imaging io "
+            "achieved build case doctor equivalent errors evaluation imaging insilico io "
             "landmark_sites meshing model musculature node_kinds osteotomy patient phantom "
             "planning prediction registration scene simulation study surface_checks "
             "surface_repair template _core"

@@ -73,6 +73,7 @@ from cmfsim.imaging import (
     segment_head,
     undeformed_mask,
 )
+from cmfsim.insilico import virtual_patients, write_virtual_patient
 from cmfsim.io import (
     Case,
     Cohort,
@@ -330,6 +331,7 @@ __all__ = [
     "template_names",
     "tissue_level",
     "undeformed_mask",
+    "virtual_patients",
     "wilcoxon_test",
     "with_muscles",
     "write_image",
@@ -342,4 +344,5 @@ __all__ = [
     "write_scene",
     "write_surface",
     "write_transform",
+    "write_virtual_patient",
 ]

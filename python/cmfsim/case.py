@@ -243,7 +243,8 @@ class NodeKinds:
     kind : (n,) uint8
         0 free, 1 fixed, 2 joined, 3 sliding: the order of `NODE_KINDS` in scene files.
     segment : (n,) int16
-        Index into `segments` of joined and sliding nodes, −1 elsewhere.
+        Index into `segments` of the nodes that lie on a segment: joined, sliding, and those that
+        are fixed on bone; −1 elsewhere.
     segments : tuple of str
     """
 

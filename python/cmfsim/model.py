@@ -42,6 +42,8 @@ class PatientModel:
         Unit direction of the fibres of each tet; zero where there is no muscle.
     landmarks : mapping of str to mapping of str to (3,) float64, mm
         "skull" and "skin", where given.
+    face : SurfaceData or None
+        The skin of the whole head in full detail, as given or segmented.
     findings : tuple of Finding
         What every stage noticed.
     summary : mapping
@@ -60,6 +62,7 @@ class PatientModel:
     fraction: Floats | None = None
     fibre: Floats | None = None
     landmarks: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
+    face: SurfaceData | None = None
     findings: tuple[Finding, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
 

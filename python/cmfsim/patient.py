@@ -57,6 +57,8 @@ POSTERIOR_LANDMARKS = ("supraglenoid_L", "supraglenoid_R")
 # Edge length of the mesh where a case states none, mm: some 400 000 tets of a face with its neck,
 # whose edges are 2.9 mm long on average, half of an edge where tissue is thin.
 EDGE_LENGTH = 4.0
+# Tooth rows rest 2 to 4 mm apart, and a mucoperiosteal flap is lifted about as far at a cut, mm.
+CLEFT = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,12 +222,16 @@ class CaseMesh:
         Smaller tets where tissue is thin.
     parting : Path or None
         A surface that parts the lips where the image or skin shows them as one.
+    cleft : float, mm
+        Tissue of which two segments that part are less than this away, taken together, is left out:
+        between tooth rows and at cuts. 0: none.
     file : Path or None
-        Tets from elsewhere; edge length and refinement are then not used.
+        Tets from elsewhere; edge length, refinement and cleft are then not used.
     """
 
     edge_length: float = EDGE_LENGTH
     refine: bool = True
+    cleft: float = CLEFT
     parting: Path | None = None
     file: Path | None = None
 
@@ -334,13 +340,13 @@ class CasePostoperative:
     Attributes
     ----------
     skin : Path or None
-        Surface of the skin after the operation; this or `image` is given.
+        Surface of the skin after the operation.
     image : Path or None
-        CT after the operation.
+        CT after the operation, instead of skin and bones.
     landmarks : Path or None
         Skin landmarks on it, for correspondences.
     bones : mapping of str to Path
-        Surfaces of the moved segments, by name, for the achieved plan.
+        Surfaces of bones or segments, by name, for the achieved plan.
     aligned : bool
         Whether it lies in the frame of the data before the operation already.
     units, frame : str
@@ -356,8 +362,10 @@ class CasePostoperative:
     frame: str = "LPS"
 
     def __post_init__(self) -> None:
-        if (self.skin is None) == (self.image is None):
-            raise CaseInputError("after the operation there is either a skin or an image")
+        if self.image is not None and (self.skin is not None or self.bones):
+            raise CaseInputError("after the operation there are surfaces or an image, not both")
+        if self.image is None and self.skin is None and not self.bones:
+            raise CaseInputError("after the operation there is a skin, an image, or a bone")
         check_one_of("units", self.units, tuple(UNITS))
         check_one_of("frame", self.frame, FRAMES)
         object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))

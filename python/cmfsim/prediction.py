@@ -6,19 +6,22 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from cmfsim._core import Surface, SurfaceMotion
 from cmfsim.case import Finding
-from cmfsim.checks import Floats, check_one_of
+from cmfsim.checks import Floats, as_rows, check_one_of
 from cmfsim.model import PatientModel
 from cmfsim.musculature import Musculature
-from cmfsim.scene import Scene, SceneResult, SurfaceData
+from cmfsim.scene import MovedSurface, Scene, SceneResult, SurfaceData
 
 __all__ = ["MODELS", "Prediction"]
 
 # Models of the paper (3.2): homogeneous or with muscles, without or with sliding at teeth and
 # mucosa.
 MODELS = ("H", "M", "H+S", "M+S")
+# Up to so many edges off the mesh's skin a point follows it whole, and from so many on not at all.
+FOLLOWS, FADED = 2.0, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +76,62 @@ class Prediction:
     def skin_displacements(self) -> Floats:
         """How each vertex of the skin moves, (k, 3) mm."""
         return np.asarray(self.result.displacements)[self.skin_nodes]
+
+    def carried(self, points: ArrayLike) -> Floats:
+        """How points on or near the skin move, (k, 3) mm: as the closest point of the mesh's skin.
+
+        What lies away from the tissue that was simulated, as the back of the head, stays: from two
+        edges off its movement fades, to nothing at four.
+
+        Parameters
+        ----------
+        points : (k, 3) float64, mm
+            Before the operation: landmarks, or the vertices of any surface of the patient's skin.
+        """
+        before = self.skin_before
+        skin = Surface(before.vertices, before.triangles)
+        moved = np.asarray(before.vertices) + self.skin_displacements
+        places = as_rows("points", points, 3)
+        closest, _, _ = skin.closest(places)
+        away = np.linalg.norm(closest - places, axis=1)
+        ends = skin.vertices[skin.triangles]
+        edge = float(np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).mean())
+        share = np.clip((FADED - away / edge) / (FADED - FOLLOWS), 0.0, 1.0)
+        carried: Floats = share[:, None] * SurfaceMotion(skin, moved).displacement(places)
+        return carried
+
+    @property
+    def face_before(self) -> SurfaceData:
+        """The patient's face in full detail, as given or segmented; else as the mesh has it."""
+        return self.patient.face or self.skin_before
+
+    @property
+    def face(self) -> SurfaceData:
+        """The predicted face: the vertices and triangles of `face_before`, carried by the skin."""
+        before = self.face_before
+        vertices = np.asarray(before.vertices)
+        return SurfaceData(vertices + self.carried(vertices), before.triangles)
+
+    @property
+    def bones(self) -> dict[str, tuple[SurfaceData, Floats]]:
+        """Each bone segment with its vertices after the operation, (v, 3) mm, by name.
+
+        A segment whose motion is known vertex by vertex has the surface that it is known on; one
+        whose joined nodes alone have motions stays where it was.
+        """
+        found = {}
+        for segment in self.patient.segments:
+            surface, motion = segment.surface, self.scene.plan.get(segment.name)
+            vertices = np.asarray(surface.vertices, dtype=np.float64)
+            if isinstance(motion, MovedSurface):
+                surface = motion.surface
+                vertices = np.asarray(motion.moved_vertices, dtype=np.float64)
+            elif motion is not None and np.shape(motion) == (4, 4):
+                matrix = np.asarray(motion, dtype=np.float64)
+                if not np.array_equal(matrix, np.eye(4)):
+                    vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+            found[segment.name] = (surface, vertices)
+        return found
 
     @property
     def muscles(self) -> Musculature | None:

@@ -19,6 +19,7 @@ from cmfsim._core import (
     TetMesh,
     Tissue,
     __version__,
+    rigid_fit,
 )
 from cmfsim.checks import check_one_of
 from cmfsim.errors import CaseInputError
@@ -273,15 +274,26 @@ def predict_patient(patient: PatientModel, model: str = "M+S") -> Prediction:
 def _motion(patient: PatientModel, name: str, motion: Any) -> dict[str, Any]:
     """A segment's motion in a planner's numbers, about its own centre (paper, Table 2)."""
     if isinstance(motion, MovedSurface):
-        shift = np.asarray(motion.moved_vertices) - np.asarray(motion.surface.vertices)
-        size = np.linalg.norm(shift, axis=1)
-        return {"mean": float(size.mean()), "largest": float(size.max())}
+        here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
+        size = np.linalg.norm(there - here, axis=1)
+        fit = rigid_fit(here, there)
+        return {
+            "mean": float(size.mean()),
+            "largest": float(size.max()),
+            # The nearest rigid motion, and what it leaves of the vertices' own.
+            **_rigid_numbers(np.asarray(fit.matrix), here.mean(axis=0)),
+            "bending": float(fit.rms),
+        }
     matrix = np.asarray(motion, dtype=np.float64)
     if matrix.shape != (4, 4):
         size = np.linalg.norm(matrix, axis=1)
         return {"mean": float(size.mean()), "largest": float(size.max())}
     surfaces = {segment.name: segment.surface for segment in patient.segments}
     centre = np.asarray(surfaces[name].vertices).mean(axis=0)
+    return _rigid_numbers(matrix, centre)
+
+
+def _rigid_numbers(matrix: NDArray[np.float64], centre: NDArray[np.float64]) -> dict[str, Any]:
     parts = decompose_motion(matrix, centre)
     return {
         "translation": parts.translation.tolist(),

@@ -255,3 +255,15 @@ def test_lines_are_found_through_texts_comments_and_arrays():
     assert lines["t", 1, "u", "w"] == 20
     assert line_of(lines, ("e", "f", "g")) == 10
     assert line_of(lines, ("nowhere",)) == 1
+
+
+def test_a_note_is_kept_and_must_be_text(tmp_path):
+    path = tmp_path / "case.toml"
+    text = 'format = "cmfsim-case"\nversion = 1\n[image]\nfile = "ct.nrrd"\n'
+    path.write_text(text, encoding="utf-8")
+    assert cmfsim.Case.load(path).note == ""
+    path.write_text('note = "a made head"\n' + text, encoding="utf-8")
+    assert cmfsim.Case.load(path).note == "a made head"
+    path.write_text("note = 3\n" + text, encoding="utf-8")
+    with pytest.raises(cmfsim.CaseError, match=r"case\.toml:1: note is 3"):
+        cmfsim.Case.load(path)

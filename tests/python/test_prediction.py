@@ -86,6 +86,26 @@ def test_moving_nothing_predicts_no_change(predictions):
     assert np.abs(cmfsim.predict_patient(patient, "M").skin_displacements).max() < 1e-9
 
 
+def test_the_detailed_face_follows_the_skin_of_the_mesh(predictions):
+    prediction = predictions["H"]
+    skin, before, after = prediction.skin_before, prediction.face_before, prediction.face
+    assert np.array_equal(before.triangles, after.triangles)
+    # On the mesh's own nodes it is the solution; far away nothing moves.
+    places = np.asarray(skin.vertices)
+    assert prediction.carried(places) == pytest.approx(prediction.skin_displacements, abs=1e-9)
+    assert not prediction.carried(places[:1] + [0.0, 500.0, 0.0]).any()
+    # Between them it moves as the nodes next to it.
+    moved = np.asarray(after.vertices) - np.asarray(before.vertices)
+    near = pytest.importorskip("scipy.spatial").cKDTree(places)
+    away, nearest = near.query(np.asarray(before.vertices))
+    close = away < 3.0
+    assert close.mean() > 0.2
+    size = np.linalg.norm(moved[close] - prediction.skin_displacements[nearest[close]], axis=1)
+    assert (
+        np.percentile(size, 95) < 0.1 * np.linalg.norm(prediction.skin_displacements, axis=1).max()
+    )
+
+
 def test_without_sliding_what_would_slide_is_joined(predictions):
     patient = predictions["M"].patient
     sliding, joined = (cmfsim.model_scene(patient, m) for m in ("M+S", "M"))

@@ -13,15 +13,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import TetMesh, __version__
+from cmfsim.build.clefts import without_clefts
+from cmfsim.build.face import detailed_face
 from cmfsim.build.held import held_part
 from cmfsim.build.inputs import (
     check_output,
     input_hashes,
     read_anatomy,
     read_case_landmarks,
-    read_motion,
 )
+from cmfsim.build.motions import planned_bones
 from cmfsim.build.muscles import with_muscles
+from cmfsim.build.postoperative import Postoperative
+from cmfsim.build.skin_part import on_skin
 from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.checks import Floats
 from cmfsim.doctor import diagnose
@@ -36,6 +40,7 @@ from cmfsim.meshing import (
     mesh_report,
     near_skin,
     part_mesh,
+    report_of_part,
     tissue_level,
 )
 from cmfsim.model import PatientModel
@@ -131,6 +136,8 @@ def build_model(
     progress: Progress | None = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
+    anatomy: Anatomy | None = None,
+    after: Postoperative | None = None,
 ) -> PatientModel:
     """The model of a case: read, segmented, cut, meshed and classified; nothing is written.
 
@@ -141,6 +148,10 @@ def build_model(
     check : bool
     findings : iterable of Finding
         As for `build_case`.
+    anatomy : Anatomy, optional
+        The head, where it is known; the image or surfaces of the case are then not read.
+    after : Postoperative, optional
+        What `read_postoperative` gives, where it is known already; an achieved plan is read off it.
 
     Returns
     -------
@@ -164,20 +175,18 @@ def build_model(
     landmarks, noticed = read_case_landmarks(case)
     findings += noticed
     skull = landmarks.get("skull", {})
-    anatomy, noticed = read_anatomy(case, skull, stages.begin)
-    findings += noticed
+    if anatomy is None:
+        anatomy, noticed = read_anatomy(case, skull, stages.begin)
+        findings += noticed
 
     stages.begin("cutting the bones")
     cut = cut_bones(anatomy.bones, _procedures(case, skull))
     findings += cut.findings
-    moved = [*dict.fromkeys([*_cut_segments(case), *case.plan])]
-    known = [segment.name for segment in cut.segments]
-    for name in moved:
-        if name not in known:
-            raise CaseInputError(
-                f"{case.where(f'plan.{name}')}: there is no segment {name!r}; segments are: "
-                f"{', '.join(known)}; an osteotomy makes others"
-            )
+    if case.achieved:
+        stages.begin("reading the achieved plan")
+    bones = planned_bones(case, cut.segments, after)
+    findings += bones.findings
+    moved = [*dict.fromkeys([*_cut_segments(case), *bones.motions])]
 
     stages.begin("finding the soft tissue")
     region = _region(case, anatomy, skull)
@@ -194,38 +203,47 @@ def build_model(
         mesh.nodes,
         mesh.boundary_triangles(),
         anatomy,
-        cut.segments,
+        bones.segments,
         moved=moved,
         landmarks=skull,
         fixed_planes=_planes(region),
         options=KindOptions(**case.node_kinds),
     )
     findings += classified.findings
-    mesh, kinds, noticed = held_part(mesh, classified.kinds)
-    if noticed:
-        report = mesh_report(mesh)
+    kinds, whole = classified.kinds, mesh.n_tets
+    if case.mesh.file is None:
+        mesh, kinds, noticed = without_clefts(mesh, kinds, bones.segments, moved, case.mesh.cleft)
+        findings += noticed
+    mesh, kinds, noticed = held_part(mesh, kinds)
     findings += noticed
-    findings += _untouched(case, kinds)
+    if mesh.n_tets < whole:
+        report = report_of_part(mesh, report)
+    findings += _untouched(case, kinds, bones.motions)
     findings = [*dict.fromkeys(findings)]
 
     stages.begin("assembling the scene")
-    motions = {name: read_motion(case, motion) for name, motion in case.plan.items()}
-    scene = _scene(case, mesh, kinds, cut.segments, motions)
+    scene = _scene(case, mesh, kinds, bones.segments, bones.motions)
     boundary = np.asarray(mesh.boundary_triangles())
-    skin = _on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)
+    skin = boundary[on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)]
+    stages.begin("drawing the face")
+    face = detailed_face(anatomy)
     stages.end()
     patient = PatientModel(
         name=case.name,
         scene=scene,
         kinds=kinds,
         boundary_triangles=boundary,
-        skin_triangles=boundary[skin],
-        segments=cut.segments,
+        skin_triangles=skin,
+        segments=bones.segments,
         anatomy=anatomy,
         fat=case.tissue,
         landmarks=landmarks,
+        face=face,
         findings=tuple(findings),
-        summary=_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
+        summary={
+            **_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
+            **({} if bones.achieved is None else {"achieved": bones.achieved.as_dict()}),
+        },
     )
     if case.muscles is None:
         return patient
@@ -354,7 +372,7 @@ def _mesh(
     return parted, replace(made.report, n_nodes=parted.n_nodes), made.findings
 
 
-def _untouched(case: Case, kinds: NodeKinds) -> list[Finding]:
+def _untouched(case: Case, kinds: NodeKinds, motions: Iterable[str]) -> list[Finding]:
     return [
         Finding(
             "warning",
@@ -364,7 +382,7 @@ def _untouched(case: Case, kinds: NodeKinds) -> list[Finding]:
             "its motion does not reach the face",
             "check the cut that makes it, bone_distance in [node_kinds], and the posterior plane",
         )
-        for name in case.plan
+        for name in motions
         if not len(kinds.nodes("joined", name)) and not len(kinds.nodes("sliding", name))
     ]
 
@@ -394,20 +412,6 @@ def _scene(
     )
 
 
-def _on_skin(
-    nodes: Floats, triangles: NDArray[np.uint32], anatomy: Anatomy, level: ImageData
-) -> NDArray[np.bool_]:
-    """Which boundary triangles are skin: their centroids lie nearer to it than to anything else."""
-    centroids = nodes[triangles].mean(axis=1)
-    others = [*anatomy.bones.values(), *([] if anatomy.air is None else [anatomy.air])]
-    from_skin = np.abs(anatomy.skin.sample(centroids))
-    near = np.ones(len(centroids), dtype=bool)
-    for other in others:
-        near &= from_skin < np.abs(other.sample(centroids))
-    # On a plane that bounds the region, the level is zero well inside the skin.
-    return near & (from_skin <= np.abs(level.sample(centroids)) + 0.25)
-
-
 def _summary(
     case: Case,
     kinds: NodeKinds,
@@ -420,6 +424,7 @@ def _summary(
     grid = anatomy.skin
     return {
         "case": case.name,
+        "note": case.note,
         "nodes": {name: len(kinds.nodes(name)) for name in NODE_KINDS},
         "segments": {
             name: {kind: len(kinds.nodes(kind, name)) for kind in ("joined", "sliding")}

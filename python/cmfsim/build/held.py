@@ -14,10 +14,15 @@ __all__ = ["held_part"]
 
 # Held nodes that a body needs: three hold it unless they are in line.
 LEAST_HELD = 3
+# What is left out below this volume nobody will miss, mm³.
+SPECKS = 100.0
 
 
 def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
     """The mesh without bodies that neither bone nor plane holds, and a finding for them.
+
+    A body hangs together by the faces of its tets: what an edge or a node joins to the rest swings
+    about it.
 
     Raises
     ------
@@ -25,9 +30,13 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
         (also `ValueError`) Nothing of it is held.
     """
     tets = np.asarray(mesh.tets)
-    n_bodies, body = _bodies(tets, mesh.n_nodes)
-    held = np.bincount(body[np.isin(kinds.kind, (1, 2))], minlength=n_bodies)
-    loose = held < LEAST_HELD
+    body = _bodies(tets)
+    n_bodies = int(body.max(initial=-1)) + 1
+    holds = np.isin(kinds.kind, (1, 2))
+    corner = holds[tets]
+    # Each held node once for each body that it is in.
+    pairs = np.unique(np.stack([np.repeat(body, 4)[corner.ravel()], tets[corner]]), axis=1)
+    loose = np.bincount(pairs[0], minlength=n_bodies) < LEAST_HELD
     if not loose.any():
         return mesh, kinds, ()
     if loose.all():
@@ -35,31 +44,39 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
             "no part of the tissue is held: no node lies on the posterior plane or on a bone; "
             "check that bones and skin are in one frame, and the posterior plane"
         )
-    keep_tet = ~loose[body[tets[:, 0]]]
-    keep_node = ~loose[body]
+    dropped = loose[body]
+    keep_node = np.zeros(mesh.n_nodes, dtype=bool)
+    keep_node[tets[~dropped]] = True
     number = np.cumsum(keep_node) - 1
-    kept = TetMesh(np.asarray(mesh.nodes)[keep_node], number[tets[keep_tet]])
-    volume = float(np.asarray(mesh.volumes)[~keep_tet].sum())
-    place = np.asarray(mesh.nodes)[~keep_node].mean(axis=0)
+    kept = TetMesh(np.asarray(mesh.nodes)[keep_node], number[tets[~dropped]])
+    volume = float(np.asarray(mesh.volumes)[dropped].sum())
+    place = np.asarray(mesh.nodes)[tets[dropped]].reshape(-1, 3).mean(axis=0)
+    speck = volume < SPECKS
     finding = Finding(
-        "warning",
+        "note" if speck else "warning",
         "tissue-not-held",
-        f"{int(loose.sum())} bodies of tissue of {volume:.0f} mm³ in all touch no bone and were "
+        f"{int(loose.sum())} bodies of tissue of {volume:.3g} mm³ in all touch no bone and were "
         "left out",
         f"mesh, about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
         "nothing says where they would go",
-        "check skin and bone near there; a larger bone threshold or closing may have parted them",
+        "nothing: they are specks beside the face"
+        if speck
+        else "check skin and bone near there; a larger bone threshold or closing may have parted "
+        "them",
     )
-    parted = NodeKinds(kinds.kind[keep_node], kinds.segment[keep_node], kinds.segments)
-    return kept, parted, (finding,)
+    left = NodeKinds(kinds.kind[keep_node], kinds.segment[keep_node], kinds.segments)
+    return kept, left, (finding,)
 
 
-def _bodies(tets: NDArray[Any], n_nodes: int) -> tuple[int, NDArray[np.int32]]:
-    """Number of bodies, and the body of each node."""
+def _bodies(tets: NDArray[Any]) -> NDArray[np.int64]:
+    """The body of each tet."""
+    corners = np.sort(tets.astype(np.int64), axis=1)
+    faces = corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
+    order = np.lexsort(faces.T)
+    same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
+    pairs = np.stack([order[:-1][same], order[1:][same]], axis=1) // 4
     sparse = import_module("scipy.sparse")
-    rows = np.repeat(tets[:, 0], 3)
-    columns = tets[:, 1:].reshape(-1)
-    ones = np.ones(len(rows), dtype=bool)
-    graph = sparse.coo_matrix((ones, (rows, columns)), shape=(n_nodes, n_nodes))
-    count, body = import_module("scipy.sparse.csgraph").connected_components(graph, directed=False)
-    return int(count), body
+    ones = np.ones(len(pairs), dtype=bool)
+    graph = sparse.coo_matrix((ones, pairs.T), shape=(len(tets), len(tets)))
+    _, body = import_module("scipy.sparse.csgraph").connected_components(graph, directed=False)
+    return np.asarray(body, dtype=np.int64)

@@ -25,7 +25,14 @@ from cmfsim.patient import CaseMotion
 from cmfsim.scene import MovedSurface
 from cmfsim.surface_repair import repair_surface
 
-__all__ = ["check_output", "input_hashes", "read_anatomy", "read_case_landmarks", "read_motion"]
+__all__ = [
+    "check_output",
+    "input_hashes",
+    "read_anatomy",
+    "read_case_landmarks",
+    "read_motion",
+    "segment_options",
+]
 
 Progress = Callable[[str], None]
 
@@ -56,14 +63,9 @@ def read_anatomy(
     if case.image is not None:
         progress("reading the image")
         read = read_image_file(case.image.file)
-        given = {
-            name: getattr(case.image, name)
-            for name in ("skin_threshold", "bone_threshold", "working_spacing")
-            if getattr(case.image, name) is not None
-        }
         anatomy = segment_head(
             read.image,
-            SegmentOptions(**given),
+            segment_options(case),
             landmarks=landmarks or None,
             progress=lambda stage: progress(f"segmenting the head: {stage}"),
         )
@@ -84,6 +86,18 @@ def read_anatomy(
     skin = surfaces.pop("skin")
     anatomy = anatomy_from_surfaces(skin, surfaces, spacing=spacing)
     return anatomy, (*findings, *anatomy.findings)
+
+
+def segment_options(case: Case) -> SegmentOptions:
+    """How tissue is read from a CT of the case, before the operation or after it."""
+    if case.image is None:
+        return SegmentOptions()
+    given = {
+        name: getattr(case.image, name)
+        for name in ("skin_threshold", "bone_threshold", "working_spacing")
+        if getattr(case.image, name) is not None
+    }
+    return SegmentOptions(**given)
 
 
 def read_motion(case: Case, motion: CaseMotion) -> Floats | MovedSurface:
@@ -113,8 +127,14 @@ def _path_from(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
 
 
-def check_output(case: Case) -> None:
-    """Finds before the work what would keep the model from being written, or spoil an input.
+def check_output(case: Case, is_written: Callable[[str], bool] = is_model_file) -> None:
+    """Finds before the work what would keep results from being written, or spoil an input.
+
+    Parameters
+    ----------
+    case : Case
+    is_written : callable
+        Whether a file of a name is written: of a model where left out.
 
     Raises
     ------
@@ -132,11 +152,11 @@ def check_output(case: Case) -> None:
         raise PermissionError(f"{there}: the output cannot be written there")
     for path in _files(case):
         written = folder / path.name
-        if not is_model_file(path.name) or not path.exists() or not written.exists():
+        if not is_written(path.name) or not path.exists() or not written.exists():
             continue
         if path.samefile(written):
             raise CaseInputError(
-                f"{path}: the model would replace this input; give another output folder"
+                f"{path}: the results would replace this input; give another output folder"
             )
 
 

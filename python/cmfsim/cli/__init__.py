@@ -1,4 +1,4 @@
-"""The command line: `cmfsim doctor`, `build`, `phantom`, `solve` and `info`.
+"""The command line: `cmfsim doctor`, `build`, `solve`, `info`, and made heads to try them on.
 
 Results and `--json` go to standard output, progress and errors to standard error.
 Exit codes: 0 done, 1 failed, 2 bad input.

@@ -7,11 +7,15 @@ from typing import Any
 from cmfsim import __version__
 from cmfsim.cli import (
     case_commands,
+    demo_command,
     phantom_command,
     scene_commands,
     study_commands,
     template_commands,
+    view_command,
+    virtual_patients_command,
 )
+from cmfsim.insilico import PATIENTS
 from cmfsim.io import result_suffixes
 from cmfsim.prediction import MODELS
 from cmfsim.scene import CONTACTS, METHODS
@@ -41,6 +45,42 @@ def make_parser() -> argparse.ArgumentParser:
 def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     named = argparse.ArgumentParser(add_help=False, parents=[common])
     named.add_argument("case", metavar="CASE", type=Path, help="case.toml")
+
+    demo = commands.add_parser(
+        "demo", parents=[common], help="predict the face of an embedded case, and open its report"
+    )
+    demo.add_argument(
+        "folder",
+        metavar="FOLDER",
+        type=Path,
+        nargs="?",
+        default=demo_command.DEMO_FOLDER,
+        help=f"new, empty or an earlier demo's (default {demo_command.DEMO_FOLDER})",
+    )
+    demo.add_argument(
+        "--edge-length", metavar="H", type=float, default=6.0, help="of the tets, mm (default 6)"
+    )
+    demo.add_argument("--no-open", action="store_true", help="do not open the report")
+    demo.set_defaults(run=demo_command.demo, models=demo_command.DEMO_MODELS)
+
+    view = commands.add_parser(
+        "view", parents=[common], help="look at a prediction, model, scene, result or surface"
+    )
+    view.add_argument(
+        "path",
+        metavar="FOLDER_OR_FILE",
+        type=Path,
+        help="what predict, build or demo wrote; case.toml, scene, result or surface",
+    )
+    view.add_argument(
+        "--model",
+        choices=MODELS,
+        help="of several predictions (default the last of H, M, H+S, M+S)",
+    )
+    view.add_argument(
+        "--screenshot", metavar="PNG", type=Path, help="write a picture; open no window"
+    )
+    view.set_defaults(run=view_command.view)
 
     doctor = commands.add_parser(
         "doctor",
@@ -75,6 +115,32 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         "--spacing", metavar="MM", type=float, default=1.0, help="of the CT (default 1)"
     )
     phantom.set_defaults(run=phantom_command.phantom)
+
+    virtual = commands.add_parser(
+        "virtual-patients",
+        parents=[common],
+        help="write virtual patients with the face after their operation (in silico)",
+        epilog="Patients who are there already, made with the same settings, are kept.",
+    )
+    virtual.add_argument("folder", metavar="FOLDER", type=Path, help="made if it is not there")
+    virtual.add_argument(
+        "--patients",
+        metavar="N",
+        type=int,
+        nargs="+",
+        default=sorted(PATIENTS),
+        help="which of them (default all)",
+    )
+    virtual.add_argument(
+        "--seed", metavar="N", type=int, default=0, help="of all noise (default 0)"
+    )
+    virtual.add_argument(
+        "--edge-length", metavar="H", type=float, default=6.0, help="mm, true mesh (default 6)"
+    )
+    virtual.add_argument(
+        "--spacing", metavar="MM", type=float, default=2.0, help="of the CT (default 2)"
+    )
+    virtual.set_defaults(run=virtual_patients_command.virtual_patients)
 
 
 def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentParser) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from cmfsim.errors import CmfsimError
 from cmfsim.evaluation import error_table
-from cmfsim.io import replacing_files, write_prediction
+from cmfsim.io import finish_writing, replacing_files, write_prediction
 from cmfsim.pictures import (
     chart_errors,
     picture_distances,
@@ -43,9 +43,12 @@ def folder_of(output: Path, model: str, n_models: int) -> Path:
     return output if n_models == 1 else output / model
 
 
-def write_prediction_files(folder: Path, prediction: Prediction) -> list[str]:
+def write_prediction_files(
+    folder: Path, prediction: Prediction, *, pictures: bool = True
+) -> list[str]:
     """The names of the files of a prediction, with its pictures where they can be drawn."""
-    return write_prediction(folder, prediction, partial(_draw, prediction))
+    draw = partial(_draw, prediction) if pictures else None
+    return write_prediction(folder, prediction, draw)
 
 
 def _draw(prediction: Prediction, folder: Path) -> list[str]:
@@ -82,8 +85,15 @@ def _pictures() -> Iterator[None]:
 
 
 def write_evaluation(folder: Path, evaluation: CaseEvaluation) -> list[str]:
-    """The names of the files of a comparison: figures as JSON and CSV, and pictures."""
+    """The names of the files of a comparison: figures as JSON and CSV, pictures, and the report.
+
+    They take their places together: a case that has its figures has its report. The predictions
+    are in the folder already.
+    """
     comparison = evaluation.comparison
+    models = [prediction.model for prediction in evaluation.predictions]
+    n_models = len(models) + len(evaluation.failed)
+    places = [folder_of(folder, model, n_models) for model in models]
 
     def fill(fresh: Path) -> list[str]:
         names = ["metrics.csv"]
@@ -102,7 +112,9 @@ def write_evaluation(folder: Path, evaluation: CaseEvaluation) -> list[str]:
                 names.append(f"error-{model}.png")
             chart_errors(fresh / "errors.png", _by_region(evaluation))
             names.append("errors.png")
-        names.append(EVALUATION_FILE)
+        document = _document(places, {**evaluation.as_dict(), "files": names}, fresh)
+        written = _write_report(fresh, document)
+        names += [*([written] if written else []), EVALUATION_FILE]
         text = json.dumps({**evaluation.as_dict(), "files": names}, indent=1, allow_nan=False)
         (fresh / EVALUATION_FILE).write_text(text + "\n", encoding="utf-8")
         return names
@@ -111,7 +123,7 @@ def write_evaluation(folder: Path, evaluation: CaseEvaluation) -> list[str]:
 
 
 def _is_evaluation_file(name: str) -> bool:
-    return name in {"metrics.csv", "errors.png", EVALUATION_FILE} or (
+    return name in {"metrics.csv", "errors.png", EVALUATION_FILE, REPORT_FILE} or (
         name.startswith("error-") and name.endswith(".png")
     )
 
@@ -129,11 +141,20 @@ def _by_region(evaluation: CaseEvaluation) -> dict[str, dict[str, Any]]:
     }
 
 
-def write_case_report(folder: Path, models: Sequence[str]) -> str | None:
-    """The name of the report made from the results in a folder; none without Jinja2."""
-    places = [folder_of(folder, model, len(models)) for model in models]
-    predictions = [_json(place / "prediction.json") for place in places]
+def write_case_report(folder: Path, models: Sequence[str], n_models: int = 0) -> str | None:
+    """The name of the report made from the results in a folder; none without Jinja2.
+
+    `n_models` were asked for, of which `models` have results.
+    """
+    finish_writing(folder)
     evaluation = _json(folder / EVALUATION_FILE) if (folder / EVALUATION_FILE).exists() else None
+    places = [folder_of(folder, model, n_models or len(models)) for model in models]
+    return _write_report(folder, _document(places, evaluation, folder))
+
+
+def _document(places: Sequence[Path], evaluation: Any, folder: Path) -> Any:
+    """The report of predictions in their places, with an evaluation whose pictures a folder has."""
+    predictions = [_json(place / "prediction.json") for place in places]
     pictures = {
         name: (places[-1] / f"{name}.png").read_bytes()
         for name in PREDICTION_PICTURES
@@ -141,14 +162,14 @@ def write_case_report(folder: Path, models: Sequence[str]) -> str | None:
     }
     figures = []
     if evaluation is not None:
-        for name in evaluation["files"]:
+        # The box plot first: it shows all models together.
+        for name in sorted(evaluation["files"], key=lambda name: name != "errors.png"):
             if not name.endswith(".png"):
                 continue
             model = name.removeprefix("error-").removesuffix(".png")
             caption = BOXES_CAPTION if name == "errors.png" else _error_caption(model)
             figures.append(Figure((folder / name).read_bytes(), caption))
-    document = case_document(predictions, evaluation=evaluation, pictures=pictures, figures=figures)
-    return _write_report(folder, document)
+    return case_document(predictions, evaluation=evaluation, pictures=pictures, figures=figures)
 
 
 def _error_caption(model: str) -> str:

@@ -3,13 +3,15 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cmfsim.build import check_output
 from cmfsim.cli.case_commands import case_of, checked
 from cmfsim.cli.exit_codes import BAD_INPUT, DONE, FAILED
 from cmfsim.cli.results import (
+    REPORT_FILE,
     folder_of,
     write_case_report,
     write_evaluation,
@@ -17,14 +19,15 @@ from cmfsim.cli.results import (
     write_study_report,
 )
 from cmfsim.cli.terminal import StageProgress, escaped
-from cmfsim.errors import CaseInputError
-from cmfsim.io import Cohort, read_landmarks
+from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.io import Cohort, read_landmarks, replacing
+from cmfsim.io.predictions import is_prediction_file
 from cmfsim.prediction import MODELS, Prediction
 from cmfsim.study import CaseOutcome, StudyReport, predict_models, run_study
 from cmfsim.study import evaluate as evaluate_case
 from cmfsim.study import sensitivity as landmark_sensitivity
 
-__all__ = ["evaluate", "models_of", "predict", "report", "sensitivity", "study"]
+__all__ = ["achieved_text", "evaluate", "models_of", "predict", "report", "sensitivity", "study"]
 
 
 def models_of(given: Sequence[str] | None, default: Sequence[str]) -> tuple[str, ...]:
@@ -40,26 +43,35 @@ def predict(options: argparse.Namespace) -> int:
     findings = () if options.no_doctor else checked(case, quiet=options.quiet)
     if findings is None:
         return BAD_INPUT
+    check_output(case, is_prediction_file)
     written: list[dict[str, Any]] = []
+    failed: dict[str, CmfsimError] = {}
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         predictions = predict_models(
-            case, models, progress=progress.stage, check=False, findings=findings
+            case, models, progress=progress.stage, check=False, findings=findings, failed=failed
         )
         for prediction in predictions:
             progress.stage(f"writing {prediction.model}")
             folder = folder_of(case.output, prediction.model, len(models))
             names = write_prediction_files(folder, prediction)
             written.append({**_figures(prediction), "output": str(folder), "files": names})
+        if not written:
+            raise next(iter(failed.values()))
         progress.stage("writing the report")
-        made = write_case_report(case.output, models)
+        solved = [entry["model"] for entry in written]
+        made = write_case_report(case.output, solved, len(models))
     if options.json:
-        answer = {"case": case.name, "predictions": written, "report": made}
+        reasons = {model: str(error) for model, error in failed.items()}
+        answer = {"case": case.name, "predictions": written, "failed": reasons, "report": made}
         print(json.dumps(answer, allow_nan=False))
-        return DONE
+        return FAILED if failed else DONE
+    if prediction.patient.summary.get("achieved") is not None:
+        print(achieved_text(prediction.patient.summary["achieved"]))
     for entry in written:
         print(_prediction_text(entry))
     _print_report(case.output, made)
-    return DONE
+    _say_failed({model: str(error) for model, error in failed.items()})
+    return FAILED if failed else DONE
 
 
 def evaluate(options: argparse.Namespace) -> int:
@@ -69,20 +81,25 @@ def evaluate(options: argparse.Namespace) -> int:
     findings = () if options.no_doctor else checked(case, quiet=options.quiet)
     if findings is None:
         return BAD_INPUT
+    check_output(case, is_prediction_file)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         found = evaluate_case(case, models, progress=progress.stage, check=False, findings=findings)
         for prediction in found.predictions:
             progress.stage(f"writing {prediction.model}")
             folder = folder_of(case.output, prediction.model, len(models))
             write_prediction_files(folder, prediction)
-        progress.stage("writing the comparison")
+        progress.stage("writing the comparison and the report")
         names = write_evaluation(case.output, found)
-        made = write_case_report(case.output, models)
+        made = REPORT_FILE if REPORT_FILE in names else None
     values = found.as_dict()
+    code = FAILED if found.failed else DONE
     if options.json:
         answer = {**values, "output": str(case.output), "files": names, "report": made}
         print(json.dumps(answer, allow_nan=False))
-        return DONE
+        return code
+    achieved = found.predictions[0].patient.summary.get("achieved")
+    if achieved is not None:
+        print(achieved_text(achieved))
     print(f"{escaped(case.name)}: distance from the face after the operation, mm")
     print("  model        mean     SD   95 %    max   < 2 mm")
     for name, entry in [*values["models"].items(), ("no change", values["no_change"])]:
@@ -93,7 +110,8 @@ def evaluate(options: argparse.Namespace) -> int:
             f"{100 * figures['within']['2 mm']:6.0f} %"
         )
     _print_report(case.output, made)
-    return DONE
+    _say_failed(found.failed)
+    return code
 
 
 def sensitivity(options: argparse.Namespace) -> int:
@@ -115,7 +133,8 @@ def sensitivity(options: argparse.Namespace) -> int:
     values = found.as_dict()
     text = json.dumps(values, indent=1, allow_nan=False)
     case.output.mkdir(parents=True, exist_ok=True)
-    (case.output / "sensitivity.json").write_text(text + "\n", encoding="utf-8")
+    with replacing(case.output / "sensitivity.json") as file:
+        file.write(f"{text}\n".encode())
     if options.json:
         print(json.dumps(values, allow_nan=False))
         return DONE
@@ -234,6 +253,25 @@ def _study_text(found: StudyReport) -> str:
             mean = "–" if entry is None else f"{entry['regions']['whole']['mean_mm']:.2f}"
             cells += f"{mean:>8}"
         lines.append(f"  {escaped(outcome.name):<12} {cells}  {outcome.status}")
+    return "\n".join(lines)
+
+
+def _say_failed(failed: Mapping[str, str]) -> None:
+    """Says which of several models have no result; the others were written."""
+    for model, reason in failed.items():
+        print(f"cmfsim: error: model {model}: {escaped(reason)}", file=sys.stderr)
+
+
+def achieved_text(achieved: Mapping[str, Any]) -> str:
+    """What the operation did to each segment, as Table 2 of Kim et al. (2010) writes it."""
+    lines = ["achieved plan: motion of each segment's middle, mm (L, P, S), and turn about it"]
+    for name, found in achieved["segments"].items():
+        shift = " ".join(f"{c:+6.2f}" for c in found["translation_mm"])
+        axis = ", ".join(f"{c:+.2f}" for c in found["axis"])
+        lines.append(
+            f"  {escaped(name):<14} {shift}  {found['angle_degrees']:5.2f}° about ({axis}), "
+            f"laid on the bone to {found['rms_mm']:.2f} mm rms ({found['share']:.0%} of it)"
+        )
     return "\n".join(lines)
 
 

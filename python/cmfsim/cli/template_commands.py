@@ -16,7 +16,7 @@ from cmfsim.cli.terminal import StageProgress, columns, escaped, in_colour
 from cmfsim.doctor import findings_text
 from cmfsim.errors import CaseInputError
 from cmfsim.musculature import Musculature
-from cmfsim.pictures import picture_muscle_names, picture_muscles
+from cmfsim.pictures import picture_muscles
 from cmfsim.template import (
     MorphedMusculature,
     MuscleTemplate,
@@ -127,8 +127,7 @@ def show(options: argparse.Namespace) -> int:
         muscles = template.musculature
         if options.only:
             muscles = _chosen(template, options.only)
-        picture = picture_muscles if options.fibres else picture_muscle_names
-        picture(path, muscles, template.skull)
+        picture_muscles(path, muscles, template.skull, fibres=options.fibres)
     if options.json:
         print(json.dumps({"picture": str(path), "muscles": [m.name for m in muscles]}))
     else:

@@ -141,6 +141,14 @@ def gather(case: Case) -> Evidence:
         _check_file(case, "mesh.parting.surface", case.mesh.parting, findings)
     if case.mesh.file is not None:
         _check_file(case, "mesh.file", case.mesh.file, findings)
+    after = case.postoperative
+    if after is not None:
+        files = {name: getattr(after, name) for name in ("skin", "image", "landmarks")}
+        files |= {f"bones.{name}": path for name, path in after.bones.items()}
+        for key, path in files.items():
+            if path is not None:
+                folder = key == "image"
+                _check_file(case, f"postoperative.{key}", path, findings, folder=folder)
     motions: dict[str, Floats] = {}
     for name, motion in case.plan.items():
         _check_motion_files(case, name, motion, findings)

@@ -13,7 +13,7 @@ from cmfsim.osteotomy import Procedure, place_procedure
 from cmfsim.patient import CaseOsteotomy
 from cmfsim.planning import decompose_motion
 
-__all__ = ["check_cuts", "check_plan"]
+__all__ = ["FAR", "TOO_FAR", "check_against_skin", "check_cuts", "check_plan"]
 
 # Motions of bone above which a plan is unusual, and above which it cannot be meant; mm and degrees.
 # The largest relocation in Table 2 of the paper is 12.6 mm; distraction reaches 30 mm.
@@ -133,8 +133,9 @@ def check_plan(evidence: Evidence) -> Iterator[Finding]:
         yield from wrong
         # A bone that flies off passes the skin as well: one reason is enough.
         if piece is not None and not any(f.severity == "error" for f in wrong):
-            yield from _check_through_skin(evidence, name, matrix, piece[:, :3])
-            yield from _check_tissue(evidence, name, piece)
+            yield from check_against_skin(
+                evidence, name, piece[:, :3], _moved(matrix, piece[:, :3])
+            )
 
 
 def _check_size(
@@ -171,13 +172,22 @@ def _check_size(
         )
 
 
+def check_against_skin(
+    evidence: Evidence, name: str, points: Floats, moved: Floats
+) -> Iterator[Finding]:
+    """Findings about a segment whose points move through the skin, or touch no tissue."""
+    yield from _check_through_skin(evidence, name, points, moved)
+    piece = _piece(evidence, name)
+    if piece is not None:
+        yield from _check_tissue(evidence, name, piece)
+
+
 def _check_through_skin(
-    evidence: Evidence, name: str, matrix: Floats, points: Floats
+    evidence: Evidence, name: str, points: Floats, moved: Floats
 ) -> Iterator[Finding]:
     skin = evidence.skin
     if skin is None:
         return
-    moved = _moved(matrix, points)
     inside_before = skin.index.winding_number(points) >= 0.5
     outside_after = skin.index.winding_number(moved) < 0.5
     through = np.flatnonzero(inside_before & outside_after)

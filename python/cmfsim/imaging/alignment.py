@@ -1,11 +1,6 @@
 """Rigid registration of two scans of one head by mutual information (paper 3, Figure 5)."""
 
-import contextlib
-import itertools
 import logging
-import math
-import threading
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,101 +8,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.case import ImageData
-from cmfsim.checks import Floats, as_floats, as_number, as_positive, as_rows, check_instance
-from cmfsim.errors import LandmarkInputError, RegistrationError, RegistrationInputError
-from cmfsim.imaging.morphology import (
-    Mask,
-    as_itk,
-    box_of,
-    distance,
-    resampled_to,
-    simpleitk,
-    smoothed,
-)
+from cmfsim.checks import Floats, as_floats, check_instance
+from cmfsim.errors import RegistrationError, RegistrationInputError
+from cmfsim.imaging.alignment_options import AlignmentOptions
+from cmfsim.imaging.descent import Clipped, Places, align, inverse, matrix_of
+from cmfsim.imaging.morphology import Mask
 
-__all__ = ["AlignmentOptions", "VolumeAlignment", "register_volumes", "undeformed_mask"]
+__all__ = ["VolumeAlignment", "register_volumes"]
 
 _LOG = logging.getLogger(__name__)
-_ONE_AT_A_TIME = threading.Lock()
 
-# Landmarks through which the plane runs above which surgery of the jaws moves no bone: the lower
-# rims of the orbits and the roots of the zygomatic arches, close to the Frankfurt plane.
-CRANIAL_LANDMARKS = ("suborbital_L", "suborbital_R", "supraglenoid_L", "supraglenoid_R")
-# A mask needs this many voxels at the coarsest resolution for a histogram, and this extent, mm, for
-# an angle.
-LEAST_VOXELS = 500
-LEAST_EXTENT = 20.0
 # Values outside these shares of the voxels, %, (metal, noise) would spend the histogram's bins.
 CLIPPED = (0.2, 99.8)
-# First and last step of a resolution, as shares of its voxel size: the metric has no shape finer
-# than that, and the measured error is a fiftieth of a voxel.
-FIRST_STEP = 0.7
-LAST_STEP = 1.0 / 1500.0
-# Factor on the step when the gradient turns about.
-RELAXATION = 0.8
-# Gradients below this end a resolution, 1/mm; the length of the step decides before.
-LEAST_GRADIENT = 1e-9
-
-
-@dataclass(frozen=True)
-class AlignmentOptions:
-    """How two volumes are brought together; the defaults suit a CT of a head.
-
-    Attributes
-    ----------
-    resolutions : tuple of float, mm
-        Voxel sizes, coarse to fine. Starts further away than ten of the first may fail.
-    samples : int
-        Points of the mask that the metric is taken over, at random places (Mattes et al. 2003).
-    bins : int
-        Of the joint histogram, along each axis.
-    max_iterations : int
-        At each resolution.
-    least_overlap : float
-        Share of the mask that must lie in the moving volume at the end.
-    least_similarity : float
-        Correlation of both volumes over the mask that is needed at the end. Scans of one head reach
-        0.9; of two heads, or at a wrong place, 0.3.
-    seed : int
-
-    Raises
-    ------
-    RegistrationError, CaseError
-        (also `ValueError`) A value out of its range; not a number.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> cmfsim.AlignmentOptions(resolutions=(8, 4)).samples
-    60000
-    """
-
-    resolutions: tuple[float, ...] = (6.0, 3.0, 1.5)
-    samples: int = 60_000
-    bins: int = 48
-    max_iterations: int = 300
-    least_overlap: float = 0.5
-    least_similarity: float = 0.5
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        sizes = tuple(as_positive("resolution", s) for s in self.resolutions)
-        if not sizes or any(a <= b for a, b in itertools.pairwise(sizes)):
-            raise RegistrationInputError(
-                f"resolutions are {sizes} mm: they must become finer, and one is needed"
-            )
-        object.__setattr__(self, "resolutions", sizes)
-        for name, least in (("samples", 1000), ("bins", 8), ("max_iterations", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-                raise RegistrationInputError(
-                    f"{name} is {value!r}: a whole number of at least {least} is needed"
-                )
-        for name in ("least_overlap", "least_similarity"):
-            if not 0.0 <= as_number(name, getattr(self, name)) <= 1.0:
-                raise RegistrationInputError(
-                    f"{name} is {getattr(self, name):g}: must be from 0 to 1"
-                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,16 +111,16 @@ def register_volumes(
         check_instance(name, image, ImageData)
     chosen = _checked_mask(mask, fixed)
     start = np.eye(4) if initial is None else _rigid(initial)
-    places = _Places(chosen, fixed)
+    places = Places(chosen, fixed)
     low, high = _range("moving volume", moving.values)
-    far = _Clipped(moving, low, high)
+    far = Clipped(moving, low, high)
     low, high = _range("fixed volume", fixed.values[chosen])
-    near = _Clipped(fixed, low, high)
-    transform = places.transform(_inverse(start))
+    near = Clipped(fixed, low, high)
+    transform = places.transform(inverse(start))
     iterations: list[int] = []
     information = 0.0
     for size in options.resolutions:
-        steps, information = _align(
+        steps, information = align(
             transform,
             far.at(size, None),
             near.at(size, places.box),
@@ -220,7 +132,7 @@ def register_volumes(
         )
         iterations.append(steps)
         _LOG.info("alignment at %g mm: %d steps, %.4f nats", size, steps, information)
-    to_moving = _matrix_of(transform)
+    to_moving = matrix_of(transform)
     similarity, overlap = _agreement(to_moving, moving, fixed, places, options)
     if overlap < options.least_overlap:
         raise RegistrationError(
@@ -234,233 +146,14 @@ def register_volumes(
             f"needed {options.least_similarity:g}; start nearer with `initial`, mask out what was "
             "moved, and see whether both show the same person"
         )
-    return VolumeAlignment(_inverse(to_moving), information, similarity, overlap, tuple(iterations))
-
-
-def undeformed_mask(
-    image: ImageData,
-    landmarks: Mapping[str, ArrayLike],
-    *,
-    threshold: float = 250.0,
-    margin: float = 4.0,
-) -> ImageData:
-    """The skull above the jaws, which surgery of the jaws leaves alone, with a margin round it.
-
-    Parameters
-    ----------
-    image : ImageData
-        CT in HU.
-    landmarks : mapping of str to (3,) float64, mm
-        Of the skull: "suborbital_L", "suborbital_R", "supraglenoid_L", "supraglenoid_R".
-    threshold : float, HU
-        Bone lies above.
-    margin : float, mm
-        Round the bone: the metric needs both sides of its surface.
-
-    Returns
-    -------
-    ImageData
-        uint8, 1 in the mask, on the grid of the image. For a Le Fort III or an operation of the
-        vault draw a mask by hand.
-
-    Raises
-    ------
-    LandmarkError
-        (also `ValueError`) A landmark is missing, or they lie on one line.
-    RegistrationError
-        (also `ValueError`) No bone above the plane.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> mask = cmfsim.undeformed_mask(image, landmarks)  # doctest: +SKIP
-    """
-    check_instance("image", image, ImageData)
-    as_number("threshold", threshold)
-    as_positive("margin", margin)
-    missing = [name for name in CRANIAL_LANDMARKS if name not in landmarks]
-    if missing:
-        raise LandmarkInputError(
-            f"landmarks lack {', '.join(missing)}: the plane above the jaws runs through "
-            f"{', '.join(CRANIAL_LANDMARKS)}"
-        )
-    points = as_rows(
-        "landmarks", np.array([as_floats(name, landmarks[name]) for name in CRANIAL_LANDMARKS]), 3
-    )
-    centre = points.mean(axis=0)
-    _, sizes, axes = np.linalg.svd(points - centre)
-    # Up is +z in LPS, whichever way the head is tilted by less than a right angle.
-    normal = axes[2] if axes[2, 2] > 0.0 else -axes[2]
-    if sizes[1] < 0.1 * sizes[0]:
-        raise LandmarkInputError(
-            f"the landmarks {', '.join(CRANIAL_LANDMARKS)} lie nearly on one line: no plane runs "
-            "through them alone"
-        )
-    x, y, z = image.axes()
-    height = (x - centre[0]) * normal[0] + (y - centre[1]) * normal[1] + (z - centre[2]) * normal[2]
-    bone = (image.values > threshold) & (height > 0.0)
-    if not bone.any():
-        raise RegistrationInputError(
-            f"the image has no voxel above {threshold:g} HU on the upper side of the plane through "
-            f"{', '.join(CRANIAL_LANDMARKS)}: is it in HU, and are both in one frame?"
-        )
-    near = distance(np.asfortranarray(bone), np.asarray(image.spacing)) <= margin
-    return image.with_values((near & (height > 0.0)).astype(np.uint8))
-
-
-class _Places:
-    """The mask in mm: where it lies, how far it reaches, how it turns."""
-
-    def __init__(self, chosen: Mask, fixed: ImageData) -> None:
-        spacing = np.asarray(fixed.spacing)
-        self.box = box_of(chosen, 2)
-        index = np.argwhere(chosen)
-        self.points = fixed.lowest + index * spacing
-        self.centre = self.points.mean(axis=0)
-        spread = ((self.points - self.centre) ** 2).mean(axis=0)
-        extent = np.ptp(self.points, axis=0)
-        if (extent < LEAST_EXTENT).any():
-            raise RegistrationInputError(
-                f"the mask reaches over {' × '.join(f'{e:.0f}' for e in extent)} mm: at least "
-                f"{LEAST_EXTENT:g} mm along each axis are needed to tell a turn"
-            )
-        # Mean square of the shift of the mask's points by a turn of 1 rad about each axis, mm².
-        self.inertia = spread.sum() - spread
-
-    def transform(self, to_moving: Floats) -> Any:
-        """An Euler transform about the middle of the mask, from fixed places to moving ones."""
-        transform = simpleitk().Euler3DTransform()
-        transform.SetCenter(self.centre.tolist())
-        transform.SetMatrix(to_moving[:3, :3].ravel().tolist(), 1e-6)
-        shift = to_moving[:3, :3] @ self.centre + to_moving[:3, 3] - self.centre
-        transform.SetTranslation(shift.tolist())
-        return transform
-
-
-class _Clipped:
-    """A volume within a range of values, at any resolution."""
-
-    def __init__(self, image: ImageData, low: float, high: float) -> None:
-        self.image = image
-        self.low, self.high = low, high
-
-    def at(self, size: float, box: tuple[slice, ...] | None) -> Any:
-        """An ITK image of cubic voxels of a size, mm, of the whole volume or a block of it."""
-        spacing = np.asarray(self.image.spacing)
-        part = self.image.values if box is None else self.image.values[box]
-        first = np.zeros(3) if box is None else np.array([b.start for b in box])
-        values = np.asfortranarray(np.clip(part, self.low, self.high), dtype=np.float32)
-        # A Gaussian of half a voxel, less the blur that the volume's own voxels are.
-        width = 0.25 * (size**2 - float(np.median(spacing)) ** 2)
-        if width > 0.0:
-            values = smoothed(values, math.sqrt(width), spacing)
-        shape = tuple(int(n) for n in np.floor((np.array(part.shape) - 1) * spacing / size) + 1)
-        cubic = resampled_to(values, spacing, np.zeros(3), shape, np.full(3, size))
-        image = as_itk(cubic, np.full(3, size))
-        image.SetOrigin((self.image.lowest + first * spacing).tolist())
-        return image
-
-
-def _align(
-    transform: Any,
-    moving: Any,
-    fixed: Any,
-    chosen: Mask,
-    grid: ImageData,
-    size: float,
-    options: AlignmentOptions,
-    places: _Places,
-) -> tuple[int, float]:
-    """Betters a transform at one resolution; the steps taken and the information reached."""
-    itk = simpleitk()
-    mask = as_itk(np.asfortranarray(chosen), np.asarray(grid.spacing))
-    mask.SetOrigin(grid.lowest.tolist())
-    mask = itk.Resample(mask, fixed, itk.Transform(), itk.sitkNearestNeighbor)
-    count = int(itk.GetArrayViewFromImage(mask).sum())
-    if count < LEAST_VOXELS:
-        raise RegistrationInputError(
-            f"the mask has {count} voxels of {size:g} mm: at least {LEAST_VOXELS} are needed; "
-            "make the mask larger, or the resolutions finer"
-        )
-    with _one_thread():
-        return _descend(
-            itk.ImageRegistrationMethod(),
-            transform,
-            moving,
-            fixed,
-            mask,
-            size,
-            options,
-            options.samples / count,
-            places,
-        )
-
-
-def _descend(
-    method: Any,
-    transform: Any,
-    moving: Any,
-    fixed: Any,
-    mask: Any,
-    size: float,
-    options: AlignmentOptions,
-    share: float,
-    places: _Places,
-) -> tuple[int, float]:
-    """Goes down the metric until the step is too small to matter."""
-    method.SetMetricAsMattesMutualInformation(options.bins)
-    method.SetMetricFixedMask(mask)
-    method.SetMetricSamplingStrategy(method.RANDOM)
-    method.SetMetricSamplingPercentage(min(1.0, share), int(options.seed) + 1)
-    method.SetInterpolator(simpleitk().sitkLinear)
-    method.SetOptimizerAsRegularStepGradientDescent(
-        learningRate=FIRST_STEP * size,
-        minStep=LAST_STEP * size,
-        numberOfIterations=options.max_iterations,
-        relaxationFactor=RELAXATION,
-        gradientMagnitudeTolerance=LEAST_GRADIENT,
-    )
-    method.SetOptimizerScales([*places.inertia, 1.0, 1.0, 1.0])
-    method.SetInitialTransform(transform, True)  # noqa: FBT003 (ITK's own signature: in place)
-    try:
-        method.Execute(fixed, moving)
-    except RuntimeError as error:
-        raise RegistrationError(
-            f"the volumes do not overlap enough at {size:g} mm to go on "
-            f"({str(error).strip().splitlines()[-1]}); bring them nearer with `initial`"
-        ) from error
-    steps = int(method.GetOptimizerIteration())
-    reason = method.GetOptimizerStopConditionDescription()
-    if "Maximum number" in reason:
-        raise RegistrationError(
-            f"the volumes did not come to rest at {size:g} mm within {options.max_iterations} "
-            "steps; start nearer with `initial`, use a mask that shows the same bone in both, or "
-            "raise max_iterations"
-        )
-    return steps, -float(method.GetMetricValue())
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Has ITK sum on one thread: the last digits of its metric depend on the number of threads.
-
-    The metric heeds the default of the process alone, so two registrations wait for each other.
-    """
-    process = simpleitk().ProcessObject
-    with _ONE_AT_A_TIME:
-        before = process.GetGlobalDefaultNumberOfThreads()
-        process.SetGlobalDefaultNumberOfThreads(1)
-        try:
-            yield
-        finally:
-            process.SetGlobalDefaultNumberOfThreads(before)
+    return VolumeAlignment(inverse(to_moving), information, similarity, overlap, tuple(iterations))
 
 
 def _agreement(
     to_moving: Floats,
     moving: ImageData,
     fixed: ImageData,
-    places: _Places,
+    places: Places,
     options: AlignmentOptions,
 ) -> tuple[float, float]:
     """The correlation of both volumes over the mask, and the share of it inside the moving one."""
@@ -520,21 +213,4 @@ def _rigid(matrix: ArrayLike) -> Floats:
     u, _, v = np.linalg.svd(turn)
     matrix = given.copy()
     matrix[:3, :3] = u @ v
-    return matrix
-
-
-def _matrix_of(transform: Any) -> Floats:
-    """The (4, 4) matrix of an Euler transform."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.reshape(transform.GetMatrix(), (3, 3))
-    centre = np.array(transform.GetCenter())
-    matrix[:3, 3] = np.array(transform.GetTranslation()) + centre - matrix[:3, :3] @ centre
-    return matrix
-
-
-def _inverse(rigid: Floats) -> Floats:
-    """The rigid motion back."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rigid[:3, :3].T
-    matrix[:3, 3] = -rigid[:3, :3].T @ rigid[:3, 3]
     return matrix

@@ -2,13 +2,14 @@
 
 from cmfsim.io.case_files import Case
 from cmfsim.io.cohorts import Cohort
-from cmfsim.io.folders import replacing_files
+from cmfsim.io.files import replacing
+from cmfsim.io.folders import finish_writing, replacing_files
 from cmfsim.io.images import read_image, write_image
 from cmfsim.io.landmarks import LandmarkFile, read_landmark_file, read_landmarks, write_landmarks
 from cmfsim.io.meshes import read_tet_mesh
 from cmfsim.io.metrics import write_metrics
 from cmfsim.io.models import write_model
-from cmfsim.io.predictions import write_prediction
+from cmfsim.io.predictions import read_parts, write_prediction
 from cmfsim.io.results import read_result, result_suffixes, write_result
 from cmfsim.io.scenes import read_plan, read_scene, write_scene
 from cmfsim.io.surfaces import read_moved_surface, read_surface, write_surface
@@ -18,16 +19,19 @@ __all__ = [
     "Case",
     "Cohort",
     "LandmarkFile",
+    "finish_writing",
     "read_image",
     "read_landmark_file",
     "read_landmarks",
     "read_moved_surface",
+    "read_parts",
     "read_plan",
     "read_result",
     "read_scene",
     "read_surface",
     "read_tet_mesh",
     "read_transform",
+    "replacing",
     "replacing_files",
     "result_suffixes",
     "write_image",

@@ -44,10 +44,13 @@ from cmfsim.scene import (
 __all__ = ["CASE_FORMAT", "Case"]
 
 CASE_FORMAT = "cmfsim-case"
+# What stands for the plan where it is read off the bones after the operation.
+ACHIEVED = "achieved"
 TABLES = (
     "format",
     "version",
     "name",
+    "note",
     "image",
     "surfaces",
     "landmarks",
@@ -66,6 +69,7 @@ TABLES = (
 SAMPLES = (1, 100_000)
 # Edge lengths that make a mesh of a head, mm: below, more tets than any memory; above, no face.
 EDGE_LENGTHS = (0.3, 30.0)
+MOST_CLEFT = 20.0
 # Grid spacings that a head can be worked on at, mm.
 WORKING_SPACINGS = (0.2, 5.0)
 
@@ -91,6 +95,8 @@ class Case:
         In the order in which they are made.
     plan : mapping of str to CaseMotion
         Segments that it does not name stay.
+    achieved : bool
+        The plan is what the operation achieved, read off the bones after it; `plan` is empty.
     node_kinds : mapping of str to plain values
         Options of the stage that classifies nodes.
     tissue : TissueData
@@ -99,6 +105,8 @@ class Case:
         None leaves them out of what `cmfsim build` makes.
     solver : SolverOptions
     postoperative : CasePostoperative or None
+    note : str
+        What readers of its report should know, such as that the patient is made by code.
     lines : mapping of str to int
         The line of each dotted key in the case file, for findings.
 
@@ -118,17 +126,21 @@ class Case:
     mesh: CaseMesh = field(default_factory=CaseMesh)
     osteotomies: tuple[CaseOsteotomy, ...] = ()
     plan: Mapping[str, CaseMotion] = field(default_factory=dict)
+    achieved: bool = False
     node_kinds: Mapping[str, Any] = field(default_factory=dict)
     tissue: TissueData = field(default_factory=lambda: TissueData("preset", fraction=0.0))
     muscles: CaseMuscles | None = None
     solver: SolverOptions = field(default_factory=SolverOptions)
     postoperative: CasePostoperative | None = None
+    note: str = ""
     lines: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         as_text("case name", self.name)
         if (self.image is None) == (self.surfaces is None):
             raise CaseInputError("a case has either an image or surfaces")
+        if self.achieved and self.plan:
+            raise CaseInputError("a plan is given or achieved, not both")
         for name in ("plan", "node_kinds", "lines"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
@@ -189,7 +201,8 @@ def _read(path: Path) -> Case:
         region=_region(document.table("region")),
         mesh=_mesh(document.table("mesh"), folder),
         osteotomies=_osteotomies(document),
-        plan=_plan(document.table("plan"), folder),
+        plan={} if _is_achieved(document) else _plan(document, folder),
+        achieved=_is_achieved(document),
         node_kinds=_plain(document.table("node_kinds")),
         tissue=_tissue(document.table("tissue")),
         muscles=_muscles(document.table("muscles"), folder) if "muscles" in document else None,
@@ -199,6 +212,7 @@ def _read(path: Path) -> Case:
             if "postoperative" in document
             else None
         ),
+        note=document.text("note") if "note" in document else "",
         lines=document.all_lines(),
     )
 
@@ -293,14 +307,16 @@ def _region(table: Table) -> Region:
 
 
 def _mesh(table: Table, folder: Path) -> CaseMesh:
-    table.only("edge_length", "refine", "parting", "file")
+    table.only("edge_length", "refine", "cleft", "parting", "file")
     low, high = EDGE_LENGTHS
     edge_length = table.number("edge_length", "mm", low=low, high=high)
+    cleft = table.number("cleft", "mm", low=0.0, high=MOST_CLEFT)
     parting = table.table("parting").only("surface") if "parting" in table else None
     default = CaseMesh()
     return CaseMesh(
         default.edge_length if edge_length is None else edge_length,
         table.flag("refine", default=default.refine),
+        default.cleft if cleft is None else cleft,
         None if parting is None else _file(parting, "surface", folder),
         _file_or_none(table, "file", folder),
     )
@@ -329,8 +345,48 @@ def _osteotomies(document: Table) -> tuple[CaseOsteotomy, ...]:
     return tuple(cuts)
 
 
-def _plan(table: Table, folder: Path) -> dict[str, CaseMotion]:
-    return {_name(table, name, name): _motion(table.table(name), folder) for name in table}
+def _is_achieved(document: Table) -> bool:
+    """Whether the case asks for the plan that the operation achieved."""
+    if "plan" not in document or isinstance(document.need("plan"), dict):
+        return False
+    if document.need("plan") != ACHIEVED:
+        document.fail(
+            "plan", f'is {document.need("plan")!r}: tables [plan.SEGMENT] are needed, or "achieved"'
+        )
+    after = document.table("postoperative")
+    if "image" not in after and "bones" not in after:
+        document.fail(
+            "plan",
+            "is achieved, and there is no bone after the operation to read it off: add "
+            "[postoperative] image, or [postoperative.bones]",
+        )
+    return True
+
+
+def _plan(document: Table, folder: Path) -> dict[str, CaseMotion]:
+    table = document.table("plan")
+    motions = {}
+    for name in table:
+        motion = table.table(name)
+        if "moved" in motion:
+            motions[_name(table, name, name)] = _moved(document, motion, name, folder)
+        else:
+            motions[_name(table, name, name)] = _motion(motion, folder)
+    return motions
+
+
+def _moved(document: Table, motion: Table, name: str, folder: Path) -> CaseMotion:
+    """The motion of a bone of the case, given by the same surface after it moved."""
+    bones = document.table("surfaces").table("bones") if "surfaces" in document else ()
+    if name not in bones:
+        known = f"one of {', '.join(bones)}" if bones else "no bone, for there is no [surfaces]"
+        motion.fail(
+            "moved",
+            f"is for bones that [surfaces.bones] names ({known}), not for {name!r}: give surface "
+            "and moved_surface, the piece before and after",
+        )
+    before = _file(document.table("surfaces").table("bones"), name, folder)
+    return CaseMotion(surface=before, moved_surface=_file(motion.only("moved"), "moved", folder))
 
 
 def _motion(table: Table, folder: Path) -> CaseMotion:
@@ -345,7 +401,7 @@ def _motion(table: Table, folder: Path) -> CaseMotion:
         table.only("surface", "moved_surface")
         surface = _file(table, "surface", folder)
         return CaseMotion(surface=surface, moved_surface=_file(table, "moved_surface", folder))
-    table.only("translation", "angle", "axis", "centre", "matrix", "transform", "surface")
+    table.only("translation", "angle", "axis", "centre", "matrix", "transform", "moved", "surface")
     given: dict[str, Any] = {
         key: vector
         for key in ("translation", "axis", "centre")
@@ -396,12 +452,13 @@ def _muscles(table: Table, folder: Path) -> CaseMuscles:
 
 def _postoperative(table: Table, folder: Path) -> CasePostoperative:
     table.only("skin", "image", "landmarks", "bones", "aligned", "units", "frame")
-    if ("skin" in table) == ("image" in table):
-        table.fail(
-            "image" if "image" in table else None,
-            "stands beside skin: give one of them" if "image" in table else "lacks skin or image",
-        )
     bones = table.table("bones")
+    if "skin" in table and "image" in table:
+        table.fail("image", "stands beside skin: give one of them")
+    if "image" in table and "bones" in table:
+        table.fail("bones", "stands beside image, from which bones are read: give one of them")
+    if "skin" not in table and "image" not in table and not list(bones):
+        table.fail(None, "lacks skin, image or bones")
     return CasePostoperative(
         _file_or_none(table, "skin", folder),
         _file_or_none(table, "image", folder),

@@ -6,15 +6,16 @@ whole.
 """
 
 import contextlib
+import glob
 import json
 import os
-import tempfile
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
 from cmfsim.errors import CaseInputError
+from cmfsim.io.leftovers import abandoned, temporary_file
 
 __all__ = [
     "FORMAT_VERSION",
@@ -37,20 +38,28 @@ FORMAT_VERSION = 1
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """A file under a temporary name in the same folder, renamed to `path` when all went well."""
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    temporary = Path(name)
+    for left in abandoned(path.parent, f".{glob.escape(path.name)}.*.part"):
+        left.unlink(missing_ok=True)
+    handle, temporary = temporary_file(path)
     try:
+        # The lock lasts as long as the handle: until the file has its name.
         with os.fdopen(handle, "wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        # mkstemp makes files that only their owner reads; results follow the user's umask.
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        temporary.replace(path)
-    except BaseException:
+            # Such files are their owner's alone; results follow the user's umask.
+            umask = os.umask(0)
+            os.umask(umask)
+            temporary.chmod(0o666 & ~umask)
+            if os.name != "nt":
+                temporary.replace(path)
+        if os.name == "nt":
+            # Windows renames no open file.
+            temporary.replace(path)
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None and error.errno is not None:
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 
 

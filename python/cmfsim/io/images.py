@@ -1,9 +1,10 @@
 """Images in the formats that SimpleITK reads: NRRD, NIfTI, MetaImage and folders of DICOM."""
 
+import glob
 import gzip
 import os
+import shutil
 import struct
-import tempfile
 import zlib
 from dataclasses import dataclass
 from importlib import import_module
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from cmfsim.case import Finding, ImageData
 from cmfsim.errors import ImageError, ImageInputError
+from cmfsim.io.leftovers import abandoned, temporary_folder
 
 __all__ = ["ImageFile", "read_image", "read_image_file", "write_image"]
 
@@ -136,21 +138,19 @@ def write_image(image: ImageData, path: str | os.PathLike[str]) -> None:
     written = itk.GetImageFromArray(np.ascontiguousarray(values.T))
     written.SetSpacing([float(s) for s in np.asarray(image.spacing)])
     written.SetOrigin([float(o) for o in image.lowest])
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        itk.WriteImage(written, str(temporary), useCompression=True)
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        temporary.replace(path)
-    except RuntimeError as error:
-        temporary.unlink(missing_ok=True)
-        raise ImageError(f"{path.name}: cannot be written ({_last_line(error)})") from error
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    # ITK tells the format by the ending of a name, and opens the file itself: so it gets a folder.
+    prefix = f".{path.name}.writing-"
+    for left in abandoned(path.parent, f"{glob.escape(prefix)}*"):
+        shutil.rmtree(left, ignore_errors=True)
+    with temporary_folder(path.parent, prefix) as fresh:
+        try:
+            temporary = fresh / f"image{suffix}"
+            itk.WriteImage(written, str(temporary), useCompression=True)
+            temporary.replace(path)
+        except RuntimeError as error:
+            raise ImageError(f"{path.name}: cannot be written ({_last_line(error)})") from error
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
 
 
 def _simpleitk() -> Any:

@@ -102,7 +102,9 @@ def _read_vtp(path: Path) -> Any:
     finally:
         pyvista.vtk_verbosity(shown)
     triangles = surface.faces.reshape(-1, 4)[:, 1:]
-    return _meshio().Mesh(surface.points, [("triangle", triangles)] if len(triangles) else [])
+    values = {name: np.asarray(surface.point_data[name]) for name in surface.point_data}
+    cells = [("triangle", triangles)] if len(triangles) else []
+    return _meshio().Mesh(surface.points, cells, point_data=values)
 
 
 def _refuse_headless(path: Path) -> None:

@@ -2,10 +2,9 @@
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +24,6 @@ __all__ = [
     "surface_suffixes",
     "write_surface",
 ]
-
-
-@dataclass(frozen=True)
-class _Weld:
-    """Which vertices of a file were kept when equal ones became one."""
-
-    n_read: int
-    kept: NDArray[np.intp]
 
 
 def read_surface(
@@ -72,7 +63,7 @@ def read_surface(
     """
     check_one_of("units", units, tuple(UNITS))
     check_one_of("frame", frame, FRAMES)
-    surface = read_triangles(Path(path), crease_angle)[0]
+    surface = read_triangles(Path(path), crease_angle)
     if units == "mm" and frame == "LPS":
         return surface
     # RAS to LPS is half a turn about the long axis: triangles keep their orientation.
@@ -106,7 +97,7 @@ def read_moved_surface(
     FileNotFoundError
         A file does not exist.
     CaseError
-        (also `ValueError`) Not surfaces, another number of vertices.
+        (also `ValueError`) Not surfaces; other vertices or triangles; a vertex that is not finite.
 
     Examples
     --------
@@ -116,35 +107,75 @@ def read_moved_surface(
     check_one_of("units", units, tuple(UNITS))
     check_one_of("frame", frame, FRAMES)
     scale = UNITS[units] * np.array([-1.0, -1.0, 1.0] if frame == "RAS" else [1.0, 1.0, 1.0])
-    surface, weld = read_triangles(Path(before))
-    moved = np.asarray(read_mesh(Path(after)).points, dtype=np.float64)
-    if len(moved) != weld.n_read:
-        raise CaseInputError(
-            f"{Path(after).name} has {len(moved)} vertices, {Path(before).name} {weld.n_read}: the "
-            "same vertices in the same order are needed"
-        )
-    rest = SurfaceData(
-        np.asarray(surface.vertices) * scale, surface.triangles, surface.crease_angle
+    (here, triangles), (there, moved_triangles) = (
+        _numbered(Path(path)) for path in (before, after)
     )
-    return MovedSurface(rest, moved[weld.kept] * scale)
+    names = f"{Path(after).name} has {{}}, {Path(before).name} {{}}"
+    for what, a, b in (
+        ("vertices", len(there), len(here)),
+        ("triangles", len(moved_triangles), len(triangles)),
+    ):
+        if a != b:
+            raise CaseInputError(f"{names.format(f'{a} {what}', b)}: {SAME_NEEDED}")
+    other_corners = np.flatnonzero((triangles != moved_triangles).any(axis=1))
+    if len(other_corners):
+        first = int(other_corners[0])
+        raise CaseInputError(
+            f"{names.format(f'triangle {first} at other vertices', 'at its own')}: {SAME_NEEDED}"
+        )
+    if not np.isfinite(there).all():
+        vertex = int(np.flatnonzero(~np.isfinite(there).all(axis=1))[0])
+        raise CaseInputError(f"{Path(after).name}: vertex {vertex} is not finite")
+    # One place with two motions is two vertices: there the bone was cut.
+    kept, number = _welded(np.concatenate([here, there], axis=1))
+    rest = SurfaceData(here[kept] * scale, number[triangles])
+    return MovedSurface(rest, there[kept] * scale)
 
 
-def read_triangles(path: Path, crease_angle: float = 60.0) -> tuple[SurfaceData, _Weld]:
+SAME_NEEDED = (
+    "the same vertices and triangles in the same order are needed; where the bone was segmented or "
+    'remeshed anew, name it in [postoperative.bones] and write plan = "achieved", which lays the '
+    "bone before on the one after"
+)
+
+
+def read_triangles(path: Path, crease_angle: float = 60.0) -> SurfaceData:
     """A surface with vertices in the same place made one: STL repeats them for each triangle."""
     mesh = read_mesh(path)
+    triangles = _triangles(mesh, path)
+    points = np.asarray(mesh.points)
+    kept, number = _welded(points)
+    return SurfaceData(points[kept], number[triangles], crease_angle)
+
+
+def _numbered(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The vertices and triangles of a file as it numbers them; STL has corners alone."""
+    mesh = read_mesh(path)
+    triangles = _triangles(mesh, path)
+    points = np.asarray(mesh.points, dtype=np.float64)
+    if path.suffix.lower() == ".stl":
+        points = points[triangles].reshape(-1, 3)
+        triangles = np.arange(len(points)).reshape(-1, 3)
+    return points, triangles
+
+
+def _triangles(mesh: Any, path: Path) -> NDArray[np.int64]:
+    """The triangles of a mesh that has nothing else."""
     triangles = [b.data for b in mesh.cells if b.type == "triangle"]
     if not triangles or any(b.type not in {"triangle", "vertex", "line"} for b in mesh.cells):
         found = ", ".join(sorted({b.type for b in mesh.cells})) or "nothing"
         raise CaseInputError(f"{path.name}: a surface of triangles is needed, found {found}")
-    points = np.asarray(mesh.points)
-    _, first, back = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    return np.concatenate(triangles).astype(np.int64)
+
+
+def _welded(rows: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+    """The rows that are kept when equal ones become one, and the number each row then has."""
+    _, first, back = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     # In the order of the file, so that a surface without repetitions keeps its numbers.
     order = np.argsort(first)
     number = np.empty(len(first), dtype=np.int64)
     number[order] = np.arange(len(first))
-    kept = first[order]
-    welded = number[back.reshape(-1)][np.concatenate(triangles)]
-    return SurfaceData(points[kept], welded, crease_angle), _Weld(len(points), kept)
+    return first[order], number[back.reshape(-1)]
 
 
 def write_surface(path: str | os.PathLike[str], surface: SurfaceData) -> None:

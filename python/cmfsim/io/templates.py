@@ -4,11 +4,11 @@ A survey reads as much as it can and lists everything that is wrong; reading ref
 """
 
 import contextlib
+import glob
 import json
 import os
 import re
 import shutil
-import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +20,7 @@ from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.curves import read_curves, write_curves
 from cmfsim.io.files import FORMAT_VERSION, beside, named
 from cmfsim.io.landmarks import read_landmark_file, write_landmarks
+from cmfsim.io.leftovers import abandoned, temporary_folder
 from cmfsim.io.surfaces import read_surface, write_surface
 from cmfsim.io.tables import Table, read_tables
 from cmfsim.io.template_archives import (
@@ -351,21 +352,27 @@ def _replacing_folder(folder: Path) -> Iterator[Path]:
     folder = Path.cwd() / folder
     _refuse_foreign(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
-        new, old = fresh / "new", fresh / "old"
-        new.mkdir()
-        yield new
-        if folder.exists():
-            folder.replace(old)
+    prefix = f".{folder.name}.writing-"
+    for left in abandoned(folder.parent, f"{glob.escape(prefix)}*"):
+        # Killed between the two renames below: the old folder comes back.
+        if (left / "old").exists() and not folder.exists():
+            (left / "old").replace(folder)
+        shutil.rmtree(left, ignore_errors=True)
+    with temporary_folder(folder.parent, prefix) as fresh:
         try:
-            new.replace(folder)
-        except BaseException:
-            if old.exists():
-                old.replace(folder)
-            raise
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
+            new, old = fresh / "new", fresh / "old"
+            new.mkdir()
+            yield new
+            if folder.exists():
+                folder.replace(old)
+            try:
+                new.replace(folder)
+            except BaseException:
+                if old.exists():
+                    old.replace(folder)
+                raise
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
 
 
 # What templates and their reports are written as.

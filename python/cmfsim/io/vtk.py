@@ -20,6 +20,7 @@ VTK_TYPES = {
     "float64": "Float64",
     "float32": "Float32",
     "uint32": "UInt32",
+    "int32": "Int32",
     "int64": "Int64",
     "uint8": "UInt8",
 }
@@ -78,8 +79,8 @@ def write_triangles(
         f'NumberOfStrips="0" NumberOfPolys="{len(polys)}">'
         f"<Points>{data_array('points', points)}</Points>"
         f"<PointData>{_arrays(point_data)}</PointData>"
-        f"<Polys>{data_array('connectivity', polys.reshape(-1).astype(np.int64))}"
-        f"{data_array('offsets', 3 * np.arange(1, len(polys) + 1, dtype=np.int64))}</Polys></Piece>"
+        f"<Polys>{data_array('connectivity', polys.reshape(-1).astype(np.int32))}"
+        f"{data_array('offsets', 3 * np.arange(1, len(polys) + 1, dtype=np.int32))}</Polys></Piece>"
     )
     write_vtk(file, "PolyData", body)
 

@@ -1,7 +1,7 @@
 """From labels, levels or surfaces to tets, with a report of their quality."""
 
 from cmfsim.meshing.levels import anatomy_from_surfaces, signed_level
-from cmfsim.meshing.quality import MeshReport, mesh_findings, mesh_report
+from cmfsim.meshing.quality import MeshReport, mesh_findings, mesh_report, report_of_part
 from cmfsim.meshing.stuffing import (
     MeshOptions,
     TissueMesh,
@@ -25,6 +25,7 @@ __all__ = [
     "mesh_with_tetwild",
     "near_skin",
     "part_mesh",
+    "report_of_part",
     "signed_level",
     "tissue_level",
 ]

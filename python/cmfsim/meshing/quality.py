@@ -1,7 +1,7 @@
 """What a mesh is worth: shapes, volume and boundary, in figures that a report can print."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from cmfsim._core import TetMesh
 from cmfsim.case import Finding
 
-__all__ = ["LEAST_DIHEDRAL", "MeshReport", "mesh_findings", "mesh_report"]
+__all__ = ["LEAST_DIHEDRAL", "MeshReport", "mesh_findings", "mesh_report", "report_of_part"]
 
 # Smallest dihedral angle that a tet of a good mesh has, degrees; below, the stiffness matrix loses
 # digits and the deformation of the tet its meaning.
@@ -155,6 +155,19 @@ def mesh_report(mesh: TetMesh, making: Mapping[str, Any] | None = None) -> MeshR
         dropped_parts=int(making.get("dropped_parts", 0)),
         dropped_volume=float(making.get("dropped_volume", 0.0)),
         dropped_tets=int(making.get("dropped_tets", 0)),
+    )
+
+
+def report_of_part(part: TetMesh, whole: MeshReport) -> MeshReport:
+    """The quality of a mesh of which tets were left out, with what the making of the whole said."""
+    return replace(
+        mesh_report(part),
+        volume_error=whole.volume_error,
+        boundary_error_mean=whole.boundary_error_mean,
+        boundary_error_max=whole.boundary_error_max,
+        dropped_parts=whole.dropped_parts,
+        dropped_volume=whole.dropped_volume,
+        dropped_tets=whole.dropped_tets,
     )
 
 

@@ -135,8 +135,8 @@ def classify_nodes(
     part[slides] = SLIDING
     part[on_plane] = FIXED
     kind[border.ids] = part
-    held = np.isin(part, (JOINED, SLIDING))
-    owner[border.ids[held]] = nearest[held]
+    lies = on_bone & ~on_plane
+    owner[border.ids[lies]] = nearest[lies]
     kinds = NodeKinds(kind, owner, names)
     counts = {n: len(kinds.nodes(n)) for n in NODE_KINDS}
     for name in names:

@@ -1,6 +1,7 @@
 """Bone segments from bones: cutting planes, standard procedures, the pieces and their surfaces."""
 
 from cmfsim.osteotomy.cutting import CutBones, CutOptions, cut_bones, segments_from_surfaces
+from cmfsim.osteotomy.parting import part_segment
 from cmfsim.osteotomy.planes import Cut, CuttingPlane, Procedure, free_cut
 from cmfsim.osteotomy.procedures import PROCEDURES, place_procedure, procedure_options
 from cmfsim.osteotomy.surfaces import SurfaceOptions, contact_surface, surface_of_level
@@ -16,6 +17,7 @@ __all__ = [
     "contact_surface",
     "cut_bones",
     "free_cut",
+    "part_segment",
     "place_procedure",
     "procedure_options",
     "segments_from_surfaces",

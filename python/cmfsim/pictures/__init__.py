@@ -3,28 +3,35 @@
 from cmfsim.pictures.anatomy import (
     KIND_COLOURS,
     SEGMENT_COLOURS,
+    SKIN_COLOUR,
     picture_anatomy,
     picture_node_kinds,
     picture_segments,
+    segment_colours,
 )
 from cmfsim.pictures.charts import MODEL_COLOURS, chart_errors
 from cmfsim.pictures.distances import DISTANCE_LIMIT, distance_colour, picture_distances
 from cmfsim.pictures.faces import picture_plan, picture_prediction
-from cmfsim.pictures.muscles import picture_muscle_names, picture_muscles
+from cmfsim.pictures.muscles import picture_muscles
+from cmfsim.pictures.window import ViewPart, has_screen, view_parts
 
 __all__ = [
     "DISTANCE_LIMIT",
     "KIND_COLOURS",
     "MODEL_COLOURS",
     "SEGMENT_COLOURS",
+    "SKIN_COLOUR",
+    "ViewPart",
     "chart_errors",
     "distance_colour",
+    "has_screen",
     "picture_anatomy",
     "picture_distances",
-    "picture_muscle_names",
     "picture_muscles",
     "picture_node_kinds",
     "picture_plan",
     "picture_prediction",
     "picture_segments",
+    "segment_colours",
+    "view_parts",
 ]

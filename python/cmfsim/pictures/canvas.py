@@ -25,9 +25,21 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError
 
-__all__ = ["LEGEND_ROW", "SIZE", "View", "bounds", "draw", "polydata"]
+__all__ = [
+    "LEGEND_ROW",
+    "SIZE",
+    "View",
+    "bounds",
+    "check_can_draw",
+    "draw",
+    "look_at",
+    "polydata",
+    "pyvista_module",
+    "silent_vtk",
+    "write_picture",
+]
 
-SIZE = (1600, 900)
+SIZE = (1650, 820)
 # Where the camera stands, as a direction from the head, in LPS.
 DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
     {
@@ -75,30 +87,30 @@ def draw(
     size: tuple[int, int],
     paint: Callable[[Any, View], None],
     legend: Sequence[tuple[str, str]],
+    columns: int | None = None,
 ) -> None:
-    """Writes the views side by side, under a temporary name first."""
+    """Writes the views side by side, in rows of `columns`, under a temporary name first."""
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise CaseInputError(f"{path.name}: a picture is written as .png, not {path.suffix!r}")
     width, height = (int(as_positive("picture size", n)) for n in size)
-    pv = _pyvista()
-    if not _candraw():
-        raise CaseInputError(
-            f"{path.name}: the picture cannot be drawn (OpenGL does not work); {NO_OPENGL}"
-        )
+    pv = pyvista_module()
+    check_can_draw(path.name)
     # One scale for all views.
-    half = max(_half_height(view, corners, width / len(views), height) for view in views)
+    columns = columns or len(views)
+    rows = -(-len(views) // columns)
+    half = max(_half_height(view, corners, width / columns, height / rows) for view in views)
     try:
         # PyVista and VTK warn of missing screens; whether the picture was made decides here.
-        with _silent_vtk(), warnings.catch_warnings():
+        with silent_vtk(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             plotter = pv.Plotter(
-                off_screen=True, shape=(1, len(views)), window_size=[width, height], border=False
+                off_screen=True, shape=(rows, columns), window_size=[width, height], border=False
             )
             try:
                 plotter.enable_anti_aliasing("ssaa")
-                for column, view in enumerate(views):
-                    plotter.subplot(0, column)
+                for place, view in enumerate(views):
+                    plotter.subplot(*divmod(place, columns))
                     plotter.set_background("white")
                     _place_camera(plotter, view, corners, half)
                     paint(plotter, view)
@@ -122,6 +134,11 @@ def draw(
     for top, colour in swatches:
         image[top - 1 : top + 19, 11:31] = 90
         image[top : top + 18, 12:30] = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+    write_picture(path, image)
+
+
+def write_picture(path: Path, image: NDArray[np.uint8]) -> None:
+    """Writes an (h, w, 3) image as PNG, under a temporary name first."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         temporary.write_bytes(_png(image))
@@ -148,6 +165,11 @@ def _half_height(view: View, corners: Floats, width: float, height: float) -> fl
     return MARGIN * float(max(upright, np.abs(box @ across).max() * height / width))
 
 
+def look_at(plotter: Any, view: View, corners: Floats, aspect: float) -> None:
+    """Places the camera so that the whole box is seen in a window of this width to height."""
+    _place_camera(plotter, view, corners, _half_height(view, corners, aspect, 1.0))
+
+
 def _place_camera(plotter: Any, view: View, corners: Floats, half_height: float) -> None:
     """Looks at the middle of the box in parallel projection."""
     middle = corners.mean(axis=0)
@@ -165,8 +187,9 @@ def _place_camera(plotter: Any, view: View, corners: Floats, half_height: float)
 def _png(image: NDArray[np.uint8]) -> bytes:
     """The bytes of a PNG file of an (h, w, 3) image, the same for the same image."""
     height, width, _ = image.shape
-    rows = np.zeros((height, 1 + 3 * width), dtype=np.uint8)
-    rows[:, 1:] = image.reshape(height, -1)
+    # Each row as its difference from the one above (filter 2): shaded surfaces shrink by half.
+    rows = np.full((height, 1 + 3 * width), 2, dtype=np.uint8)
+    rows[:, 1:] = np.diff(image.reshape(height, -1), axis=0, prepend=np.uint8(0))
 
     def chunk(name: bytes, data: bytes) -> bytes:
         check = zlib.crc32(name + data)
@@ -194,9 +217,23 @@ def bounds(clouds: Sequence[ArrayLike]) -> Floats:
 
 def polydata(vertices: ArrayLike, triangles: ArrayLike) -> Any:
     """A triangle surface as PyVista has it."""
-    return _pyvista().PolyData.from_regular_faces(
+    return pyvista_module().PolyData.from_regular_faces(
         np.asarray(vertices, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
     )
+
+
+def check_can_draw(name: str) -> None:
+    """Refuses to draw where OpenGL does not work: VTK would end the process.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) It does not.
+    """
+    if not _candraw():
+        raise CaseInputError(
+            f"{name}: the picture cannot be drawn (OpenGL does not work); {NO_OPENGL}"
+        )
 
 
 @cache
@@ -220,7 +257,7 @@ def _candraw() -> bool:
 
 
 @contextlib.contextmanager
-def _silent_vtk() -> Iterator[None]:
+def silent_vtk() -> Iterator[None]:
     """Keeps VTK's warnings, as of a screen that is not there, off the standard error."""
     logger = import_module("vtkmodules.vtkCommonCore").vtkLogger
     before = logger.GetCurrentVerbosityCutoff()
@@ -231,7 +268,8 @@ def _silent_vtk() -> Iterator[None]:
         logger.SetStderrVerbosity(before)
 
 
-def _pyvista() -> Any:
+def pyvista_module() -> Any:
+    """PyVista, of the extra `view`; a named error where it cannot be imported."""
     try:
         return import_module("pyvista")
     except ImportError as error:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.checks import Floats, as_floats, as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
+from cmfsim.pictures.skin_ends import skin_ends, trimmed
 from cmfsim.scene import SurfaceData
 
 __all__ = ["DISTANCE_LIMIT", "distance_colour", "picture_distances"]
@@ -69,7 +70,8 @@ def picture_distances(
     vertices = np.asarray(skin.vertices)
     values, shown = _values(distances, len(vertices))
     low, high = bounds([vertices[shown]])
-    corners = np.array([low - MARGIN * (high - low), high + MARGIN * (high - low)])
+    ends = skin_ends(skin)
+    corners = ends.within(np.array([low - MARGIN * (high - low), high + MARGIN * (high - low)]))
     legend = [
         (f"{name} {mean:+.2f} mm", distance_colour(mean, limit))
         for name, mean in (regions or {}).items()
@@ -81,6 +83,7 @@ def picture_distances(
     def paint(plotter: Any, view: View) -> None:
         surface = polydata(vertices, skin.triangles)
         surface["distance"] = np.where(shown, values, np.nan)
+        surface = trimmed(surface, ends)
         last = view.direction == "left"
         plotter.add_mesh(
             surface,

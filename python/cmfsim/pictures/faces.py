@@ -6,27 +6,31 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.case import BoneSegment
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
 from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
+from cmfsim.pictures.skin_ends import skin_ends, trimmed
 from cmfsim.prediction import Prediction
-from cmfsim.scene import MovedSurface, SurfaceData
+from cmfsim.scene import SurfaceData
 
 __all__ = ["picture_plan", "picture_prediction"]
 
-# Of pictures with six views, pixels.
-WIDE = (2400, 700)
+# Of six views in two rows, pixels.
+TWO_ROWS = (1650, 1240)
+# Skin shines a little.
+SKIN_SHADING = {"smooth_shading": True, "ambient": 0.12, "specular": 0.12, "specular_power": 12}
 # Movement that fills the colour scale at least, mm.
 LEAST_SCALE = 0.01
 # Of bone where it was before the operation.
 GHOST_COLOUR = "#7f8c9a"
+# A segment that moves less than this, mm, is drawn where it was: two surfaces in one place flicker.
+STAYS = 0.5
 
 
 def picture_prediction(
     path: str | os.PathLike[str],
     prediction: Prediction,
     *,
-    size: tuple[int, int] = WIDE,
+    size: tuple[int, int] = TWO_ROWS,
 ) -> None:
     """Writes a picture of a face before and after, and how far each point of it moves.
 
@@ -47,31 +51,49 @@ def picture_prediction(
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_prediction("prediction.png", prediction)  # doctest: +SKIP
     """
-    before, after = prediction.skin_before, prediction.skin
-    moved = np.linalg.norm(prediction.skin_displacements, axis=1)
+    before, after = prediction.face_before, prediction.face
+    moved = np.linalg.norm(np.asarray(after.vertices) - np.asarray(before.vertices), axis=1)
     largest = max(float(moved.max()), LEAST_SCALE)
+    ends = skin_ends(prediction.skin_before)
 
     def paint(plotter: Any, view: View) -> None:
         surface = before if view.caption.startswith("before") else after
         shape = polydata(surface.vertices, surface.triangles)
+        shape.point_data["movement"] = moved
+        shape = trimmed(shape, ends)
         if not view.caption.startswith("movement"):
-            plotter.add_mesh(shape, color=SKIN_COLOUR, smooth_shading=True)
+            plotter.add_mesh(shape, color=SKIN_COLOUR, **SKIN_SHADING)
             return
-        shape.point_data["movement, mm"] = moved
         plotter.add_mesh(
             shape,
-            scalars="movement, mm",
+            scalars="movement",
             clim=(0.0, largest),
             cmap="viridis",
             smooth_shading=True,
-            show_scalar_bar=view.direction == "front",
-            scalar_bar_args={"n_labels": 4, "fmt": "%.1f", "color": "black"},
+            ambient=0.3,
+            show_scalar_bar=False,
         )
+        if view.direction == "left":
+            bar = plotter.add_scalar_bar(
+                title="mm",
+                n_labels=4,
+                fmt="%.1f",
+                vertical=True,
+                position_x=0.89,
+                position_y=0.25,
+                width=0.09,
+                height=0.5,
+                color="black",
+                title_font_size=16,
+                label_font_size=14,
+            )
+            bar.SetUnconstrainedFontSize(True)  # noqa: FBT003 (VTK's own signature)
 
     names = ("before", "after", "movement")
     views = tuple(View(d, f"{name}, {d}") for d in ("front", "left") for name in names)
     corners = bounds([before.vertices, after.vertices])
-    draw(path, views, corners, size, paint, [])
+    corners = ends.within(corners)
+    draw(path, views, corners, size, paint, [], columns=len(names))
 
 
 def picture_plan(
@@ -99,30 +121,26 @@ def picture_plan(
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_plan("plan.png", prediction)  # doctest: +SKIP
     """
-    segments = prediction.patient.segments
-    moved = [replace(s, surface=_moved(s, prediction.scene.plan.get(s.name))) for s in segments]
+    segments, after = prediction.patient.segments, prediction.bones
+    moved = [
+        replace(s, surface=SurfaceData(after[s.name][1], after[s.name][0].triangles))
+        for s in segments
+    ]
+    shifts = {
+        name: np.linalg.norm(vertices - np.asarray(surface.vertices), axis=1)
+        for name, (surface, vertices) in after.items()
+    }
+    still = {name for name, shift in shifts.items() if np.quantile(shift, 0.99) < STAYS}
     colours = segment_colours([s.name for s in segments])
     corners = bounds([np.asarray(s.surface.vertices) for s in (*segments, *moved)])
 
     def paint(plotter: Any, view: View) -> None:
         del view
-        for before, after in zip(segments, moved, strict=True):
-            add_bone(plotter, after, colours[after.name])
-            if before.surface is not after.surface:
+        for before, now in zip(segments, moved, strict=True):
+            add_bone(plotter, now, colours[now.name])
+            if now.name not in still:
                 shape = polydata(before.surface.vertices, before.surface.triangles)
                 plotter.add_mesh(shape, color=GHOST_COLOUR, opacity=0.3, smooth_shading=True)
 
     views = tuple(View(name, name) for name in ("right", "front", "left"))
     draw(path, views, corners, size, paint, [*colours.items(), ("before", GHOST_COLOUR)])
-
-
-def _moved(segment: BoneSegment, motion: object) -> SurfaceData:
-    """A segment's surface where its motion takes it; the same surface where it stays."""
-    surface = segment.surface
-    if isinstance(motion, MovedSurface):
-        return SurfaceData(motion.moved_vertices, motion.surface.triangles)
-    matrix = np.eye(4) if motion is None else np.asarray(motion, dtype=np.float64)
-    if matrix.shape != (4, 4) or np.array_equal(matrix, np.eye(4)):
-        return surface
-    vertices = np.asarray(surface.vertices) @ matrix[:3, :3].T + matrix[:3, 3]
-    return SurfaceData(vertices, surface.triangles, surface.crease_angle)

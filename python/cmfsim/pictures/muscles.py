@@ -1,7 +1,4 @@
-"""Pictures of muscles: with their names, or with fibre boxes and directions.
-
-The latter after Kim et al. (2010), Figure 2.
-"""
+"""Pictures of muscles: with their names, or with fibre boxes and directions."""
 
 import colorsys
 import os
@@ -16,7 +13,7 @@ from cmfsim.musculature import MuscleSurface, Musculature
 from cmfsim.pictures.canvas import LEGEND_ROW, SIZE, View, bounds, draw, polydata
 from cmfsim.scene import SurfaceData
 
-__all__ = ["picture_muscle_names", "picture_muscles"]
+__all__ = ["add_muscle", "picture_muscles"]
 
 MUSCLE_COLOUR, BONE_COLOUR = "#b8564b", "#e6dcc3"
 # Boxes whose direction the outline hardly tells are drawn in the second colour.
@@ -32,73 +29,14 @@ def picture_muscles(
     musculature: Musculature,
     skull: SurfaceData | None = None,
     *,
+    fibres: bool = False,
     size: tuple[int, int] = SIZE,
 ) -> None:
-    """Writes a picture of muscles with boxes and fibre directions: front, left front and left.
+    """Writes a picture of muscles: in colours with their names, or with their fibres.
 
-    Boxes of muscles whose outline hardly tells the direction are orange, others blue. Where fibre
-    lines are known the directions follow them.
-
-    Parameters
-    ----------
-    path : path
-        Ends in `.png`.
-    musculature : Musculature
-    skull : SurfaceData or None
-        Drawn behind the muscles.
-    size : (int, int), pixels
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) PyVista or OpenGL is missing, no muscle, another ending.
-    MeshError
-        (also `ValueError`) A muscle's surface that cannot be used.
-
-    Examples
-    --------
-    >>> import cmfsim.pictures
-    >>> cmfsim.pictures.picture_muscles("muscles.png", muscles)  # doctest: +SKIP
-    """
-    if not len(musculature):
-        raise CaseInputError("there is no muscle to draw")
-    clouds = [np.asarray(muscle.surface.vertices) for muscle in musculature]
-    if skull is not None:
-        clouds.append(np.asarray(skull.vertices))
-    corners = bounds(clouds)
-    length = STROKE * float(np.linalg.norm(corners[1] - corners[0]))
-    drawn = [(muscle, *_lines(muscle, length)) for muscle in musculature]
-
-    def paint(plotter: Any, view: View) -> None:
-        del view
-        if skull is not None:
-            plotter.add_mesh(polydata(skull.vertices, skull.triangles), color=BONE_COLOUR)
-        for muscle, strokes, edges, colour in drawn:
-            surface = polydata(muscle.surface.vertices, muscle.surface.triangles)
-            plotter.add_mesh(surface, color=MUSCLE_COLOUR, smooth_shading=True, ambient=0.2)
-            plotter.add_lines(strokes, color=LINE_COLOUR, width=2)
-            plotter.add_lines(edges, color=colour, width=1)
-
-    views = tuple(View(name, name) for name in ("front", "left front", "left"))
-    legend = [
-        ("muscle", MUSCLE_COLOUR),
-        ("fibre direction", LINE_COLOUR),
-        ("box", BOX_COLOUR),
-        ("box of a sheet", SHEET_COLOUR),
-    ]
-    draw(path, views, corners, size, paint, legend)
-
-
-def picture_muscle_names(
-    path: str | os.PathLike[str],
-    musculature: Musculature,
-    skull: SurfaceData | None = None,
-    *,
-    size: tuple[int, int] = SIZE,
-) -> None:
-    """Writes a picture of muscles in colours with their names: from the front and the left.
-
-    Muscles of both sides that are called alike have one colour.
+    In colours, from the front and the left, muscles of both sides that are called alike have one
+    colour. With fibres, boxes of muscles whose outline hardly tells the direction are orange,
+    others blue; where fibre lines are known the directions follow them.
 
     Parameters
     ----------
@@ -107,44 +45,77 @@ def picture_muscle_names(
     musculature : Musculature
     skull : SurfaceData, optional
         Drawn with them, such as the patient's bones.
+    fibres : bool
+        Whether to draw boxes and directions (Kim et al. 2010, Figure 2) instead of names.
     size : (int, int), pixels
 
     Raises
     ------
     CaseError
         (also `ValueError`) PyVista or OpenGL is missing, no muscle, another ending.
+    MeshError
+        (also `ValueError`) A muscle's surface that cannot be used for fibres.
 
     Examples
     --------
     >>> import cmfsim, cmfsim.pictures
     >>> template = cmfsim.MuscleTemplate.load("default")
-    >>> cmfsim.pictures.picture_muscle_names(
+    >>> cmfsim.pictures.picture_muscles(
     ...     "muscles.png", template.musculature, template.skull
     ... )  # doctest: +SKIP
     """
     if not len(musculature):
         raise CaseInputError("there is no muscle to draw")
-    names = list(dict.fromkeys(_without_side(muscle.name) for muscle in musculature))
-    colours = {name: _hue(number) for number, name in enumerate(names)}
-    drawn = [np.asarray(muscle.surface.vertices) for muscle in musculature]
-    corners = bounds(drawn if skull is None else [*drawn, np.asarray(skull.vertices)])
+    clouds = [np.asarray(muscle.surface.vertices) for muscle in musculature]
+    corners = bounds(clouds if skull is None else [*clouds, np.asarray(skull.vertices)])
 
-    def paint(plotter: Any, view: View) -> None:
-        if not view.caption:
-            return
+    def paint_skull(plotter: Any) -> None:
         if skull is not None:
             shape = polydata(skull.vertices, skull.triangles)
             plotter.add_mesh(shape, color=BONE_COLOUR, smooth_shading=True)
+
+    if fibres:
+        length = STROKE * float(np.linalg.norm(corners[1] - corners[0]))
+        drawn = [(muscle, *_lines(muscle, length)) for muscle in musculature]
+
+        def paint_fibres(plotter: Any, view: View) -> None:
+            del view
+            paint_skull(plotter)
+            for muscle, strokes, edges, colour in drawn:
+                add_muscle(plotter, muscle, MUSCLE_COLOUR)
+                plotter.add_lines(strokes, color=LINE_COLOUR, width=2)
+                plotter.add_lines(edges, color=colour, width=1)
+
+        legend = [
+            ("muscle", MUSCLE_COLOUR),
+            ("fibre direction", LINE_COLOUR),
+            ("box", BOX_COLOUR),
+            ("box of a sheet", SHEET_COLOUR),
+        ]
+        views = tuple(View(name, name) for name in ("front", "left front", "left"))
+        draw(path, views, corners, size, paint_fibres, legend)
+        return
+
+    names = list(dict.fromkeys(_without_side(muscle.name) for muscle in musculature))
+    colours = {name: _hue(number) for number, name in enumerate(names)}
+
+    def paint_names(plotter: Any, view: View) -> None:
+        if not view.caption:
+            return
+        paint_skull(plotter)
         for muscle in musculature:
-            shape = polydata(muscle.surface.vertices, muscle.surface.triangles)
-            colour = colours[_without_side(muscle.name)]
-            plotter.add_mesh(shape, color=colour, smooth_shading=True, ambient=0.15)
+            add_muscle(plotter, muscle, colours[_without_side(muscle.name)])
 
     # The legend stands beside the heads, not on them.
-    blank = View("front", "")
-    views = (blank, View("front", "front"), View("left", "left"))
+    views = (View("front", ""), View("front", "front"), View("left", "left"))
     rows = int(size[1]) // LEGEND_ROW - 1
-    draw(path, views, corners, size, paint, list(colours.items())[:rows])
+    draw(path, views, corners, size, paint_names, list(colours.items())[:rows])
+
+
+def add_muscle(plotter: Any, muscle: MuscleSurface, colour: str) -> None:
+    """Adds a muscle in a colour to a view."""
+    shape = polydata(muscle.surface.vertices, muscle.surface.triangles)
+    plotter.add_mesh(shape, color=colour, smooth_shading=True, ambient=0.15)
 
 
 def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:

@@ -20,12 +20,15 @@ PICTURES: Mapping[str, str] = {
     "prediction": "The face before the operation and as predicted after it, and how far it moves.",
     "plan": "The plan: bone segments where they are moved to, and before as outlines.",
     "muscles": "The muscles, carried from the template to the skull by its landmarks.",
-    "error": "Signed distance of the prediction from the face after the operation, −5 to 5 mm: "
-    "blue where the prediction lies behind it.",
     "anatomy": "Skin and bone segments.",
     "node_kinds": "Kinds of node (Kim et al. 2010, Figure 4): fixed pink, joined orange, sliding "
     "blue, free white.",
 }
+
+NO_PICTURES = (
+    "Without pictures: none could be drawn where this was made. PyVista and OpenGL draw them "
+    "(pip install 'cmfsim[view]'; Debian: libgl1, libegl1)."
+)
 
 
 def case_document(
@@ -56,9 +59,10 @@ def case_document(
     pictures = pictures or {}
     models = ", ".join(entry["model"] for entry in predictions)
     sections = [
+        *_note_section(first),
         _prediction_section(predictions, pictures),
         _plan_section(first, pictures),
-        *_evaluation_sections(evaluation, pictures, figures),
+        *_evaluation_sections(evaluation, figures),
         *_muscle_section(predictions, pictures),
         _model_section(predictions, pictures),
         _time_section(predictions),
@@ -90,6 +94,12 @@ def _facts(prediction: Values, evaluation: Values | None) -> dict[str, str]:
     return facts
 
 
+def _note_section(prediction: Values) -> list[Section]:
+    """What the case's own note says of it."""
+    note = prediction.get("note")
+    return [Section("About this case", (Note(note, "warning"),))] if note else []
+
+
 def _prediction_section(predictions: Sequence[Values], pictures: Mapping[str, bytes]) -> Section:
     rows = tuple(
         (
@@ -101,11 +111,15 @@ def _prediction_section(predictions: Sequence[Values], pictures: Mapping[str, by
         for entry in predictions
     )
     table = Table(("model", "mean", "95 %", "largest"), rows, "How far the skin moves, mm.")
-    return Section("Prediction", (*_picture("prediction", pictures), table))
+    drawn: Sequence[Figure | Note] = [
+        Figure(figure.image, f"{figure.caption} Model {predictions[-1]['model']}.")
+        for figure in _picture("prediction", pictures)
+    ]
+    return Section("Prediction", (*(drawn or (Note(NO_PICTURES, "warning"),)), table))
 
 
 def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
-    rows = []
+    rows, bent = [], []
     for name, motion in prediction["plan"].items():
         if "translation" in motion:
             cells = [*motion["translation"], motion["angle"]]
@@ -114,20 +128,45 @@ def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
             rows.append((name, *(number(value) for value in cells), axis))
         else:
             rows.append((name, "surface", "", "", "", f"mean {number(motion['mean'])} mm"))
+        if "bending" in motion:
+            bent.append(f"{name} ({number(motion['bending'])} mm rms)")
     table = Table(
         ("segment", "L", "P", "S", "turn, °", "axis (L, P, S)"),
         tuple(rows),
         "Motion of each bone segment: that of its centre, mm, and the turn about it.",
     )
-    return Section("Plan", (*_picture("plan", pictures), table))
+    notes = []
+    if bent:
+        notes.append(
+            Note(
+                "Moved vertex by vertex, with the nearest rigid motion in the table and what it "
+                f"leaves: {', '.join(bent)}."
+            )
+        )
+    return Section(
+        "Plan", (*_picture("plan", pictures), table, *notes, *_achieved(prediction.get("achieved")))
+    )
 
 
-def _evaluation_sections(
-    evaluation: Values | None, pictures: Mapping[str, bytes], figures: Sequence[Figure]
-) -> list[Section]:
+def _achieved(achieved: Values | None) -> list[Note | Table | Figure]:
+    """How well each segment was laid on the bone after the operation."""
+    if achieved is None:
+        return []
+    rows = tuple(
+        (name, number(found["rms_mm"]), number(found["worst_mm"]), f"{found['share']:.0%}")
+        for name, found in achieved["segments"].items()
+    )
+    caption = (
+        "The plan was read off the bones after the operation: what is left between each segment "
+        "and that bone, mm, and the share of its vertices that lie on it."
+    )
+    return [Table(("segment", "RMS", "largest", "share"), rows, caption)]
+
+
+def _evaluation_sections(evaluation: Values | None, figures: Sequence[Figure]) -> list[Section]:
     if evaluation is None:
         return []
-    blocks: list[Note | Table | Figure] = [*_picture("error", pictures)]
+    blocks: list[Note | Table | Figure] = [_mean_table(evaluation), *figures]
     for model, entry in evaluation["models"].items():
         blocks.append(
             statistics_table(
@@ -142,9 +181,28 @@ def _evaluation_sections(
                 "For comparison, the face before the operation taken as the prediction, mm.",
             )
         )
-    blocks += figures
     blocks += [Note(text) for text in evaluation.get("notes", ())]
     return [Section("Error", tuple(blocks))]
+
+
+def _mean_table(evaluation: Values) -> Table:
+    """Mean errors of every model by region."""
+    entries = dict(evaluation["models"])
+    if "no_change" in evaluation:
+        entries["no change"] = evaluation["no_change"]
+    regions = list(dict.fromkeys(r for entry in entries.values() for r in entry["regions"]))
+    rows = tuple(
+        (
+            region,
+            *(
+                number(entry["regions"].get(region, {}).get("mean_mm"))
+                for entry in entries.values()
+            ),
+        )
+        for region in regions
+    )
+    caption = "Mean distance from the face after the operation, mm, by region and model."
+    return Table(("region", *entries), rows, caption)
 
 
 def statistics_table(regions: Mapping[str, Values], caption: str) -> Table:
@@ -162,7 +220,7 @@ def statistics_table(regions: Mapping[str, Values], caption: str) -> Table:
         (
             name,
             *(number(values[key]) for key in keys),
-            number(values["signed_mean_mm"]),
+            f"{values['signed_mean_mm']:+.2f}",
             f"{100 * values['within']['2 mm']:.0f} %",
         )
         for name, values in regions.items()
@@ -233,12 +291,18 @@ def _finding_section(prediction: Values) -> Section:
     kinds = {"error": "error", "warning": "warning"}
     blocks = [
         Note(
-            f"{f['severity']}: {f['what']} ({f['where']}). {f['why']}; {f['mend']}.",
+            f"{f['severity']}: {f['what']} ({f['where']}). {_reason(f)}".rstrip(),
             kinds.get(f["severity"], "plain"),
         )
         for f in found
     ]
     return Section("Findings", tuple(blocks or [Note("Nothing was noticed.")]))
+
+
+def _reason(finding: Values) -> str:
+    """Why a finding matters and what mends it, as far as it says so."""
+    said = "; ".join(text for text in (finding["why"], finding["mend"]) if text)
+    return f"{said}." if said else ""
 
 
 def _input_section(prediction: Values) -> Section:

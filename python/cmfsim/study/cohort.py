@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io import Case, Cohort
+from cmfsim.io import Case, Cohort, finish_writing
 from cmfsim.study.evaluation import EVALUATION_FILE, evaluation_key
 
 __all__ = ["CaseJob", "CaseOutcome", "StudyReport", "run_study"]
@@ -21,6 +21,8 @@ __all__ = ["CaseJob", "CaseOutcome", "StudyReport", "run_study"]
 # Lines of a failed case's log that are shown.
 SHOWN_LINES = 12
 LOG_FILE = "log.txt"
+# In which a Dask scheduler must answer, s.
+ANSWER_TIME = 10.0
 
 
 @dataclass(frozen=True)
@@ -170,13 +172,21 @@ def run_study(
 def _kept(name: str, file: Path, output: Path, models: tuple[str, ...]) -> CaseOutcome | None:
     """The outcome of an earlier run, if nothing has changed since."""
     try:
+        finish_writing(output)
         written = json.loads((output / EVALUATION_FILE).read_text(encoding="utf-8"))
         key = evaluation_key(Case.load(file), models)
     except (OSError, ValueError, CmfsimError):
         return None
     if not isinstance(written, dict) or written.get("key") != key:
         return None
-    return CaseOutcome(name, "kept", evaluation=written)
+    return _outcome(name, "kept", 0.0, written)
+
+
+def _outcome(name: str, status: str, seconds: float, written: Mapping[str, Any]) -> CaseOutcome:
+    """The outcome of a case that was evaluated; failed if one of its models did."""
+    failed = written.get("failed") or {}
+    error = "\n".join(f"model {model}: {reason}" for model, reason in failed.items())
+    return CaseOutcome(name, "failed" if failed else status, seconds, error, written)
 
 
 def _on_this_machine(jobs: list[CaseJob], workers: int) -> Iterator[CaseOutcome]:
@@ -200,7 +210,7 @@ def _on_dask(jobs: list[CaseJob], scheduler: str) -> Iterator[CaseOutcome]:
             f"a study on a cluster needs Dask ({error}): pip install 'cmfsim[study]'"
         ) from error
     try:
-        client = distributed.Client(scheduler)
+        client = distributed.Client(scheduler, timeout=ANSWER_TIME)
     except (OSError, ValueError) as error:
         raise CaseInputError(f"no Dask scheduler answers at {scheduler!r}: {error}") from error
     with client:
@@ -225,6 +235,7 @@ def run_job(job: CaseJob) -> CaseOutcome:
     environment = {**os.environ, "RAYON_NUM_THREADS": str(job.threads)}
     try:
         output.mkdir(parents=True, exist_ok=True)
+        before = _stamp(output / EVALUATION_FILE)
         with (output / LOG_FILE).open("wb") as log:
             done = subprocess.run(  # noqa: S603 (this interpreter and our own words)
                 command,
@@ -235,13 +246,24 @@ def run_job(job: CaseJob) -> CaseOutcome:
                 check=False,
             )
         seconds = time.perf_counter() - begun
-        if done.returncode != 0:
+        # A case of which a model failed, or none, has written its figures all the same.
+        written = _stamp(output / EVALUATION_FILE) not in {before, None}
+        if done.returncode < 0 or not written:
             return CaseOutcome(job.name, "failed", seconds, _reason(done.returncode, output))
         evaluation = json.loads((output / EVALUATION_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         seconds = time.perf_counter() - begun
         return CaseOutcome(job.name, "failed", seconds, f"{type(error).__name__}: {error}")
-    return CaseOutcome(job.name, "done", seconds, evaluation=evaluation)
+    return _outcome(job.name, "done", seconds, evaluation)
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """What tells one writing of a file from another; none where there is no file."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_ino, found.st_mtime_ns
 
 
 def _reason(code: int, output: Path) -> str:

@@ -3,17 +3,20 @@
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from cmfsim._core import __version__
 from cmfsim.build import Postoperative, input_hashes, read_postoperative
-from cmfsim.case import Finding
+from cmfsim.case import Anatomy, Finding
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.evaluation import NO_CHANGE, WHOLE, ModelComparison, compare_models
 from cmfsim.io import Case
 from cmfsim.prediction import MODELS, Prediction
+from cmfsim.scene import SurfaceData
 from cmfsim.study.prediction import predict_models
 
 __all__ = ["EVALUATION_FILE", "CaseEvaluation", "evaluate", "evaluation_key"]
@@ -38,12 +41,15 @@ class CaseEvaluation:
     comparison : ModelComparison
     key : str
         Of everything that the result depends on: inputs, models, version.
+    failed : mapping of str to str
+        Why a model has no prediction, by its name.
     """
 
     predictions: tuple[Prediction, ...]
     postoperative: Postoperative
     comparison: ModelComparison
     key: str
+    failed: Mapping[str, str] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON: errors by model and region, tests, key."""
@@ -64,6 +70,7 @@ class CaseEvaluation:
             "case": first.name,
             "key": self.key,
             "models": errors,
+            "failed": dict(self.failed),
             "no_change": still,
             "wilcoxon": tests,
             "notes": [WILCOXON_NOTE] if tests else [],
@@ -88,6 +95,7 @@ def evaluate(
     progress: Progress | None = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
+    anatomy: Anatomy | None = None,
 ) -> CaseEvaluation:
     """The predictions of several models for a case, compared with what came after.
 
@@ -102,6 +110,7 @@ def evaluate(
     progress : callable, optional
     check : bool
     findings : iterable of Finding
+    anatomy : Anatomy, optional
         As for `predict_models`.
 
     Returns
@@ -111,7 +120,8 @@ def evaluate(
     Raises
     ------
     CmfsimError
-        (also `ValueError` where the input is at fault) What a stage cannot work with.
+        (also `ValueError` where the input is at fault) What a stage cannot work with; a model that
+        does not solve, where none of the others does.
 
     Examples
     --------
@@ -124,25 +134,45 @@ def evaluate(
         progress("reading the face after the operation")
     # First, for it fails at once where the case has none.
     postoperative = read_postoperative(case)
+    if postoperative.skin is None:
+        raise CaseInputError(
+            f"{case.where('postoperative')}: there is no face to compare with: add skin or image"
+        )
+    failed: dict[str, CmfsimError] = {}
     predictions = tuple(
-        predict_models(case, models, progress=progress, check=check, findings=findings)
+        predict_models(
+            case,
+            models,
+            progress=progress,
+            check=check,
+            findings=findings,
+            after=postoperative,
+            failed=failed,
+            anatomy=anatomy,
+        )
     )
+    if not predictions:
+        raise next(iter(failed.values()))
     if progress is not None:
         progress("comparing the faces")
-    comparison = _compare(predictions, postoperative)
-    return CaseEvaluation(predictions, postoperative, comparison, evaluation_key(case, models))
+    comparison = _compare(predictions, postoperative.skin, postoperative.landmarks)
+    reasons = {model: str(error) for model, error in failed.items()}
+    key = evaluation_key(case, models)
+    return CaseEvaluation(predictions, postoperative, comparison, key, reasons)
 
 
-def _compare(predictions: Sequence[Prediction], after: Postoperative) -> ModelComparison:
+def _compare(
+    predictions: Sequence[Prediction], skin: SurfaceData, landmarks: Mapping[str, Floats]
+) -> ModelComparison:
     before = predictions[0].skin_before
     ours = predictions[0].patient.landmarks.get("skin", {})
-    both = bool(ours) and bool(after.landmarks)
+    both = bool(ours) and bool(landmarks)
     moved = {p.model: np.asarray(p.skin.vertices) for p in predictions}
     return compare_models(
         before,
         moved,
-        after.skin,
-        landmarks=(ours, after.landmarks) if both else None,
+        skin,
+        landmarks=(ours, landmarks) if both else None,
         mask="face" if both else None,
     )
 

@@ -1,11 +1,13 @@
 """One case from its files to the predicted face."""
 
+import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from cmfsim.build import build_model
-from cmfsim.case import Finding
+from cmfsim.build import Postoperative, build_model
+from cmfsim.case import Anatomy, Finding
 from cmfsim.checks import check_one_of
+from cmfsim.errors import CmfsimError, ContactError, SolverError
 from cmfsim.io import Case
 from cmfsim.model import PatientModel
 from cmfsim.patient import CaseMuscles
@@ -13,6 +15,8 @@ from cmfsim.prediction import MODELS, Prediction
 from cmfsim.simulation import predict_patient
 
 __all__ = ["build_patient", "predict", "predict_models"]
+
+_log = logging.getLogger(__name__)
 
 Progress = Callable[[str], None]
 
@@ -62,6 +66,9 @@ def predict_models(
     progress: Progress | None = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
+    anatomy: Anatomy | None = None,
+    after: Postoperative | None = None,
+    failed: dict[str, CmfsimError] | None = None,
 ) -> Iterator[Prediction]:
     """The predictions of several models for one case, which is built once.
 
@@ -74,6 +81,13 @@ def predict_models(
         As for `predict`.
     findings : iterable of Finding
         What is known of the case already.
+    anatomy : Anatomy, optional
+        The head, where it is known; the image or surfaces of the case are then not read.
+    after : Postoperative, optional
+        What is known after the operation, where that was read already.
+    failed : dict, optional
+        Where given, a model whose solution does not come about (contact that does not settle, say)
+        is put there with its error, and the others go on.
 
     Yields
     ------
@@ -93,11 +107,27 @@ def predict_models(
     """
     for model in models:
         check_one_of("model", model, MODELS)
-    patient = build_patient(case, models, progress=progress, check=check, findings=findings)
+    patient = build_patient(
+        case,
+        models,
+        progress=progress,
+        check=check,
+        findings=findings,
+        anatomy=anatomy,
+        after=after,
+    )
     for model in models:
         if progress is not None:
             progress(f"solving {model}")
-        yield predict_patient(patient, model)
+        try:
+            prediction = predict_patient(patient, model)
+        except (ContactError, SolverError) as error:
+            if failed is None:
+                raise
+            _log.warning("model %s: %s", model, error)
+            failed[model] = error
+        else:
+            yield prediction
 
 
 def build_patient(
@@ -107,6 +137,8 @@ def build_patient(
     progress: Progress | None = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
+    anatomy: Anatomy | None = None,
+    after: Postoperative | None = None,
 ) -> PatientModel:
     """The patient as models need it: muscles are placed if one of them has muscles."""
     wanted = any(model.startswith("M") for model in models)
@@ -114,4 +146,6 @@ def build_patient(
         case = replace(case, muscles=None)
     elif case.muscles is None:
         case = replace(case, muscles=CaseMuscles())
-    return build_model(case, progress=progress, check=check, findings=findings)
+    return build_model(
+        case, progress=progress, check=check, findings=findings, anatomy=anatomy, after=after
+    )

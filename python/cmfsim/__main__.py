@@ -1,0 +1,7 @@
+"""`python -m cmfsim`: the command line where its own command is not on the path."""
+
+import sys
+
+from cmfsim.cli import main
+
+sys.exit(main())

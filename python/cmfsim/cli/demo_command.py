@@ -1,0 +1,82 @@
+"""`cmfsim demo`: the embedded case from its files to its report."""
+
+import argparse
+import json
+import os
+import sys
+import time
+import webbrowser
+from collections.abc import Iterable
+from pathlib import Path
+
+from cmfsim.cli.exit_codes import DONE, FAILED
+from cmfsim.cli.results import (
+    folder_of,
+    write_case_report,
+    write_evaluation,
+    write_prediction_files,
+)
+from cmfsim.cli.terminal import StageProgress, escaped
+from cmfsim.demo import DemoCase, write_demo_case
+from cmfsim.pictures import has_screen
+from cmfsim.prediction import Prediction
+from cmfsim.study import evaluate, predict_models
+
+__all__ = ["DEMO_FOLDER", "DEMO_MODELS", "demo"]
+
+DEMO_FOLDER = Path("cmfsim-demo")
+# Without muscles or sliding, with muscles, with both.
+DEMO_MODELS = ("H", "M", "M+S")
+
+
+def demo(options: argparse.Namespace) -> int:
+    """Predicts the face of the embedded case, writes its report and opens it."""
+    models: tuple[str, ...] = options.models
+    begun = time.perf_counter()
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        progress.stage("making a head")
+        made = write_demo_case(options.folder, edge_length=options.edge_length)
+        _work(made, models, progress)
+        progress.stage("writing the report")
+        name = write_case_report(made.case.output, models)
+    if name is None:
+        return FAILED
+    page = made.case.output / name
+    seconds = time.perf_counter() - begun
+    if options.json:
+        answer = {"case": str(made.case.file), "report": str(page), "seconds": seconds}
+        print(json.dumps(answer, allow_nan=False))
+        return DONE
+    print(f"case    {escaped(str(made.case.file))}")
+    print(f"report  {escaped(str(page))}")
+    print(f"time    {seconds:.0f} s")
+    if not options.no_open and _someone_looks():
+        webbrowser.open(page.resolve().as_uri())
+    return DONE
+
+
+def _work(made: DemoCase, models: tuple[str, ...], progress: StageProgress) -> None:
+    """Predicts by each model, compares where the truth is known, and writes everything."""
+    case, found = made.case, None
+    predictions: Iterable[Prediction]
+    if made.truth is None:
+        predictions = predict_models(
+            case, models, progress=progress.stage, check=False, anatomy=made.anatomy
+        )
+    else:
+        found = evaluate(case, models, progress=progress.stage, check=False, anatomy=made.anatomy)
+        predictions = found.predictions
+    for prediction in predictions:
+        progress.stage(f"writing {prediction.model}")
+        # The report shows the pictures of the last model alone.
+        pictures = prediction.model == models[-1]
+        folder = folder_of(case.output, prediction.model, len(models))
+        write_prediction_files(folder, prediction, pictures=pictures)
+    if found is not None:
+        progress.stage("writing the comparison")
+        write_evaluation(case.output, found)
+
+
+def _someone_looks() -> bool:
+    """Whether someone sits in front of this: not in a pipe, not in CI, not without a display."""
+    return sys.stdout.isatty() and not os.environ.get("CI") and has_screen()

@@ -1,0 +1,179 @@
+"""Whether bones given before and after can be meant as one bone that moved."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from cmfsim._core import rigid_fit
+from cmfsim.case import Finding
+from cmfsim.checks import Floats
+from cmfsim.doctor.evidence import Evidence
+from cmfsim.doctor.operation import FAR, TOO_FAR, check_against_skin
+from cmfsim.doctor.places import place_text
+from cmfsim.errors import CmfsimError, RegistrationError
+from cmfsim.io import Case, read_moved_surface
+from cmfsim.patient import CaseMotion
+from cmfsim.scene import MovedSurface
+from cmfsim.topology import edges_of
+
+__all__ = ["check_moved"]
+
+# A bone whose vertices all move less than this was not moved, mm: a tenth of a voxel of a CT.
+STILL = 0.05
+# A bone that is scaled by more than this was not measured in the same unit.
+SCALED = 0.03
+# Cosine between an edge before and after the bone's own turn, on average: 1 of a rigid bone, above
+# 0.9 with noise, 0 where vertices have nothing to do with one another.
+ALONG = 0.5
+# Where no vertex of any bone stays this near, mm, the scans may lie in two frames.
+STAYS = 3.0
+# Share of the vertices that rest where part of a bone does.
+FEW = 0.05
+# What is left of a motion if the bone is mirrored first, as a share of what is left if it is not.
+MIRRORED = 0.1
+# Vertices that a fit is made of.
+SAMPLES = 5000
+
+
+def check_moved(evidence: Evidence) -> Iterator[Finding]:
+    """Findings about motions given by surfaces, vertex by vertex."""
+    case = evidence.case
+    least: dict[str, float] = {}
+    for name, motion in case.plan.items():
+        if motion.surface is None or motion.moved_surface is None:
+            continue
+        if not (motion.surface.is_file() and motion.moved_surface.is_file()):
+            # Said where files are looked for.
+            continue
+        where = case.where(f"plan.{name}")
+        try:
+            moved = _read(case, motion)
+        except CmfsimError as error:
+            yield Finding(
+                "error",
+                "moved-not-paired",
+                str(error),
+                where,
+                f"nobody knows where each vertex of {name} went",
+                "export the bone before, and the same mesh after the motion",
+            )
+            continue
+        here, there = np.asarray(moved.surface.vertices), np.asarray(moved.moved_vertices)
+        wrong = list(_check_pairs(name, where, moved))
+        wrong = wrong or list(_check_distance(name, where, here, there))
+        yield from wrong
+        if not any(finding.severity == "error" for finding in wrong):
+            least[name] = float(np.quantile(np.linalg.norm(there - here, axis=1), FEW))
+            yield from check_against_skin(evidence, name, here, there)
+    others = set(evidence.bones) - set(case.plan) if case.surfaces is not None else {""}
+    if least and not others and not case.osteotomies and min(least.values()) > STAYS:
+        yield Finding(
+            "warning",
+            "moved-all",
+            f"every bone moves: {', '.join(least)}, by {min(least.values()):.1f} mm at least",
+            case.where("plan"),
+            "the skull above the jaws stays in surgery of the jaws; if the scans lie in two "
+            "frames, the whole face is moved by the difference",
+            "lay the scan after on the one before by the skull (register_volumes, icp)",
+        )
+
+
+def _read(case: Case, motion: CaseMotion) -> MovedSurface:
+    units, frame = ("mm", "LPS")
+    if case.surfaces is not None:
+        units, frame = case.surfaces.units, case.surfaces.frame
+    return read_moved_surface(
+        str(motion.surface), str(motion.moved_surface), units=units, frame=frame
+    )
+
+
+def _check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]:
+    """Whether both are one bone: of one size, with vertices that belong together, not mirrored."""
+    here, there = np.asarray(moved.surface.vertices), np.asarray(moved.moved_vertices)
+    if _is_mirrored(here, there):
+        yield Finding(
+            "error",
+            "moved-mirrored",
+            f"{name} is mirrored after against before",
+            where,
+            "no motion of bone does that: one file has left and right, or an axis, swapped",
+            "export both in one frame (LPS or RAS)",
+        )
+        return
+    scale, along = _edges(moved)
+    if along < ALONG:
+        yield Finding(
+            "error",
+            "moved-scrambled",
+            f"the edges of {name} point elsewhere after (cosine {along:.2f} on average, not 1)",
+            where,
+            "both files have as many vertices, but these do not belong together in their order",
+            "export the moved mesh without remeshing or sorting its vertices, or name it in "
+            '[postoperative.bones] and write plan = "achieved"',
+        )
+    elif abs(scale - 1.0) > SCALED:
+        yield Finding(
+            "error",
+            "moved-scaled",
+            f"{name} is {scale:.3g} times as large after as before",
+            where,
+            "bone does not grow in an operation: the files are in two units, or scaled",
+            "export both in the unit that [surfaces] states",
+        )
+
+
+def _edges(moved: MovedSurface) -> tuple[float, float]:
+    """How much longer edges are after, and the cosine between before and after, less the turn."""
+    here, there = np.asarray(moved.surface.vertices), np.asarray(moved.moved_vertices)
+    ends = edges_of(np.asarray(moved.surface.triangles).astype(np.int64)).ends
+    try:
+        turn = np.asarray(rigid_fit(here, there).matrix)[:3, :3]
+    except RegistrationError:
+        # All in one place after: as small as can be.
+        return 0.0, 1.0
+    before = (here[ends[:, 1]] - here[ends[:, 0]]) @ turn.T
+    after = there[ends[:, 1]] - there[ends[:, 0]]
+    one, other = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
+    some = (one > 0.0) & (other > 0.0)
+    if not some.any():
+        return 0.0, 1.0
+    cosine = (before[some] * after[some]).sum(axis=1) / (one[some] * other[some])
+    return float(np.median(other[some] / one[some])), float(cosine.mean())
+
+
+def _is_mirrored(here: Floats, there: Floats) -> bool:
+    step = -(-len(here) // SAMPLES)
+    here, there = here[::step], there[::step]
+    try:
+        kept = float(rigid_fit(here, there).rms)
+        mirrored = float(rigid_fit(here * [-1.0, 1.0, 1.0], there).rms)
+    except RegistrationError:
+        return False
+    return kept > STAYS and mirrored < MIRRORED * kept
+
+
+def _check_distance(name: str, where: str, here: Floats, there: Floats) -> Iterator[Finding]:
+    moved = np.linalg.norm(there - here, axis=1)
+    worst = int(np.argmax(moved))
+    if moved[worst] < STILL:
+        yield Finding(
+            "warning",
+            "moved-still",
+            f"{name} moves by {moved[worst]:.2g} mm at most",
+            where,
+            "the plan moves nothing there",
+            "check that the file is the bone after the operation; else leave it out",
+        )
+    elif moved[worst] > FAR:
+        turned = np.linalg.norm(here * [-1.0, -1.0, 1.0] - there, axis=1).max() < moved[worst]
+        yield Finding(
+            "error" if moved[worst] > TOO_FAR else "warning",
+            "plan-far",
+            f"{name} moves by up to {moved[worst]:.1f} mm, at {place_text(here[worst])}",
+            where,
+            f"bone moves by {FAR:g} mm at most in ordinary surgery; tissue would be torn",
+            "one file is in LPS, the other in RAS: export both in one frame"
+            if turned
+            else "lay the scan after on the one before by the skull, and check that both files "
+            "number their vertices alike",
+        )

@@ -1,0 +1,183 @@
+"""The four virtual patients P1 to P4: who they are, and what is done to them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from cmfsim.errors import CaseInputError
+from cmfsim.phantom import HeadParameters
+
+__all__ = ["PATIENTS", "Relocation", "VirtualPatient", "patient_named"]
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Relocation:
+    """How a segment moves, in a planner's numbers (Kim et al. 2010, Table 2, is written so).
+
+    Attributes
+    ----------
+    translation : tuple of 3 float, mm
+        Left, backwards, up.
+    angle : float, degrees
+        About `axis` by the right-hand rule, through the landmark `centre`.
+    axis : tuple of 3 float
+    centre : str
+        A skull landmark.
+    """
+
+    translation: Triple
+    angle: float = 0.0
+    axis: Triple = (1.0, 0.0, 0.0)
+    centre: str = "supradentale"
+
+
+@dataclass(frozen=True)
+class VirtualPatient:
+    """One person made by code, with the operation.
+
+    Attributes
+    ----------
+    number : int
+    label : str
+        Of the operation, in the paper's letters: MxA, MxSB maxilla advanced, set back; MA, MSB the
+        same of the mandible; G genioplasty.
+    parameters : HeadParameters
+    muscle_thickness, muscle_stiffness : float
+        Of the true muscles, in those that the phantom draws and in the ordinary moduli.
+    osteotomies : tuple of str
+        Procedures, in their order.
+    plan : mapping of str to Relocation
+        By segment.
+    """
+
+    number: int
+    label: str
+    parameters: HeadParameters
+    muscle_thickness: float
+    muscle_stiffness: float
+    osteotomies: tuple[str, ...]
+    plan: Mapping[str, Relocation] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "plan", MappingProxyType(dict(self.plan)))
+
+    @property
+    def name(self) -> str:
+        """P1 to P4."""
+        return f"P{self.number}"
+
+
+_BOTH_JAWS = ("le_fort_1", "bsso")
+_WITH_CHIN = ("le_fort_1", "bsso", "genioplasty")
+
+# Moves and people are ours, of the kind and size of the paper's four patients, not its numbers.
+# Lips stand 2 mm apart and teeth 2.5 mm, as in a patient who is scanned at rest.
+PATIENTS: Mapping[int, VirtualPatient] = MappingProxyType(
+    {
+        patient.number: patient
+        for patient in (
+            VirtualPatient(
+                1,
+                "MxA, MSB",
+                HeadParameters(
+                    face_height=1.02,
+                    nose_length=1.0,
+                    chin_projection=2.0,
+                    mandible_advance=3.0,
+                    lip_gap=2.0,
+                    bite_gap=2.5,
+                ),
+                0.85,
+                1.2,
+                _BOTH_JAWS,
+                {
+                    "maxilla": Relocation((0.0, -5.0, 0.5), 2.0),
+                    "mandible_body": Relocation((0.0, 3.5, 0.5), centre="infradentale"),
+                },
+            ),
+            VirtualPatient(
+                2,
+                "MxA, MA",
+                HeadParameters(
+                    scale=0.94,
+                    face_height=0.96,
+                    nose_projection=2.0,
+                    lip_fullness=1.15,
+                    chin_projection=-2.5,
+                    mandible_advance=-3.0,
+                    fat_thickness=1.5,
+                    jaw_width=0.96,
+                    lip_gap=2.0,
+                    bite_gap=2.5,
+                ),
+                1.2,
+                0.8,
+                _BOTH_JAWS,
+                {
+                    "maxilla": Relocation((0.0, -3.0, 0.0), 3.0),
+                    "mandible_body": Relocation((0.0, -6.0, 0.0), -2.0, centre="infradentale"),
+                },
+            ),
+            VirtualPatient(
+                3,
+                "MxSB, MSB",
+                HeadParameters(
+                    scale=1.04,
+                    nose_length=-1.5,
+                    lip_fullness=1.2,
+                    fat_thickness=3.0,
+                    jaw_width=1.04,
+                    lip_gap=2.0,
+                    bite_gap=2.5,
+                ),
+                1.1,
+                1.0,
+                _BOTH_JAWS,
+                {
+                    "maxilla": Relocation((0.0, 3.0, 2.5), 1.5),
+                    "mandible_body": Relocation((0.0, 2.5, 2.0), centre="infradentale"),
+                },
+            ),
+            VirtualPatient(
+                4,
+                "MxA, MSB, G",
+                HeadParameters(
+                    face_height=1.05,
+                    nose_projection=-1.0,
+                    lip_fullness=0.9,
+                    fat_thickness=0.5,
+                    asymmetry=3.0,
+                    mandible_advance=2.0,
+                    chin_projection=-2.0,
+                    lip_gap=2.0,
+                    bite_gap=2.5,
+                ),
+                0.9,
+                0.9,
+                _WITH_CHIN,
+                {
+                    "maxilla": Relocation((-1.0, -4.0, 0.5), -2.0, (0.0, 0.0, 1.0)),
+                    "mandible_body": Relocation(
+                        (-2.0, 2.5, 0.5), -2.0, (0.0, 0.0, 1.0), "infradentale"
+                    ),
+                    "chin": Relocation((-3.0, -1.5, 1.0), -2.0, (0.0, 0.0, 1.0), "infradentale"),
+                },
+            ),
+        )
+    }
+)
+
+
+def patient_named(number: int) -> VirtualPatient:
+    """One of the four.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Another number than 1 to 4.
+    """
+    if number not in PATIENTS:
+        raise CaseInputError(f"patient is {number!r}: {', '.join(map(str, PATIENTS))} are there")
+    return PATIENTS[number]

@@ -1,0 +1,168 @@
+"""A window in which a case can be turned about, or one picture of it."""
+
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cmfsim.checks import Floats, as_positive
+from cmfsim.errors import CaseInputError
+from cmfsim.pictures.canvas import (
+    View,
+    bounds,
+    check_can_draw,
+    look_at,
+    polydata,
+    pyvista_module,
+    silent_vtk,
+    write_picture,
+)
+from cmfsim.scene import SurfaceData
+
+__all__ = ["ViewPart", "has_screen", "view_parts"]
+
+WINDOW = (1300, 900)
+# Of the letter that shows and hides each part, and its place in the window, pixels.
+ROW, LEFT = 30, 12
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPart:
+    """A surface of a view.
+
+    Attributes
+    ----------
+    name : str
+    surface : SurfaceData
+    colour : str
+        "#rrggbb"; unused where there are values.
+    opacity : float
+        0 to 1.
+    values : (v,) float64 or None
+        At the vertices, shown in colours from 0 to the largest.
+    shown : bool
+        At first; the box beside its name shows and hides it.
+    """
+
+    name: str
+    surface: SurfaceData
+    colour: str
+    opacity: float = 1.0
+    values: Floats | None = None
+    shown: bool = True
+
+
+def view_parts(
+    parts: Sequence[ViewPart],
+    *,
+    title: str = "cmfsim",
+    unit: str = "mm",
+    screenshot: str | os.PathLike[str] | None = None,
+    size: tuple[int, int] = WINDOW,
+) -> None:
+    """Opens a window with surfaces that can be turned, shown and hidden, or writes a picture of it.
+
+    Parameters
+    ----------
+    parts : sequence of ViewPart
+    title : str
+    unit : str
+        Of the values, beside their colours.
+    screenshot : path, optional
+        Ends in `.png`: nothing is opened.
+    size : (int, int), pixels
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Nothing to show; PyVista, OpenGL or a screen is missing.
+
+    Examples
+    --------
+    >>> from cmfsim.pictures import ViewPart, view_parts
+    >>> view_parts([ViewPart("skin", prediction.skin, "#e3b7a0")])  # doctest: +SKIP
+    """
+    if not parts:
+        raise CaseInputError("there is no surface to show")
+    path = None if screenshot is None else Path(screenshot)
+    if path is not None and path.suffix.lower() != ".png":
+        raise CaseInputError(f"{path.name}: a picture is written as .png, not {path.suffix!r}")
+    if path is None and not has_screen():
+        raise CaseInputError(
+            "there is no screen to open a window on: write a picture (--screenshot FILE.png)"
+        )
+    width, height = (int(as_positive("window size", n)) for n in size)
+    pv = pyvista_module()
+    check_can_draw("the window" if path is None else path.name)
+    corners = bounds([part.surface.vertices for part in parts])
+    with silent_vtk(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        plotter = pv.Plotter(off_screen=path is not None, window_size=[width, height], title=title)
+        try:
+            plotter.set_background("white")
+            plotter.enable_anti_aliasing("ssaa")
+            look_at(plotter, View("left front", ""), corners, width / height)
+            # A picture names what it shows; a window has a box for every part.
+            named = [part for part in parts if part.shown or path is None]
+            for part in parts:
+                _add(plotter, part, unit)
+            for row, part in enumerate(named):
+                _add_name(plotter, part, height - (row + 1) * ROW - LEFT, switch=path is None)
+            plotter.reset_camera_clipping_range()
+            if path is None:
+                plotter.show()
+            else:
+                image = np.array(plotter.screenshot(return_img=True))[:, :, :3]
+                for row, part in enumerate(named):
+                    top = (row + 1) * ROW + LEFT - ROW + 4
+                    colour = [int(part.colour[k : k + 2], 16) for k in (1, 3, 5)]
+                    image[top : top + ROW - 10, LEFT : LEFT + ROW - 10] = colour
+                write_picture(path, image)
+        finally:
+            plotter.close()
+
+
+def has_screen() -> bool:
+    """Whether windows can be opened here, as far as the environment says."""
+    if sys.platform.startswith(("win", "darwin")):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _add(plotter: Any, part: ViewPart, unit: str) -> None:
+    shape = polydata(part.surface.vertices, part.surface.triangles)
+    looks = {"smooth_shading": True, "ambient": 0.15, "opacity": part.opacity, "name": part.name}
+    if part.values is None:
+        plotter.add_mesh(shape, color=part.colour, **looks)
+    else:
+        shape.point_data[part.name] = part.values
+        top = max(float(np.max(part.values)), 1e-6)
+        bar = {"title": unit, "vertical": True, "fmt": "%.1f", "color": "black"}
+        plotter.add_mesh(
+            shape,
+            scalars=part.name,
+            cmap="viridis",
+            clim=(0.0, top),
+            show_scalar_bar=part.shown,
+            scalar_bar_args=bar,
+            **looks,
+        )
+    plotter.renderer.actors[part.name].SetVisibility(part.shown)
+
+
+def _add_name(plotter: Any, part: ViewPart, low: int, *, switch: bool) -> None:
+    """The name of a part; in a window with a box that shows and hides it."""
+    plotter.add_text(part.name, position=(LEFT + ROW, low), font_size=9, color="black")
+    if switch:
+        plotter.add_checkbox_button_widget(
+            plotter.renderer.actors[part.name].SetVisibility,
+            value=part.shown,
+            position=(LEFT, low),
+            size=ROW - 8,
+            color_on=part.colour,
+        )
