@@ -47,8 +47,9 @@ impl From<Lame> for NeoHookean {
     }
 }
 
-/// C for the stretch energy.
+/// C for the stretch energy, without a detour through a box: it is read at every point.
 #[derive(Debug, Clone, Copy)]
+#[allow(clippy::large_enum_variant)]
 enum Stiffness {
     Isotropic(Lame),
     General(Voigt),

@@ -39,7 +39,7 @@ const STEP_TOLERANCE: f64 = 0.1;
 
 /// How tangent systems are solved.
 enum TangentSolver {
-    Cholesky(Symbolic),
+    Cholesky(Box<Symbolic>),
     Pcg,
 }
 
@@ -118,7 +118,7 @@ impl Equilibrium {
                     advice: "use method=\"pcg\"",
                 });
             }
-            TangentSolver::Cholesky(symbolic)
+            TangentSolver::Cholesky(Box::new(symbolic))
         } else {
             TangentSolver::Pcg
         };

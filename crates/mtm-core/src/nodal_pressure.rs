@@ -25,8 +25,9 @@ pub(crate) struct Split {
     pub rest: Rest,
 }
 
-/// What a tet keeps of its material.
+/// What a tet keeps of its material; lives as long as the tet is looked at.
 #[derive(Debug, Clone, Copy)]
+#[allow(clippy::large_enum_variant)]
 pub(crate) enum Rest {
     Isotropic(Lame),
     Spencer(Spencer, [f64; 3]),

@@ -36,7 +36,7 @@ pub struct StaticSolver {
 /// How the unknown rows follow from a plan.
 enum Mechanics {
     /// One linear system for every plan.
-    Linear(System),
+    Linear(Box<System>),
     /// Newton's method.
     LargeRotation(Box<Equilibrium>),
 }
@@ -98,7 +98,7 @@ impl StaticSolver {
                 &mut clock,
                 interrupted,
             )
-            .map(|(system, method)| (Mechanics::Linear(system), method))
+            .map(|(system, method)| (Mechanics::Linear(Box::new(system)), method))
         } else {
             Equilibrium::new(tensors.clone(), &matrix, &options, &mut clock)
                 .map(|(body, method)| (Mechanics::LargeRotation(Box::new(body)), method))
