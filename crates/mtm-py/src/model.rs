@@ -462,10 +462,8 @@ impl PyStaticSolver {
 pub struct PySolution {
     core: Solution,
     n_nodes: usize,
-    displacements: Py<PyArray2<f64>>,
-    forces: Py<PyArray2<f64>>,
-    all_displacements: Py<PyArray2<f64>>,
-    all_forces: Py<PyArray2<f64>>,
+    displacements: Field,
+    forces: Field,
 }
 
 #[pymethods]
@@ -473,27 +471,27 @@ impl PySolution {
     /// Displacement of every node of the mesh, (n, 3) float64, mm, read-only.
     #[getter]
     fn displacements<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
-        self.displacements.bind(py).clone()
+        self.displacements.corners.bind(py).clone()
     }
 
     /// Internal force of every node of the mesh (K u if linear), (n, 3) float64, N, read-only; zero at free
     /// nodes without loads.
     #[getter]
     fn forces<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
-        self.forces.bind(py).clone()
+        self.forces.corners.bind(py).clone()
     }
 
     /// Displacement of every node of `MassTensors.nodes`, those in the middle of edges included, (n + e, 3)
     /// float64, mm, read-only.
     #[getter]
     fn all_displacements<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
-        self.all_displacements.bind(py).clone()
+        self.displacements.all.bind(py).clone()
     }
 
     /// Internal force of every node of `MassTensors.nodes`, (n + e, 3) float64, N, read-only.
     #[getter]
     fn all_forces<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
-        self.all_forces.bind(py).clone()
+        self.forces.all.bind(py).clone()
     }
 
     /// Force out of balance over the forces that the plan brings in.
@@ -590,27 +588,29 @@ impl PySolution {
 
 impl PySolution {
     fn wrap(py: Python<'_>, mut core: Solution, n_nodes: usize) -> PyResult<Self> {
-        let displacements = std::mem::take(&mut core.displacements);
-        let forces = std::mem::take(&mut core.forces);
-        let (all_displacements, displacements) = of_corners(py, displacements, n_nodes)?;
-        let (all_forces, forces) = of_corners(py, forces, n_nodes)?;
-        Ok(Self { core, n_nodes, displacements, forces, all_displacements, all_forces })
+        let displacements = Field::new(py, std::mem::take(&mut core.displacements), n_nodes)?;
+        let forces = Field::new(py, std::mem::take(&mut core.forces), n_nodes)?;
+        Ok(Self { core, n_nodes, displacements, forces })
     }
 }
 
-/// Read-only rows of all nodes, and of the first `n`; one array where these are all.
-fn of_corners(
-    py: Python<'_>,
-    rows: Vec<[f64; 3]>,
-    n: usize,
-) -> PyResult<(Py<PyArray2<f64>>, Py<PyArray2<f64>>)> {
-    let corners = (rows.len() > n).then(|| rows[..n].to_vec());
-    let all = arrays::frozen(arrays::rows(py, rows))?.unbind();
-    let corners = match corners {
-        Some(corners) => arrays::frozen(arrays::rows(py, corners))?.unbind(),
-        None => all.clone_ref(py),
-    };
-    Ok((all, corners))
+/// A field on all nodes and on those of the mesh; one array where these are the same.
+struct Field {
+    all: Py<PyArray2<f64>>,
+    corners: Py<PyArray2<f64>>,
+}
+
+impl Field {
+    /// Read-only arrays of `rows` and of the first `n` of them.
+    fn new(py: Python<'_>, rows: Vec<[f64; 3]>, n: usize) -> PyResult<Self> {
+        let first = (rows.len() > n).then(|| rows[..n].to_vec());
+        let all = arrays::frozen(arrays::rows(py, rows))?.unbind();
+        let corners = match first {
+            Some(first) => arrays::frozen(arrays::rows(py, first))?.unbind(),
+            None => all.clone_ref(py),
+        };
+        Ok(Self { all, corners })
+    }
 }
 
 /// Exact map from rigid plans to displacements of chosen nodes; call it with a plan.
