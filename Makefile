@@ -35,7 +35,7 @@ $(ENV_STAMP): pyproject.toml scripts/make_venv.sh
 	@touch $@
 
 $(BUILD_STAMP): $(ENV_STAMP) $(RUST_SOURCES)
-	VIRTUAL_ENV="$(VENV_PATH)" "$(BIN)/maturin" develop --release $(CARGO_FLAGS) --extras imaging,mesh,report,test,lint
+	VIRTUAL_ENV="$(VENV_PATH)" "$(BIN)/maturin" develop --release $(CARGO_FLAGS) --extras imaging,mesh,report,study,test,lint
 	@touch $@
 
 $(DOCS_STAMP): $(BUILD_STAMP)
@@ -50,7 +50,7 @@ test-rust: $(ENV_STAMP)
 	cargo test --workspace --release $(CARGO_FLAGS) $(CORE_FEATURES)
 
 test-python: $(BUILD_STAMP)
-	"$(PY)" -m pytest
+	"$(PY)" -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 lint: $(BUILD_STAMP) ## rustfmt, clippy, ruff, mypy, stubtest and the import rules
 	cargo fmt --all --check

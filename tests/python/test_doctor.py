@@ -355,6 +355,32 @@ def test_units_and_frame_of_the_case_file_are_used(tmp_path):
     assert serious(tmp_path, head) == []
 
 
+def test_one_bone_alone_has_landmarks_of_the_other_far_away(tmp_path):
+    """The mandible without the skull is a case; landmarks turned about fit it no better."""
+    head = HeadCase()
+    head.replace('cranium = "cranium.ply"\n', "")
+    assert "landmark-frame" not in [code for _, code in serious(tmp_path, head)]
+    head.skull = {n: p * HALF_TURN for n, p in head.skull.items()}
+    assert ("error", "landmark-frame") in serious(tmp_path, head)
+
+
+def test_landmarks_off_the_face_after_the_operation_are_said(tmp_path):
+    """Those of the skin before, on a face that came 20 mm forwards; those on it say nothing."""
+    head = HeadCase()
+    path = head.write(tmp_path)
+    skin = head.surfaces["skin"]
+    after = cmfsim.SurfaceData(skin.vertices + [0.0, -20.0, 0.0], skin.triangles)
+    cmfsim.write_surface(tmp_path / "after.ply", after)
+    places = {"pronasale": after.vertices[np.argmin(after.vertices[:, 1])]}
+    more = '\n[postoperative]\nskin = "after.ply"\nlandmarks = "after.mrk.json"\n'
+    path.write_text(path.read_text(encoding="utf-8") + more, encoding="utf-8")
+    for shift, expected in ((0.0, False), (30.0, True)):
+        moved = {name: place - [0.0, shift, 0.0] for name, place in places.items()}
+        cmfsim.write_landmarks(tmp_path / "after.mrk.json", moved)
+        found = [f.code for f in cmfsim.diagnose(cmfsim.Case.load(path))]
+        assert ("postoperative-landmarks-off" in found) == expected
+
+
 def test_an_unstated_landmark_frame_is_said(tmp_path):
     """Neither file nor case says whether it is LPS: a warning; if the case says, a note."""
     head = HeadCase()

@@ -2,11 +2,13 @@
 
 `diagnose` reads the files of a case and looks; it changes and writes nothing. `evidence` is what
 was read, `placement` asks whether it lies where it should, `surfaces` whether it is sound,
-`operation` whether cuts and plan can be meant, `moved` whether a bone before
-and after is one bone, `muscles` whether these can be placed.
+`operation` whether cuts and plan can be meant, `moved` whether a bone before and after is one bone,
+`after` whether what is given after the operation belongs together, `muscles` whether these can be
+placed.
 """
 
 from cmfsim.case import SEVERITIES, Finding
+from cmfsim.doctor.after import check_after
 from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.moved import check_moved
 from cmfsim.doctor.muscles import check_muscles
@@ -52,5 +54,6 @@ def diagnose(case: Case) -> tuple[Finding, ...]:
         findings += check_mesh_size(evidence)
         findings += check_plan(evidence)
         findings += check_moved(evidence)
+        findings += check_after(evidence)
         findings += check_muscles(evidence)
     return tuple(sorted(findings, key=lambda f: SEVERITIES.index(f.severity)))

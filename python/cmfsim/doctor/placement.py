@@ -35,6 +35,8 @@ THROUGH_SKIN = 0.1
 # Distance of a landmark from its surface, mm: twice the placing error of an operator, and so far
 # that it lies on something else.
 LANDMARK_WARNING, LANDMARK_ERROR = 5.0, 15.0
+# So many landmarks on a bone that is given alone are no accident.
+OF_ONE_BONE = 4
 # Distance of two groups of landmarks below which they give no direction, mm.
 SHORTEST = 5.0
 # Share of the length of a direction that its main axis must have for the head to be upright.
@@ -162,8 +164,12 @@ def _check_landmark_fit(
     if not bodies:
         return
     points = np.stack(list(landmarks.values()))
-    median = float(np.median(_nearest(bodies, points)))
+    nearest = np.sort(_nearest(bodies, points))
+    median = float(np.median(nearest))
     if median <= LANDMARK_ERROR:
+        return
+    if key == "skull" and len(bodies) == 1 and (nearest <= LANDMARK_WARNING).sum() >= OF_ONE_BONE:
+        # The others belong to the bone that is not given.
         return
     where = evidence.case.where(f"landmarks.{key}")
     surface = "bones" if key == "skull" else "skin"
