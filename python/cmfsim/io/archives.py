@@ -1,5 +1,6 @@
 """Archives of arrays with a JSON text, the `.npz` form of values. Nothing is unpickled."""
 
+import errno
 import json
 import zipfile
 import zlib
@@ -38,7 +39,12 @@ def read_archive(
             members = {name: archive[name] for name in archive.files}
     except zipfile.BadZipFile as error:
         raise CaseInputError(f"is not an .npz archive, or is cut short ({error})") from error
-    except (ValueError, EOFError, KeyError, zlib.error, MemoryError, NotImplementedError) as error:
+    except OSError as error:
+        # A damaged directory sends the reader to places before the file's start.
+        if error.errno != errno.EINVAL:
+            raise
+        raise CaseInputError(f"is not an .npz archive, or is damaged ({error})") from error
+    except (ValueError, EOFError, KeyError, zlib.error, MemoryError, RuntimeError) as error:
         if isinstance(error, CaseInputError):
             raise
         raise CaseInputError(f"holds an array that cannot be read ({error})") from error
