@@ -60,7 +60,9 @@ def picture_prediction(
         surface = before if view.caption.startswith("before") else after
         shape = polydata(surface.vertices, surface.triangles)
         shape.point_data["movement"] = moved
-        shape = trimmed(shape, ends)
+        if prediction.patient.face is None:
+            # The mesh's own skin ends in a ragged rim; a whole head goes on past the picture.
+            shape = trimmed(shape, ends)
         if not view.caption.startswith("movement"):
             plotter.add_mesh(shape, color=SKIN_COLOUR, **SKIN_SHADING)
             return
