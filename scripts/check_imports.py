@@ -188,7 +188,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         ),
         "pictures": "case checks errors musculature prediction scene _core",
         "report": "case errors io scene",
-        "insilico": "build case checks errors io phantom planning scene _core",
+        "insilico": "build case checks errors io phantom planning scene topology _core",
         "topology": "",
         "crossings": "checks",
         "capping": "checks",

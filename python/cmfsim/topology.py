@@ -1,11 +1,20 @@
-"""How triangles hang together: edges, connected pieces, and consistent orientation."""
+"""How triangles and tets hang together: edges, connected pieces, and consistent orientation."""
 
 from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Edges", "component_labels", "connected_labels", "edges_of", "orientation_flips"]
+__all__ = [
+    "Edges",
+    "component_labels",
+    "connected_labels",
+    "edges_of",
+    "orientation_flips",
+    "tet_bodies",
+]
 
 Integers = NDArray[np.int64]
 
@@ -116,3 +125,20 @@ def orientation_flips(edges: Edges, n_triangles: int) -> tuple[NDArray[np.bool_]
     n_turned = np.bincount(piece, weights=turned, minlength=1)
     flips = np.where(2 * n_turned[piece] > size[piece], ~turned, turned) & ~one_sided
     return flips, not bool(one_sided.any())
+
+
+def tet_bodies(tets: NDArray[Any]) -> Integers:
+    """The number of the body of each tet; bodies hang together by faces.
+
+    What an edge or a node alone joins to the rest would swing about it without resistance.
+    """
+    corners = np.sort(tets.astype(np.int64), axis=1)
+    faces = corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
+    order = np.lexsort(faces.T)
+    same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
+    pairs = np.stack([order[:-1][same], order[1:][same]]) // 4
+    sparse = import_module("scipy.sparse")
+    ones = np.ones(pairs.shape[1], dtype=bool)
+    graph = sparse.coo_matrix((ones, pairs), shape=(len(tets), len(tets)))
+    _, body = import_module("scipy.sparse.csgraph").connected_components(graph, directed=False)
+    return np.asarray(body, dtype=np.int64)

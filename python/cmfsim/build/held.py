@@ -1,14 +1,11 @@
 """Which bodies of a mesh are held, and the mesh without those that are not."""
 
-from importlib import import_module
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from cmfsim._core import TetMesh
 from cmfsim.case import Finding, NodeKinds
 from cmfsim.errors import MeshInputError
+from cmfsim.topology import tet_bodies
 
 __all__ = ["held_part"]
 
@@ -30,7 +27,7 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
         (also `ValueError`) Nothing of it is held.
     """
     tets = np.asarray(mesh.tets)
-    body = _bodies(tets)
+    body = tet_bodies(tets)
     n_bodies = int(body.max(initial=-1)) + 1
     holds = np.isin(kinds.kind, (1, 2))
     corner = holds[tets]
@@ -66,17 +63,3 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
     )
     left = NodeKinds(kinds.kind[keep_node], kinds.segment[keep_node], kinds.segments)
     return kept, left, (finding,)
-
-
-def _bodies(tets: NDArray[Any]) -> NDArray[np.int64]:
-    """The body of each tet."""
-    corners = np.sort(tets.astype(np.int64), axis=1)
-    faces = corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
-    order = np.lexsort(faces.T)
-    same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
-    pairs = np.stack([order[:-1][same], order[1:][same]], axis=1) // 4
-    sparse = import_module("scipy.sparse")
-    ones = np.ones(len(pairs), dtype=bool)
-    graph = sparse.coo_matrix((ones, pairs.T), shape=(len(tets), len(tets)))
-    _, body = import_module("scipy.sparse.csgraph").connected_components(graph, directed=False)
-    return np.asarray(body, dtype=np.int64)

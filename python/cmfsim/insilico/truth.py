@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -29,6 +28,7 @@ from cmfsim.insilico.people import VirtualPatient
 from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
 from cmfsim.scene import SurfaceData
+from cmfsim.topology import tet_bodies
 
 __all__ = ["PostoperativeTruth", "largest_body", "postoperative_truth"]
 
@@ -267,16 +267,7 @@ def largest_body(tets: NDArray[Any]) -> NDArray[np.bool_]:
     ----------
     tets : (m, 4)
     """
-    sparse = import_module("scipy.sparse")
-    graph = import_module("scipy.sparse.csgraph")
-    m = len(tets)
-    faces = np.concatenate([np.delete(tets, corner, axis=1) for corner in range(4)])
-    faces.sort(axis=1)
-    order = np.lexsort(faces.T)
-    same = np.flatnonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))
-    pairs = (order[same] % m, order[same + 1] % m)
-    touching = sparse.coo_array((np.ones(len(same), dtype=bool), pairs), shape=(m, m))
-    body = graph.connected_components(touching, directed=False)[1]
+    body = tet_bodies(tets)
     return np.asarray(body == np.argmax(np.bincount(body)))
 
 
