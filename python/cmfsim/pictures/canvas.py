@@ -29,6 +29,7 @@ __all__ = [
     "LEGEND_ROW",
     "SIZE",
     "View",
+    "add_scale_bar",
     "bounds",
     "check_can_draw",
     "draw",
@@ -135,6 +136,33 @@ def draw(
         image[top - 1 : top + 19, 11:31] = 90
         image[top : top + 18, 12:30] = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
     write_picture(path, image)
+
+
+def add_scale_bar(plotter: Any, place: tuple[float, float], labels: int, form: str) -> None:
+    """Adds an upright scale in mm to a view.
+
+    Parameters
+    ----------
+    place : (float, float)
+        Its lower left corner, as shares of the view.
+    labels : int
+    form : str
+        Of their numbers, as printf has it.
+    """
+    bar = plotter.add_scalar_bar(
+        title="mm",
+        n_labels=labels,
+        fmt=form,
+        vertical=True,
+        position_x=place[0],
+        position_y=place[1],
+        width=0.1,
+        height=0.45,
+        color="black",
+        title_font_size=16,
+        label_font_size=14,
+    )
+    bar.SetUnconstrainedFontSize(True)  # noqa: FBT003 (VTK's own signature)
 
 
 def write_picture(path: Path, image: NDArray[np.uint8]) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import Floats, as_floats, as_positive
 from cmfsim.errors import CaseInputError
-from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
+from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.skin_ends import skin_ends, trimmed
 from cmfsim.scene import SurfaceData
 
@@ -96,20 +96,7 @@ def picture_distances(
             show_scalar_bar=False,
         )
         if last:
-            bar = plotter.add_scalar_bar(
-                title="mm",
-                n_labels=5,
-                fmt="%+.1f",
-                vertical=True,
-                position_x=0.84,
-                position_y=0.25,
-                width=0.10,
-                height=0.5,
-                color="black",
-                title_font_size=16,
-                label_font_size=14,
-            )
-            bar.SetUnconstrainedFontSize(True)  # noqa: FBT003 (VTK's own signature)
+            add_scale_bar(plotter, (0.84, 0.27), 5, "%+.1f")
 
     views = (
         View("right", "right"),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
-from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
+from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.skin_ends import skin_ends, trimmed
 from cmfsim.prediction import Prediction
 from cmfsim.scene import SurfaceData
@@ -76,21 +76,8 @@ def picture_prediction(
             show_scalar_bar=False,
         )
         if view.direction == "left":
-            bar = plotter.add_scalar_bar(
-                title="mm",
-                n_labels=4,
-                fmt="%.1f",
-                vertical=True,
-                # Before the forehead: the head fills the other side.
-                position_x=0.03,
-                position_y=0.52,
-                width=0.09,
-                height=0.43,
-                color="black",
-                title_font_size=16,
-                label_font_size=14,
-            )
-            bar.SetUnconstrainedFontSize(True)  # noqa: FBT003 (VTK's own signature)
+            # Before the forehead: the head fills the other side.
+            add_scale_bar(plotter, (0.03, 0.5), 4, "%.1f")
 
     names = ("before", "after", "movement")
     views = tuple(View(d, f"{name}, {d}") for d in ("front", "left") for name in names)
