@@ -151,7 +151,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "scene": "checks errors",
         "case": "checks errors scene",
         "patient": "checks errors",
-        "model": "case checks musculature scene",
+        "model": "case checks musculature osteotomy scene",
         "io": (
             "case checks errors model musculature patient planning prediction scene template_data"
         ),

@@ -1,7 +1,10 @@
 """The patient's model: what building a case makes, ready to be solved."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -10,9 +13,12 @@ from numpy.typing import NDArray
 from cmfsim.case import Anatomy, BoneSegment, Finding, NodeKinds
 from cmfsim.checks import Floats, Indices
 from cmfsim.musculature import Musculature
+from cmfsim.osteotomy import surface_of_level
 from cmfsim.scene import Scene, SurfaceData, TissueData
 
 __all__ = ["PatientModel"]
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +48,6 @@ class PatientModel:
         Unit direction of the fibres of each tet; zero where there is no muscle.
     landmarks : mapping of str to mapping of str to (3,) float64, mm
         "skull" and "skin", where given.
-    face : SurfaceData or None
-        The skin of the whole head in full detail, as given or segmented.
     findings : tuple of Finding
         What every stage noticed.
     summary : mapping
@@ -62,7 +66,6 @@ class PatientModel:
     fraction: Floats | None = None
     fibre: Floats | None = None
     landmarks: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
-    face: SurfaceData | None = None
     findings: tuple[Finding, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
 
@@ -77,3 +80,18 @@ class PatientModel:
         nodes = self.skin_nodes
         triangles = np.searchsorted(nodes, self.skin_triangles)
         return SurfaceData(np.asarray(self.scene.nodes)[nodes], triangles)
+
+    @cached_property
+    def face(self) -> SurfaceData | None:
+        """The skin of the whole head in full detail, as it was given or as the image shows it.
+
+        Tets are larger than what one sees of lips and lids. None where scikit-image is missing.
+        Made when it is first asked for: solving does not need it.
+        """
+        given = self.anatomy.surfaces.get("skin")
+        if given is not None:
+            return given
+        if find_spec("skimage") is None:
+            _log.info("no detailed face: scikit-image is not installed")
+            return None
+        return surface_of_level("skin", self.anatomy.skin)

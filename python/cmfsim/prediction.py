@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -105,7 +106,7 @@ class Prediction:
         """The patient's face in full detail, as given or segmented; else as the mesh has it."""
         return self.patient.face or self.skin_before
 
-    @property
+    @cached_property
     def face(self) -> SurfaceData:
         """The predicted face: the vertices and triangles of `face_before`, carried by the skin."""
         before = self.face_before

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import TetMesh, __version__
 from cmfsim.build.clefts import without_clefts
-from cmfsim.build.face import detailed_face
 from cmfsim.build.held import held_part
 from cmfsim.build.inputs import (
     check_output,
@@ -225,8 +224,6 @@ def build_model(
     scene = _scene(case, mesh, kinds, bones.segments, bones.motions)
     boundary = np.asarray(mesh.boundary_triangles())
     skin = boundary[on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)]
-    stages.begin("drawing the face")
-    face = detailed_face(anatomy)
     stages.end()
     patient = PatientModel(
         name=case.name,
@@ -238,7 +235,6 @@ def build_model(
         anatomy=anatomy,
         fat=case.tissue,
         landmarks=landmarks,
-        face=face,
         findings=tuple(findings),
         summary={
             **_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
