@@ -18,7 +18,8 @@ CORE: Mapping[str, frozenset[str]] = {
         "error": "",
         "mesh": "",
         "memory": "",
-        "blocks": "",
+        "simd": "",
+        "blocks": "simd",
         "ordering": "blocks",
         "triangle": "",
         "topology": "triangle",
@@ -91,12 +92,12 @@ CORE: Mapping[str, frozenset[str]] = {
         "error_bound": "",
         "krylov": "blocks error_bound row_sums",
         "multigrid/block_rows": "blocks",
-        "multigrid/small_blocks": "",
+        "multigrid/small_blocks": "simd",
         "multigrid/scaling": "multigrid/block_rows multigrid/small_blocks",
         "multigrid/scaled_matrix": (
-            "error_bound row_sums multigrid/block_rows multigrid/scaling multigrid/small_blocks"
+            "error_bound row_sums simd multigrid/block_rows multigrid/scaling multigrid/small_blocks"
         ),
-        "multigrid/smoother": "multigrid/scaled_matrix",
+        "multigrid/smoother": "simd multigrid/scaled_matrix",
         "multigrid/aggregation": "multigrid/block_rows multigrid/scaled_matrix",
         "multigrid/rigid_modes": "multigrid/aggregation",
         "multigrid/prolongator": (
@@ -108,7 +109,8 @@ CORE: Mapping[str, frozenset[str]] = {
             "multigrid/small_blocks"
         ),
         "multigrid/transfer": (
-            "multigrid/prolongator multigrid/rigid_modes multigrid/scaling multigrid/small_blocks"
+            "simd multigrid/prolongator multigrid/rigid_modes multigrid/scaling "
+            "multigrid/small_blocks"
         ),
         "multigrid/coarsest": (
             "multigrid/block_rows multigrid/galerkin multigrid/rigid_modes multigrid/scaling"
@@ -137,6 +139,7 @@ CORE: Mapping[str, frozenset[str]] = {
 CRATES: Mapping[str, str] = {
     "parry3d_f64": "mtm-core/src/surface.rs",
     "faer": "mtm-core/src/cholesky/",
+    "pulp": "mtm-core/src/simd.rs",
     "metis_sys": "mtm-core/src/ordering.rs",
     "libc": "mtm-core/src/memory.rs",
     "pyo3": "mtm-py/",

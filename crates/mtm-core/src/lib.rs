@@ -86,6 +86,7 @@ pub mod restraint;
 mod row_sums;
 mod settling;
 pub mod signed_distance;
+mod simd;
 pub mod solution;
 pub mod statics;
 pub mod strain_energy;
