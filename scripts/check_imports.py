@@ -120,17 +120,21 @@ CORE: Mapping[str, frozenset[str]] = {
         "method": "contact kinematics",
         "reduction": "blocks boundary",
         "solution": "",
+        "projected_product": "blocks constraints contact krylov mesh",
+        "iterative": (
+            "blocks constraints contact krylov mesh method multigrid projected_product relaxation"
+        ),
         "system": (
-            "blocks boundary cholesky constraints contact crease krylov mesh method multigrid "
-            "relaxation restraint solution"
+            "blocks boundary cholesky constraints contact crease iterative mesh method restraint "
+            "solution"
         ),
         "equilibrium": (
-            "blocks boundary cholesky constraints contact krylov mesh method multigrid reduction "
-            "solution strain_energy system tensors"
+            "blocks boundary cholesky constraints contact iterative krylov mesh method multigrid "
+            "reduction solution strain_energy system tensors"
         ),
         "statics": (
-            "blocks boundary contact equilibrium kinematics mesh method reduction restraint "
-            "solution system tensors"
+            "blocks boundary contact equilibrium iterative kinematics mesh method reduction "
+            "restraint solution system tensors"
         ),
         "replan": "boundary crease kinematics mesh method motion reduction statics system",
     }.items()
