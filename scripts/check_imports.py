@@ -130,7 +130,7 @@ CORE: Mapping[str, frozenset[str]] = {
         ),
         "equilibrium": (
             "blocks boundary cholesky constraints contact iterative krylov mesh method multigrid "
-            "reduction solution strain_energy system tensors"
+            "reduction solution strain_energy tensors"
         ),
         "statics": (
             "blocks boundary contact equilibrium iterative kinematics mesh method reduction "

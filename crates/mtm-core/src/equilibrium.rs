@@ -22,7 +22,6 @@ use crate::multigrid::{Multigrid, MultigridOptions};
 use crate::reduction::Reduction;
 use crate::solution::Clock;
 use crate::strain_energy::{StrainEnergy, TangentKind};
-use crate::system::AUTO_DIRECT_UNKNOWNS;
 use crate::tensors::MassTensors;
 
 /// Newton steps after which a share of the plan counts as too large.
@@ -103,9 +102,7 @@ impl Equilibrium {
                     kind: ErrorKind::Solver,
                 });
             }
-            Method::Auto if 3 * matrix.n_rows() > AUTO_DIRECT_UNKNOWNS => Method::Pcg,
-            Method::Auto => Method::Cholesky,
-            named => named,
+            method => method.for_unknowns(3 * matrix.n_rows()),
         };
         let solver = if method == Method::Cholesky {
             let symbolic = Symbolic::new(matrix, &[])?;

@@ -16,8 +16,6 @@ use crate::method::{Interrupt, Method, StaticOptions};
 use crate::restraint::Held;
 use crate::solution::Clock;
 
-/// Above this many unknowns `Method::Auto` takes conjugate gradients: a factor grows like n^1.4.
-pub(crate) const AUTO_DIRECT_UNKNOWNS: usize = 300_000;
 /// Most sliding nodes whose dense flexibility is kept (three unknowns each, 8 bytes, twice).
 const MAX_DENSE_SLIDING: usize = 2500;
 
@@ -66,12 +64,7 @@ impl System {
         clock: &mut Clock,
         interrupted: Interrupt<'_>,
     ) -> Result<(Self, Method)> {
-        let unknowns = 3 * matrix.n_rows();
-        let mut method = match options.method {
-            Method::Auto if unknowns > AUTO_DIRECT_UNKNOWNS => Method::Pcg,
-            Method::Auto => Method::Cholesky,
-            named => named,
-        };
+        let mut method = options.method.for_unknowns(3 * matrix.n_rows());
         let with = |kept: Kept| Self { kept };
         if method == Method::Cholesky {
             let slide_rows: Vec<u32> =
