@@ -65,6 +65,11 @@ impl Smoother {
         Self { steps }
     }
 
+    /// Passes over the matrix in one cycle: the first step needs none, the residual one.
+    pub(super) fn passes(&self) -> usize {
+        2 * self.steps.len()
+    }
+
     /// Smooths from x = 0 and leaves the residual in `r`.
     pub(super) fn smooth_first<const N: usize>(&self, a: &ScaledMatrix<N>, v: &mut Vectors<N>) {
         let Some((first, later)) = self.steps.split_first() else { return };
