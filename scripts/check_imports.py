@@ -95,7 +95,8 @@ CORE: Mapping[str, frozenset[str]] = {
         "multigrid/small_blocks": "simd",
         "multigrid/scaling": "multigrid/block_rows multigrid/small_blocks",
         "multigrid/scaled_matrix": (
-            "error_bound row_sums simd multigrid/block_rows multigrid/scaling multigrid/small_blocks"
+            "error_bound row_sums simd multigrid/block_rows multigrid/scaling "
+            "multigrid/small_blocks"
         ),
         "multigrid/smoother": "simd multigrid/scaled_matrix",
         "multigrid/aggregation": "multigrid/block_rows multigrid/scaled_matrix",
