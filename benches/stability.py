@@ -18,7 +18,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from extreme import linear
+from extreme import contact, linear
 from extreme.rows import BOUND_FACTOR, CONDITION_FACTOR, ERROR_LIMIT, SWEEPS, WORTHLESS
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from extreme.rows import Row
 
 # Each has `cases`, `judge`, `forget`, and the `COLUMNS` of its table.
-SUITES: tuple[ModuleType, ...] = (linear,)
+SUITES: tuple[ModuleType, ...] = (linear, contact)
 
 # What a column shows of a row, by its heading.
 FIGURES = {

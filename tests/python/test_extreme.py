@@ -9,7 +9,7 @@ import pytest
 
 import cmfsim
 import extended
-from extreme import bodies, linear
+from extreme import bodies, contact, linear
 from extreme.problem import NU
 from extreme.rows import ALL, FAST
 
@@ -23,6 +23,11 @@ SOLVED = [
     for case in CASES
     for method in case.methods
 ]
+CONTACT = [
+    pytest.param(case, method, id=f"{case.key} [{method}]")
+    for case in contact.cases(quick=True)
+    for method in case.methods
+]
 CLOSED = [case for case in CASES if not case.refusal and linear.problem(case).exact is not None]
 
 
@@ -34,6 +39,15 @@ def test_a_case_is_solved_to_its_condition_or_refused(case, method):
     hang or panic.
     """
     row = linear.judge(case, method)
+    assert row.passed, row.verdict
+
+
+@pytest.mark.parametrize(("case", "method"), CONTACT)
+def test_contact_ends_on_the_moved_surface_in_equilibrium(case, method):
+    """Each held node within 1e-6 mm of the moved triangles (Ericson 2005, 5.1.5), no force across
+    the normals, and u = u_p + Z y with Zᵀ f(u) = 0 refined with 32 digits; mechanisms refused.
+    """
+    row = contact.judge(case, method)
     assert row.passed, row.verdict
 
 
