@@ -5,7 +5,7 @@
 solves each case with each method and writes a table with the condition number, the residual, the
 error against a closed form or an independent solution, and a verdict. The exit status is 1 if any
 verdict is not the wanted one. The cases stand in `benches/extreme/`, a module per subject. Needs
-scipy beside numpy and cmfsim.
+scipy and scikit-fem beside numpy and cmfsim.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from extreme import contact, linear
+from extreme import contact, elements, kinematics, linear
+from extreme.contact import DISTANCE, TANGENTIAL
+from extreme.contact import ERROR as CONTACT_ERROR
+from extreme.elements import LOCKED
 from extreme.rows import BOUND_FACTOR, CONDITION_FACTOR, ERROR_LIMIT, SWEEPS, WORTHLESS
 
 if TYPE_CHECKING:
@@ -27,7 +30,7 @@ if TYPE_CHECKING:
     from extreme.rows import Row
 
 # Each has `cases`, `judge`, `forget`, and the `COLUMNS` of its table.
-SUITES: tuple[ModuleType, ...] = (linear, contact)
+SUITES: tuple[ModuleType, ...] = (linear, contact, elements, kinematics)
 
 # What a column shows of a row, by its heading.
 FIGURES = {
@@ -39,12 +42,14 @@ FIGURES = {
     "distance, mm": "distance",
     "tangential": "tangential",
     "least J": "least_volume",
+    "deflection": "deflection",
 }
 
 INTRODUCTION = f"""# Numerical stability: the stiff and extreme suite
 
 Made by `python benches/stability.py --markdown docs/stability.md`; `tests/python/test_extreme.py`
-runs the same cases. Numbers near 1e-15 differ from machine to machine.
+runs the linear cases and the quicker ones of the others. Numbers near 1e-15 differ from machine to
+machine.
 
 ## How to read the tables
 
@@ -75,8 +80,25 @@ refused (`SolverError`) by Cholesky where {CONDITION_FACTOR:g} ε κ > {WORTHLES
 {CONDITION_FACTOR:g} ε κ exceeds the tolerance asked for (1e-9 unless stated), by `relaxation` there
 or where κ exceeds the {SWEEPS} sweeps that it gets here.
 
-The tables measure what the solvers make of a mesh, not what the mesh makes of the tissue: linear
-tets lock as ν nears 0.5 however exactly their equations are solved.
+*Contact*, *lift-off*, *contact tolerance*, *held by contact*: **distance** is the largest from
+where a held node belongs, over the triangles of the moved surface, one by one; **tangential** the
+largest force across the normals over the largest contact force; **true residual** that of the
+tangential equilibrium in 32 digits, and **error** the distance from the displacements in that
+equilibrium with the same walls and normals (`benches/extreme/contact.py`), whose κ is that of the
+tangential unknowns. *ok* is a distance within {DISTANCE:.0e} mm (twice the contact tolerance where
+that is wider), a tangential force within {TANGENTIAL:.0e}, an error within {CONTACT_ERROR:.0e},
+normals that are the wall's, and with lift-off no pull.
+
+*Bending* and *elements*: the error is from the solution of an independent stiffness of the same
+element (`benches/independent.py`: scikit-fem; numpy for `anp`), the residual that stiffness's over
+|K| |u|. **Deflection** is that of the tip over scikit-fem's quadratic tets of half the edge: what
+the mesh makes of the tissue, where the other columns say what the solver makes of the mesh. An
+element *locks* where it bends less than {LOCKED:g} of its own share at ν = 0.3.
+
+*Large deformation*: **true residual** is of forces that scikit-fem assembles from numpy's stresses,
+over those at the held nodes; **error** the step that these would still bring with the tangent of
+cmfsim, or the distance from the closed form; **least J** the smallest volume of a tet over that at
+rest.
 
 ## Where a method must not be used
 
@@ -87,8 +109,16 @@ tets lock as ν nears 0.5 however exactly their equations are solved.
 - **relaxation**: stiff bodies in soft tissue with a contrast above 1e2, ν above 0.49, slivers: it
   runs out of sweeps and raises `SolverError`. It measures its error by conjugate gradients, so it
   is refused wherever these are.
+- **pcg** with `p2`: κ is some twenty times that of linear tets, and it is refused as much sooner.
 - **p1**: bending tissue with ν above 0.45: it locks, silently. `anp` and `p2` do not (theory,
-  *Elements*; `tests/python/test_elements.py`).
+  *Elements*), though `anp` keeps only two thirds of its share on a beam two boxes thick.
+- **corotational**: a body pressed to about half its length. Its energy is finite where a tet
+  inverts, so it may come to rest with tets turned over, and does not say so; `hyperelastic` resists
+  longer, or is refused. Look at the sign of the volumes.
+- **contact** in a gutter of 10° across which the body is pushed may find no rest: `ContactError`
+  with the nodes. A body that only walls hold is refused where they leave a motion free. Where such
+  walls carry it along without stress, `result.residual` compares rounding with rounding and is
+  about 1; displacements and `error_bound` are right.
 - **relaxation** and **plan_operator** with `corotational` or `hyperelastic`: they are of the linear
   model, and raise `SolverError`. So does a plan that Newton's method does not bring to rest in 64
   parts.
@@ -124,7 +154,10 @@ def _figure(row: Row, heading: str) -> str:
     # The bound of a direct solve is rounding, and differs from machine to machine.
     if heading == "bound" and row.method == "cholesky":
         return "–"
-    return cell(getattr(row, FIGURES[heading]))
+    value = getattr(row, FIGURES[heading])
+    if heading in ("least J", "deflection") and value is not None:
+        return f"{value:.2f}"
+    return cell(value)
 
 
 def _line(row: Row) -> tuple[str, ...]:

@@ -40,6 +40,8 @@ class Scene:
         "bilateral" or "unilateral".
     gap : float, mm
     contact_tolerance : float
+    may_not_settle : bool
+        Whether contact may find no rest, and be refused.
     bend : float, degrees
         Largest angle between facets that the walls' normals are interpolated over; 0 for planes.
     """
@@ -51,6 +53,7 @@ class Scene:
     contact: str = "bilateral"
     gap: float = 0.0
     contact_tolerance: float = 1e-9
+    may_not_settle: bool = False
     bend: float = 0.0
 
 

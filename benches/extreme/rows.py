@@ -46,7 +46,7 @@ class Case:
     build : callable
     methods : tuple of str
     refusal : tuple of str
-        Words that the BoundaryError must hold; empty where the case has a solution.
+        Words that the error must hold; empty where the case has a solution.
     tolerance : float
         Asked of the iterative methods.
     quick : bool
@@ -90,6 +90,8 @@ class Row:
         Largest force across the normals of the contact over the largest contact force.
     least_volume : float or None
         Smallest volume of a tet over its volume at rest.
+    deflection : float or None
+        Of the tip of a panel over that of a finer mesh.
     allowed : float or None
         The error that the acceptance rule allows.
     verdict : str
@@ -113,6 +115,7 @@ class Row:
     distance: float | None = None
     tangential: float | None = None
     least_volume: float | None = None
+    deflection: float | None = None
     seconds: float = 0.0
     verdict: str = ""
     passed: bool = False

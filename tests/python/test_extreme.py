@@ -9,7 +9,7 @@ import pytest
 
 import cmfsim
 import extended
-from extreme import bodies, contact, linear
+from extreme import bodies, contact, elements, kinematics, linear
 from extreme.problem import NU
 from extreme.rows import ALL, FAST
 
@@ -23,11 +23,14 @@ SOLVED = [
     for case in CASES
     for method in case.methods
 ]
-CONTACT = [
-    pytest.param(case, method, id=f"{case.key} [{method}]")
-    for case in contact.cases(quick=True)
-    for method in case.methods
-]
+CONTACT, ELEMENTS, KINEMATICS = (
+    [
+        pytest.param(case, method, id=f"{case.key} [{method}]")
+        for case in suite.cases(quick=True)
+        for method in case.methods
+    ]
+    for suite in (contact, elements, kinematics)
+)
 CLOSED = [case for case in CASES if not case.refusal and linear.problem(case).exact is not None]
 
 
@@ -48,6 +51,24 @@ def test_contact_ends_on_the_moved_surface_in_equilibrium(case, method):
     the normals, and u = u_p + Z y with Zᵀ f(u) = 0 refined with 32 digits; mechanisms refused.
     """
     row = contact.judge(case, method)
+    assert row.passed, row.verdict
+
+
+@pytest.mark.parametrize(("case", "method"), ELEMENTS)
+def test_elements_solve_their_equations_and_only_linear_tets_lock(case, method):
+    """Displacements of p1, anp (Bonet & Burton 1998) and p2 against an independent stiffness of the
+    same element, within max(1e-9, 10 ε κ) and the bound; deflection of Cook's membrane (1974).
+    """
+    row = elements.judge(case, method)
+    assert row.passed, row.verdict
+
+
+@pytest.mark.parametrize(("case", "method"), KINEMATICS)
+def test_large_deformation_is_a_closed_form_or_in_balance(case, method):
+    """U = (F − I) x for turns of 120° and J = 0.2; else P from numpy's decompositions (Smith et al.
+    2018, eq. 14; R (λ tr S + 2 μ S)), assembled by scikit-fem, is in balance at the free nodes.
+    """
+    row = kinematics.judge(case, method)
     assert row.passed, row.verdict
 
 
