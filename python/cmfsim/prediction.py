@@ -1,10 +1,12 @@
 """What a model predicts for a patient: the value that evaluation and report are made from."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,8 +15,10 @@ from cmfsim._core import Surface, SurfaceMotion
 from cmfsim.case import Finding
 from cmfsim.checks import Floats, as_rows, check_one_of
 from cmfsim.model import PatientModel
-from cmfsim.musculature import Musculature
 from cmfsim.scene import MovedSurface, Scene, SceneResult, SurfaceData
+
+if TYPE_CHECKING:
+    from cmfsim.musculature import Musculature
 
 __all__ = ["MODELS", "Prediction"]
 
