@@ -77,13 +77,13 @@ def chart_errors(
                 raise CaseInputError(f"errors of {group}, {model} have shape {values.shape}: (k,)")
     others = iter(OTHER_COLOURS * (1 + len(models) // len(OTHER_COLOURS)))
     colours = {m: MODEL_COLOURS[m] if m in MODEL_COLOURS else next(others) for m in models}
-    write_figure(Path(path), (width, height), lambda axes: _draw(axes, groups, colours))
+    write_figure(Path(path), (width, height), lambda figure: _draw(figure, groups, colours))
 
 
 def write_figure(
     path: Path, size: tuple[float, float], draw: Callable[[Any], None], *, dpi: int = 150
 ) -> None:
-    """Writes what `draw` puts on the axes of an empty figure; an old file goes in one step.
+    """Writes what `draw` puts into an empty figure; an old file goes in one step.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def write_figure(
         Ends in `.png`, `.svg` or `.pdf`.
     size : (float, float), inches
     draw : callable
-        Takes matplotlib's axes.
+        Takes matplotlib's figure.
     dpi : int
         Of a `.png`.
 
@@ -116,7 +116,7 @@ def write_figure(
     settings = {"svg.fonttype": "none", "svg.hashsalt": "cmfsim", "font.size": 9.0}
     with matplotlib.rc_context(settings):
         figure = figures.Figure(figsize=size, layout="constrained")
-        draw(figure.add_subplot())
+        draw(figure)
         file = io.BytesIO()
         kind = path.suffix.lower()[1:]
         metadata = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
@@ -129,7 +129,8 @@ def write_figure(
         temporary.unlink(missing_ok=True)
 
 
-def _draw(axes: Any, groups: Mapping[str, Mapping[str, Any]], colours: Mapping[str, str]) -> None:
+def _draw(figure: Any, groups: Mapping[str, Mapping[str, Any]], colours: Mapping[str, str]) -> None:
+    axes = figure.add_subplot()
     _boxes(axes, groups, colours)
     patches = import_module("matplotlib.patches")
     handles = [patches.Patch(facecolor=c, edgecolor="black", label=m) for m, c in colours.items()]
