@@ -35,6 +35,7 @@ from cmfsim.achieved import (
     achieved_plan,
     measure_motion,
 )
+from cmfsim.bench import Choice, Frontier, FrontierRow, case_choice, frontier, sweep_choices
 from cmfsim.build import build_case, build_model, with_muscles, write_phantom_case
 from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.doctor import diagnose
@@ -195,6 +196,7 @@ __all__ = [
     "CaseError",
     "CaseEvaluation",
     "CaseMuscles",
+    "Choice",
     "ClassifiedNodes",
     "CmfsimError",
     "Cohort",
@@ -206,6 +208,8 @@ __all__ = [
     "Finding",
     "FoldReport",
     "Folds",
+    "Frontier",
+    "FrontierRow",
     "HeadParameters",
     "IcpFit",
     "ImageData",
@@ -272,6 +276,7 @@ __all__ = [
     "anatomy_from_surfaces",
     "build_case",
     "build_model",
+    "case_choice",
     "check_surface",
     "check_template",
     "classify_nodes",
@@ -287,6 +292,7 @@ __all__ = [
     "evaluate",
     "fold_report",
     "free_cut",
+    "frontier",
     "icp",
     "import_bodyparts3d",
     "landmark_trials",
@@ -328,6 +334,7 @@ __all__ = [
     "signed_level",
     "skin_regions",
     "solve_scene",
+    "sweep_choices",
     "template_names",
     "tissue_level",
     "undeformed_mask",
