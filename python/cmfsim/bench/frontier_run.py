@@ -209,7 +209,6 @@ class _Jobs:
             if alike and "error" in answers[0] and STOPPED in answers[0]["error"]:
                 why = f"not run: at {other.edge_length:g} mm it was {answers[0]['error']}"
                 self.answers[choice] = [{"error": why}]
-                self.builds.setdefault(choice.build_key(self.of), {})
                 return True
         return False
 
@@ -252,7 +251,9 @@ def _frontier(
     rows = []
     for choice in [*choices, reference]:
         answers = jobs.answers[choice]
-        row = _row(choice, jobs.builds[choice.build_key(jobs.of)], answers, paces)
+        # None was made for a choice that was not run.
+        built = jobs.builds.get(choice.build_key(jobs.of), {})
+        row = _row(choice, built, answers, paces)
         if not row.failure:
             row = replace(row, error=skin_errors(_moved(jobs, choice), exact, regions))
         rows.append(replace(row, is_base=choice == base, is_reference=choice == reference))
