@@ -192,6 +192,10 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "pictures": "case checks errors musculature prediction scene _core",
         "report": "case errors io scene",
         "insilico": "build case checks errors io phantom planning scene topology _core",
+        "bench": (
+            "build checks errors evaluation io model patient patient_prediction pictures "
+            "prediction scene simulation _core"
+        ),
         "topology": "",
         "crossings": "checks",
         "capping": "checks",
@@ -202,13 +206,13 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "surface_checks surface_repair template topology _core"
         ),
         "cli": (
-            "build case checks cmfsim demo doctor errors evaluation insilico io meshing "
+            "bench build case checks cmfsim demo doctor errors evaluation insilico io meshing "
             "musculature phantom pictures prediction report scene simulation study template"
         ),
         "__main__": "cli",
         "__init__": (
-            "achieved build case deferred doctor equivalent errors evaluation imaging insilico io "
-            "landmark_sites meshing model musculature node_kinds osteotomy patient "
+            "achieved bench build case deferred doctor equivalent errors evaluation imaging "
+            "insilico io landmark_sites meshing model musculature node_kinds osteotomy patient "
             "patient_prediction phantom planning prediction registration scene simulation study "
             "surface_checks surface_repair template _core"
         ),

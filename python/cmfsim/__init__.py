@@ -41,6 +41,14 @@ __getattr__, __dir__, __all__ = deferred(
             "achieved_plan",
             "measure_motion",
         ),
+        "bench": (
+            "Choice",
+            "Frontier",
+            "FrontierRow",
+            "case_choice",
+            "frontier",
+            "sweep_choices",
+        ),
         "build": (
             "build_case",
             "build_model",

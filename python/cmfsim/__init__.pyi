@@ -29,6 +29,14 @@ from cmfsim.achieved import (
     achieved_plan,
     measure_motion,
 )
+from cmfsim.bench import (
+    Choice,
+    Frontier,
+    FrontierRow,
+    case_choice,
+    frontier,
+    sweep_choices,
+)
 from cmfsim.build import build_case, build_model, with_muscles, write_phantom_case
 from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.doctor import diagnose
@@ -190,6 +198,7 @@ __all__ = [
     "CaseError",
     "CaseEvaluation",
     "CaseMuscles",
+    "Choice",
     "ClassifiedNodes",
     "CmfsimError",
     "Cohort",
@@ -201,6 +210,8 @@ __all__ = [
     "Finding",
     "FoldReport",
     "Folds",
+    "Frontier",
+    "FrontierRow",
     "HeadParameters",
     "IcpFit",
     "ImageData",
@@ -267,6 +278,7 @@ __all__ = [
     "anatomy_from_surfaces",
     "build_case",
     "build_model",
+    "case_choice",
     "check_surface",
     "check_template",
     "classify_nodes",
@@ -282,6 +294,7 @@ __all__ = [
     "evaluate",
     "fold_report",
     "free_cut",
+    "frontier",
     "icp",
     "import_bodyparts3d",
     "landmark_trials",
@@ -323,6 +336,7 @@ __all__ = [
     "signed_level",
     "skin_regions",
     "solve_scene",
+    "sweep_choices",
     "template_names",
     "tissue_level",
     "undeformed_mask",
