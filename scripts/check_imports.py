@@ -51,7 +51,7 @@ CORE: Mapping[str, frozenset[str]] = {
         "equivalent/direction": "triangle",
         "equivalent/shares": (
             "equivalent equivalent/crossing equivalent/direction equivalent/packet "
-            "equivalent/sequence equivalent/shape mesh triangle"
+            "equivalent/sequence equivalent/shape fibre mesh triangle"
         ),
         "equivalent/stiffness": "equivalent/shares material",
         "equivalent": "fibre material mesh surface triangle winding",
