@@ -18,7 +18,8 @@ CORE: Mapping[str, frozenset[str]] = {
         "error": "",
         "mesh": "",
         "memory": "",
-        "blocks": "",
+        "simd": "",
+        "blocks": "simd",
         "ordering": "blocks",
         "triangle": "",
         "topology": "triangle",
@@ -91,12 +92,13 @@ CORE: Mapping[str, frozenset[str]] = {
         "error_bound": "",
         "krylov": "blocks error_bound row_sums",
         "multigrid/block_rows": "blocks",
-        "multigrid/small_blocks": "",
+        "multigrid/small_blocks": "simd",
         "multigrid/scaling": "multigrid/block_rows multigrid/small_blocks",
         "multigrid/scaled_matrix": (
-            "error_bound row_sums multigrid/block_rows multigrid/scaling multigrid/small_blocks"
+            "error_bound row_sums simd multigrid/block_rows multigrid/scaling "
+            "multigrid/small_blocks"
         ),
-        "multigrid/smoother": "multigrid/scaled_matrix",
+        "multigrid/smoother": "simd multigrid/scaled_matrix",
         "multigrid/aggregation": "multigrid/block_rows multigrid/scaled_matrix",
         "multigrid/rigid_modes": "multigrid/aggregation",
         "multigrid/prolongator": (
@@ -108,7 +110,8 @@ CORE: Mapping[str, frozenset[str]] = {
             "multigrid/small_blocks"
         ),
         "multigrid/transfer": (
-            "multigrid/prolongator multigrid/rigid_modes multigrid/scaling multigrid/small_blocks"
+            "simd multigrid/prolongator multigrid/rigid_modes multigrid/scaling "
+            "multigrid/small_blocks"
         ),
         "multigrid/coarsest": (
             "multigrid/block_rows multigrid/galerkin multigrid/rigid_modes multigrid/scaling"
@@ -118,17 +121,21 @@ CORE: Mapping[str, frozenset[str]] = {
         "method": "contact kinematics",
         "reduction": "blocks boundary",
         "solution": "",
+        "projected_product": "blocks constraints contact krylov mesh",
+        "iterative": (
+            "blocks constraints contact krylov mesh method multigrid projected_product relaxation"
+        ),
         "system": (
-            "blocks boundary cholesky constraints contact crease krylov mesh method multigrid "
-            "relaxation restraint solution"
+            "blocks boundary cholesky constraints contact crease iterative mesh method restraint "
+            "solution"
         ),
         "equilibrium": (
-            "blocks boundary cholesky constraints contact krylov mesh method multigrid reduction "
-            "solution strain_energy system tensors"
+            "blocks boundary cholesky constraints contact iterative krylov mesh method multigrid "
+            "reduction solution strain_energy tensors"
         ),
         "statics": (
-            "blocks boundary contact equilibrium kinematics mesh method reduction restraint "
-            "solution system tensors"
+            "blocks boundary contact equilibrium iterative kinematics mesh method reduction "
+            "restraint solution system tensors"
         ),
         "replan": "boundary crease kinematics mesh method motion reduction statics system",
     }.items()
@@ -137,6 +144,7 @@ CORE: Mapping[str, frozenset[str]] = {
 CRATES: Mapping[str, str] = {
     "parry3d_f64": "mtm-core/src/surface.rs",
     "faer": "mtm-core/src/cholesky/",
+    "pulp": "mtm-core/src/simd.rs",
     "metis_sys": "mtm-core/src/ordering.rs",
     "libc": "mtm-core/src/memory.rs",
     "pyo3": "mtm-py/",

@@ -89,6 +89,33 @@ fn methods_agree_with_sliding_contact() {
     }
 }
 
+/// Contact that settles in several steps costs conjugate gradients little more than one plan that knew
+/// its end from the start, and ends as exact: the steps before the last are loose.
+#[test]
+fn contact_costs_conjugate_gradients_two_plain_plans_at_most() {
+    let (mesh, bounds, _) = slab([12, 12, 6]);
+    let tensors = tensors(&mesh, &muscle(mesh.n_tets()));
+    let shape = BoxShape { cells: [12, 12, 6], size: [12.0, 12.0, 6.0], jitter: 0.15 };
+    let press = rigid([0.0, 0.0, 1.0], 5.0, [6.0, 6.0, 6.0], [0.4, 0.0, -0.3]);
+    let tilt = rigid([1.0, 0.5, 0.0], 4.0, [6.0, 6.0, 0.0], [0.0, 0.0, 0.1]);
+    let pcg = || with_method(Method::Pcg);
+    let moved = |motion| plan([("lid", Motion::Rigid(press)), ("floor", motion)]);
+    let found = solve(&tensors, &bounds, pcg(), &moved(Motion::Rigid(tilt)), None).unwrap();
+    assert!(found.contact_iterations >= 3, "{}", found.contact_iterations);
+    assert!(found.error_bound <= 1e-7, "{:e}", found.error_bound);
+
+    let held = vec![joined("lid", shape.side(2, true))];
+    let floor_fixed = boundary(shape.side(2, false), held);
+    let alone = plan([("lid", Motion::Rigid(press))]);
+    let plain = solve(&tensors, &floor_fixed, pcg(), &alone, None).unwrap();
+    assert!(
+        found.iterations <= 2 * plain.iterations,
+        "{} iterations with contact, {} without",
+        found.iterations,
+        plain.iterations
+    );
+}
+
 /// A rigid motion is affine in R − I and t: twelve columns a segment answer any finite motion exactly.
 #[test]
 fn plan_operator_equals_solve_at_twenty_degrees() {

@@ -2,6 +2,8 @@
 
 use rayon::prelude::*;
 
+use crate::simd::{Kernel, LANES, add_products, widest};
+
 /// A 3×3 block, row by row.
 pub type Block = [f64; 9];
 
@@ -88,9 +90,7 @@ impl BlockMatrix {
     /// `y = A x`, parallel over rows; each row sums in column order, so the bits do not depend on threads.
     pub fn multiply_into(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
         y.par_chunks_mut(ROWS_PER_TASK).enumerate().for_each(|(chunk, rows)| {
-            for (offset, out) in rows.iter_mut().enumerate() {
-                *out = self.row_product(chunk * ROWS_PER_TASK + offset, x);
-            }
+            self.multiply_rows(chunk * ROWS_PER_TASK, x, rows);
         });
     }
 
@@ -101,16 +101,47 @@ impl BlockMatrix {
         y
     }
 
+    /// The rows of `A x` from `first` on, as many as `out` has, on this thread.
+    pub(crate) fn multiply_rows(&self, first: usize, x: &[[f64; 3]], out: &mut [[f64; 3]]) {
+        widest(RowProducts { matrix: self, first, x, out });
+    }
+
     /// Row `j` of `A x`.
+    #[inline(always)]
     pub fn row_product(&self, j: usize, x: &[[f64; 3]]) -> [f64; 3] {
         let (columns, blocks) = self.row(j);
-        let mut sum = [0.0; 3];
+        // One sum a row of the block, its lanes over the components of x. The fourth lane is loaded
+        // because memory has it, and left out at the end; the last row takes the first for that.
+        let mut sums = [[0.0; LANES]; 3];
         for (&k, b) in columns.iter().zip(blocks) {
             let v = x[k as usize];
-            sum[0] += b[0] * v[0] + b[1] * v[1] + b[2] * v[2];
-            sum[1] += b[3] * v[0] + b[4] * v[1] + b[5] * v[2];
-            sum[2] += b[6] * v[0] + b[7] * v[1] + b[8] * v[2];
+            let (head, tail) = ([v[0], v[1], v[2], 0.0], [0.0, v[0], v[1], v[2]]);
+            add_products(&mut sums[0], [b[0], b[1], b[2], b[3]], head);
+            add_products(&mut sums[1], [b[3], b[4], b[5], b[6]], head);
+            add_products(&mut sums[2], [b[5], b[6], b[7], b[8]], tail);
         }
-        sum
+        [
+            sums[0][0] + sums[0][1] + sums[0][2],
+            sums[1][0] + sums[1][1] + sums[1][2],
+            sums[2][1] + sums[2][2] + sums[2][3],
+        ]
+    }
+}
+
+/// Some rows of a product.
+struct RowProducts<'a> {
+    matrix: &'a BlockMatrix,
+    first: usize,
+    x: &'a [[f64; 3]],
+    out: &'a mut [[f64; 3]],
+}
+
+impl Kernel for RowProducts<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        for (offset, out) in self.out.iter_mut().enumerate() {
+            *out = self.matrix.row_product(self.first + offset, self.x);
+        }
     }
 }

@@ -130,6 +130,8 @@ pub struct Response {
     pub displacements: Vec<[f64; 3]>,
     /// Contact force of each of `Constraints::rows`.
     pub forces: Vec<f64>,
+    /// Whether they are within the tolerance of the solver: contact cannot end before that.
+    pub solved: bool,
 }
 
 impl Sliding {

@@ -14,6 +14,7 @@ use crate::constraints::{
 };
 use crate::contact::{Constraints, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result};
+use crate::iterative::Effort;
 use crate::krylov::{PcgOptions, Preconditioner, pcg};
 use crate::mesh::{add, dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
@@ -21,7 +22,6 @@ use crate::multigrid::{Multigrid, MultigridOptions};
 use crate::reduction::Reduction;
 use crate::solution::Clock;
 use crate::strain_energy::{StrainEnergy, TangentKind};
-use crate::system::{AUTO_DIRECT_UNKNOWNS, Effort};
 use crate::tensors::MassTensors;
 
 /// Newton steps after which a share of the plan counts as too large.
@@ -102,9 +102,7 @@ impl Equilibrium {
                     kind: ErrorKind::Solver,
                 });
             }
-            Method::Auto if 3 * matrix.n_rows() > AUTO_DIRECT_UNKNOWNS => Method::Pcg,
-            Method::Auto => Method::Cholesky,
-            named => named,
+            method => method.for_unknowns(3 * matrix.n_rows()),
         };
         let solver = if method == Method::Cholesky {
             let symbolic = Symbolic::new(matrix, &[])?;
@@ -172,7 +170,7 @@ impl Equilibrium {
             let forces = along_normals(&asked, reaction);
             let displacement = |node: u32| u[node as usize];
             let displacements = sliding.nodes().iter().map(|n| displacement(n.node)).collect();
-            Ok(Response { displacements, forces })
+            Ok(Response { displacements, forces, solved: true })
         })?;
         Ok((reduction.rows(&u), Some(state), clock.total()))
     }

@@ -9,6 +9,9 @@ const RITZ_SAFETY: f64 = 0.5;
 /// Relative change of the smallest Ritz value, over the last [`RITZ_WINDOW`] of all iterations, below
 /// which it counts as resolved.
 const RITZ_SETTLED: f64 = 0.1;
+/// Power of the fall of the smallest Ritz value over that window by which the bounds count as larger
+/// where it is not resolved: it may go on to fall as much several times more.
+const RITZ_DOUBT: i32 = 4;
 /// Share of all iterations over which the smallest Ritz value must stay put. A share, not a number: a
 /// weak preconditioner lets it rest on plateaus for long before the slowest motion shows.
 const RITZ_WINDOW: f64 = 0.3;
@@ -79,8 +82,9 @@ pub(crate) struct StoppingRule<'a> {
 /// Why the true residual is due.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Due {
-    /// Whether the bounds can be believed.
-    resolved: bool,
+    /// Factor by which the bounds count as larger: one where the spectrum is resolved, see
+    /// [`Spectrum::doubt`].
+    pub(crate) doubt: f64,
     /// Whether no iteration is left.
     exhausted: bool,
 }
@@ -114,14 +118,19 @@ impl<'a> StoppingRule<'a> {
         excess: impl FnOnce() -> f64,
     ) -> Option<Due> {
         let floor = rz <= ROUND_OFF * ROUND_OFF * self.first_rz;
-        let resolved = floor || (iterations >= self.options.min_iterations && spectrum.settled());
+        let shown = spectrum.recent.len() >= self.options.min_iterations;
+        let doubt = match (floor, shown) {
+            (true, _) => 1.0,
+            (false, true) => spectrum.doubt(),
+            (false, false) => f64::INFINITY,
+        };
         if error_mm < self.best.0 {
             self.best = (error_mm, iterations);
         }
         let stagnant = iterations - self.best.1 >= STAGNATION_ITERATIONS.max(iterations / 2);
         let exhausted = iterations >= self.options.max_iterations;
-        let met = resolved && error_mm <= self.options.tolerance && excess() <= 1.0;
-        (met || floor || stagnant || exhausted).then_some(Due { resolved, exhausted })
+        let met = doubt * error_mm <= self.options.tolerance && doubt * excess() <= 1.0;
+        (met || floor || stagnant || exhausted).then_some(Due { doubt, exhausted })
     }
 
     /// What follows from the bounds of the true residual.
@@ -135,7 +144,7 @@ impl<'a> StoppingRule<'a> {
         // Two restarts in a row from the same true residual: round-off lets it go no lower.
         let at_floor = self.restarts >= MAX_RESTARTS || excess > FLOOR_PROGRESS * self.verified;
         let allowed = if at_floor && !due.exhausted { self.options.slack } else { 1.0 };
-        if due.resolved && excess <= allowed {
+        if due.doubt * excess <= allowed {
             return Verdict::Converged;
         }
         if due.exhausted || at_floor {
@@ -149,6 +158,8 @@ impl<'a> StoppingRule<'a> {
 }
 
 /// The Lanczos matrix of `M⁻¹ A` that the coefficients of the iteration spell out.
+///
+/// It may outlive a solution, for the next of a system that differs little.
 #[derive(Debug, Default)]
 pub(crate) struct Spectrum {
     alphas: Vec<f64>,
@@ -189,13 +200,15 @@ impl Spectrum {
         self.recent.push(self.smallest);
     }
 
-    /// Whether the smallest Ritz value has come to rest.
-    fn settled(&self) -> bool {
+    /// Factor of doubt in the bounds: one where the smallest Ritz value has come to rest, a power of its
+    /// recent fall where it has not, infinite where too little is known.
+    pub(crate) fn doubt(&self) -> f64 {
         let window = RITZ_WINDOW_MIN.max((RITZ_WINDOW * self.recent.len() as f64) as usize);
-        match self.recent.len().checked_sub(window + 1) {
-            None => false,
-            Some(before) => self.recent[before] <= (1.0 + RITZ_SETTLED) * self.smallest,
-        }
+        let Some(before) = self.recent.len().checked_sub(window + 1) else {
+            return f64::INFINITY;
+        };
+        let fall = self.recent[before] / self.smallest;
+        if fall <= 1.0 + RITZ_SETTLED { 1.0 } else { fall.powi(RITZ_DOUBT) }
     }
 
     /// A lower end of the spectrum, as far as it has shown.

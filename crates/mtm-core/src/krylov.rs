@@ -9,10 +9,45 @@ use rayon::prelude::*;
 
 use crate::blocks::{Block, BlockMatrix};
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
-use crate::error_bound::{Spectrum, StoppingRule, Verdict};
+use crate::error_bound::{StoppingRule, Verdict};
 use crate::row_sums::{ROWS_PER_SUM, advance, dot, dot_and_largest, in_pool, multiply_and_dot};
 
 pub use crate::error_bound::PcgOptions;
+pub(crate) use crate::error_bound::Spectrum;
+
+/// A symmetric positive definite matrix, as conjugate gradients see it.
+///
+/// It may be one on a subspace alone: [`Operator::project`] then says which.
+pub trait Operator: Sync {
+    /// Number of block rows.
+    fn n_rows(&self) -> usize;
+
+    /// Writes `y = A x` for an `x` of the subspace; `y` lies in it too.
+    fn multiply_into(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]);
+
+    /// Writes `y = A x` and returns `xᵀ y`. The bits must not depend on the threads.
+    fn multiply_and_dot(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) -> f64 {
+        self.multiply_into(x, y);
+        dot(x, y)
+    }
+
+    /// Replaces `x` by its nearest vector of the subspace; nothing where that is the whole space.
+    fn project(&self, _x: &mut [[f64; 3]]) {}
+}
+
+impl Operator for BlockMatrix {
+    fn n_rows(&self) -> usize {
+        self.n_rows()
+    }
+
+    fn multiply_into(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
+        self.multiply_into(x, y);
+    }
+
+    fn multiply_and_dot(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) -> f64 {
+        multiply_and_dot(self, x, y)
+    }
+}
 
 /// A symmetric positive definite approximation of `A⁻¹`.
 pub trait Preconditioner: Sync {
@@ -102,13 +137,42 @@ pub struct PcgOutcome {
 /// [`MtmError::NotPositiveDefinite`] for a breakdown, [`MtmError::NotConverged`] and
 /// [`MtmError::Interrupted`].
 pub fn pcg(
-    a: &BlockMatrix,
+    a: &dyn Operator,
     b: &[[f64; 3]],
     x0: &[[f64; 3]],
     preconditioner: &dyn Preconditioner,
     options: &PcgOptions,
     interrupted: &(dyn Fn() -> bool + Sync),
 ) -> Result<PcgOutcome> {
+    let mut seen = Spectrum::default();
+    match pcg_near(a, b, x0, preconditioner, options, None, &mut seen, interrupted)? {
+        Reached::Solution(outcome) | Reached::Step(outcome) => Ok(outcome),
+    }
+}
+
+/// Where [`pcg_near`] ended.
+pub(crate) enum Reached {
+    /// Within the tolerances, checked with the true residual.
+    Solution(PcgOutcome),
+    /// Near enough for a step; its bound is that of the recurrence.
+    Step(PcgOutcome),
+}
+
+/// [`pcg`] for one of several systems that differ little, with the same preconditioner.
+///
+/// `seen`: what earlier systems showed of the spectrum. With `share`, the solution is only a step on the
+/// way to another system: the iteration ends as soon as the bound has fallen to that share of the one at
+/// `x0` (the bound of the step is then as good as what was seen), unless that lies within the tolerances.
+pub(crate) fn pcg_near(
+    a: &dyn Operator,
+    b: &[[f64; 3]],
+    x0: &[[f64; 3]],
+    preconditioner: &dyn Preconditioner,
+    options: &PcgOptions,
+    share: Option<f64>,
+    seen: &mut Spectrum,
+    interrupted: &(dyn Fn() -> bool + Sync),
+) -> Result<Reached> {
     let n = a.n_rows();
     for (what, rows) in [("right-hand side", b), ("start vector", x0)] {
         if rows.len() != n {
@@ -124,7 +188,7 @@ pub fn pcg(
     }
     let b_norm = dot(b, b).sqrt();
     if b_norm == 0.0 {
-        return Ok(PcgOutcome {
+        return Ok(Reached::Solution(PcgOutcome {
             solution: vec![[0.0; 3]; n],
             iterations: 0,
             error_bound_mm: 0.0,
@@ -132,12 +196,13 @@ pub fn pcg(
             residual: 0.0,
             residual_history: Vec::new(),
             ritz: [1.0; 2],
-        });
+        }));
     }
 
-    let mut state = State::new(a, b, x0, preconditioner);
+    let mut state = State::new(a, b, x0, preconditioner, seen);
     in_pool(|| state.replace_residual());
     state.restart();
+    let step = share.map(|share| share * state.error_mm()).filter(|&e| e > options.tolerance);
     let mut rule = StoppingRule::new(options, state.rz);
     let mut iterations = 0;
     let mut history = Vec::new();
@@ -152,22 +217,18 @@ pub fn pcg(
             history.push(state.r_norm / b_norm);
         }
 
+        if step.is_some_and(|goal| state.error_mm() <= goal) {
+            return Ok(Reached::Step(state.outcome(1.0, b_norm, iterations, history)));
+        }
         let excess = || state.excess(options);
-        let due = rule.due(iterations, state.rz, &state.spectrum, state.error_mm(), excess);
+        let due = rule.due(iterations, state.rz, state.spectrum, state.error_mm(), excess);
         let Some(due) = due else { continue };
         // The recurrence drifts from b − A x at the round-off floor: only the true residual counts.
         in_pool(|| state.replace_residual());
         match rule.verdict(due, iterations, state.error_mm(), state.excess(options)) {
             Verdict::Converged => {
-                return Ok(PcgOutcome {
-                    error_bound_mm: state.error_mm(),
-                    energy_error: state.energy_error(),
-                    residual: state.r_norm / b_norm,
-                    ritz: [state.spectrum.smallest, state.spectrum.largest],
-                    solution: state.x,
-                    iterations,
-                    residual_history: history,
-                });
+                let doubt = due.doubt;
+                return Ok(Reached::Solution(state.outcome(doubt, b_norm, iterations, history)));
             }
             Verdict::GiveUp => {
                 return Err(MtmError::NotConverged {
@@ -185,7 +246,7 @@ pub fn pcg(
 
 /// The vectors and coefficients of the iteration.
 struct State<'a> {
-    a: &'a BlockMatrix,
+    a: &'a dyn Operator,
     b: &'a [[f64; 3]],
     preconditioner: &'a dyn Preconditioner,
     x: Vec<[f64; 3]>,
@@ -196,15 +257,16 @@ struct State<'a> {
     rz: f64,
     r_norm: f64,
     largest_z: f64,
-    spectrum: Spectrum,
+    spectrum: &'a mut Spectrum,
 }
 
 impl<'a> State<'a> {
     fn new(
-        a: &'a BlockMatrix,
+        a: &'a dyn Operator,
         b: &'a [[f64; 3]],
         x0: &[[f64; 3]],
         preconditioner: &'a dyn Preconditioner,
+        spectrum: &'a mut Spectrum,
     ) -> Self {
         let zeros = vec![[0.0; 3]; b.len()];
         Self {
@@ -219,7 +281,7 @@ impl<'a> State<'a> {
             rz: 0.0,
             r_norm: 0.0,
             largest_z: 0.0,
-            spectrum: Spectrum::default(),
+            spectrum,
         }
     }
 
@@ -235,8 +297,33 @@ impl<'a> State<'a> {
             }
         });
         self.r_norm = dot(&self.r, &self.r).sqrt();
-        self.preconditioner.apply(&self.r, &mut self.z);
+        self.precondition();
         (self.rz, self.largest_z) = dot_and_largest(&self.r, &self.z);
+    }
+
+    /// z = P M⁻¹ r, P the projection of the operator.
+    fn precondition(&mut self) {
+        self.preconditioner.apply(&self.r, &mut self.z);
+        self.a.project(&mut self.z);
+    }
+
+    /// `doubt`: see [`Spectrum::doubt`].
+    fn outcome(
+        self,
+        doubt: f64,
+        b_norm: f64,
+        iterations: usize,
+        residual_history: Vec<f64>,
+    ) -> PcgOutcome {
+        PcgOutcome {
+            error_bound_mm: doubt * self.error_mm(),
+            energy_error: doubt * self.energy_error(),
+            residual: self.r_norm / b_norm,
+            ritz: [self.spectrum.smallest, self.spectrum.largest],
+            solution: self.x,
+            iterations,
+            residual_history,
+        }
     }
 
     /// Forgets the search directions: the next step follows z alone.
@@ -247,13 +334,13 @@ impl<'a> State<'a> {
 
     /// One iteration.
     fn step(&mut self) -> Result<()> {
-        let pq = multiply_and_dot(self.a, &self.p, &mut self.q);
+        let pq = self.a.multiply_and_dot(&self.p, &mut self.q);
         if !(pq > 0.0 && self.rz > 0.0 && pq.is_finite() && self.rz.is_finite()) {
             return Err(self.breakdown(pq));
         }
         let alpha = self.rz / pq;
         self.r_norm = advance(alpha, &self.p, &self.q, &mut self.x, &mut self.r).sqrt();
-        self.preconditioner.apply(&self.r, &mut self.z);
+        self.precondition();
         let (rz, largest_z) = dot_and_largest(&self.r, &self.z);
         if !(rz >= 0.0 && rz.is_finite() && self.r_norm.is_finite() && largest_z.is_finite()) {
             return Err(self.breakdown(pq));

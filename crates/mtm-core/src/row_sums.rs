@@ -58,9 +58,7 @@ pub(crate) fn multiply_and_dot(a: &BlockMatrix, p: &[[f64; 3]], q: &mut [[f64; 3
         .enumerate()
         .map(|(chunk, q)| {
             let first = chunk * ROWS_PER_SUM;
-            for (offset, out) in q.iter_mut().enumerate() {
-                *out = a.row_product(first + offset, p);
-            }
+            a.multiply_rows(first, p, q);
             chunk_dot(&p[first..first + q.len()], q)
         })
         .collect();

@@ -113,7 +113,7 @@ impl Sliding {
             let active = held.active.clone();
             let changed = held.update(&forces, &gaps, limit) || rebuilt;
             let balance = (options.tolerance * largest_force).max(rounding);
-            let settled = !changed && gap <= limit && turned <= balance;
+            let settled = response.solved && !changed && gap <= limit && turned <= balance;
             let last = ContactState {
                 displacements: response.displacements,
                 points: nearest.iter().zip(&seats).map(|(f, s)| sub(f.point, s.offset)).collect(),

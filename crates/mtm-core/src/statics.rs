@@ -8,13 +8,14 @@ use crate::boundary::{Boundary, Motion, NodeKind, Plan};
 use crate::contact::{ContactState, Sliding};
 use crate::equilibrium::Equilibrium;
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
+use crate::iterative::Effort;
 use crate::kinematics::Kinematics;
 use crate::mesh::{dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
 use crate::reduction::{NO_ROW, Reduction};
 use crate::restraint;
 use crate::solution::{Clock, ContactResult, Solution, Timings};
-use crate::system::{Effort, Frozen, System};
+use crate::system::{Frozen, System};
 use crate::tensors::MassTensors;
 
 /// A patient's tensors and node kinds, ready for any plan.

@@ -7,43 +7,25 @@ use crate::cholesky::{Factor, Symbolic, TailFactor};
 use crate::constraints::{
     Constraint, add_offsets, along_normals, orthonormal, projected, projected_rhs,
 };
-use crate::contact::{Constraints, ContactState, Response, Sliding, Spring};
+use crate::contact::{Constraints, ContactMode, ContactState, Response, Sliding, Spring};
 use crate::crease::ContactRow;
 use crate::error::{MtmError, Result};
-use crate::krylov::{PcgOptions, Preconditioner, pcg};
+use crate::iterative::{Effort, Iterative, Trail};
 use crate::mesh::{add, dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
-use crate::multigrid::{Multigrid, MultigridOptions};
-use crate::relaxation::{RelaxationOptions, relax};
 use crate::restraint::Held;
 use crate::solution::Clock;
 
-/// Above this many unknowns `Method::Auto` takes conjugate gradients: a factor grows like n^1.4.
-pub(crate) const AUTO_DIRECT_UNKNOWNS: usize = 300_000;
 /// Most sliding nodes whose dense flexibility is kept (three unknowns each, 8 bytes, twice).
 const MAX_DENSE_SLIDING: usize = 2500;
-/// Over-relaxation of the node-wise iteration.
-const RELAXATION_FACTOR: f64 = 1.6;
-/// Sweeps after which the node-wise iteration gives up.
-const MAX_SWEEPS: usize = 200_000;
 
-/// Share of the tolerance to which the error left by the sweeps is measured.
-const MEASURED_SHARE: f64 = 0.1;
-/// λ/μ from which a stronger smoother pays: at ν = 0.499 it takes 113 iterations instead of 186. ν = 0.48.
-const NEARLY_INCOMPRESSIBLE: f64 = 24.0;
+/// Share of the error at its start to which a contact iteration is solved, until the tolerance is near:
+/// what it leaves is less than what the next closest points change.
+const STEP_SHARE: f64 = 1e-2;
+/// The same where nodes may lift off: small forces decide which.
+const LIFTING_STEP_SHARE: f64 = 1e-4;
 /// Multiple of a factor's trial error that stands for the error of any solution by it.
 const TRIAL_SAFETY: f64 = 10.0;
-
-/// Counters of the iterative solves of one plan.
-#[derive(Default)]
-pub(crate) struct Effort {
-    /// Error bound of the last solve, mm.
-    pub error_bound: f64,
-    /// Iterations of all solves.
-    pub iterations: usize,
-    /// Residual measure of each.
-    pub history: Vec<f64>,
-}
 
 /// What is kept from one plan to the next.
 enum Kept {
@@ -52,16 +34,12 @@ enum Kept {
     /// The structure of the factor: the values change with the contact normals.
     Refactored { symbolic: Symbolic, matrix: BlockMatrix },
     /// The preconditioner.
-    Pcg { multigrid: Box<Multigrid>, matrix: BlockMatrix },
-    /// The preconditioner serves the error bound alone.
-    Relaxation { multigrid: Box<Multigrid>, matrix: BlockMatrix },
+    Iterative(Iterative),
 }
 
 /// The system of the unknown nodes, ready for any right-hand side.
 pub(crate) struct System {
     kept: Kept,
-    tolerance: f64,
-    max_iterations: Option<usize>,
 }
 
 /// Contact constraints that do not change, for several right-hand sides.
@@ -86,17 +64,8 @@ impl System {
         clock: &mut Clock,
         interrupted: Interrupt<'_>,
     ) -> Result<(Self, Method)> {
-        let unknowns = 3 * matrix.n_rows();
-        let mut method = match options.method {
-            Method::Auto if unknowns > AUTO_DIRECT_UNKNOWNS => Method::Pcg,
-            Method::Auto => Method::Cholesky,
-            named => named,
-        };
-        let with = |kept: Kept| Self {
-            kept,
-            tolerance: options.tolerance,
-            max_iterations: options.max_iterations,
-        };
+        let mut method = options.method.for_unknowns(3 * matrix.n_rows());
+        let with = |kept: Kept| Self { kept };
         if method == Method::Cholesky {
             let slide_rows: Vec<u32> =
                 sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
@@ -129,29 +98,9 @@ impl System {
             }
             method = Method::Pcg;
         }
-        let normals: Vec<(usize, [f64; 3])> = sliding
-            .iter()
-            .flat_map(|s| s.nodes().iter().zip(s.rest_normals()))
-            .map(|(node, &n)| (node.row as usize, n))
-            .collect();
-        let constraints: Vec<Constraint> =
-            normals.iter().map(|&(row, normal)| Constraint { row, normal, offset: 0.0 }).collect();
-        let held_matrix = (!constraints.is_empty()).then(|| projected(&matrix, &constraints));
-        let multigrid = Box::new(Multigrid::new(
-            held_matrix.as_ref().unwrap_or(&matrix),
-            positions,
-            &normals,
-            &multigrid_options(lame_ratio),
-        )?);
+        let iterative = Iterative::new(matrix, positions, sliding, lame_ratio, method, options)?;
         clock.lap("preconditioner", true);
-        Ok((
-            with(if method == Method::Relaxation {
-                Kept::Relaxation { multigrid, matrix }
-            } else {
-                Kept::Pcg { multigrid, matrix }
-            }),
-            method,
-        ))
+        Ok((with(Kept::Iterative(iterative)), method))
     }
 
     /// Bytes of the factor or preconditioner.
@@ -161,9 +110,7 @@ impl System {
                 symbolic.factor_bytes() + tail.as_ref().map_or(0, TailFactor::bytes)
             }
             Kept::Refactored { symbolic, .. } => symbolic.factor_bytes(),
-            Kept::Pcg { multigrid, .. } | Kept::Relaxation { multigrid, .. } => {
-                multigrid.memory_bytes()
-            }
+            Kept::Iterative(iterative) => iterative.bytes(),
         }
     }
 
@@ -184,10 +131,7 @@ impl System {
             Kept::Refactored { symbolic, matrix } => {
                 Ok(symbolic.solve(&symbolic.factor(matrix)?, b))
             }
-            Kept::Pcg { matrix, .. } | Kept::Relaxation { matrix, .. } => {
-                let start = vec![[0.0; 3]; b.len()];
-                self.iterate(matrix, b, &start, scale, effort, interrupted)
-            }
+            Kept::Iterative(iterative) => iterative.solve(b, scale, effort, interrupted),
         }
     }
 
@@ -216,14 +160,15 @@ impl System {
             effort.error_bound = direct_error(factor, &x);
             return Ok((x, state, seconds));
         }
-        let mut last = Vec::new();
+        let mut trail = Trail::default();
+        let share = Some(match options.contact.mode {
+            ContactMode::Bilateral => STEP_SHARE,
+            ContactMode::Unilateral => LIFTING_STEP_SHARE,
+        });
         let state = sliding.settle(motions, &options.contact, interrupted, |c| {
-            let (u, response) =
-                self.solve_projected(b, sliding, c, &last, scale, effort, interrupted)?;
-            last = u;
-            Ok(response)
+            self.solve_projected(b, sliding, c, scale, share, &mut trail, effort, interrupted)
         })?;
-        Ok((last, state, clock.total()))
+        Ok((trail.rows, state, clock.total()))
     }
 
     /// Rows for several right-hand sides; `scales` is the length of each one's prescribed field, mm.
@@ -249,9 +194,9 @@ impl System {
             }
             let c = Constraints { rows: frozen.rows, offsets, springs: &[] };
             let Kept::Direct { symbolic, factor, tail: Some(tail) } = &self.kept else {
-                let solved =
-                    self.solve_projected(b, sliding, &c, &[], scale, &mut effort, interrupted);
-                return Ok(solved?.0);
+                let (mut trail, effort) = (Trail::default(), &mut effort);
+                self.solve_projected(b, sliding, &c, scale, None, &mut trail, effort, interrupted)?;
+                return Ok(trail.rows);
             };
             let mut x = symbolic.permuted(b);
             symbolic.forward(factor, &mut x, 1);
@@ -264,179 +209,67 @@ impl System {
         columns.iter().zip(frozen.offsets).zip(scales).map(solve).collect()
     }
 
-    /// One constrained solve on the projected system P A P + k (I − P), P = I − n⊗n on held nodes.
+    /// One constrained solve on the projected system, P A P + k (I − P), P = I − n⊗n on held nodes; its
+    /// rows are left in `trail`.
     ///
-    /// `near`: displacements that conjugate gradients start from, or nothing.
+    /// `share`: see [`Iterative::solve_projected`].
     fn solve_projected(
         &self,
         b: &[[f64; 3]],
         sliding: &Sliding,
         c: &Constraints<'_>,
-        near: &[[f64; 3]],
         scale: f64,
+        share: Option<f64>,
+        trail: &mut Trail,
         effort: &mut Effort,
         interrupted: Interrupt<'_>,
-    ) -> Result<(Vec<[f64; 3]>, Response)> {
+    ) -> Result<Response> {
+        let row = |node: usize| sliding.nodes()[node].row as usize;
         let asked: Vec<Constraint> = c
             .rows
             .iter()
             .zip(c.offsets)
-            .map(|(r, &offset)| Constraint {
-                row: sliding.nodes()[r.node].row as usize,
-                normal: r.normal,
-                offset,
-            })
+            .map(|(r, &offset)| Constraint { row: row(r.node), normal: r.normal, offset })
             .collect();
         let constraints = orthonormal(&asked);
         let matrix = match &self.kept {
-            Kept::Refactored { matrix, .. }
-            | Kept::Pcg { matrix, .. }
-            | Kept::Relaxation { matrix, .. } => matrix,
+            Kept::Refactored { matrix, .. } => matrix,
+            Kept::Iterative(iterative) => iterative.matrix(),
             Kept::Direct { .. } => unreachable!("the dense flexibility serves contact there"),
         };
-        let mut system = projected(matrix, &constraints);
+        let springs: Vec<(usize, Spring)> = c.springs.iter().map(|&s| (row(s.node), s)).collect();
         let mut rhs = projected_rhs(matrix, b, &constraints);
-        add_springs(&mut system, &mut rhs, sliding, c.springs);
-        let mut x = match &self.kept {
+        for (row, s) in &springs {
+            rhs[*row] = add(rhs[*row], scaled(s.axis, s.stiffness * s.goal));
+        }
+        let (mut x, solved) = match &self.kept {
+            Kept::Iterative(iterative) => iterative.solve_projected(
+                &rhs,
+                &constraints,
+                &springs,
+                scale,
+                share,
+                trail,
+                effort,
+                interrupted,
+            )?,
             Kept::Refactored { symbolic, .. } => {
+                let mut system = projected(matrix, &constraints);
+                for (row, s) in &springs {
+                    system.add_to_diagonal(*row, s.axis, s.stiffness);
+                }
                 let factor = symbolic.factor(&system)?;
                 let x = symbolic.solve(&factor, &rhs);
                 effort.error_bound = direct_error(&factor, &x);
-                x
+                (x, true)
             }
-            _ => {
-                let reach = constraints.iter().fold(scale, |m, c| m.max(c.offset.abs()));
-                let mut start = near.to_vec();
-                start.resize(b.len(), [0.0; 3]);
-                for k in &constraints {
-                    start[k.row] = sub(start[k.row], scaled(k.normal, dot(k.normal, start[k.row])));
-                }
-                self.iterate(&system, &rhs, &start, reach, effort, interrupted)?
-            }
+            Kept::Direct { .. } => unreachable!("the dense flexibility serves contact there"),
         };
         add_offsets(&mut x, &constraints);
         let forces = along_normals(&asked, |row| sub(matrix.row_product(row, &x), b[row]));
         let displacements = sliding.nodes().iter().map(|n| x[n.row as usize]).collect();
-        Ok((x, Response { displacements, forces }))
-    }
-
-    /// Solves with the iterative method, conjugate gradients from `start`, to an error bound of `tolerance × scale`.
-    fn iterate(
-        &self,
-        matrix: &BlockMatrix,
-        b: &[[f64; 3]],
-        start: &[[f64; 3]],
-        scale: f64,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
-    ) -> Result<Vec<[f64; 3]>> {
-        if b.iter().flatten().all(|&v| v == 0.0) {
-            return Ok(vec![[0.0; 3]; b.len()]);
-        }
-        // Loads move the body where bone does not: one cycle tells how far, to the order of magnitude.
-        let tolerance = |multigrid: &Multigrid| {
-            let mut first = vec![[0.0; 3]; b.len()];
-            multigrid.apply(b, &mut first);
-            self.tolerance * first.iter().fold(scale, |m, v| m.max(norm(*v)))
-        };
-        match &self.kept {
-            Kept::Pcg { multigrid, .. } => {
-                let tolerance = tolerance(multigrid);
-                let defaults = PcgOptions::default();
-                let max_iterations = self.max_iterations.unwrap_or(defaults.max_iterations);
-                let options = PcgOptions { tolerance, max_iterations, ..defaults };
-                let found = pcg(matrix, b, start, multigrid.as_ref(), &options, interrupted)?;
-                effort.error_bound = found.error_bound_mm;
-                effort.iterations += found.iterations;
-                effort.history.extend(found.residual_history);
-                Ok(found.solution)
-            }
-            Kept::Relaxation { multigrid, .. } => {
-                let tolerance = tolerance(multigrid);
-                self.relax_to_bound(matrix, multigrid, b, tolerance, effort, interrupted)
-            }
-            Kept::Direct { .. } | Kept::Refactored { .. } => {
-                unreachable!("a factor solves without iterating")
-            }
-        }
-    }
-
-    /// Sweeps until the error itself is within `tolerance`, mm.
-    ///
-    /// The steps of the sweeps do not tell: where a stiff body hangs on soft tissue they become tiny long
-    /// before it has moved. The error that is left, A⁻¹ (b − A x), is therefore solved for by conjugate
-    /// gradients each time the steps say that the sweeps are done, and measured, not used.
-    fn relax_to_bound(
-        &self,
-        matrix: &BlockMatrix,
-        multigrid: &Multigrid,
-        b: &[[f64; 3]],
-        tolerance: f64,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
-    ) -> Result<Vec<[f64; 3]>> {
-        let most = self.max_iterations.unwrap_or(MAX_SWEEPS);
-        let (mut x, mut goal, mut sweeps) = (vec![[0.0; 3]; b.len()], tolerance, 0);
-        loop {
-            let options = RelaxationOptions {
-                tolerance: goal,
-                factor: RELAXATION_FACTOR,
-                max_sweeps: most - sweeps,
-            };
-            let found = relax(matrix, b, &x, &options, interrupted)
-                .map_err(|e| gave_up(e, most, tolerance))?;
-            (x, sweeps) = (found.solution, sweeps + found.sweeps);
-            effort.iterations += found.sweeps;
-            effort.history.extend(found.steps);
-            let rest: Vec<[f64; 3]> =
-                b.iter().zip(matrix.multiply(&x)).map(|(&b, f)| sub(b, f)).collect();
-            let options = PcgOptions {
-                tolerance: MEASURED_SHARE * tolerance,
-                energy_tolerance: MEASURED_SHARE,
-                ..PcgOptions::default()
-            };
-            let start = vec![[0.0; 3]; b.len()];
-            let left = pcg(matrix, &rest, &start, multigrid, &options, interrupted)
-                .map_err(|e| gave_up(e, sweeps, tolerance))?;
-            let largest = left.solution.iter().fold(0.0_f64, |m, e| m.max(norm(*e)));
-            let error = largest + left.error_bound_mm;
-            if error <= tolerance {
-                effort.error_bound = error;
-                return Ok(x);
-            }
-            if sweeps >= most {
-                return Err(no_rest(most, error, tolerance));
-            }
-            goal *= (0.5 * tolerance / error).min(0.5);
-        }
-    }
-}
-
-/// Options of the cycle for tissue with the given largest λ/μ.
-fn multigrid_options(lame_ratio: f64) -> MultigridOptions {
-    let defaults = MultigridOptions::default();
-    if lame_ratio < NEARLY_INCOMPRESSIBLE {
-        return defaults;
-    }
-    MultigridOptions { smoother_degree: 2 * defaults.smoother_degree, ..defaults }
-}
-
-/// That the sweeps ended before the error was within the tolerance.
-fn no_rest(sweeps: usize, error: f64, tolerance: f64) -> MtmError {
-    MtmError::NotConverged {
-        method: "relaxation",
-        iterations: sweeps,
-        error,
-        tolerance,
-        advice: "use method=\"cholesky\" or \"pcg\"; node-wise relaxation is kept for comparison",
-    }
-}
-
-/// An error of a step of the relaxation, in the terms that the caller asked in.
-fn gave_up(error: MtmError, sweeps: usize, tolerance: f64) -> MtmError {
-    match error {
-        MtmError::NotConverged { error, .. } => no_rest(sweeps, error, tolerance),
-        other => other,
+        trail.rows = x;
+        Ok(Response { displacements, forces, solved })
     }
 }
 
@@ -461,7 +294,7 @@ fn respond(tail: &TailFactor, free: &[[f64; 3]], c: &Constraints<'_>) -> Result<
         .map(|(r, f)| [0, 1, 2].map(|i| r[i] + f[i]))
         .collect();
     forces.truncate(c.rows.len());
-    Ok(Response { displacements, forces })
+    Ok(Response { displacements, forces, solved: true })
 }
 
 /// The rows of `c` and after them one for each spring, with what each asks for and how softly.
@@ -474,20 +307,6 @@ fn with_springs(c: &Constraints<'_>) -> (Vec<ContactRow>, Vec<f64>, Vec<f64>) {
         softness.push(1.0 / spring.stiffness);
     }
     (rows, goals, softness)
-}
-
-/// Adds springs to a projected system: k a⊗a on their rows, and k a g to the right-hand side.
-fn add_springs(
-    system: &mut BlockMatrix,
-    rhs: &mut [[f64; 3]],
-    sliding: &Sliding,
-    springs: &[Spring],
-) {
-    for spring in springs {
-        let row = sliding.nodes()[spring.node].row as usize;
-        rhs[row] = add(rhs[row], scaled(spring.axis, spring.stiffness * spring.goal));
-        system.add_to_diagonal(row, spring.axis, spring.stiffness);
-    }
 }
 
 /// Estimate of the largest nodal error of a solution by factor, mm.

@@ -262,7 +262,8 @@ fn plan(value: &Bound<'_, PyAny>) -> PyResult<Plan> {
 /// boundary : Boundary
 /// method : {"auto", "cholesky", "pcg", "relaxation"}
 ///     Sparse Cholesky; conjugate gradients with multigrid, stopped by an error bound; the node-wise
-///     iteration of the literature; or by size and memory.
+///     iteration of the literature; or by size and memory: Cholesky up to 100 000 unknowns, else
+///     conjugate gradients. Ask for "cholesky" where many plans of one large case follow.
 /// contact : {"bilateral", "unilateral"}
 ///     Sliding nodes stay on the surface (the paper), or may lift off but never penetrate.
 /// tolerance : float

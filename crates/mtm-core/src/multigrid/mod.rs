@@ -48,6 +48,9 @@ const STALL: f64 = 0.8;
 /// Rows of a coarsest level too large to factor densely when coarsening stalls.
 const DENSE_LIMIT: usize = 400;
 
+/// Vectors that a pass of the smoother reads or writes: d, r twice, the next d, x twice.
+const VECTORS_PER_PASS: usize = 6;
+
 /// How the hierarchy is built and cycled.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MultigridOptions {
@@ -193,6 +196,16 @@ impl Multigrid {
             + self.coarsest.as_ref().map_or(0, |c| 8 * c.size * c.size)
     }
 
+    /// Bytes that one application moves at the least: every matrix and vector once per pass over it.
+    pub fn traffic_bytes(&self) -> usize {
+        let passes = self.smoother.passes();
+        // The scaling, r in and z out, and the scaled vector between.
+        let ends = self.scaling.len() * (2 * 72 + 4 * 24);
+        ends + self.finest.traffic_bytes(passes)
+            + self.coarse.iter().map(|l| l.traffic_bytes(passes)).sum::<usize>()
+            + self.coarsest.as_ref().map_or(0, |c| 2 * 8 * c.size * c.size / 2)
+    }
+
     fn correct_coarse(&self, depth: usize, work: &mut [Vectors<MODES>]) {
         let Some((vectors, rest)) = work.split_first_mut() else { return };
         match self.coarse.get(depth) {
@@ -328,5 +341,12 @@ impl<const N: usize> Level<N> {
 
     fn memory_bytes(&self) -> usize {
         self.matrix.memory_bytes() + self.transfer.as_ref().map_or(0, Transfer::memory_bytes)
+    }
+
+    fn traffic_bytes(&self, passes: usize) -> usize {
+        let vector = self.matrix.n_rows() * N * 8;
+        let smoothing = passes * (self.matrix.memory_bytes() + VECTORS_PER_PASS * vector);
+        let transfer = self.transfer.as_ref().map_or(0, |t| t.memory_bytes() + 2 * vector);
+        smoothing + transfer
     }
 }

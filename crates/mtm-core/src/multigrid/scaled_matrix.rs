@@ -4,6 +4,7 @@ use rayon::prelude::*;
 
 use crate::error_bound::tridiagonal_extremes;
 use crate::row_sums::dot;
+use crate::simd::{Kernel, widest};
 
 use super::block_rows::{ENTRIES_PER_TASK, SystemRows, split_rows};
 use super::scaling::{Scaling, scaled_block};
@@ -64,7 +65,7 @@ impl<const N: usize> ScaledMatrix<N> {
     }
 
     /// Row `i` of A x.
-    #[inline]
+    #[inline(always)]
     pub(super) fn row_product(&self, i: usize, x: &[[f64; N]]) -> [f64; N] {
         let range = self.row_start[i]..self.row_start[i + 1];
         block_row_product(&self.columns[range.clone()], &self.blocks[range], x)
@@ -105,14 +106,9 @@ impl<const N: usize> ScaledMatrix<N> {
                 }
             });
             let (v_ref, previous_ref) = (&v, &previous);
-            w.par_chunks_mut(self.rows_per_task).enumerate().for_each(|(chunk, w)| {
-                for (offset, w) in w.iter_mut().enumerate() {
-                    let j = chunk * self.rows_per_task + offset;
-                    let y = self.row_product(j, v_ref);
-                    for c in 0..N {
-                        w[c] = y[c] - beta * previous_ref[j][c];
-                    }
-                }
+            w.par_chunks_mut(self.rows_per_task).enumerate().for_each(|(chunk, out)| {
+                let first = chunk * self.rows_per_task;
+                widest(LanczosRows { a: self, first, v: v_ref, previous: previous_ref, beta, out });
             });
             let alpha = dot(&w, &v);
             diagonal.push(alpha);
@@ -129,5 +125,29 @@ impl<const N: usize> ScaledMatrix<N> {
             return 1.0;
         }
         tridiagonal_extremes(&diagonal, &off_squared)[1].max(1.0)
+    }
+}
+
+/// Some rows of A v − β v₋₁, v₋₁ the vector before.
+struct LanczosRows<'a, const N: usize> {
+    a: &'a ScaledMatrix<N>,
+    first: usize,
+    v: &'a [[f64; N]],
+    previous: &'a [[f64; N]],
+    beta: f64,
+    out: &'a mut [[f64; N]],
+}
+
+impl<const N: usize> Kernel for LanczosRows<'_, N> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        for (offset, out) in self.out.iter_mut().enumerate() {
+            let j = self.first + offset;
+            let y = self.a.row_product(j, self.v);
+            for c in 0..N {
+                out[c] = y[c] - self.beta * self.previous[j][c];
+            }
+        }
     }
 }

@@ -1,25 +1,41 @@
 //! Products of small dense blocks.
 
+use crate::simd::{LANES, add_scaled};
+
 /// Sum of the products of a row of blocks, stored by columns, with the rows of `x` they meet.
-#[inline]
+///
+/// A column of R values is loaded as its first four and, where R is not four, its last four: of three
+/// rows, the first columns take the next one's head along, and the last column the one's before.
+#[inline(always)]
 pub(super) fn block_row_product<const C: usize, const R: usize>(
     columns: &[u32],
     blocks: &[[[f32; R]; C]],
     x: &[[f64; C]],
 ) -> [f64; R] {
-    // Three sums at once: one alone would wait for its own last addition, three times a block.
-    let mut sums = [[0.0; R]; 3];
+    // Sums of even and odd columns apart: one alone would wait for its own last addition.
+    let (mut heads, mut tails) = ([[0.0; LANES]; 2], [[0.0; LANES]; 2]);
     for (&j, block) in columns.iter().zip(blocks) {
         let x = &x[j as usize];
+        let values = block.as_flattened();
+        let four = |at: usize| [0, 1, 2, 3].map(|lane| f64::from(values[at + lane]));
         for c in 0..C {
-            for r in 0..R {
-                sums[c % 3][r] += f64::from(block[c][r]) * x[c];
+            if R >= LANES || c + 1 < C {
+                add_scaled(&mut heads[c % 2], four(c * R), x[c]);
+            }
+            if R > LANES || c + 1 == C {
+                add_scaled(&mut tails[c % 2], four(c * R + R - LANES), x[c]);
             }
         }
     }
-    let mut sum = sums[0];
+    let mut sum = [0.0; R];
     for r in 0..R {
-        sum[r] += sums[1][r] + sums[2][r];
+        if R <= LANES || r < LANES {
+            sum[r] += heads[0][r] + heads[1][r];
+        }
+        if R <= LANES || r >= LANES {
+            let lane = r + LANES - R;
+            sum[r] += tails[0][lane] + tails[1][lane];
+        }
     }
     sum
 }

@@ -2,6 +2,8 @@
 
 use rayon::prelude::*;
 
+use crate::simd::{Kernel, widest};
+
 use super::scaled_matrix::ScaledMatrix;
 
 /// The vectors of one level in the cycle.
@@ -63,6 +65,11 @@ impl Smoother {
         Self { steps }
     }
 
+    /// Passes over the matrix in one cycle: the first step needs none, the residual one.
+    pub(super) fn passes(&self) -> usize {
+        2 * self.steps.len()
+    }
+
     /// Smooths from x = 0 and leaves the residual in `r`.
     pub(super) fn smooth_first<const N: usize>(&self, a: &ScaledMatrix<N>, v: &mut Vectors<N>) {
         let Some((first, later)) = self.steps.split_first() else { return };
@@ -86,12 +93,7 @@ impl Smoother {
         }
         let x = &v.x;
         v.r.par_chunks_mut(rows).enumerate().for_each(|(chunk, r)| {
-            for (offset, r) in r.iter_mut().enumerate() {
-                let y = a.row_product(chunk * rows + offset, x);
-                for c in 0..N {
-                    r[c] -= y[c];
-                }
-            }
+            widest(Residual { a, first: chunk * rows, x, r });
         });
     }
 
@@ -126,22 +128,65 @@ impl SmootherStep {
         d_next: &mut [[f64; N]],
         x: &mut [[f64; N]],
     ) {
-        let gain = self.gain / a.largest_eigenvalue;
         let rows = a.rows_per_task;
         x.par_chunks_mut(rows)
             .zip(r.par_chunks_mut(rows))
             .zip(d_next.par_chunks_mut(rows))
             .enumerate()
             .for_each(|(chunk, ((x, r), d_next))| {
-                for (offset, ((x, r), d_next)) in x.iter_mut().zip(r).zip(d_next).enumerate() {
-                    let i = chunk * rows + offset;
-                    let y = a.row_product(i, d);
-                    for c in 0..N {
-                        r[c] -= y[c];
-                        d_next[c] = self.keep * d[i][c] + gain * r[c];
-                        x[c] += correction * d[i][c] + self.weight * d_next[c];
-                    }
-                }
+                let first = chunk * rows;
+                widest(Sweep { step: *self, a, first, correction, d, r, d_next, x });
             });
+    }
+}
+
+/// Some rows of r −= A x.
+struct Residual<'a, const N: usize> {
+    a: &'a ScaledMatrix<N>,
+    first: usize,
+    x: &'a [[f64; N]],
+    r: &'a mut [[f64; N]],
+}
+
+impl<const N: usize> Kernel for Residual<'_, N> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        for (offset, r) in self.r.iter_mut().enumerate() {
+            let y = self.a.row_product(self.first + offset, self.x);
+            for c in 0..N {
+                r[c] -= y[c];
+            }
+        }
+    }
+}
+
+/// Some rows of [`SmootherStep::sweep`]; `d` is whole, the other vectors are those rows.
+struct Sweep<'a, const N: usize> {
+    step: SmootherStep,
+    a: &'a ScaledMatrix<N>,
+    first: usize,
+    correction: f64,
+    d: &'a [[f64; N]],
+    r: &'a mut [[f64; N]],
+    d_next: &'a mut [[f64; N]],
+    x: &'a mut [[f64; N]],
+}
+
+impl<const N: usize> Kernel for Sweep<'_, N> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        let Self { step, a, first, correction, d, r, d_next, x } = self;
+        let gain = step.gain / a.largest_eigenvalue;
+        for (offset, ((x, r), d_next)) in x.iter_mut().zip(r).zip(d_next).enumerate() {
+            let i = first + offset;
+            let y = a.row_product(i, d);
+            for c in 0..N {
+                r[c] -= y[c];
+                d_next[c] = step.keep * d[i][c] + gain * r[c];
+                x[c] += correction * d[i][c] + step.weight * d_next[c];
+            }
+        }
     }
 }

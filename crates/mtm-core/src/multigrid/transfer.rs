@@ -2,6 +2,8 @@
 
 use rayon::prelude::*;
 
+use crate::simd::{Kernel, widest};
+
 use super::prolongator::{Prolongator, TransposedIndex};
 use super::rigid_modes::MODES;
 use super::scaling::Scaling;
@@ -87,31 +89,39 @@ impl<const N: usize> Transfer<N> {
 
     /// `coarse = Pᵀ fine`.
     pub(super) fn restrict(&self, fine: &[[f64; N]], coarse: &mut [[f64; MODES]]) {
-        coarse.par_chunks_mut(self.coarse_per_task).enumerate().for_each(|(chunk, rows)| {
-            for (offset, out) in rows.iter_mut().enumerate() {
-                let i = chunk * self.coarse_per_task + offset;
-                let range = self.coarse_start[i]..self.coarse_start[i + 1];
-                *out = block_row_product(
-                    &self.coarse_columns[range.clone()],
-                    &self.coarse_blocks[range],
-                    fine,
-                );
-            }
+        coarse.par_chunks_mut(self.coarse_per_task).enumerate().for_each(|(chunk, out)| {
+            let start = &self.coarse_start[chunk * self.coarse_per_task..];
+            let (columns, blocks) = (&self.coarse_columns[..], &self.coarse_blocks[..]);
+            widest(Products { start, columns, blocks, x: fine, out });
         });
     }
 
     /// `fine = P coarse`.
     pub(super) fn prolong(&self, coarse: &[[f64; MODES]], fine: &mut [[f64; N]]) {
-        fine.par_chunks_mut(self.rows_per_task).enumerate().for_each(|(chunk, rows)| {
-            for (offset, out) in rows.iter_mut().enumerate() {
-                let i = chunk * self.rows_per_task + offset;
-                let range = self.fine_start[i]..self.fine_start[i + 1];
-                *out = block_row_product(
-                    &self.fine_columns[range.clone()],
-                    &self.fine_blocks[range],
-                    coarse,
-                );
-            }
+        fine.par_chunks_mut(self.rows_per_task).enumerate().for_each(|(chunk, out)| {
+            let start = &self.fine_start[chunk * self.rows_per_task..];
+            let (columns, blocks) = (&self.fine_columns[..], &self.fine_blocks[..]);
+            widest(Products { start, columns, blocks, x: coarse, out });
         });
+    }
+}
+
+/// The products of some rows of blocks, which begin where `start` says.
+struct Products<'a, const C: usize, const R: usize> {
+    start: &'a [usize],
+    columns: &'a [u32],
+    blocks: &'a [[[f32; R]; C]],
+    x: &'a [[f64; C]],
+    out: &'a mut [[f64; R]],
+}
+
+impl<const C: usize, const R: usize> Kernel for Products<'_, C, R> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        for (out, range) in self.out.iter_mut().zip(self.start.windows(2)) {
+            let range = range[0]..range[1];
+            *out = block_row_product(&self.columns[range.clone()], &self.blocks[range], self.x);
+        }
     }
 }
