@@ -83,9 +83,13 @@ CORE: Mapping[str, frozenset[str]] = {
         "cholesky/workspace": "",
         "cholesky/structure": "blocks ordering cholesky/workspace",
         "cholesky/numeric": "blocks cholesky/structure",
-        "cholesky/dense": "cholesky/workspace",
+        "cholesky/symmetric": "cholesky/workspace",
+        "cholesky/dense": "cholesky/symmetric cholesky/workspace",
+        "cholesky/normal": "cholesky/symmetric",
+        "cholesky/reach": "cholesky/symmetric",
         "cholesky": (
-            "blocks ordering cholesky/dense cholesky/numeric cholesky/structure cholesky/workspace"
+            "blocks ordering cholesky/dense cholesky/normal cholesky/numeric cholesky/reach "
+            "cholesky/structure cholesky/symmetric cholesky/workspace"
         ),
         "row_sums": "blocks",
         "error_bound": "",
@@ -118,9 +122,10 @@ CORE: Mapping[str, frozenset[str]] = {
         "method": "contact kinematics",
         "reduction": "blocks boundary",
         "solution": "",
+        "reaction": "cholesky contact crease mesh",
         "system": (
             "blocks boundary cholesky constraints contact crease krylov mesh method multigrid "
-            "relaxation restraint solution"
+            "reaction relaxation restraint solution"
         ),
         "equilibrium": (
             "blocks boundary cholesky constraints contact krylov mesh method multigrid reduction "

@@ -78,6 +78,7 @@ pub mod ordering;
 pub mod parting;
 mod polar;
 mod quadratic;
+mod reaction;
 mod reduction;
 pub mod registration;
 pub mod relaxation;
