@@ -1,21 +1,21 @@
 //! How sliding nodes answer to constraints where the factor of the body without them is kept.
 //!
 //! Contact forces λ along the normals N follow from (Nᵀ A⁻¹ N) λ = g − Nᵀ u_free. Few sliding nodes have
-//! their whole flexibility at hand, so that the matrix is written down for each set of normals. Where they
-//! are many it costs more than the factor itself: its products come from sweeps through the part of the
-//! factor that they reach. Either way the factor of the matrix at rest makes a few steps of conjugate
-//! gradients do.
+//! their whole flexibility at hand, so that the matrix is written down for each set of normals, and factored
+//! anew where the factor of an earlier one makes too poor a start for conjugate gradients. Where they are
+//! many, its products come from sweeps through the part of the factor that they reach: less to make and to
+//! keep, but springs and second walls, which the factor at rest knows nothing of, can take a hundred of them.
 
 use crate::cholesky::{
-    DenseSymmetric, Factor, NormalFactor, Reach, RowKey, Symbolic, TailFactor, conjugate_gradients,
-    solve_normal,
+    DenseSymmetric, Factor, NormalFactor, Progress, Reach, RowKey, Symbolic, TailFactor,
+    conjugate_gradients, solve_normal,
 };
 use crate::contact::{Constraints, Response, Sliding};
 use crate::crease::ContactRow;
 use crate::error::{MtmError, Result};
 use crate::mesh::{add, dot, scaled};
 
-/// Steps of sweeps after which contact gives up; about ten are common.
+/// Steps of sweeps after which contact gives up: ten on smooth bone, a hundred on teeth.
 const MOST_SWEEPS: usize = 1000;
 /// Relative error of the contact forces that sweeps go down to, as errors quote it.
 const SWEEP_TOLERANCE: f64 = 1e-14;
@@ -202,14 +202,16 @@ impl Answers<'_> {
                 let diagonal =
                     rows.rows.iter().zip(&rows.softness).map(|(r, s)| own[r.node] + s).collect();
                 let (keys, kept) = (&rows.keys, &self.contact.rest);
-                conjugate_gradients(product, diagonal, keys, &goals, start, kept, MOST_SWEEPS)
-                    .map_err(|error| MtmError::NotConverged {
+                let give_up = |progress: &Progress| progress.step >= MOST_SWEEPS;
+                conjugate_gradients(product, diagonal, keys, &goals, start, kept, give_up).map_err(
+                    |error| MtmError::NotConverged {
                         method: "contact by sweeps",
                         iterations: MOST_SWEEPS,
                         error,
                         tolerance: SWEEP_TOLERANCE,
                         advice: "use method=\"pcg\"; contact normals or walls may be degenerate",
-                    })?
+                    },
+                )?
             }
         };
         self.last = rows.keys.iter().copied().zip(forces.iter().copied()).collect();

@@ -21,9 +21,9 @@ use crate::solution::Clock;
 
 /// Above this many unknowns `Method::Auto` takes conjugate gradients: a factor grows like n^1.4.
 pub(crate) const AUTO_DIRECT_UNKNOWNS: usize = 300_000;
-/// Most sliding nodes whose whole flexibility is kept: a plan is then a few products of it, but to make
-/// it takes longer than the factor itself where there are more.
-const MAX_DENSE_SLIDING: usize = 1000;
+/// Most sliding nodes whose whole flexibility is kept (three unknowns each, 8 bytes a pair, twice): with
+/// it a set of normals costs a few dense products, by sweeps a few passes over the factor.
+const MAX_DENSE_SLIDING: usize = 2500;
 /// Most sliding nodes of which the flexibility along the normals at rest is kept: 8 bytes a pair.
 const MAX_KEPT_SLIDING: usize = 6000;
 /// Over-relaxation of the node-wise iteration.

@@ -14,7 +14,7 @@ use faer::sparse::linalg::cholesky::supernodal;
 use faer::{Conj, Mat, MatMut, Par};
 
 pub use dense::TailFactor;
-pub use normal::{NormalFactor, NormalForces, RowKey, conjugate_gradients, solve_normal};
+pub use normal::{NormalFactor, NormalForces, Progress, RowKey, conjugate_gradients, solve_normal};
 pub use reach::Reach;
 use structure::{minimum_degree, supernodal_structure};
 pub use symmetric::{DenseFactor, DenseSymmetric};

@@ -9,7 +9,9 @@ use super::symmetric::{DenseFactor, DenseSymmetric, dot};
 /// Error in the energy norm, relative to the solution, at which conjugate gradients end: rounding.
 const ENERGY_ERROR: f64 = 1e-14;
 /// Steps after which a new factor is cheaper than more of them.
-const MOST_STEPS: usize = 24;
+const MOST_STEPS: usize = 12;
+/// Steps that tell how many it will take: later ones gain no less.
+const TRIAL_STEPS: usize = 5;
 /// Row of the kept factor that a constraint has none in.
 const NO_ROW: u32 = u32::MAX;
 
@@ -59,7 +61,7 @@ pub fn solve_normal(
 ) -> Result<NormalForces, usize> {
     let diagonal = (0..flexibility.size()).map(|c| flexibility.column(c)[0]).collect();
     let product = |x: &[f64]| flexibility.multiply(x);
-    let near = conjugate_gradients(product, diagonal, &keys, goals, start, kept, MOST_STEPS);
+    let near = conjugate_gradients(product, diagonal, &keys, goals, start, kept, hopeless);
     if let Ok(forces) = near {
         return Ok(NormalForces { forces, made: None });
     }
@@ -69,12 +71,29 @@ pub fn solve_normal(
     Ok(NormalForces { forces, made: Some(made) })
 }
 
+/// Whether more steps cost more than a factor, judged by how the error has fallen so far.
+fn hopeless(progress: &Progress) -> bool {
+    let Progress { step, fallen, error } = *progress;
+    let rest = (MOST_STEPS as f64 - step as f64) / step.max(1) as f64;
+    step >= MOST_STEPS || step >= TRIAL_STEPS && error * fallen.powf(rest) > ENERGY_ERROR
+}
+
+/// How far conjugate gradients have come.
+pub struct Progress {
+    /// Steps done.
+    pub step: usize,
+    /// Measure of the residual over that at the start.
+    pub fallen: f64,
+    /// Relative error in the energy norm.
+    pub error: f64,
+}
+
 /// x with A x = `goals` by conjugate gradients from `start`, preconditioned by `kept` on the rows that it
 /// has and by `diagonal` (above 0) on the others.
 ///
 /// # Errors
-/// The relative error in the energy norm that was left after `most_steps`, or where `product` proved not
-/// to be that of a positive definite matrix.
+/// The relative error in the energy norm that was left where `give_up` held, or where `product` proved
+/// not to be that of a positive definite matrix.
 pub fn conjugate_gradients(
     mut product: impl FnMut(&[f64]) -> Vec<f64>,
     diagonal: Vec<f64>,
@@ -82,7 +101,7 @@ pub fn conjugate_gradients(
     goals: &[f64],
     start: Vec<f64>,
     kept: &NormalFactor,
-    most_steps: usize,
+    give_up: impl Fn(&Progress) -> bool,
 ) -> Result<Vec<f64>, f64> {
     let preconditioner = Preconditioner::new(diagonal, keys, kept);
     let mut x = start;
@@ -95,13 +114,16 @@ pub fn conjugate_gradients(
     let mut z = preconditioner.apply(&r);
     let mut p = z.clone();
     let mut rz = dot(&r, &z);
-    let mut error = f64::INFINITY;
-    for _ in 0..=most_steps {
+    let first = rz;
+    for step in 0.. {
         // xᵀA x = xᵀ(g − r): how large the solution is in the same norm.
         let size: f64 = x.iter().zip(goals.iter().zip(&r)).map(|(x, (g, r))| x * (g - r)).sum();
-        error = (rz / size).sqrt();
+        let error = (rz / size).sqrt();
         if rz == 0.0 || error <= ENERGY_ERROR {
-            return Ok(x);
+            break;
+        }
+        if give_up(&Progress { step, fallen: (rz / first).sqrt(), error }) {
+            return Err(error);
         }
         let ap = product(&p);
         let curvature = dot(&p, &ap);
@@ -122,7 +144,7 @@ pub fn conjugate_gradients(
             *p = z + beta * *p;
         }
     }
-    Err(error)
+    Ok(x)
 }
 
 /// The kept factor on the rows it has, the diagonal on the others: positive definite for any rows.
