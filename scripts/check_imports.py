@@ -84,9 +84,13 @@ CORE: Mapping[str, frozenset[str]] = {
         "cholesky/workspace": "",
         "cholesky/structure": "blocks ordering cholesky/workspace",
         "cholesky/numeric": "blocks cholesky/structure",
-        "cholesky/dense": "cholesky/workspace",
+        "cholesky/symmetric": "cholesky/workspace",
+        "cholesky/dense": "cholesky/symmetric cholesky/workspace",
+        "cholesky/normal": "cholesky/symmetric",
+        "cholesky/reach": "cholesky/symmetric",
         "cholesky": (
-            "blocks ordering cholesky/dense cholesky/numeric cholesky/structure cholesky/workspace"
+            "blocks ordering cholesky/dense cholesky/normal cholesky/numeric cholesky/reach "
+            "cholesky/structure cholesky/symmetric cholesky/workspace"
         ),
         "row_sums": "blocks",
         "error_bound": "",
@@ -125,9 +129,10 @@ CORE: Mapping[str, frozenset[str]] = {
         "iterative": (
             "blocks constraints contact krylov mesh method multigrid projected_product relaxation"
         ),
+        "reaction": "cholesky contact crease mesh",
         "system": (
-            "blocks boundary cholesky constraints contact crease iterative mesh method restraint "
-            "solution"
+            "blocks boundary cholesky constraints contact crease iterative mesh method reaction "
+            "restraint solution"
         ),
         "equilibrium": (
             "blocks boundary cholesky constraints contact iterative krylov mesh method multigrid "
