@@ -301,8 +301,10 @@ impl<'a> State<'a> {
         (self.rz, self.largest_z) = dot_and_largest(&self.r, &self.z);
     }
 
-    /// z = P M⁻¹ r, P the projection of the operator.
+    /// z = P M⁻¹ P r, P the projection of the operator: what rounding leaves outside the subspace may be
+    /// all of a small residual, and there the operator says nothing.
     fn precondition(&mut self) {
+        self.a.project(&mut self.r);
         self.preconditioner.apply(&self.r, &mut self.z);
         self.a.project(&mut self.z);
     }

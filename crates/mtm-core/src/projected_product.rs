@@ -5,7 +5,10 @@ use crate::blocks::BlockMatrix;
 use crate::constraints::Constraint;
 use crate::contact::Spring;
 use crate::krylov::Operator;
-use crate::mesh::{add, dot, scaled, sub};
+use crate::mesh::{add, dot, norm, scaled, sub};
+
+/// Length, relative to what it was, below which nothing but rounding is left of a projected vector.
+const PROJECTION_ROUNDING: f64 = 16.0 * f64::EPSILON;
 
 /// P (A + Σ k a⊗a) P on the vectors without a component along the normals of held rows.
 ///
@@ -44,8 +47,16 @@ impl Operator for ProjectedProduct<'_> {
     }
 
     fn project(&self, x: &mut [[f64; 3]]) {
-        for &Constraint { row, normal, .. } in self.constraints {
-            x[row] = sub(x[row], scaled(normal, dot(normal, x[row])));
+        for held in self.constraints.chunk_by(|a, b| a.row == b.row) {
+            let row = held[0].row;
+            let least = PROJECTION_ROUNDING * norm(x[row]);
+            for &Constraint { normal, .. } in held {
+                x[row] = sub(x[row], scaled(normal, dot(normal, x[row])));
+            }
+            // What rounding leaves points anywhere, and may be all that a held node has.
+            if norm(x[row]) <= least {
+                x[row] = [0.0; 3];
+            }
         }
     }
 }
@@ -74,6 +85,10 @@ mod tests {
         product.project(&mut x);
         assert!(dot(x[0], [0.6, 0.8, 0.0]).abs() < 1e-15);
         assert!(x[2][1].abs() + x[2][2].abs() < 1e-15);
+        let corner = [at(1, [0.6, 0.8, 0.0]), at(1, [-0.8, 0.6, 0.0]), at(1, [0.0, 0.0, 1.0])];
+        let mut held = x.clone();
+        ProjectedProduct::new(&matrix, &corner, &[]).project(&mut held);
+        assert_eq!(held[1], [0.0; 3]);
         let mut y = vec![[0.0; 3]; 3];
         product.multiply_into(&x, &mut y);
         for (y, expected) in y.iter().zip(whole.multiply(&x)) {
