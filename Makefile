@@ -25,7 +25,7 @@ PYTHON_DIRS := python tests/python scripts examples benches
 CORE_FEATURES := --features mtm-core/metis
 
 .DEFAULT_GOAL := help
-.PHONY: help build test test-rust test-python lint format bench peers demo docs clean
+.PHONY: help build test test-rust test-python lint format bench peers frontier demo docs clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sort | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 16
@@ -78,6 +78,10 @@ bench: $(BUILD_STAMP) ## run the benches (minutes; close other programs first)
 
 peers: $(BUILD_STAMP) ## compare with the peers that are installed (benches/peers/README.md)
 	"$(PY)" benches/peers/run.py --markdown peers.md --out peers.json
+
+frontier: $(BUILD_STAMP) ## measure error against run time (hours), and put it into docs/frontier.md
+	"$(PY)" -m cmfsim bench frontier -o target/frontier
+	"$(PY)" scripts/fill_frontier.py target/frontier
 
 demo: $(BUILD_STAMP) ## predict a face after surgery, and open its report
 	"$(BIN)/cmfsim" demo

@@ -1,6 +1,7 @@
 """What an element and its kinematics cost and buy: error on the outer surface against run time.
 
     python benches/elements.py [--level 2] [--layers 3] [--json FILE]
+        [--markdown docs/benchmarks.md]
 
 A shell of soft tissue (12 mm over a bone of 40 mm) is held over one half of the bone and joined to
 a segment over the other, which advances by 5 mm and turns by 8°, and is solved with every element
@@ -21,6 +22,7 @@ from scipy.spatial import cKDTree
 
 import cmfsim
 import meshes
+from marked import replace_marked
 
 BONE, SKIN = 40.0, 52.0  # radii, mm
 YOUNG, POISSON = 0.003, 0.46  # fat (Kim et al. 2010, table 1)
@@ -87,27 +89,38 @@ def rows(level: int, layers: int, poisson: float) -> list[dict[str, float | str 
     return out
 
 
+def table(found: list[dict[str, float | str | int]]) -> str:
+    """The rows as Markdown, with the times over those of linear tets in linear kinematics."""
+    lines = [
+        "| ν | element | kinematics | mean, mm | P95, mm | largest, mm | time |",
+        "|---:|---|---|---:|---:|---:|---:|",
+    ]
+    for row in found:
+        first = next(r for r in found if r["poisson"] == row["poisson"])
+        ratio = float(row["seconds"]) / float(first["seconds"])
+        lines.append(
+            f"| {row['poisson']} | {row['element']} | {row['kinematics']} | {row['mean']:.3f} | "
+            f"{row['p95']:.3f} | {row['largest']:.3f} | {ratio:.1f} |"
+        )
+    return "\n".join(lines)
+
+
 def main() -> None:
-    """Prints the table; writes it as JSON where asked."""
+    """Prints the table; writes it as JSON and into a page where asked."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--level", type=int, default=2, help="splits of the icosphere")
     parser.add_argument("--layers", type=int, default=3, help="layers through the tissue")
     parser.add_argument("--poisson", type=float, nargs="+", default=[POISSON, 0.499])
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--markdown", type=Path, help="page whose table of elements is replaced")
     options = parser.parse_args()
-    table = [row for nu in options.poisson for row in rows(options.level, options.layers, nu)]
-    print(f"{table[0]['n_tets']} tets; error on the outer surface, mm; time over p1 linear")
-    print("| ν | element | kinematics | mean | P95 | largest | time |")
-    print("|---|---|---|---|---|---|---|")
-    for row in table:
-        first = next(r for r in table if r["poisson"] == row["poisson"])
-        ratio = float(row["seconds"]) / float(first["seconds"])
-        print(
-            f"| {row['poisson']} | {row['element']} | {row['kinematics']} | {row['mean']:.3f} | "
-            f"{row['p95']:.3f} | {row['largest']:.3f} | {ratio:.1f} |"
-        )
+    found = [row for nu in options.poisson for row in rows(options.level, options.layers, nu)]
+    text = f"{found[0]['n_tets']} tets.\n\n{table(found)}"
+    print(text)
     if options.json:
-        options.json.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+        options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    if options.markdown:
+        replace_marked(options.markdown, "benches/elements.py", text)
 
 
 if __name__ == "__main__":

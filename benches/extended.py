@@ -384,12 +384,12 @@ def solve(
         u = u + Twofold(correction.reshape(-1, 3))
         size = float(np.abs(correction).max() / np.abs(u.hi).max())
         if size <= REFINED or (size < 1e-20 and size > 0.5 * last):
-            return Reference(u.hi, _condition(scaled, factor), size, step)
+            return Reference(u.hi, condition_number(scaled, factor), size, step)
         last = size
     raise ArithmeticError(f"the refinement stopped at a relative correction of {last:.1e}")
 
 
-def _condition(scaled: sp.csc_matrix, factor: spla.SuperLU) -> float:
+def condition_number(scaled: sp.csc_matrix, factor: spla.SuperLU) -> float:
     """Ratio of the extreme eigenvalues of a symmetric matrix."""
     n = scaled.shape[0]
     if n <= DENSE_UNKNOWNS:

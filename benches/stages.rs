@@ -20,11 +20,14 @@ use mtm_core::blocks::BlockMatrix;
 use mtm_core::cholesky::Symbolic;
 use mtm_core::krylov::{PcgOptions, pcg};
 use mtm_core::multigrid::{Multigrid, MultigridOptions};
-use mtm_core::{MassTensors, Method, StaticOptions, StaticSolver, TetMesh};
+use mtm_core::{Element, Kinematics, MassTensors, Method, StaticOptions, StaticSolver, TetMesh};
 use shell::Shell;
 
 /// Bytes above which a factor is left to machines with more memory.
 const LARGEST_FACTOR: usize = 6 << 30;
+
+/// Tets of the shell on which elements and kinematics are compared.
+const CHOICE_TETS: usize = 5_000;
 
 /// What the stages share at one size, made before any clock runs.
 struct Prepared {
@@ -56,6 +59,38 @@ fn stages(c: &mut Criterion) {
         iterative(c, n_tets, &prepared);
         plans(c, n_tets, &prepared);
     }
+    choices(c);
+}
+
+/// Set-up and solve of each element and kinematics, at one size whatever the others are: quadratic
+/// tets in large deformation would take minutes at those.
+fn choices(c: &mut Criterion) {
+    let shell = Shell::generate(CHOICE_TETS);
+    let (mesh, tissue) = (scene::mesh(&shell), scene::tissue(&shell));
+    let boundary = scene::boundary(&shell, false);
+    let plan = scene::plan(&shell, 0);
+    let mut group = c.benchmark_group("choices");
+    for element in [Element::Linear, Element::NodalPressure, Element::Quadratic] {
+        for kinematics in [Kinematics::Linear, Kinematics::Corotational, Kinematics::Hyperelastic] {
+            let options = StaticOptions { kinematics, ..StaticOptions::default() };
+            let set_up = || {
+                let tensors = MassTensors::with_element(mesh.clone(), tissue.clone(), element)
+                    .expect("matching tissue");
+                StaticSolver::new(tensors.into(), boundary.clone(), options, &|| false)
+                    .expect("a held body")
+            };
+            let id = |stage: &str| {
+                let name = format!("{}_{}_{stage}", element.name(), kinematics.name());
+                BenchmarkId::new(name, CHOICE_TETS)
+            };
+            group.bench_function(id("set_up"), |b| b.iter(|| black_box(set_up())));
+            let solver = set_up();
+            group.bench_function(id("solve"), |b| {
+                b.iter(|| black_box(solver.solve(&plan, None, &|| false).expect("a sound plan")));
+            });
+        }
+    }
+    group.finish();
 }
 
 fn geometry(c: &mut Criterion, n_tets: usize, p: &Prepared) {

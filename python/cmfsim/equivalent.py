@@ -151,8 +151,9 @@ def equivalent_material(
     together, and none where no muscle is near. A crossed tet takes `samples` points of a
     low-discrepancy sequence, uniform in volume, shifted anew for each tet. A point inside several
     muscles counts once in the fraction; each of k muscles gets 1/k of it. The fibre of a tet is the
-    principal eigenvector of Σ w a aᵀ over the directions a at its points in muscle, with these
-    weights w. The result does not depend on the number of threads nor on the order of the muscles.
+    principal eigenvector of Σ w a aᵀ over the directions a at its points in muscle, the first 16 in
+    each, with these weights w. The result does not depend on the number of threads nor on the order
+    of the muscles.
 
     Parameters
     ----------

@@ -1,20 +1,24 @@
 """The patient's model: what building a case makes, ready to be solved."""
 
+from __future__ import annotations
+
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.util import find_spec
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.case import Anatomy, BoneSegment, Finding, NodeKinds
 from cmfsim.checks import Floats, Indices
-from cmfsim.musculature import Musculature
 from cmfsim.osteotomy import surface_of_level
 from cmfsim.scene import Scene, SurfaceData, TissueData
+
+if TYPE_CHECKING:
+    from cmfsim.musculature import Musculature
 
 __all__ = ["PatientModel"]
 

@@ -1,10 +1,12 @@
 """What a model predicts for a patient: the value that evaluation and report are made from."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,16 +15,44 @@ from cmfsim._core import Surface, SurfaceMotion
 from cmfsim.case import Finding
 from cmfsim.checks import Floats, as_rows, check_one_of
 from cmfsim.model import PatientModel
-from cmfsim.musculature import Musculature
 from cmfsim.scene import MovedSurface, Scene, SceneResult, SurfaceData
 
-__all__ = ["MODELS", "Prediction"]
+if TYPE_CHECKING:
+    from cmfsim.musculature import Musculature
+
+__all__ = ["MODELS", "Prediction", "carried_points"]
 
 # Models of the paper (3.2): homogeneous or with muscles, without or with sliding at teeth and
 # mucosa.
 MODELS = ("H", "M", "H+S", "M+S")
 # Up to so many edges off the mesh's skin a point follows it whole, and from so many on not at all.
 FOLLOWS, FADED = 2.0, 4.0
+
+
+def carried_points(before: SurfaceData, displacements: Floats, points: ArrayLike) -> Floats:
+    """How points on or near a mesh's skin move, (k, 3) mm: as its closest point.
+
+    What lies away from the tissue that was simulated, as the back of the head, stays: from two
+    edges off its movement fades, to nothing at four.
+
+    Parameters
+    ----------
+    before : SurfaceData
+        The mesh's skin.
+    displacements : (v, 3) float64, mm
+        Of its vertices.
+    points : (k, 3) float64, mm
+    """
+    moved = np.asarray(before.vertices) + displacements
+    skin = Surface(before.vertices, before.triangles)
+    places = as_rows("points", points, 3)
+    closest, _, _ = skin.closest(places)
+    away = np.linalg.norm(closest - places, axis=1)
+    ends = skin.vertices[skin.triangles]
+    edge = float(np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).mean())
+    share = np.clip((FADED - away / edge) / (FADED - FOLLOWS), 0.0, 1.0)
+    carried: Floats = share[:, None] * SurfaceMotion(skin, moved).displacement(places)
+    return carried
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,27 +109,14 @@ class Prediction:
         return np.asarray(self.result.displacements)[self.skin_nodes]
 
     def carried(self, points: ArrayLike) -> Floats:
-        """How points on or near the skin move, (k, 3) mm: as the closest point of the mesh's skin.
-
-        What lies away from the tissue that was simulated, as the back of the head, stays: from two
-        edges off its movement fades, to nothing at four.
+        """How points on or near the skin move, (k, 3) mm: as `carried_points` has it.
 
         Parameters
         ----------
         points : (k, 3) float64, mm
             Before the operation: landmarks, or the vertices of any surface of the patient's skin.
         """
-        before = self.skin_before
-        skin = Surface(before.vertices, before.triangles)
-        moved = np.asarray(before.vertices) + self.skin_displacements
-        places = as_rows("points", points, 3)
-        closest, _, _ = skin.closest(places)
-        away = np.linalg.norm(closest - places, axis=1)
-        ends = skin.vertices[skin.triangles]
-        edge = float(np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).mean())
-        share = np.clip((FADED - away / edge) / (FADED - FOLLOWS), 0.0, 1.0)
-        carried: Floats = share[:, None] * SurfaceMotion(skin, moved).displacement(places)
-        return carried
+        return carried_points(self.skin_before, self.skin_displacements, points)
 
     @property
     def face_before(self) -> SurfaceData:

@@ -3,8 +3,6 @@
 import logging
 import math
 import platform
-import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,16 +17,10 @@ from cmfsim._core import (
     TetMesh,
     Tissue,
     __version__,
-    rigid_fit,
 )
-from cmfsim.checks import check_one_of
-from cmfsim.errors import CaseInputError
-from cmfsim.model import PatientModel
-from cmfsim.planning import decompose_motion
-from cmfsim.prediction import MODELS, Prediction
-from cmfsim.scene import MovedSurface, Scene, SceneResult, SegmentData, SurfaceData, TissueData
+from cmfsim.scene import MovedSurface, Scene, SceneResult, SurfaceData, TissueData
 
-__all__ = ["model_scene", "predict_patient", "scene_plan", "scene_solver", "solve_scene"]
+__all__ = ["scene_plan", "scene_solver", "solve_scene"]
 
 _log = logging.getLogger(__name__)
 
@@ -180,147 +172,6 @@ def solve_scene(scene: Scene) -> SceneResult:
         contact_gaps=solution.contact_gaps,
         summary=summary,
     )
-
-
-def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
-    """The scene of a patient under one of the paper's four models.
-
-    Homogeneous models have the patient's fat everywhere. Models without sliding move the nodes at
-    teeth and mucosa with their bone segment, as those that are joined to it.
-
-    Parameters
-    ----------
-    patient : PatientModel
-    model : str
-        "H", "M", "H+S" or "M+S" (Kim et al. 2010, section 3.2).
-
-    Returns
-    -------
-    Scene
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Another name; muscles where the patient has none.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> scene = cmfsim.model_scene(patient, "H+S")  # doctest: +SKIP
-    """
-    check_one_of("model", model, MODELS)
-    if model.startswith("M") and patient.muscles is None:
-        raise CaseInputError(
-            f"model {model} needs muscles, and {patient.name!r} was built without: add [muscles] "
-            "to the case and skull landmarks"
-        )
-    scene = patient.scene
-    if model.startswith("H"):
-        scene = replace(scene, tissue=patient.fat)
-    if model.endswith("+S"):
-        return scene
-    joined = {
-        name: SegmentData(joined=np.union1d(segment.joined, segment.sliding))
-        for name, segment in scene.segments.items()
-    }
-    return replace(scene, segments=joined)
-
-
-def predict_patient(patient: PatientModel, model: str = "M+S") -> Prediction:
-    """The face that a model predicts for a patient who is built already.
-
-    Parameters
-    ----------
-    patient : PatientModel
-    model : str
-        "H", "M", "H+S" or "M+S".
-
-    Returns
-    -------
-    Prediction
-
-    Raises
-    ------
-    CaseError, MeshError, MaterialError, BoundaryError, ContactError, SolverError
-        As `model_scene` and `solve_scene`.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> prediction = cmfsim.predict_patient(patient, "H")  # doctest: +SKIP
-    >>> prediction.skin.vertices  # doctest: +SKIP
-    """
-    scene = model_scene(patient, model)
-    begun = time.perf_counter()
-    result = solve_scene(scene)
-    timings = {**patient.summary.get("timings", {}), "solving": time.perf_counter() - begun}
-    moved = np.linalg.norm(np.asarray(result.displacements)[patient.skin_nodes], axis=1)
-    summary = {
-        **patient.summary,
-        "model": model,
-        "plan": {name: _motion(patient, name, m) for name, m in scene.plan.items()},
-        "skin": {
-            "mean": float(moved.mean()),
-            "p95": float(np.percentile(moved, 95)),
-            "largest": float(moved.max()),
-        },
-        "solution": dict(result.summary),
-        "timings": timings,
-        "left_out": _left_out(patient, scene, model),
-    }
-    return Prediction(model, patient, scene, result, summary)
-
-
-def _motion(patient: PatientModel, name: str, motion: Any) -> dict[str, Any]:
-    """A segment's motion in a planner's numbers, about its own centre (paper, Table 2)."""
-    if isinstance(motion, MovedSurface):
-        here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
-        size = np.linalg.norm(there - here, axis=1)
-        fit = rigid_fit(here, there)
-        return {
-            "mean": float(size.mean()),
-            "largest": float(size.max()),
-            # The nearest rigid motion, and what it leaves of the vertices' own.
-            **_rigid_numbers(np.asarray(fit.matrix), here.mean(axis=0)),
-            "bending": float(fit.rms),
-        }
-    matrix = np.asarray(motion, dtype=np.float64)
-    if matrix.shape != (4, 4):
-        size = np.linalg.norm(matrix, axis=1)
-        return {"mean": float(size.mean()), "largest": float(size.max())}
-    surfaces = {segment.name: segment.surface for segment in patient.segments}
-    centre = np.asarray(surfaces[name].vertices).mean(axis=0)
-    return _rigid_numbers(matrix, centre)
-
-
-def _rigid_numbers(matrix: NDArray[np.float64], centre: NDArray[np.float64]) -> dict[str, Any]:
-    parts = decompose_motion(matrix, centre)
-    return {
-        "translation": parts.translation.tolist(),
-        "angle": parts.angle,
-        "axis": parts.axis.tolist(),
-        "centre": parts.centre.tolist(),
-    }
-
-
-def _left_out(patient: PatientModel, scene: Scene, model: str) -> list[str]:
-    """What the scene did not need, as sentences."""
-    left = []
-    if model.startswith("H"):
-        left.append("muscles: the model is homogeneous")
-    elif patient.fraction is not None:
-        share = float(np.mean(patient.fraction == 0.0))
-        left.append(f"muscle law: {100 * share:.0f} % of the tets hold no muscle, and are fat")
-    if not any(np.size(segment.sliding) for segment in scene.segments.values()):
-        left.append("contact: no node slides")
-    still = [name for name, motion in scene.plan.items() if _stays(motion)]
-    if still:
-        left.append(f"motion: {', '.join(still)} stay")
-    return left
-
-
-def _stays(motion: object) -> bool:
-    return not isinstance(motion, MovedSurface) and np.array_equal(np.asarray(motion), np.eye(4))
 
 
 def _finite(value: float) -> float | None:

@@ -7,13 +7,21 @@ and scipy's linear algebra.
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.linalg import polar
 
 import cmfsim
 import meshes
 
 skfem = pytest.importorskip("skfem")
 from skfem.models.elasticity import linear_elasticity  # noqa: E402
+
+from independent import (  # noqa: E402
+    corotational_stress,
+    internal_forces,
+    lame,
+    neo_hookean_stress,
+    space_of,
+)
+from panels import BEAM, COOK, far_side_loads, panel  # noqa: E402
 
 Array = NDArray[np.float64]
 STILL = np.eye(4)
@@ -29,24 +37,6 @@ def plate(z: float, reach: float, *, up: bool) -> cmfsim.Surface:
     vertices = [(-reach, -reach, z), (reach, -reach, z), (reach, reach, z), (-reach, reach, z)]
     triangles = [(0, 1, 2), (0, 2, 3)] if up else [(0, 2, 1), (0, 3, 2)]
     return cmfsim.Surface(vertices, triangles)
-
-
-def space_of(mesh: cmfsim.TetMesh, element: str, tensors: cmfsim.MassTensors):
-    """scikit-fem's space on the mesh, and its unknown for each node and axis of ours."""
-    kind = {"p1": skfem.ElementTetP1, "p2": skfem.ElementTetP2}[element]
-    space = skfem.MeshTet(mesh.nodes.T.copy(), mesh.tets.T.astype(np.int64))
-    basis = skfem.Basis(space, skfem.ElementVector(kind()), intorder=2)
-    order = basis.nodal_dofs.T
-    if element == "p2":
-        edges = [tuple(edge) for edge in np.sort(space.edges.T, axis=1).tolist()]
-        at = {edge: row for row, edge in enumerate(edges)}
-        rows = [at[tuple(edge)] for edge in tensors.mid_edges.tolist()]
-        order = np.concatenate([order, basis.edge_dofs.T[rows]])
-    return basis, order
-
-
-def lame(young: float, poisson: float) -> tuple[float, float]:
-    return young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))
 
 
 @pytest.mark.parametrize("element", ["p1", "p2"])
@@ -86,26 +76,6 @@ def test_quadratic_displacements_are_those_of_scikit_fem(poisson: float) -> None
     assert np.array_equal(found.displacements, found.all_displacements[: mesh.n_nodes])
 
 
-def neo_hookean_stress(f: Array, first: float, second: float) -> Array:
-    """P of the stable neo-Hookean law (Smith et al. 2018, eq. 14) as it is printed."""
-    lam, mu = first + 5 / 6 * second, 4 / 3 * second
-    alpha = 1 + mu / lam - mu / (4 * lam)
-    j = np.linalg.det(f)[..., None, None]
-    size = np.einsum("...ij,...ij->...", f, f)[..., None, None]
-    cofactor = j * np.linalg.inv(f).swapaxes(-1, -2)
-    return mu * (1 - 1 / (size + 1)) * f + lam * (j - alpha) * cofactor
-
-
-def corotational_stress(f: Array, first: float, second: float) -> Array:
-    """R (lambda tr(S) + 2 mu S) with S = U - I, R U = F by scipy."""
-    out = np.empty_like(f)
-    for at in np.ndindex(f.shape[:-2]):
-        r, u = polar(f[at])
-        s = u - np.eye(3)
-        out[at] = r @ (first * np.trace(s) * np.eye(3) + 2 * second * s)
-    return out
-
-
 @pytest.mark.parametrize("element", ["p1", "p2"])
 @pytest.mark.parametrize(
     ("kinematics", "stress"),
@@ -114,22 +84,11 @@ def corotational_stress(f: Array, first: float, second: float) -> Array:
 def test_large_forces_are_those_that_scikit_fem_assembles(element, kinematics, stress) -> None:
     mesh = jittered((2, 2, 2))
     tensors = cmfsim.MassTensors(mesh, cmfsim.Tissue.isotropic(0.01, 0.45), element=element)
-    basis, order = space_of(mesh, element, tensors)
     x = tensors.nodes
     turn = cmfsim.rigid_motion(angle=70.0, axis=(1, 2, -1))[:3, :3]
     bent = np.stack([0.1 * x[:, 1] ** 2, -0.05 * x[:, 0] * x[:, 2], 0.08 * x[:, 0] ** 2], axis=1)
     u = (x + bent) @ turn.T - x
-    field = np.zeros(basis.N)
-    field[order] = u
-
-    @skfem.LinearForm
-    def internal(v, w):
-        # Gradients are (component, axis, tet, point).
-        f = np.moveaxis(w["u"].grad, (0, 1), (-2, -1)) + np.eye(3)
-        p = np.moveaxis(stress(f, *lame(0.01, 0.45)), (-2, -1), (0, 1))
-        return np.einsum("ij...,ij...", p, v.grad)
-
-    reference = internal.assemble(basis, u=basis.interpolate(field))[order]
+    reference = internal_forces(mesh, tensors, u, stress, 0.01, 0.45)
     ours = tensors.force(u, kinematics=kinematics)
     assert np.abs(ours - reference).max() < 1e-12 * np.abs(reference).max()
 
@@ -159,22 +118,13 @@ def test_tangent_is_the_slope_of_force(element: str, kinematics: str) -> None:
 # Bending and shear near incompressibility.
 
 
-def panel(cells: int, corners: Array, depth: float) -> cmfsim.TetMesh:
-    """A slab over the quadrilateral `corners` (4, 2), `cells` boxes a side, one through."""
-    nodes, tets = meshes.box((cells, cells, 1))
-    s, t = nodes[:, :1], nodes[:, 1:2]
-    a, b, c, d = corners
-    flat = (1 - s) * (1 - t) * a + s * (1 - t) * b + s * t * c + (1 - s) * t * d
-    return cmfsim.TetMesh(np.column_stack([flat, depth * nodes[:, 2]]), tets)
-
-
 def tip(element: str, poisson: float, corners: Array, cells: int, load: float) -> float:
     """Rise of the far upper corner of a panel in plane strain under a shear load, E = 1 MPa.
 
     The two sides slide on planes that stay: plane strain.
     """
     depth = 4.0
-    mesh = panel(cells, corners, depth)
+    mesh = cmfsim.TetMesh(*panel((cells, cells, 1), corners, depth))
     tensors = cmfsim.MassTensors(mesh, cmfsim.Tissue.isotropic(1.0, poisson), element=element)
     nodes, far = mesh.nodes, corners[2]
     low, high = nodes[:, 2] < 1e-9, nodes[:, 2] > depth - 1e-9
@@ -184,17 +134,7 @@ def tip(element: str, poisson: float, corners: Array, cells: int, load: float) -
         contact={"low": plate(0.0, 200.0, up=True), "high": plate(depth, 200.0, up=False)},
         conflicts="resolve",
     )
-    # A uniform traction: a third of each triangle to its corners, or if quadratic to its mid-edges.
-    middles = {tuple(edge): mesh.n_nodes + i for i, edge in enumerate(tensors.mid_edges.tolist())}
-    loads = np.zeros(tensors.nodes.shape)
-    for triangle in mesh.boundary_triangles():
-        if np.all(nodes[triangle, 0] > far[0] - 1e-9):
-            sides = nodes[triangle[1:]] - nodes[triangle[0]]
-            a, b, c = np.sort(triangle).tolist()
-            edges = ((a, b), (a, c), (b, c))
-            ends = [middles[edge] for edge in edges] if middles else [a, b, c]
-            loads[ends, 1] += np.linalg.norm(np.cross(*sides)) / 6
-    loads *= load / loads.sum()
+    loads = far_side_loads(mesh, tensors, corners, load)
     solution = cmfsim.StaticSolver(tensors, boundary).solve(
         {"low": STILL, "high": STILL}, loads=loads
     )
@@ -227,8 +167,6 @@ def plane_strain_tip(poisson: float, corners: Array, load: float) -> float:
     return float(u[basis.nodal_dofs[1, at]])
 
 
-COOK = np.array([(0.0, 0.0), (48.0, 44.0), (48.0, 60.0), (0.0, 44.0)])
-BEAM = np.array([(0.0, 0.0), (40.0, 0.0), (40.0, 8.0), (0.0, 8.0)])
 RATIOS = (0.3, 0.45, 0.49, 0.499, 0.4999)
 
 

@@ -28,6 +28,8 @@ MADE_BY_STAGES = {
     "Finding",
     "FoldReport",
     "Folds",
+    "Frontier",
+    "FrontierRow",
     "IcpFit",
     "Improvement",
     "LandmarkAgreement",

@@ -9,9 +9,11 @@ import pytest
 
 import cmfsim
 import extended
-import stability
+from extreme import bodies, contact, elements, kinematics, linear
+from extreme.problem import NU
+from extreme.rows import ALL, FAST
 
-CASES = stability.cases()
+CASES = linear.cases()
 SOLVED = [
     pytest.param(
         case,
@@ -21,7 +23,15 @@ SOLVED = [
     for case in CASES
     for method in case.methods
 ]
-CLOSED = [case for case in CASES if not case.refusal and stability.problem(case).exact is not None]
+CONTACT, ELEMENTS, KINEMATICS = (
+    [
+        pytest.param(case, method, id=f"{case.key} [{method}]")
+        for case in suite.cases(quick=True)
+        for method in case.methods
+    ]
+    for suite in (contact, elements, kinematics)
+)
+CLOSED = [case for case in CASES if not case.refusal and linear.problem(case).exact is not None]
 
 
 @pytest.mark.parametrize(("case", "method"), SOLVED)
@@ -31,7 +41,34 @@ def test_a_case_is_solved_to_its_condition_or_refused(case, method):
     SolverError, and for mechanisms BoundaryError with the free modes. Never a quiet wrong answer,
     hang or panic.
     """
-    row = stability.judge(case, method)
+    row = linear.judge(case, method)
+    assert row.passed, row.verdict
+
+
+@pytest.mark.parametrize(("case", "method"), CONTACT)
+def test_contact_ends_on_the_moved_surface_in_equilibrium(case, method):
+    """Each held node within 1e-6 mm of the moved triangles (Ericson 2005, 5.1.5), no force across
+    the normals, and u = u_p + Z y with Zᵀ f(u) = 0 refined with 32 digits; mechanisms refused.
+    """
+    row = contact.judge(case, method)
+    assert row.passed, row.verdict
+
+
+@pytest.mark.parametrize(("case", "method"), ELEMENTS)
+def test_elements_solve_their_equations_and_only_linear_tets_lock(case, method):
+    """Displacements of p1, anp (Bonet & Burton 1998) and p2 against an independent stiffness of the
+    same element, within max(1e-9, 10 ε κ) and the bound; deflection of Cook's membrane (1974).
+    """
+    row = elements.judge(case, method)
+    assert row.passed, row.verdict
+
+
+@pytest.mark.parametrize(("case", "method"), KINEMATICS)
+def test_large_deformation_is_a_closed_form_or_in_balance(case, method):
+    """U = (F − I) x for turns of 120° and J = 0.2; else P from numpy's decompositions (Smith et al.
+    2018, eq. 14; R (λ tr S + 2 μ S)), assembled by scikit-fem, is in balance at the free nodes.
+    """
+    row = kinematics.judge(case, method)
     assert row.passed, row.verdict
 
 
@@ -40,8 +77,8 @@ def test_the_reference_equals_the_closed_form(case):
     """32-digit refinement (Demmel et al. 2006) against fields that linear tets hold exactly: affine
     (patch test, Irons 1972), rigid u = (R − I)x + t, series bar σ = E u′, layers σ_n continuous.
     """
-    exact = stability.problem(case).exact
-    found = stability.reference(case)
+    exact = linear.problem(case).exact
+    found = linear.reference(case)
     assert found.uncertainty <= 1e-18
     # The closed form itself is rounded to float64 on the boundary.
     assert np.abs(found.displacements - exact).max() <= 1e-13 * np.abs(exact).max()
@@ -122,7 +159,7 @@ def test_elasticity_of_equal_moduli_is_isotropic_for_any_fibre():
         assert float(found[p][q]) == pytest.approx(expected[p, q], abs=1e-15)
 
 
-@pytest.mark.parametrize("method", stability.ALL)
+@pytest.mark.parametrize("method", ALL)
 @pytest.mark.parametrize("power", [-60, -20, 20, 60])
 def test_units_by_powers_of_two_change_no_bit(method, power):
     """u(s x; s t) = s u(x; t) and u(s E) = u(E): with s = 2^k every float64 operation scales
@@ -130,9 +167,9 @@ def test_units_by_powers_of_two_change_no_bit(method, power):
     """
 
     def solved(length, modulus):
-        p = stability.scaled(length, modulus)
+        p = bodies.scaled(length, modulus)
         case = replace(CASES[0], build=lambda: p)
-        return stability.run_cmfsim(case, method).displacements
+        return linear.run_cmfsim(case, method).displacements
 
     s = 2.0**power
     base = solved(1.0, 1.0)
@@ -140,18 +177,18 @@ def test_units_by_powers_of_two_change_no_bit(method, power):
     np.testing.assert_array_equal(solved(1.0, s), base)
 
 
-@pytest.mark.parametrize("method", stability.FAST)
+@pytest.mark.parametrize("method", FAST)
 @pytest.mark.parametrize("angle", [30.0, 90.0, 180.0])
 def test_the_plan_operator_is_exact_for_large_turns_at_contrast(method, angle):
     """u_b = (R − I)x + t is affine in (R, t), so 12 columns a segment hold for any turn; contrast
     1e4, against 32 digits.
     """
-    p = replace(stability.checkerboard(1e4), plan={"maxilla": stability.advance(angle, 50.0)})
+    p = replace(bodies.checkerboard(1e4), plan={"maxilla": bodies.advance(angle, 50.0)})
     model = extended.ExtendedModel(p.nodes, p.tets, p.materials, p.material_of)
     exact = extended.solve(model, *p.prescribed())
     young = np.array([m.along for m in p.materials])[p.material_of]
     tensors = cmfsim.MassTensors(
-        cmfsim.TetMesh(p.nodes, p.tets), cmfsim.Tissue.isotropic(young, stability.NU)
+        cmfsim.TetMesh(p.nodes, p.tets), cmfsim.Tissue.isotropic(young, NU)
     )
     boundary = cmfsim.Boundary(fixed=p.fixed, joined=p.joined)
     operator = cmfsim.StaticSolver(tensors, boundary, method=method).plan_operator()

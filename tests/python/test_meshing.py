@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import cmfsim
 import head_case
+from cmfsim import _core
 from cmfsim.meshing import TissueRegion, near_skin, tissue_level
 
 LEAST = 10.0
@@ -441,3 +442,18 @@ def test_without_tetwild_the_package_to_install_is_named(monkeypatch):
     vertices, triangles = head_case.icosphere(1)
     with pytest.raises(cmfsim.MeshError, match=r"pip install 'cmfsim\[tetwild\]'"):
         cmfsim.mesh_with_tetwild(cmfsim.SurfaceData(vertices, triangles))
+
+
+def test_distances_up_to_a_bound_are_those_of_scipy_and_the_others_infinite():
+    ndimage = pytest.importorskip("scipy.ndimage")
+    rng = np.random.default_rng(4)
+    targets = ndimage.binary_opening(rng.random((31, 24, 40)) < 0.7) | (
+        rng.random((31, 24, 40)) < 1e-3
+    )
+    spacing = (1.0, 0.7, 1.3)
+    exact = ndimage.distance_transform_edt(~targets, sampling=spacing)
+    for within in (0.0, 1.5, 4.0, np.inf):
+        found = _core.distance_image(targets, spacing, within=within)
+        near = exact <= within
+        np.testing.assert_allclose(found[near], exact[near], rtol=1e-6)
+        assert np.isinf(found[exact > within * (1.0 + 1e-5)]).all()

@@ -113,7 +113,7 @@ def test_a_level_that_reaches_the_border_has_a_closed_surface():
 
 
 def test_surfaces_are_decimated_to_the_wanted_size_and_stay_closed():
-    pytest.importorskip("pyvista")
+    pytest.importorskip("fast_simplification")
     image = cmfsim.ImageData(np.zeros((50, 50, 50)), (1, 1, 1))
     x, y, z = image.axes()
     wave = 3.0 * np.sin(x / 3) * np.sin(y / 3)

@@ -1,10 +1,14 @@
 """A report is one page with everything inside, and no name of a stranger's becomes markup."""
 
+from dataclasses import asdict
+
 import pytest
 
 import cmfsim
+import meshes
 from cmfsim.report import Document, Figure, Note, Section, Table, render_page
 from cmfsim.report.document import number
+from cmfsim.report.labels import MESH, MUSCLES, labelled
 
 pytest.importorskip("jinja2")
 
@@ -57,3 +61,20 @@ def test_rows_fit_their_head():
 )
 def test_numbers_never_pass_for_zero(value, text):
     assert number(value) == text
+
+
+def test_figures_of_mesh_and_muscles_have_labels_and_units():
+    """Every number of both summaries is called by a name, and mm³ become cm³."""
+    nodes, tets = meshes.box((3, 3, 3), (30.0, 30.0, 30.0))
+    mesh = cmfsim.TetMesh(nodes, tets)
+    found = labelled(cmfsim.mesh_report(mesh).as_dict(), MESH)
+    assert found["volume, cm³"] == pytest.approx(27.0)
+    assert found["nodes"] == 64
+    ball = cmfsim.SurfaceData(*meshes.icosphere(2, 10.0))
+    muscle = cmfsim.MuscleSurface("masseter", "L", ball)
+    used = {**asdict(cmfsim.CaseMuscles()), **cmfsim.equivalent_material(mesh, [muscle]).summary}
+    shown = labelled(used, MUSCLES)
+    assert shown["points in each of these"] == 64
+    assert not [label for label in (*found, *shown) if "_" in label]
+    assert {k for k, v in used.items() if isinstance(v, str | int | float)} <= set(MUSCLES)
+    assert labelled({"new_figure": 1.5}, MUSCLES) == {"new figure": 1.5}

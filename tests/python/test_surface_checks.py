@@ -4,12 +4,14 @@ import os
 import time
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
 
 import cmfsim
 from cmfsim.capping import cap_loop
 from cmfsim.crossings import crossing_pairs
+from cmfsim.io.ply import read_plain_ply
 from cmfsim.topology import connected_labels
 from head_case import icosphere
 
@@ -73,6 +75,60 @@ def test_unknown_endings_are_not_written(tmp_path):
     with pytest.raises(cmfsim.CaseError, match=r"\.ply, \.stl, \.obj, \.vtp"):
         cmfsim.write_surface(tmp_path / "x.3mf", cmfsim.SurfaceData(*sphere(1)))
     assert list(tmp_path.iterdir()) == []
+
+
+HEADER = """ply
+format {format} 1.0
+comment of no weight
+element vertex 4
+property {real} x
+property {real} y
+property {real} z{more}
+element face 2
+property list uchar {whole} {name}
+end_header
+"""
+
+
+def ply(tmp_path, order="<", real="float", whole="int", name="vertex_indices", rows=None, more=""):
+    """A file of two triangles on four points, written byte by byte."""
+    places = np.arange(12.0).reshape(4, 3) ** 1.5
+    kinds = {"float": "f4", "double": "f8", "int": "i4", "uint": "u4"}
+    format_ = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    head = HEADER.format(format=format_, real=real, whole=whole, name=name, more=more)
+    data = places.astype(order + kinds[real]).tobytes()
+    for row in rows or [[0, 1, 2], [2, 1, 3]]:
+        data += bytes([len(row)]) + np.array(row, order + kinds[whole]).tobytes()
+    path = tmp_path / "file.ply"
+    path.write_bytes(head.encode() + data)
+    return path
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize(("real", "whole"), [("float", "int"), ("double", "uint")])
+def test_plain_ply_is_read_as_meshio_reads_it(order, real, whole, tmp_path):
+    path = ply(tmp_path, order, real, whole)
+    points, triangles = read_plain_ply(path)
+    known = meshio.read(path)
+    assert points.dtype.itemsize == known.points.dtype.itemsize
+    np.testing.assert_array_equal(points, known.points)
+    np.testing.assert_array_equal(triangles, known.cells_dict["triangle"])
+    surface = cmfsim.read_surface(path)
+    np.testing.assert_array_equal(surface.triangles, known.cells_dict["triangle"])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"rows": [[0, 1, 2], [0, 1, 2, 3]]},
+        {"rows": [[0, 1, 2], [2, 1, 4]]},
+        {"rows": [[0, 1, 2], [2, 1, -1]]},
+        {"name": "corners"},
+        {"more": "\nproperty uchar red"},
+    ],
+)
+def test_other_ply_is_left_to_a_reader_of_all_of_it(change, tmp_path):
+    assert read_plain_ply(ply(tmp_path, **change)) is None
 
 
 @pytest.mark.parametrize("ending", [".ply", ".stl", ".obj", ".vtp"])

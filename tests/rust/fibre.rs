@@ -3,7 +3,7 @@
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-use mtm_core::fibre::{MuscleFibres, MuscleKind, OrientedBox};
+use mtm_core::fibre::{MuscleFibres, MuscleKind, NearFibres, OrientedBox};
 use mtm_core::{ErrorKind, MtmError, Surface};
 
 type Point = [f64; 3];
@@ -204,6 +204,32 @@ fn lines_are_followed_and_come_before_boxes() {
         .collect();
     let fibres = MuscleFibres::from_courses(&[closed]).unwrap();
     assert!(angle(fibres.direction([1.0, 0.0, 0.0]), [0.0, 1.0, 0.0]) < 0.1);
+}
+
+/// In balls far from the lines, between them, on their ends, and so large that they hold everything.
+#[test]
+fn directions_near_a_ball_are_the_bits_of_all_lines() {
+    let line = |turn: f64| -> Vec<Point> {
+        let place = |i: i32| {
+            let s = 0.1 * f64::from(i);
+            [30.0 * (s + turn).cos(), 30.0 * (s * turn).sin(), 2.0 * s * turn]
+        };
+        (0..60).map(place).collect()
+    };
+    let lines: Vec<Vec<Point>> = [0.4, 0.9, 1.3, 2.2].map(line).to_vec();
+    let fibres = MuscleFibres::from_courses(&lines).unwrap();
+    let mut near = NearFibres::default();
+    for (radius, step) in [(0.0, 1), (0.5, 1), (3.0, 7), (80.0, 30)] {
+        for p in lines.iter().flatten().step_by(step) {
+            let centre = [p[0] + 0.3 * radius, p[1], p[2] - 0.4 * radius];
+            fibres.near(centre, radius, &mut near);
+            for corner in 0..8 {
+                let side = |axis: usize| if corner >> axis & 1 == 1 { 0.57 } else { -0.57 };
+                let x = [0, 1, 2].map(|axis| centre[axis] + side(axis) * radius);
+                assert_eq!(fibres.direction_near(&near, x), fibres.direction(x), "{x:?}, {radius}");
+            }
+        }
+    }
 }
 
 #[test]

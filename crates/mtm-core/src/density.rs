@@ -8,7 +8,7 @@
 //! Hyperelastic: stable neo-Hookean (Smith, de Goes & Kim 2018, eq. 14) for the isotropic stiffness nearest to C
 //! (Fedorov 1968), and ½ e : (C − C_iso) : e for the fibre. At F = I the tangent is C.
 
-use nalgebra::{Matrix3, SMatrix, SymmetricEigen};
+use nalgebra::{Cholesky, Matrix3, Matrix6, SMatrix, SymmetricEigen, Vector3};
 
 use crate::kinematics::Kinematics;
 use crate::material::{Lame, TetMaterial, Voigt};
@@ -20,8 +20,13 @@ pub(crate) type Tangent = SMatrix<f64, 9, 9>;
 /// Sum of two principal stretches below which rotation about the third axis has no meaning: both sides of
 /// the tet have all but passed each other.
 const LEAST_STRETCH_SUM: f64 = 1e-2;
+/// Stiffness added to a tangent over its largest entry, so that its zeros, as those of turning a body at
+/// rest, do not count as negative by rounding. Newton's method converges as without.
+const DEFINITE_LIFT: f64 = 1e-10;
 /// Rows and columns of strain components in Voigt order.
 const PAIRS: [(usize, usize); 6] = [(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)];
+/// Place in Voigt order of each entry of a tensor, row by row.
+const VOIGT: [usize; 9] = [0, 5, 4, 5, 1, 3, 4, 3, 2];
 
 /// Energy density of one material.
 #[derive(Debug, Clone, Copy)]
@@ -165,12 +170,19 @@ pub(crate) fn volumetric(f: &Matrix3<f64>, kinematics: Kinematics) -> Volumetric
 }
 
 /// `tangent` without its negative eigenvalues (Teran et al. 2005).
+///
+/// Most points have none: a factor of it with a trifle added shows that, and that sum is then the answer.
 pub(crate) fn definite(tangent: Tangent) -> Tangent {
     // The eigenvalue iteration would not end.
     if tangent.iter().any(|x| !x.is_finite()) {
         return tangent;
     }
-    let eigen = SymmetricEigen::new(0.5 * (tangent + tangent.transpose()));
+    let symmetric = 0.5 * (tangent + tangent.transpose());
+    let lifted = symmetric + Tangent::identity() * (DEFINITE_LIFT * symmetric.amax());
+    if Cholesky::new(lifted).is_some() {
+        return lifted;
+    }
+    let eigen = SymmetricEigen::new(symmetric);
     let mut out = Tangent::zeros();
     for i in (0..9).filter(|&i| eigen.eigenvalues[i] > 0.0) {
         let mode = eigen.eigenvectors.column(i);
@@ -212,6 +224,33 @@ impl Stiffness {
     }
 }
 
+impl Stiffness {
+    /// C in the axes that are the columns of `v`, by the stress transformation of Bond (1943).
+    fn in_frame(&self, v: &Matrix3<f64>) -> Voigt {
+        match self {
+            Self::Isotropic(l) => std::array::from_fn(|i| {
+                std::array::from_fn(|j| match (i, j) {
+                    (0..3, 0..3) if i == j => l.lambda_ + 2.0 * l.mu,
+                    (0..3, 0..3) => l.lambda_,
+                    _ if i == j => l.mu,
+                    _ => 0.0,
+                })
+            }),
+            Self::General(c) => {
+                // σ'_ij = Σ v_ki v_lj σ_kl: a shear stress of Voigt stands for two of the sum.
+                let bond = Matrix6::from_fn(|row, col| {
+                    let ((i, j), (k, l)) = (PAIRS[row], PAIRS[col]);
+                    let one = v[(k, i)] * v[(l, j)];
+                    if k == l { one } else { one + v[(l, i)] * v[(k, j)] }
+                });
+                let c = Matrix6::from_fn(|i, j| 0.5 * (c[i][j] + c[j][i]));
+                let turned = bond * c * bond.transpose();
+                std::array::from_fn(|i| std::array::from_fn(|j| turned[(i, j)]))
+            }
+        }
+    }
+}
+
 /// e = U − I in global axes.
 fn stretch_strain(polar: &Polar) -> Matrix3<f64> {
     let e = polar.v * Matrix3::from_diagonal(&polar.stretch.add_scalar(-1.0)) * polar.v.transpose();
@@ -236,63 +275,94 @@ fn stretch_sum(a: f64, b: f64) -> f64 {
 /// ∂²W/∂F² of the stretch energy; `pressure` is added to T where U bends.
 ///
 /// With A = Qᵀ δF V, E_ij = (u_i A_ij + u_j A_ji)/(u_i + u_j) is δU and Ω_ij = (A_ij − A_ji)/(u_i + u_j) the
-/// turn, A_ij = Ω_ij u_j + E_ij, in the principal frame at rest. Then δ²W = E : C : E + T : δ²U with
-/// δ²U_ij = 2 Σ_k (Ω_ki Ω_kj u_i u_j + Ω_ki u_i E_kj + E_ki Ω_kj u_j)/(u_i + u_j).
+/// turn, A_ij = Ω_ij u_j + E_ij, in the principal frame at rest. Then δ²W = E : C : E + T : δ²U, and
+/// U² = FᵀF differentiated twice gives δ²U_ij = 2 Σ_k (A_ki A_kj − E_ki E_kj)/(u_i + u_j).
 fn stretch_tangent(stiffness: &Stiffness, f: &Matrix3<f64>, pressure: f64) -> Tangent {
     let polar = Polar::new(f);
     let (u, v) = (polar.stretch, polar.v);
     let t = v.transpose() * stiffness.apply(&stretch_strain(&polar)) * v
         + Matrix3::identity() * pressure;
+    let sum = Matrix3::from_fn(|i, j| stretch_sum(u[i], u[j]));
 
-    // E and Ω of each unit A, entry (r, c) at 3r + c.
-    let unit = |r: usize, c: usize| {
-        let (mut e, mut turn) = (Matrix3::zeros(), Matrix3::zeros());
-        if r == c {
-            e[(r, r)] = 1.0;
-        } else {
-            let sum = stretch_sum(u[r], u[c]);
-            e[(r, c)] = u[r] / sum;
-            e[(c, r)] = u[r] / sum;
-            turn[(r, c)] = 1.0 / sum;
-            turn[(c, r)] = -1.0 / sum;
-        }
-        (e, turn)
-    };
-    let units: [(Matrix3<f64>, Matrix3<f64>); 9] = std::array::from_fn(|i| unit(i / 3, i % 3));
-    let stresses: [Matrix3<f64>; 9] = std::array::from_fn(|i| match stiffness {
-        Stiffness::Isotropic(_) => stiffness.apply(&units[i].0),
-        Stiffness::General(_) => {
-            v.transpose() * stiffness.apply(&(v * units[i].0 * v.transpose())) * v
-        }
+    // E : C : E. Entry (r, c) of A strains one component of E alone, by `strains` in Voigt order.
+    let strains: [f64; 9] = std::array::from_fn(|rc| {
+        let (r, c) = (rc / 3, rc % 3);
+        if r == c { 1.0 } else { 2.0 * u[r] / sum[(r, c)] }
     });
-    // 2 T_ij / (u_i + u_j) and on the diagonal T_ii / u_i, whose u_i the bracket holds as a factor.
+    let c = stiffness.in_frame(&v);
     let mut in_frame = Tangent::zeros();
     for a in 0..9 {
-        for b in a..9 {
-            let ((ea, wa), (eb, wb)) = (&units[a], &units[b]);
-            let mut sum = stresses[a].dot(eb);
-            for i in 0..3 {
-                for k in 0..3 {
-                    let bend = 2.0 * wa[(k, i)] * wb[(k, i)] * u[i]
-                        + 2.0 * (wa[(k, i)] * eb[(k, i)] + wb[(k, i)] * ea[(k, i)]);
-                    sum += 0.5 * t[(i, i)] * bend;
-                    for j in (0..3).filter(|&j| j != i) {
-                        let weight = t[(i, j)] / stretch_sum(u[i], u[j]);
-                        let bend =
-                            (wa[(k, i)] * wb[(k, j)] + wb[(k, i)] * wa[(k, j)]) * u[i] * u[j]
-                                + (wa[(k, i)] * eb[(k, j)] + wb[(k, i)] * ea[(k, j)]) * u[i]
-                                + (ea[(k, i)] * wb[(k, j)] + eb[(k, i)] * wa[(k, j)]) * u[j];
-                        sum += weight * bend;
-                    }
-                }
-            }
-            in_frame[(a, b)] = sum;
-            in_frame[(b, a)] = sum;
+        for b in 0..9 {
+            in_frame[(a, b)] = strains[a] * c[VOIGT[a]][VOIGT[b]] * strains[b];
         }
     }
-    // A = Qᵀ δF V: A_rc = Σ Q_ir V_jc δF_ij.
-    let carry = Tangent::from_fn(|rc, ij| polar.q[(ij / 3, rc / 3)] * v[(ij % 3, rc % 3)]);
-    carry.transpose() * in_frame * carry
+    // T : δ²U on the diagonal: A² − E² = u_i Ω (A + E), whose factor u_i is that of T_ii / u_i.
+    for i in 0..3 {
+        for k in (0..3).filter(|&k| k != i) {
+            let (here, there) = (3 * k + i, 3 * i + k);
+            let turn = t[(i, i)] / sum[(k, i)];
+            // A_ki + E_ki over A_ki and A_ik.
+            let (own, other) = (1.0 + u[k] / sum[(k, i)], u[i] / sum[(k, i)]);
+            in_frame[(here, here)] += turn * own;
+            in_frame[(there, there)] -= turn * other;
+            in_frame[(here, there)] += 0.5 * turn * (other - own);
+            in_frame[(there, here)] += 0.5 * turn * (other - own);
+        }
+    }
+    // Off the diagonal: 2 T_ij/(u_i + u_j) on both sides of it.
+    for (i, j) in [(0, 1), (1, 2), (2, 0)] {
+        let weight = 2.0 * t[(i, j)] / sum[(i, j)];
+        if weight == 0.0 {
+            continue;
+        }
+        for k in 0..3 {
+            let (ki, kj) = (3 * k + i, 3 * k + j);
+            in_frame[(ki, kj)] += weight;
+            in_frame[(kj, ki)] += weight;
+            for (a, share_a) in strained_by(k, i, &u, &sum) {
+                for (b, share_b) in strained_by(k, j, &u, &sum) {
+                    in_frame[(a, b)] -= weight * share_a * share_b;
+                    in_frame[(b, a)] -= weight * share_a * share_b;
+                }
+            }
+        }
+    }
+    carried(&in_frame, &polar.q, &v)
+}
+
+/// The entries of A that E_ij is made of, at 3r + c, with their shares.
+fn strained_by(i: usize, j: usize, u: &Vector3<f64>, sum: &Matrix3<f64>) -> [(usize, f64); 2] {
+    if i == j {
+        return [(4 * i, 0.5), (4 * i, 0.5)];
+    }
+    [(3 * i + j, u[i] / sum[(i, j)]), (3 * j + i, u[j] / sum[(i, j)])]
+}
+
+/// Derivatives by F from those by A = Qᵀ F V, one index after another.
+fn carried(in_frame: &Tangent, q: &Matrix3<f64>, v: &Matrix3<f64>) -> Tangent {
+    // Columns (t, u) to (k, l) by Q and V, twice: the form is symmetric, so its transpose is turned alike.
+    let turned = |h: &Tangent| {
+        let mut half = Tangent::zeros();
+        for t in 0..3 {
+            for l in 0..3 {
+                let mut column = h.column(3 * t) * v[(l, 0)];
+                column += h.column(3 * t + 1) * v[(l, 1)];
+                column += h.column(3 * t + 2) * v[(l, 2)];
+                half.set_column(3 * t + l, &column);
+            }
+        }
+        let mut out = Tangent::zeros();
+        for k in 0..3 {
+            for l in 0..3 {
+                let mut column = half.column(l) * q[(k, 0)];
+                column += half.column(3 + l) * q[(k, 1)];
+                column += half.column(6 + l) * q[(k, 2)];
+                out.set_column(3 * k + l, &column);
+            }
+        }
+        out
+    };
+    turned(&turned(in_frame).transpose())
 }
 
 /// Adds `stress` ∂²J/∂F²: δ²J = F : (δF × δF), the cross product of tensors.

@@ -80,6 +80,7 @@ pub mod parting;
 mod polar;
 mod projected_product;
 mod quadratic;
+mod reaction;
 mod reduction;
 pub mod registration;
 pub mod relaxation;

@@ -3,7 +3,7 @@
 
 use crate::blocks::BlockMatrix;
 use crate::boundary::Motion;
-use crate::cholesky::{Factor, Symbolic, TailFactor};
+use crate::cholesky::{Factor, Symbolic};
 use crate::constraints::{
     Constraint, add_offsets, along_normals, orthonormal, projected, projected_rhs,
 };
@@ -11,13 +11,17 @@ use crate::contact::{Constraints, ContactMode, ContactState, Response, Sliding, 
 use crate::crease::ContactRow;
 use crate::error::{MtmError, Result};
 use crate::iterative::{Effort, Iterative, Trail};
-use crate::mesh::{add, dot, norm, scaled, sub};
+use crate::mesh::{add, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
+use crate::reaction::ContactFactor;
 use crate::restraint::Held;
 use crate::solution::Clock;
 
-/// Most sliding nodes whose dense flexibility is kept (three unknowns each, 8 bytes, twice).
+/// Most sliding nodes whose whole flexibility is kept (three unknowns each, 8 bytes a pair, twice): with
+/// it a set of normals costs a few dense products, by sweeps a few passes over the factor.
 const MAX_DENSE_SLIDING: usize = 2500;
+/// Most sliding nodes of which the flexibility along the normals at rest is kept: 8 bytes a pair.
+const MAX_KEPT_SLIDING: usize = 6000;
 
 /// Share of the error at its start to which a contact iteration is solved, until the tolerance is near:
 /// what it leaves is less than what the next closest points change.
@@ -29,8 +33,8 @@ const TRIAL_SAFETY: f64 = 10.0;
 
 /// What is kept from one plan to the next.
 enum Kept {
-    /// The factor, and with sliding nodes its dense end.
-    Direct { symbolic: Symbolic, factor: Factor, tail: Option<TailFactor> },
+    /// The factor, and with sliding nodes what answers for them.
+    Direct { symbolic: Symbolic, factor: Factor, contact: Option<ContactFactor> },
     /// The structure of the factor: the values change with the contact normals.
     Refactored { symbolic: Symbolic, matrix: BlockMatrix },
     /// The preconditioner.
@@ -69,24 +73,33 @@ impl System {
         if method == Method::Cholesky {
             let slide_rows: Vec<u32> =
                 sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
-            let dense = !slide_rows.is_empty()
+            // Where sliding nodes alone hold a part, there is no flexibility without them.
+            let kept = !slide_rows.is_empty()
                 && held == Held::ByPrescribed
-                && slide_rows.len() <= MAX_DENSE_SLIDING;
+                && slide_rows.len() <= MAX_KEPT_SLIDING;
+            let dense = kept && slide_rows.len() <= MAX_DENSE_SLIDING;
             let symbolic = Symbolic::new(&matrix, if dense { &slide_rows } else { &[] })?;
             clock.lap("ordering", true);
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
             let fits = options.memory_limit.is_none_or(|limit| symbolic.factor_bytes() <= limit);
-            if fits && sliding.is_some() && !dense {
+            if fits && sliding.is_some() && !kept {
                 return Ok((with(Kept::Refactored { symbolic, matrix }), method));
             }
             if fits {
                 let factor = symbolic.factor(&matrix)?;
                 clock.lap("factor", true);
-                let tail = dense.then(|| symbolic.tail_flexibility(&factor));
-                clock.lap("contact_factor", dense);
-                return Ok((with(Kept::Direct { symbolic, factor, tail }), method));
+                let contact = sliding.map(|sliding| {
+                    if dense {
+                        ContactFactor::dense(&symbolic, &factor, sliding)
+                    } else {
+                        ContactFactor::by_sweeps(&symbolic, &factor, sliding)
+                    }
+                });
+                let contact = contact.transpose()?;
+                clock.lap("contact_factor", contact.is_some());
+                return Ok((with(Kept::Direct { symbolic, factor, contact }), method));
             }
             if options.method == Method::Cholesky {
                 return Err(MtmError::OutOfMemory {
@@ -106,8 +119,8 @@ impl System {
     /// Bytes of the factor or preconditioner.
     pub fn bytes(&self) -> usize {
         match &self.kept {
-            Kept::Direct { symbolic, tail, .. } => {
-                symbolic.factor_bytes() + tail.as_ref().map_or(0, TailFactor::bytes)
+            Kept::Direct { symbolic, contact, .. } => {
+                symbolic.factor_bytes() + contact.as_ref().map_or(0, ContactFactor::bytes)
             }
             Kept::Refactored { symbolic, .. } => symbolic.factor_bytes(),
             Kept::Iterative(iterative) => iterative.bytes(),
@@ -147,13 +160,13 @@ impl System {
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, ContactState, f64)> {
         let clock = Clock::new();
-        if let Kept::Direct { symbolic, factor, tail: Some(tail) } = &self.kept {
+        if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
             let mut x = symbolic.permuted(b);
             symbolic.forward(factor, &mut x, 1);
-            let free = tail.free_displacements(&x);
-            let state = sliding
-                .settle(motions, &options.contact, interrupted, |c| respond(tail, &free, c))?;
-            tail.add_forces(&mut x, &pushes(&state.normals, &state.forces));
+            let mut answers = contact.answers(symbolic, factor, &x);
+            let state =
+                sliding.settle(motions, &options.contact, interrupted, |c| answers.respond(c))?;
+            answers.add_forces(&mut x, &pushes(&state.normals, &state.forces));
             let seconds = clock.total();
             symbolic.backward(factor, &mut x, 1);
             let x = symbolic.unpermuted(&x);
@@ -188,23 +201,30 @@ impl System {
             let each = columns.iter().zip(scales);
             return each.map(|(b, &s)| self.solve(b, s, &mut effort, interrupted)).collect();
         };
+        if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
+            let frozen = contact.frozen(frozen.rows, frozen.offsets)?;
+            let solve = |(k, b): (usize, &Vec<[f64; 3]>)| {
+                if interrupted() {
+                    return Err(MtmError::Interrupted);
+                }
+                let mut x = symbolic.permuted(b);
+                symbolic.forward(factor, &mut x, 1);
+                let mut answers = contact.answers(symbolic, factor, &x);
+                let forces = frozen.forces(&mut answers, k)?;
+                answers.add_forces(&mut x, &forces);
+                symbolic.backward(factor, &mut x, 1);
+                Ok(symbolic.unpermuted(&x))
+            };
+            return columns.iter().enumerate().map(solve).collect();
+        }
         let solve = |((b, offsets), &scale): ((&Vec<[f64; 3]>, &Vec<f64>), &f64)| {
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
             let c = Constraints { rows: frozen.rows, offsets, springs: &[] };
-            let Kept::Direct { symbolic, factor, tail: Some(tail) } = &self.kept else {
-                let (mut trail, effort) = (Trail::default(), &mut effort);
-                self.solve_projected(b, sliding, &c, scale, None, &mut trail, effort, interrupted)?;
-                return Ok(trail.rows);
-            };
-            let mut x = symbolic.permuted(b);
-            symbolic.forward(factor, &mut x, 1);
-            let free = tail.free_displacements(&x);
-            let response = respond(tail, &free, &c)?;
-            tail.add_forces(&mut x, &row_pushes(sliding.nodes().len(), c.rows, &response.forces));
-            symbolic.backward(factor, &mut x, 1);
-            Ok(symbolic.unpermuted(&x))
+            let (mut trail, effort) = (Trail::default(), &mut effort);
+            self.solve_projected(b, sliding, &c, scale, None, &mut trail, effort, interrupted)?;
+            Ok(trail.rows)
         };
         columns.iter().zip(frozen.offsets).zip(scales).map(solve).collect()
     }
@@ -235,7 +255,7 @@ impl System {
         let matrix = match &self.kept {
             Kept::Refactored { matrix, .. } => matrix,
             Kept::Iterative(iterative) => iterative.matrix(),
-            Kept::Direct { .. } => unreachable!("the dense flexibility serves contact there"),
+            Kept::Direct { .. } => unreachable!("the factor without contact serves there"),
         };
         let springs: Vec<(usize, Spring)> = c.springs.iter().map(|&s| (row(s.node), s)).collect();
         let mut rhs = projected_rhs(matrix, b, &constraints);
@@ -263,7 +283,7 @@ impl System {
                 effort.error_bound = direct_error(&factor, &x);
                 (x, true)
             }
-            Kept::Direct { .. } => unreachable!("the dense flexibility serves contact there"),
+            Kept::Direct { .. } => unreachable!("the factor without contact serves there"),
         };
         add_offsets(&mut x, &constraints);
         let forces = along_normals(&asked, |row| sub(matrix.row_product(row, &x), b[row]));
@@ -271,42 +291,6 @@ impl System {
         trail.rows = x;
         Ok(Response { displacements, forces, solved })
     }
-}
-
-/// Contact forces λ from (Nᵀ S⁻¹ N) λ = g − Nᵀ u_free, and the displacements of the sliding nodes.
-///
-/// A spring of stiffness k adds a column along its axis, with 1/k on the diagonal.
-fn respond(tail: &TailFactor, free: &[[f64; 3]], c: &Constraints<'_>) -> Result<Response> {
-    let (rows, goals, softness) = with_springs(c);
-    let mut forces: Vec<f64> =
-        rows.iter().zip(&goals).map(|(r, g)| g - dot(r.normal, free[r.node])).collect();
-    let nodes: Vec<usize> = rows.iter().map(|r| r.node).collect();
-    let normals: Vec<[f64; 3]> = rows.iter().map(|r| r.normal).collect();
-    let dense = tail.normal_flexibility(&nodes, &normals, &softness);
-    dense.solve(&mut forces).map_err(|at| MtmError::NotPositiveDefinite {
-        node: tail.row(nodes[at]),
-        detail: "the flexibility of the sliding nodes is singular".into(),
-    })?;
-    let displacements = tail
-        .respond(&row_pushes(free.len(), &rows, &forces))
-        .iter()
-        .zip(free)
-        .map(|(r, f)| [0, 1, 2].map(|i| r[i] + f[i]))
-        .collect();
-    forces.truncate(c.rows.len());
-    Ok(Response { displacements, forces, solved: true })
-}
-
-/// The rows of `c` and after them one for each spring, with what each asks for and how softly.
-fn with_springs(c: &Constraints<'_>) -> (Vec<ContactRow>, Vec<f64>, Vec<f64>) {
-    let (mut rows, mut goals) = (c.rows.to_vec(), c.offsets.to_vec());
-    let mut softness = vec![0.0; rows.len()];
-    for spring in c.springs {
-        rows.push(ContactRow { node: spring.node, normal: spring.axis, point: [0.0; 3] });
-        goals.push(spring.goal);
-        softness.push(1.0 / spring.stiffness);
-    }
-    (rows, goals, softness)
 }
 
 /// Estimate of the largest nodal error of a solution by factor, mm.
@@ -317,13 +301,4 @@ fn direct_error(factor: &Factor, x: &[[f64; 3]]) -> f64 {
 /// Force vector of each sliding node.
 fn pushes(normals: &[[f64; 3]], forces: &[f64]) -> Vec<[f64; 3]> {
     normals.iter().zip(forces).map(|(&n, &f)| scaled(n, f)).collect()
-}
-
-/// Force vector of each of `n` sliding nodes from the forces along the rows.
-fn row_pushes(n: usize, rows: &[ContactRow], forces: &[f64]) -> Vec<[f64; 3]> {
-    let mut out = vec![[0.0; 3]; n];
-    for (r, &force) in rows.iter().zip(forces) {
-        out[r.node] = add(out[r.node], scaled(r.normal, force));
-    }
-    out
 }

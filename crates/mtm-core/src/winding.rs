@@ -126,7 +126,7 @@ impl WindingTree {
     /// Winding number at `point` (mm, finite).
     pub fn winding_number_one(&self, point: [f64; 3]) -> f64 {
         let q = Vec3::from(point);
-        let mut sum = 0.0;
+        let (mut sum, mut near) = (0.0, SolidAngle::new());
         let mut at = 0;
         while let Some(cluster) = self.clusters.get(at) {
             let r = cluster.centre - q;
@@ -135,14 +135,14 @@ impl WindingTree {
                 sum += cluster.far_field(&r, r_squared);
             } else if cluster.end_triangle > cluster.first_triangle {
                 let range = cluster.first_triangle as usize..cluster.end_triangle as usize;
-                sum += solid_angle(&q, &self.triangles[range]);
+                near.add(&q, &self.triangles[range]);
             } else {
                 at += 1;
                 continue;
             }
             at = cluster.next as usize;
         }
-        sum / (4.0 * PI)
+        (sum + near.total()) / (4.0 * PI)
     }
 
     fn build(surface: &Surface, beta: f64) -> Self {
@@ -170,7 +170,11 @@ pub fn winding_number_exact(surface: &Surface, points: &[[f64; 3]]) -> Vec<f64> 
     let triangles: Vec<Sheet> = (0..n).map(|t| Sheet::new(surface.corners(t))).collect();
     points
         .par_iter()
-        .map(|&point| solid_angle(&Vec3::from(point), &triangles) / (4.0 * PI))
+        .map(|&point| {
+            let mut sum = SolidAngle::new();
+            sum.add(&Vec3::from(point), &triangles);
+            sum.total() / (4.0 * PI)
+        })
         .collect()
 }
 
@@ -372,38 +376,51 @@ fn traceless_second(t: &[[[f64; 3]; 3]; 3]) -> [f64; 10] {
     ]
 }
 
-/// Solid angle of triangles seen from `q`, positive where `q` lies behind them; summed in their
-/// order.
+/// Solid angle of triangles seen from a point, positive where it lies behind them; summed in the order in
+/// which they come.
 ///
 /// tan(Ω/2) = det(a, b, c) / (|a||b||c| + (a·b)|c| + (b·c)|a| + (c·a)|b|) (van Oosterom & Strackee
 /// 1983). Half-angles are added as complex products while both stay below a right angle, so that
-/// most triangles need no arctangent. A triangle with `q` on a corner counts as zero.
-fn solid_angle(q: &Vec3, triangles: &[Sheet]) -> f64 {
-    let mut half_angles = 0.0;
-    let (mut re, mut im) = (1.0, 0.0);
-    for triangle in triangles {
-        let [a, b, c] = triangle.corners.map(|corner| corner - q);
-        let (la, lb, lc) = (a.norm(), b.norm(), c.norm());
-        let product = la * lb * lc;
-        let x = product + a.dot(&b) * lc + b.dot(&c) * la + c.dot(&a) * lb;
-        // det(a, b, c) = a·((b − a) × (c − a)), which keeps its digits far away.
-        let y = a.dot(&triangle.normal);
-        if y == 0.0 || product == 0.0 {
-            continue;
-        }
-        if x <= 0.0 {
-            half_angles += y.atan2(x);
-            continue;
-        }
-        let scale = 1.0 / product;
-        let (x, y) = (x * scale, y * scale);
-        // Both factors lie within a right angle of the real axis, so their angles add without a
-        // turn.
-        (re, im) = (re * x - im * y, re * y + im * x);
-        if !PRODUCT_RANGE.contains(&re) {
-            half_angles += im.atan2(re);
-            (re, im) = (1.0, 0.0);
+/// most triangles need no arctangent. A triangle with the point on a corner counts as zero.
+struct SolidAngle {
+    half_angles: f64,
+    re: f64,
+    im: f64,
+}
+
+impl SolidAngle {
+    fn new() -> Self {
+        Self { half_angles: 0.0, re: 1.0, im: 0.0 }
+    }
+
+    fn add(&mut self, q: &Vec3, triangles: &[Sheet]) {
+        for triangle in triangles {
+            let [a, b, c] = triangle.corners.map(|corner| corner - q);
+            let (la, lb, lc) = (a.norm(), b.norm(), c.norm());
+            let product = la * lb * lc;
+            let x = product + a.dot(&b) * lc + b.dot(&c) * la + c.dot(&a) * lb;
+            // det(a, b, c) = a·((b − a) × (c − a)), which keeps its digits far away.
+            let y = a.dot(&triangle.normal);
+            if y == 0.0 || product == 0.0 {
+                continue;
+            }
+            if x <= 0.0 {
+                self.half_angles += y.atan2(x);
+                continue;
+            }
+            let scale = 1.0 / product;
+            let (x, y) = (x * scale, y * scale);
+            // Both factors lie within a right angle of the real axis, so their angles add without a
+            // turn.
+            (self.re, self.im) = (self.re * x - self.im * y, self.re * y + self.im * x);
+            if !PRODUCT_RANGE.contains(&self.re) {
+                self.half_angles += self.im.atan2(self.re);
+                (self.re, self.im) = (1.0, 0.0);
+            }
         }
     }
-    2.0 * (half_angles + im.atan2(re))
+
+    fn total(&self) -> f64 {
+        2.0 * (self.half_angles + self.im.atan2(self.re))
+    }
 }

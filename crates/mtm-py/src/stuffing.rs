@@ -67,18 +67,29 @@ pub fn stuff_image<'py>(
     Ok((PyTetMesh::wrap(Arc::new(made.mesh)), report))
 }
 
-/// Distance of every voxel centre to the nearest non-zero one, (nx, ny, nz) float32, mm; infinite without any.
+/// Part by which a squared distance may exceed the square of the greatest that is asked for: more than the
+/// rounding of float32.
+const DISTANCE_MARGIN: f64 = 1e-6;
+
+/// Distance of every voxel centre to the nearest non-zero one, (nx, ny, nz) float32, mm; infinite without any,
+/// and where it exceeds `within`.
 #[pyfunction]
+#[pyo3(signature = (targets, spacing, *, within=f64::INFINITY))]
 pub fn distance_image<'py>(
     py: Python<'py>,
     targets: &Bound<'py, PyAny>,
     spacing: [f64; 3],
+    within: f64,
 ) -> PyResult<Bound<'py, PyArray3<f32>>> {
     let name = Named("targets", MESH);
     let (shape, inside) = arrays::labels(targets, name)?;
     let grid = Grid::new(shape, spacing, [0.0; 3]).map_err(Failure)?;
-    let squared = interruptible(py, move |_| Ok(squared_distance(&grid, |index| inside[index])))?;
-    arrays::volume(py, shape, squared.into_iter().map(f32::sqrt).collect())
+    let most = (within * within * (1.0 + DISTANCE_MARGIN)) as f32;
+    let distances = interruptible(py, move |_| {
+        let squared = squared_distance(&grid, most, |index| inside[index]);
+        Ok(squared.into_iter().map(f32::sqrt).collect())
+    })?;
+    arrays::volume(py, shape, distances)
 }
 
 /// Signed distance to a surface on a grid, (nx, ny, nz) float32, mm: positive inside, clipped at ±band.

@@ -1,18 +1,23 @@
 """From a case to the patient's model: here alone the stages before a solve are strung together."""
 
-from cmfsim.build.case_model import build_case, build_model
-from cmfsim.build.inputs import check_output, input_hashes
-from cmfsim.build.muscles import with_muscles
-from cmfsim.build.phantom_case import write_phantom_case
-from cmfsim.build.postoperative import Postoperative, read_postoperative
+from cmfsim.deferred import deferred
 
-__all__ = [
-    "Postoperative",
-    "build_case",
-    "build_model",
-    "check_output",
-    "input_hashes",
-    "read_postoperative",
-    "with_muscles",
-    "write_phantom_case",
-]
+__getattr__, __dir__, __all__ = deferred(
+    __name__,
+    {
+        "case_model": (
+            "build_case",
+            "build_model",
+        ),
+        "inputs": (
+            "check_output",
+            "input_hashes",
+        ),
+        "muscles": ("with_muscles",),
+        "phantom_case": ("write_phantom_case",),
+        "postoperative": (
+            "Postoperative",
+            "read_postoperative",
+        ),
+    },
+)

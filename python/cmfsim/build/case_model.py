@@ -22,7 +22,6 @@ from cmfsim.build.inputs import (
     read_case_landmarks,
 )
 from cmfsim.build.motions import planned_bones
-from cmfsim.build.muscles import with_muscles
 from cmfsim.build.postoperative import Postoperative
 from cmfsim.build.skin_part import on_skin
 from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, ImageData, NodeKinds
@@ -244,6 +243,9 @@ def build_model(
     if case.muscles is None:
         return patient
     stages.begin("placing and sampling the muscles")
+    # A case without muscles loads nothing of them.
+    from cmfsim.build.muscles import with_muscles  # noqa: PLC0415
+
     return with_muscles(patient, case.muscles, mesh=mesh)
 
 

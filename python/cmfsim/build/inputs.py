@@ -1,16 +1,18 @@
 """What the files of a case hold: anatomy, landmarks, motions, and the hashes of them all."""
 
+from __future__ import annotations
+
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cmfsim.case import Anatomy, Finding
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
-from cmfsim.imaging import SegmentOptions, segment_head
 from cmfsim.io import (
     Case,
     read_landmark_file,
@@ -24,6 +26,9 @@ from cmfsim.meshing import anatomy_from_surfaces
 from cmfsim.patient import CaseMotion
 from cmfsim.scene import MovedSurface
 from cmfsim.surface_repair import repair_surface
+
+if TYPE_CHECKING:
+    from cmfsim.imaging import SegmentOptions
 
 __all__ = [
     "check_output",
@@ -61,6 +66,9 @@ def read_anatomy(
 ) -> tuple[Anatomy, tuple[Finding, ...]]:
     """The head of a case, from its CT or its surfaces."""
     if case.image is not None:
+        # A case of surfaces loads nothing of imaging.
+        from cmfsim.imaging import segment_head  # noqa: PLC0415
+
         progress("reading the image")
         read = read_image_file(case.image.file)
         anatomy = segment_head(
@@ -90,6 +98,8 @@ def read_anatomy(
 
 def segment_options(case: Case) -> SegmentOptions:
     """How tissue is read from a CT of the case, before the operation or after it."""
+    from cmfsim.imaging import SegmentOptions  # noqa: PLC0415
+
     if case.image is None:
         return SegmentOptions()
     given = {

@@ -1,11 +1,13 @@
 """How the bone segments of a case move: as its plan says, and parted where a motion is torn."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cmfsim.achieved import AchievedPlan, achieved_plan
 from cmfsim.bone_motion import smooth_motion, sound_motion, torn_pieces
 from cmfsim.build.inputs import read_motion
 from cmfsim.build.postoperative import REFERENCES, Postoperative, read_postoperative
@@ -16,6 +18,9 @@ from cmfsim.io import Case, read_surface
 from cmfsim.osteotomy import part_segment
 from cmfsim.scene import MovedSurface, SurfaceData
 from cmfsim.surface_repair import clean_surface
+
+if TYPE_CHECKING:
+    from cmfsim.achieved import AchievedPlan
 
 __all__ = ["PlannedBones", "planned_bones"]
 
@@ -132,6 +137,8 @@ def _achieved_bones(
     if searched:
         bones = {name: clean_surface(surface) for name, surface in after.bones.items()}
         whole = _joined(list(bones.values()))
+        from cmfsim.achieved import achieved_plan  # noqa: PLC0415
+
         achieved = achieved_plan(
             {s.name: s for s in (*still, *(s for s in searched if s not in still))},
             {s.name: bones.get(s.name, whole) for s in searched},

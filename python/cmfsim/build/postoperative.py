@@ -12,12 +12,10 @@ from cmfsim.build.inputs import read_case_landmarks, segment_options
 from cmfsim.case import Finding, ImageData
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, RegistrationError
-from cmfsim.imaging import register_volumes, segment_head, undeformed_mask
 from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.io.images import read_image_file
 from cmfsim.osteotomy import surface_of_level
 from cmfsim.patient import CasePostoperative
-from cmfsim.registration import icp
 from cmfsim.scene import SurfaceData
 from cmfsim.surface_repair import RepairOptions, repair_surface
 
@@ -122,6 +120,8 @@ def _laid_on(case: Case, bones: Mapping[str, SurfaceData]) -> Floats:
         return np.asarray(_trimmed_fit(there, here))
     start = np.eye(4)
     start[:3, 3] = here.mean(axis=0) - there.mean(axis=0)
+    from cmfsim.registration import icp  # noqa: PLC0415
+
     fit = icp(after, still, initial=start, trim=TRIM, max_iterations=MOST_STEPS)
     if fit.rms > LARGEST_RMS:
         raise RegistrationError(
@@ -155,6 +155,8 @@ def _scanned(case: Case, given: CasePostoperative) -> Postoperative:
     # The jaws have moved since, but not so far that a flood from their landmarks would miss them.
     back = np.linalg.inv(matrix)
     there = {name: back[:3, :3] @ place + back[:3, 3] for name, place in skull.items()}
+    from cmfsim.imaging import segment_head  # noqa: PLC0415
+
     head = segment_head(read.image, segment_options(case), landmarks=there or None)
     levels = list(head.bones.values())
     bone = levels[0].with_values(np.maximum.reduce([np.asarray(b.values) for b in levels]))
@@ -174,6 +176,8 @@ def _registered(case: Case, after: ImageData, skull: Mapping[str, Floats]) -> Fl
             "([image]) and skull landmarks"
         )
     before = read_image_file(case.image.file).image
+    from cmfsim.imaging import register_volumes, undeformed_mask  # noqa: PLC0415
+
     matrix = register_volumes(after, before, mask=undeformed_mask(before, skull)).matrix
     _log.info("postoperative scan moved by %.2f mm", float(np.linalg.norm(matrix[:3, 3])))
     return matrix

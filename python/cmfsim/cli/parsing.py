@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim import __version__
+from cmfsim.bench import EDGES, FACTORS
 from cmfsim.cli import (
+    bench_command,
     case_commands,
     demo_command,
     phantom_command,
@@ -18,7 +20,7 @@ from cmfsim.cli import (
 from cmfsim.insilico import PATIENTS
 from cmfsim.io import result_suffixes
 from cmfsim.prediction import MODELS
-from cmfsim.scene import CONTACTS, METHODS
+from cmfsim.scene import CONTACTS, ELEMENTS, KINEMATICS, METHODS
 from cmfsim.template import WHERE
 
 __all__ = ["make_parser"]
@@ -39,6 +41,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_case_commands(commands, common)
     _add_scene_commands(commands, common)
     _add_template_commands(commands, common)
+    _add_bench_commands(commands, common)
     return parser
 
 
@@ -282,3 +285,75 @@ def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> No
         "--fibres", action="store_true", help="fibre boxes and directions instead of names"
     )
     show.set_defaults(run=template_commands.show)
+
+
+def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
+    bench = commands.add_parser("bench", help="measure: error against run time, other programs")
+    actions = bench.add_subparsers(dest="action", metavar="ACTION", required=True)
+
+    frontier = actions.add_parser(
+        "frontier",
+        parents=[common],
+        help="what each choice of a prediction costs, and what it buys",
+        epilog="Finished runs are kept in the folder: a sweep that was stopped goes on.",
+    )
+    frontier.add_argument(
+        "case", metavar="CASE", type=Path, nargs="?", help="case.toml (default: a made head)"
+    )
+    frontier.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT",
+        type=Path,
+        default=bench_command.FRONTIER_FOLDER,
+        help=f"folder (default {bench_command.FRONTIER_FOLDER})",
+    )
+    frontier.add_argument(
+        "--edge-length", metavar="H", type=float, help="of the base, mm, instead of the case's own"
+    )
+    frontier.add_argument("--model", choices=MODELS, help="of the base (default M+S)")
+    frontier.add_argument(
+        "--edges", metavar="H", type=float, nargs="+", default=EDGES, help="of the grid, mm"
+    )
+    for name, known in (("elements", ELEMENTS), ("kinematics", KINEMATICS)):
+        frontier.add_argument(
+            f"--{name}", choices=known, nargs="+", default=known, help="of the grid (default all)"
+        )
+    frontier.add_argument(
+        "--factors",
+        choices=FACTORS,
+        nargs="*",
+        default=list(FACTORS),
+        metavar="FACTOR",
+        help=f"varied one at a time, none if none is named (default {' '.join(FACTORS)})",
+    )
+    frontier.add_argument(
+        "--reference-edge", metavar="H", type=float, help="mm (default the smallest of the sweep)"
+    )
+    frontier.add_argument(
+        "--reference-kinematics",
+        choices=KINEMATICS,
+        default="hyperelastic",
+        help="(default hyperelastic)",
+    )
+    frontier.add_argument(
+        "--repeats", metavar="N", type=int, default=3, help="rounds of timing (default 3)"
+    )
+    frontier.add_argument("--threads", metavar="N", type=int, help="(default all cores)")
+    frontier.add_argument(
+        "--time-limit", metavar="S", type=float, default=600.0, help="of one job (default 600 s)"
+    )
+    frontier.add_argument("--fresh", action="store_true", help="do finished runs again")
+    frontier.set_defaults(run=bench_command.frontier)
+
+    peers = actions.add_parser(
+        "peers",
+        help="compare with other programs; needs a checkout of the source",
+        epilog="Words after -- go to benches/peers/run.py: -- --tets 20000 --peers ngsolve",
+    )
+    peers.add_argument(
+        "--checkout", metavar="FOLDER", type=Path, help="(default the working directory's)"
+    )
+    peers.add_argument("-q", "--quiet", action="store_true", help="no progress lines")
+    peers.add_argument("words", metavar="WORD", nargs="*", help="for benches/peers/run.py")
+    peers.set_defaults(run=bench_command.peers)

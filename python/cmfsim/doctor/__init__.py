@@ -11,7 +11,6 @@ from cmfsim.case import SEVERITIES, Finding
 from cmfsim.doctor.after import check_after
 from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.moved import check_moved
-from cmfsim.doctor.muscles import check_muscles
 from cmfsim.doctor.operation import check_cuts, check_plan
 from cmfsim.doctor.placement import check_placement
 from cmfsim.doctor.report import findings_text
@@ -55,5 +54,8 @@ def diagnose(case: Case) -> tuple[Finding, ...]:
         findings += check_plan(evidence)
         findings += check_moved(evidence)
         findings += check_after(evidence)
-        findings += check_muscles(evidence)
+        if case.muscles is not None:
+            from cmfsim.doctor.muscles import check_muscles  # noqa: PLC0415
+
+            findings += check_muscles(evidence)
     return tuple(sorted(findings, key=lambda f: SEVERITIES.index(f.severity)))

@@ -74,7 +74,7 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
         (also `ValueError`) No bone at this threshold.
     """
     threshold = options.bone_threshold
-    under = depth(skin.mask, work.spacing)
+    under = depth(skin.mask, work.spacing, 2.0 * options.least_skin)
     hu = metal.hu
     solid = without_streaks(hu > threshold, metal, work.spacing, bone=True)
     solid &= under > options.least_skin
@@ -166,7 +166,7 @@ def _enclosed(
     labels, count = label(~walls)
     sizes = sizes_of(labels, count)
     outer = np.zeros(count + 1, dtype=bool)
-    outer[np.unique(labels[under < 0.0])] = True
+    outer[labels.T[under.T < 0.0]] = True
     if not outer[1:].any():
         outer[np.argmax(sizes)] = True
     outer[0] = False
@@ -175,7 +175,7 @@ def _enclosed(
         hollows |= cavity
     # Of the closed walls only what bounds a hollow belongs to bone; the rest are outer grooves.
     reach = options.closing + float(work.spacing.max())
-    added = walls & (depth(hollows, work.spacing) > -reach)
+    added = walls & (depth(hollows, work.spacing, reach) > -reach)
     mask = solid | hollows | added
     mask &= under > options.least_skin
     return mask

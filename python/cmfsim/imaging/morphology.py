@@ -84,26 +84,31 @@ def as_array(image: Any) -> NDArray[Any]:
     return voxels.T
 
 
-def distance(targets: Mask, spacing: NDArray[np.float64]) -> Volume:
-    """The distance of each voxel's centre to the nearest target's, mm; infinite without targets."""
+def distance(targets: Mask, spacing: NDArray[np.float64], within: float = np.inf) -> Volume:
+    """The distance of each voxel's centre to the nearest target's, mm.
+
+    Infinite without targets, and where it exceeds `within`, which costs less.
+    """
     # The core walks C order: the transposed view has it.
     x, y, z = (float(s) for s in spacing)
-    apart: Volume = _core.distance_image(targets.T, (z, y, x)).T
+    apart: Volume = _core.distance_image(targets.T, (z, y, x), within=within).T
     return apart
 
 
-def depth(mask: Mask, spacing: NDArray[np.float64]) -> Volume:
+def depth(mask: Mask, spacing: NDArray[np.float64], within: float = np.inf) -> Volume:
     """The distance to the surface, mm: positive inside the mask, negative outside.
 
-    The surface runs half way between voxels of the mask and others, so no value is 0.
+    The surface runs half way between voxels of the mask and others, so no value is 0. Sizes above
+    `within` may be given as infinite.
     """
     if mask.all() or not mask.any():
         far = np.float32(np.linalg.norm(np.array(mask.shape) * spacing))
         return np.full(mask.shape, far if mask.any() else -far, dtype=np.float32, order="F")
     # Both sides are measured from the voxels of the mask's rim, which lie half a voxel inside.
-    to_rim = distance(mask & ~shrunk(mask), spacing)
+    half = 0.5 * float(spacing.min())
+    to_rim = distance(mask & ~shrunk(mask), spacing, within + half)
     np.negative(to_rim, out=to_rim, where=~mask)
-    to_rim += np.float32(0.5 * spacing.min())
+    to_rim += np.float32(half)
     return to_rim
 
 
@@ -137,9 +142,10 @@ def opened(mask: Mask, radius: float, spacing: NDArray[np.float64]) -> Mask:
     if not part.size:
         return swept
     wide, inner = _padded(part, radius, spacing)
-    core = depth(wide, spacing) > radius
+    core = depth(wide, spacing, radius) > radius
     if core.any():
-        near = distance(core, spacing) < radius + 0.5 * float(spacing.min())
+        reach = radius + 0.5 * float(spacing.min())
+        near = distance(core, spacing, reach) < reach
         swept[box] = near[inner] & part
     return swept
 
@@ -153,8 +159,9 @@ def closed(mask: Mask, radius: float, spacing: NDArray[np.float64]) -> Mask:
     if not part.size:
         return filled
     wide, inner = _padded(part, radius, spacing)
-    swollen = distance(wide, spacing) < radius + 0.5 * float(spacing.min())
-    filled[box] |= (depth(swollen, spacing) > radius)[inner]
+    reach = radius + 0.5 * float(spacing.min())
+    swollen = distance(wide, spacing, reach) < reach
+    filled[box] |= (depth(swollen, spacing, radius) > radius)[inner]
     return filled
 
 

@@ -37,7 +37,7 @@ def _direction(work: Working, bone: Bone) -> tuple[Finding, ...]:
     blocks = tuple(slice(None, None, n) for n in steps)
     spacing = work.spacing * np.array(steps)
     cavity = np.asfortranarray(bone.cavity[blocks])
-    beyond = bone.solid[blocks] & (depth(cavity, spacing) < -VAULT)
+    beyond = bone.solid[blocks] & (depth(cavity, spacing, VAULT) < -VAULT)
     if not beyond.any():
         return ()
     away = (np.argwhere(beyond).mean(axis=0) - np.argwhere(cavity).mean(axis=0)) * spacing

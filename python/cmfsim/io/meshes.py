@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import named
+from cmfsim.io.ply import read_plain_ply
 
 __all__ = [
     "read_mesh",
@@ -34,7 +35,7 @@ def _meshio() -> Any:
 
 def read_mesh(path: Path) -> Any:
     """What meshio reads from a file."""
-    meshio = _meshio()
+    _meshio()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     _refuse_entities(path)
@@ -46,9 +47,20 @@ def read_mesh(path: Path) -> Any:
                 contextlib.redirect_stdout(stdio.StringIO()),
                 contextlib.redirect_stderr(stdio.StringIO()),
             ):
-                return _read_vtp(path) if path.suffix == ".vtp" else meshio.read(path)
+                return _read(path)
         except (Exception, SystemExit) as error:
             raise CaseInputError(f"cannot be read as a mesh ({error})") from error
+
+
+def _read(path: Path) -> Any:
+    if path.suffix == ".vtp":
+        return _read_vtp(path)
+    # meshio takes PLY's triangles one by one.
+    plain = read_plain_ply(path) if path.suffix.lower() == ".ply" else None
+    if plain is not None:
+        points, triangles = plain
+        return _meshio().Mesh(points, [("triangle", triangles)])
+    return _meshio().read(path)
 
 
 def _refuse_entities(path: Path) -> None:

@@ -116,7 +116,7 @@ def near_skin(anatomy: Anatomy, depth: float) -> Mask:
     """Where the skin is nearer than `depth` mm: (nx, ny, nz) bool on the anatomy's grid."""
     sx, sy, sz = (float(s) for s in np.asarray(anatomy.skin.spacing))
     outside = np.asarray(anatomy.skin.values) <= 0.0
-    return np.asarray(_core.distance_image(outside, (sx, sy, sz)) < depth)
+    return np.asarray(_core.distance_image(outside, (sx, sy, sz), within=depth) < depth)
 
 
 def _inward_distances(grid: ImageData, region: TissueRegion) -> Iterator[Levels]:
@@ -141,9 +141,9 @@ def _without_hollows(
     spacing = (sx, sy, sz)
     tissue: Mask = level > 0.0
     # Where a ball of the foramen's radius fits between bones, and what such balls reach.
-    near_bone = _core.distance_image(bone > 0.0, spacing)
-    roomy = near_bone > region.foramen_radius
-    closed: Mask = _core.distance_image(roomy, spacing) > region.foramen_radius
+    radius = region.foramen_radius
+    roomy = _core.distance_image(bone > 0.0, spacing, within=radius) > radius
+    closed: Mask = _core.distance_image(roomy, spacing, within=radius) > radius
     # Outer tissue touches the skin where no bone stands between; thin tissue over bone is not
     # roomy, so that the way along the skin stays open whatever its thickness.
     shallow = np.asarray(grid.values) < 1.0
@@ -152,7 +152,7 @@ def _without_hollows(
     if count == 0:
         return
     touches = np.zeros(count + 1, dtype=bool)
-    touches[np.unique(labels[open_tissue & shallow])] = True
+    touches[labels[open_tissue & shallow]] = True
     touches[0] = False
     hollow: Mask = open_tissue & ~touches[labels]
     if not hollow.any():

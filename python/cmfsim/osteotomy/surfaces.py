@@ -75,8 +75,8 @@ def surface_of_level(
     Raises
     ------
     CaseError
-        (also `ValueError`) A level without an inside; scikit-image, or PyVista where the surface
-        has to be decimated, is missing.
+        (also `ValueError`) A level without an inside; scikit-image, or fast-simplification where
+        the surface has to be decimated, is missing.
     """
     options = options or SurfaceOptions()
     values = np.asarray(level.values, dtype=np.float32)
@@ -214,27 +214,25 @@ def _smoothed(points: Floats, triangles: NDArray[np.int64], rounds: int) -> Floa
 def _decimated(
     name: str, points: Floats, triangles: NDArray[np.int64], wanted: int
 ) -> tuple[Floats, NDArray[np.int64]]:
-    pv = _module(
-        "pyvista",
-        "mesh",
+    quadrics = _module(
+        "fast_simplification",
+        "imaging",
         f"the surface of {name!r} has {len(triangles)} triangles and is decimated to {wanted} "
-        "with PyVista (or raise max_triangles)",
+        "with fast-simplification (or raise max_triangles)",
     )
-    mesh = pv.PolyData.from_regular_faces(points, triangles)
     # Quadric decimation stays within a tenth of a voxel, but here and there it folds a sheet.
-    less = mesh.decimate(1.0 - wanted / len(triangles))
-    return _closed(
-        np.asarray(less.points, dtype=np.float64), np.asarray(less.regular_faces, dtype=np.int64)
-    )
+    fewer, corners = quadrics.simplify(points, triangles.astype(np.int32), target_count=wanted)
+    return _closed(np.asarray(fewer, dtype=np.float64), np.asarray(corners, dtype=np.int64))
 
 
 def _closed(points: Floats, triangles: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
     """The surface with triangles at edges that more than two share removed, and holes filled."""
     while True:
+        low, high = np.sort(_half_edges(triangles), axis=1).T
         _, number, count = np.unique(
-            np.sort(_half_edges(triangles), axis=1), axis=0, return_inverse=True, return_counts=True
+            low * len(points) + high, return_inverse=True, return_counts=True
         )
-        shared = (count[number.reshape(-1)] > 2).reshape(3, -1).any(axis=0)
+        shared = (count[number] > 2).reshape(3, -1).any(axis=0)
         if not shared.any():
             break
         triangles = triangles[~shared]

@@ -2,7 +2,7 @@
 
 import io
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from cmfsim.checks import as_floats
 from cmfsim.errors import CaseInputError
 
-__all__ = ["MODEL_COLOURS", "chart_errors"]
+__all__ = ["MODEL_COLOURS", "chart_errors", "write_figure"]
 
 # By model, in the order of the paper; told apart in grey too.
 MODEL_COLOURS = {
@@ -64,11 +64,6 @@ def chart_errors(
     ...     "errors.svg", {"P1": first.errors, "P2": second.errors}
     ... )  # doctest: +SKIP
     """
-    path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise CaseInputError(
-            f"{path.name}: a chart is written as {', '.join(SUFFIXES)}, not {path.suffix!r}"
-        )
     groups = {
         group: {m: np.abs(as_floats(f"errors of {group}, {m}", v)) for m, v in models.items()}
         for group, models in errors.items()
@@ -82,19 +77,36 @@ def chart_errors(
                 raise CaseInputError(f"errors of {group}, {model} have shape {values.shape}: (k,)")
     others = iter(OTHER_COLOURS * (1 + len(models) // len(OTHER_COLOURS)))
     colours = {m: MODEL_COLOURS[m] if m in MODEL_COLOURS else next(others) for m in models}
-    _write_chart(path, groups, colours, (width, height))
+    write_figure(Path(path), (width, height), lambda figure: _draw(figure, groups, colours))
 
 
-def _write_chart(
-    path: Path,
-    groups: Mapping[str, Mapping[str, Any]],
-    colours: Mapping[str, str],
-    size: tuple[float, float],
+def write_figure(
+    path: Path, size: tuple[float, float], draw: Callable[[Any], None], *, dpi: int = 150
 ) -> None:
+    """Writes what `draw` puts into an empty figure; an old file goes in one step.
+
+    Parameters
+    ----------
+    path : Path
+        Ends in `.png`, `.svg` or `.pdf`.
+    size : (float, float), inches
+    draw : callable
+        Takes matplotlib's figure.
+    dpi : int
+        Of a `.png`.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) matplotlib is missing, another ending.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise CaseInputError(
+            f"{path.name}: a chart is written as {', '.join(SUFFIXES)}, not {path.suffix!r}"
+        )
     try:
         matplotlib = import_module("matplotlib")
         figures = import_module("matplotlib.figure")
-        patches = import_module("matplotlib.patches")
     except ImportError as error:
         raise CaseInputError(
             f"charts are drawn with matplotlib, which cannot be imported ({error}): "
@@ -104,28 +116,31 @@ def _write_chart(
     settings = {"svg.fonttype": "none", "svg.hashsalt": "cmfsim", "font.size": 9.0}
     with matplotlib.rc_context(settings):
         figure = figures.Figure(figsize=size, layout="constrained")
-        axes = figure.add_subplot()
-        _boxes(axes, groups, colours)
-        handles = [
-            patches.Patch(facecolor=c, edgecolor="black", label=m) for m, c in colours.items()
-        ]
-        axes.legend(
-            handles=handles,
-            loc="upper center",
-            bbox_to_anchor=(0.5, 1.14),
-            ncols=len(handles),
-            frameon=False,
-        )
+        draw(figure)
         file = io.BytesIO()
         kind = path.suffix.lower()[1:]
         metadata = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
-        figure.savefig(file, format=kind, dpi=150, metadata=metadata[kind])
+        figure.savefig(file, format=kind, dpi=dpi, metadata=metadata[kind])
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         temporary.write_bytes(file.getvalue())
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _draw(figure: Any, groups: Mapping[str, Mapping[str, Any]], colours: Mapping[str, str]) -> None:
+    axes = figure.add_subplot()
+    _boxes(axes, groups, colours)
+    patches = import_module("matplotlib.patches")
+    handles = [patches.Patch(facecolor=c, edgecolor="black", label=m) for m, c in colours.items()]
+    axes.legend(
+        handles=handles,
+        loc="upper center",
+        bbox_to_anchor=(0.5, 1.14),
+        ncols=len(handles),
+        frameon=False,
+    )
 
 
 def _boxes(axes: Any, groups: Mapping[str, Mapping[str, Any]], colours: Mapping[str, str]) -> None:

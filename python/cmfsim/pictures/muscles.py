@@ -1,17 +1,21 @@
 """Pictures of muscles: with their names, or with fibre boxes and directions."""
 
+from __future__ import annotations
+
 import colorsys
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cmfsim._core import MuscleFibres, Surface
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
-from cmfsim.musculature import MuscleSurface, Musculature
 from cmfsim.pictures.canvas import LEGEND_ROW, SIZE, View, bounds, draw, polydata
 from cmfsim.scene import SurfaceData
+
+if TYPE_CHECKING:
+    from cmfsim.musculature import MuscleSurface, Musculature
 
 __all__ = ["add_muscle", "picture_muscles"]
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cmfsim.report.document import NOTHING, Document, Figure, Note, Section, Table, number
+from cmfsim.report.labels import MESH, MUSCLES, labelled
 
 __all__ = ["case_document", "statistics_table"]
 
@@ -232,8 +233,8 @@ def _muscle_section(predictions: Sequence[Values], pictures: Mapping[str, bytes]
     used = next((e["muscles"] for e in predictions if e["model"].startswith("M")), None)
     if used is None:
         return []
-    plain = {k: v for k, v in used.items() if isinstance(v, str | int | float)}
-    blocks: list[Note | Table | Figure] = [*_picture("muscles", pictures), Table.of_pairs(plain)]
+    figures = Table.of_pairs(labelled(used, MUSCLES), "How the muscles were placed and sampled.")
+    blocks: list[Note | Table | Figure] = [*_picture("muscles", pictures), figures]
     volumes = used.get("volumes")
     if isinstance(volumes, Mapping) and volumes:
         rows = tuple((name, number(v / 1000.0)) for name, v in volumes.items() if v > 0.0)
@@ -264,7 +265,7 @@ def _model_section(predictions: Sequence[Values], pictures: Mapping[str, bytes])
         for name, held in first["segments"].items()
     )
     kinds = Table(("segment", "joined", "sliding"), segments, "Nodes held by each segment.")
-    mesh = Table.of_pairs(_plain(first["mesh"]), "The mesh.")
+    mesh = Table.of_pairs(labelled(first["mesh"], MESH), "The mesh.")
     left_out = [
         Note(f"Left out, because the scene did not need it ({entry['model']}): " + "; ".join(left))
         for entry in predictions
@@ -312,11 +313,3 @@ def _input_section(prediction: Values) -> Section:
 
 def _picture(name: str, pictures: Mapping[str, bytes]) -> list[Figure]:
     return [Figure(pictures[name], PICTURES[name])] if name in pictures else []
-
-
-def _plain(values: Values) -> dict[str, object]:
-    return {
-        name.replace("_", " "): value
-        for name, value in values.items()
-        if isinstance(value, str | int | float)
-    }

@@ -1,26 +1,29 @@
 """Cases through every stage: prediction, evaluation, sensitivity, and cohorts of many cases."""
 
-from cmfsim.study.cohort import CaseOutcome, StudyReport, run_study
-from cmfsim.study.evaluation import EVALUATION_FILE, CaseEvaluation, evaluate
-from cmfsim.study.prediction import predict, predict_models
-from cmfsim.study.sensitivity import (
-    LandmarkTrial,
-    SensitivityReport,
-    landmark_trials,
-    sensitivity,
-)
+from cmfsim.deferred import deferred
 
-__all__ = [
-    "EVALUATION_FILE",
-    "CaseEvaluation",
-    "CaseOutcome",
-    "LandmarkTrial",
-    "SensitivityReport",
-    "StudyReport",
-    "evaluate",
-    "landmark_trials",
-    "predict",
-    "predict_models",
-    "run_study",
-    "sensitivity",
-]
+__getattr__, __dir__, __all__ = deferred(
+    __name__,
+    {
+        "cohort": (
+            "CaseOutcome",
+            "StudyReport",
+            "run_study",
+        ),
+        "evaluation": (
+            "EVALUATION_FILE",
+            "CaseEvaluation",
+            "evaluate",
+        ),
+        "prediction": (
+            "predict",
+            "predict_models",
+        ),
+        "trials": (
+            "LandmarkTrial",
+            "SensitivityReport",
+            "landmark_trials",
+            "sensitivity",
+        ),
+    },
+)

@@ -11,8 +11,8 @@ from cmfsim.errors import CmfsimError, ContactError, SolverError
 from cmfsim.io import Case
 from cmfsim.model import PatientModel
 from cmfsim.patient import CaseMuscles
+from cmfsim.patient_prediction import predict_patient
 from cmfsim.prediction import MODELS, Prediction
-from cmfsim.simulation import predict_patient
 
 __all__ = ["build_patient", "predict", "predict_models"]
 

@@ -1,15 +1,13 @@
-//! Dense factorisations for sliding contact: the flexibility of the sliding nodes and its normal part.
+//! The dense end of the factor for sliding contact: the flexibility of the sliding nodes and its normal part.
 
-use faer::dyn_stack::{MemBuffer, MemStack};
-use faer::linalg::cholesky::llt;
 use faer::linalg::matmul::triangular::{self, BlockStructure};
 use faer::linalg::triangular_inverse::invert_lower_triangular;
 use faer::linalg::triangular_solve::{
     solve_lower_triangular_in_place, solve_upper_triangular_in_place,
 };
-use faer::{Accum, Mat, MatMut, MatRef, Par};
-use rayon::prelude::*;
+use faer::{Accum, Mat, MatMut, Par};
 
+use super::symmetric::DenseSymmetric;
 use super::workspace::parallelism;
 
 /// The end of the factor and its inverse, for contact: everything that sliding nodes do to one another.
@@ -17,7 +15,7 @@ pub struct TailFactor {
     /// L_SS.
     lower: Mat<f64>,
     /// S⁻¹, mm/N.
-    flexibility: Mat<f64>,
+    flexibility: DenseSymmetric,
     /// First tail unknown in elimination order.
     first: usize,
     /// Row of the system of each tail node.
@@ -32,9 +30,9 @@ impl TailFactor {
         let par = parallelism(size);
         let mut inverse = Mat::<f64>::zeros(size, size);
         invert_lower_triangular(inverse.as_mut(), lower.as_ref(), par);
-        let mut flexibility = Mat::<f64>::zeros(size, size);
+        let mut flexibility = vec![0.0; size * size];
         triangular::matmul(
-            flexibility.as_mut(),
+            MatMut::from_column_major_slice_mut(&mut flexibility, size, size),
             BlockStructure::TriangularLower,
             Accum::Replace,
             inverse.as_ref().transpose(),
@@ -44,11 +42,7 @@ impl TailFactor {
             1.0,
             par,
         );
-        for c in 0..size {
-            for r in 0..c {
-                flexibility[(r, c)] = flexibility[(c, r)];
-            }
-        }
+        let flexibility = DenseSymmetric::from_lower(size, flexibility);
         Self { lower, flexibility, first, rows }
     }
 
@@ -59,7 +53,7 @@ impl TailFactor {
 
     /// Bytes held.
     pub fn bytes(&self) -> usize {
-        16 * self.lower.nrows() * self.lower.nrows()
+        8 * self.lower.nrows() * self.lower.nrows() + self.flexibility.bytes()
     }
 
     /// Displacements of the tail nodes without contact forces, from x = L⁻¹ P b.
@@ -91,23 +85,8 @@ impl TailFactor {
 
     /// Displacements of the tail nodes under forces on them alone, S⁻¹ f.
     pub fn respond(&self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        let n = forces.len();
-        let columns: Vec<(usize, &[f64; 3])> =
-            forces.iter().enumerate().filter(|(_, f)| f.iter().any(|&v| v != 0.0)).collect();
-        let rows: Vec<[f64; 3]> = (0..n)
-            .into_par_iter()
-            .map(|i| {
-                // S⁻¹ is symmetric: row i is read down its columns, which are contiguous.
-                [0, 1, 2].map(|a| {
-                    let column = self.flexibility.col(3 * i + a);
-                    columns
-                        .iter()
-                        .map(|(j, f)| (0..3).map(|b| column[3 * j + b] * f[b]).sum::<f64>())
-                        .sum()
-                })
-            })
-            .collect();
-        rows
+        let u = self.flexibility.multiply(forces.as_flattened());
+        u.chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect()
     }
 
     /// Normal flexibility n_rᵀ S⁻¹_ij n_s of constraint rows: row r holds tail node i = `nodes[r]` along
@@ -119,59 +98,32 @@ impl TailFactor {
         normals: &[[f64; 3]],
         softness: &[f64],
     ) -> DenseSymmetric {
-        let k = nodes.len();
-        let mut values = vec![0.0; k * k];
-        values.par_chunks_mut(k.max(1)).enumerate().for_each(|(c, column)| {
-            let j = nodes[c];
-            let n_j = normals[c];
-            let [c0, c1, c2] = [0, 1, 2].map(|b| self.flexibility.col(3 * j + b));
-            for (r, out) in column.iter_mut().enumerate().skip(c) {
-                let i = nodes[r];
-                let n_i = normals[r];
-                *out = (0..3)
-                    .map(|a| {
-                        let row = 3 * i + a;
-                        n_i[a] * (c0[row] * n_j[0] + c1[row] * n_j[1] + c2[row] * n_j[2])
-                    })
-                    .sum();
+        DenseSymmetric::from_columns(nodes.len(), |c, column| {
+            let (j, n_j) = (nodes[c], normals[c]);
+            // S⁻¹ n_j for node j and those after it. The columns begin on the diagonal, and what the
+            // second and third lack of the block there is in the first.
+            let [c0, c1, c2] = [0, 1, 2].map(|b| self.flexibility.column(3 * j + b));
+            let mut along: Vec<f64> = c0.iter().map(|v| v * n_j[0]).collect();
+            for (out, v) in along[1..].iter_mut().zip(c1) {
+                *out += v * n_j[1];
             }
-            column[c] += softness[c];
-        });
-        DenseSymmetric { size: k, values }
-    }
-}
-
-/// Dense symmetric matrix, lower triangle by columns.
-pub struct DenseSymmetric {
-    size: usize,
-    values: Vec<f64>,
-}
-
-impl DenseSymmetric {
-    /// A⁻¹ b by Cholesky; the row of the first pivot that is not positive on failure.
-    pub fn solve(mut self, b: &mut [f64]) -> std::result::Result<(), usize> {
-        let n = self.size;
-        if n == 0 {
-            return Ok(());
-        }
-        let par = parallelism(4 * n);
-        let need = llt::factor::cholesky_in_place_scratch::<f64>(n, par, Default::default());
-        let mut memory = MemBuffer::new(need);
-        let mut a = MatMut::from_column_major_slice_mut(&mut self.values, n, n);
-        llt::factor::cholesky_in_place(
-            a.as_mut(),
-            Default::default(),
-            par,
-            MemStack::new(&mut memory),
-            Default::default(),
-        )
-        .map_err(|llt::factor::LltError::NonPositivePivot { index }| index)?;
-        llt::solve::solve_in_place(
-            MatRef::from_column_major_slice(&self.values, n, n),
-            MatMut::from_column_major_slice_mut(b, n, 1),
-            Par::Seq,
-            MemStack::new(&mut memory),
-        );
-        Ok(())
+            for (out, v) in along[2..].iter_mut().zip(c2) {
+                *out += v * n_j[2];
+            }
+            along[0] += c0[1] * n_j[1] + c0[2] * n_j[2];
+            along[1] += c1[1] * n_j[2];
+            for (out, (&i, n_i)) in column.iter_mut().zip(nodes[c..].iter().zip(&normals[c..])) {
+                *out = if i >= j {
+                    let v = &along[3 * (i - j)..3 * (i - j) + 3];
+                    n_i[0] * v[0] + n_i[1] * v[1] + n_i[2] * v[2]
+                } else {
+                    let entry = |a: usize, b: usize| {
+                        n_i[a] * n_j[b] * self.flexibility.column(3 * i + a)[3 * (j - i) + b - a]
+                    };
+                    (0..3).map(|a| entry(a, 0) + entry(a, 1) + entry(a, 2)).sum()
+                };
+            }
+            column[0] += softness[c];
+        })
     }
 }

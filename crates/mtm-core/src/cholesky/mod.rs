@@ -2,16 +2,22 @@
 //! The only folder that names faer.
 
 mod dense;
+mod normal;
 mod numeric;
+mod reach;
 mod structure;
+mod symmetric;
 mod workspace;
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::sparse::linalg::cholesky::supernodal;
 use faer::{Conj, Mat, MatMut, Par};
 
-pub use dense::{DenseSymmetric, TailFactor};
+pub use dense::TailFactor;
+pub use normal::{NormalFactor, NormalForces, Progress, RowKey, conjugate_gradients, solve_normal};
+pub use reach::Reach;
 use structure::{minimum_degree, supernodal_structure};
+pub use symmetric::{DenseFactor, DenseSymmetric};
 use workspace::{out_of_memory, parallelism};
 
 use crate::blocks::BlockMatrix;
@@ -228,6 +234,71 @@ impl Symbolic {
         let l = supernodal::SupernodalLltRef::new(&self.structure, &factor.values);
         let x = MatMut::from_column_major_slice_mut(x, n, k);
         solve(&l, x, par, MemStack::new(&mut memory));
+    }
+
+    /// What the given rows of the system reach in the factor.
+    pub fn reach(&self, rows: &[u32]) -> Reach {
+        let position = structure::positions(&self.order);
+        let places = rows.iter().map(|&row| 3 * position[row as usize] as usize).collect();
+        Reach::new(&self.structure, places)
+    }
+
+    /// Displacements of the rows of `reach` under forces on them alone; `x`, as long as the unknowns, is
+    /// zero before and after.
+    pub fn respond(
+        &self,
+        factor: &Factor,
+        reach: &Reach,
+        forces: &[[f64; 3]],
+        x: &mut [f64],
+    ) -> Vec<[f64; 3]> {
+        let columns = (&self.structure, factor.values.as_slice());
+        reach.scatter(forces, x);
+        reach.forward(columns, x);
+        reach.backward(columns, x);
+        let found = reach.gather(x);
+        reach.clear(&self.structure, x);
+        found
+    }
+
+    /// Displacements of the rows of `reach` from x = L⁻¹ P b; x stays as it is elsewhere.
+    pub fn reach_displacements(
+        &self,
+        factor: &Factor,
+        reach: &Reach,
+        x: &mut [f64],
+    ) -> Vec<[f64; 3]> {
+        reach.backward((&self.structure, &factor.values), x);
+        reach.gather(x)
+    }
+
+    /// Adds L⁻¹ P f for forces on the rows of `reach` to x = L⁻¹ P b; `work`, as long, is zero before and
+    /// after.
+    pub fn add_reach_forces(
+        &self,
+        factor: &Factor,
+        reach: &Reach,
+        forces: &[[f64; 3]],
+        work: &mut [f64],
+        x: &mut [f64],
+    ) {
+        reach.scatter(forces, work);
+        reach.forward((&self.structure, &factor.values), work);
+        for (x, v) in x.iter_mut().zip(work.iter()) {
+            *x += v;
+        }
+        reach.clear(&self.structure, work);
+    }
+
+    /// Flexibility of the rows of `reach` along a unit normal each, mm/N, and the row of the set that each
+    /// of its rows is.
+    pub fn reach_flexibility(
+        &self,
+        factor: &Factor,
+        reach: &Reach,
+        normals: &[[f64; 3]],
+    ) -> (DenseSymmetric, Vec<usize>) {
+        reach.normal_flexibility((&self.structure, &factor.values), normals)
     }
 
     /// Flexibility S⁻¹ of the tail rows, S = L_SS L_SSᵀ their Schur complement, order 3·n_tail, mm/N.

@@ -32,6 +32,11 @@ impl DirectionSum {
         self.first.get_or_insert(a);
     }
 
+    /// Multiplies all weights.
+    pub fn scale(&mut self, factor: f64) {
+        self.tensor *= factor;
+    }
+
     /// Adds all of another sum, whose directions come after those of this one.
     pub fn append(&mut self, other: &Self) {
         self.tensor += other.tensor;

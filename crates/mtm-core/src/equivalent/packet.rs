@@ -54,6 +54,12 @@ impl Packet {
         }
     }
 
+    /// Centre and radius of a ball that holds the tet, mm.
+    pub fn ball(&self) -> (Vec3, f64) {
+        let radius = self.corners.iter().map(|c| (c - self.centroid).norm()).fold(0.0, f64::max);
+        (self.centroid, radius)
+    }
+
     /// Sample `s`, mm.
     pub fn point(&self, s: usize) -> Vec3 {
         self.centroid + Vec3::from([0, 1, 2].map(|axis| self.coordinates[axis][s]))
@@ -67,7 +73,7 @@ impl Packet {
     /// evaluated by itself. Two triangles on an edge see the same bits of the plane through it and the
     /// anchor: no way slips between them or counts twice.
     pub fn inside(&mut self, muscle: &MuscleShape<'_>, near: &[u32], inside: &mut [bool]) {
-        let radius = self.corners.iter().map(|c| (c - self.centroid).norm()).fold(0.0, f64::max);
+        let (_, radius) = self.ball();
         let anchored = match muscle.test {
             InsideTest::Winding => self.anchor(muscle, near, radius),
             InsideTest::Normal => None,

@@ -4,12 +4,16 @@ use crate::equivalent::aligned_box::AlignedBox;
 use crate::equivalent::border::Border;
 use crate::surface::Surface;
 use crate::triangle::Vec3;
-use crate::winding::WindingTree;
+use crate::winding::{WindingOptions, WindingTree};
 
 /// Winding number that parts inside from outside.
 const INSIDE: f64 = 0.5;
 /// Error of a hierarchical winding number, with a margin: the tests hold it below half of this.
 const WINDING_ERROR: f64 = 0.02;
+
+/// [`WindingOptions::beta`] of a surface without a border: its winding number is whole, so that an error of
+/// a tenth says as much as one of a hundredth.
+const CLOSED_BETA: f64 = 1.4;
 
 /// How a point is found to lie inside a muscle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -57,7 +61,11 @@ impl<'a> MuscleShape<'a> {
         let bounds = boxes.iter().fold(AlignedBox::EMPTY, |all, one| all.joined(one));
         let signed_volume = signed_volume(&corners, &bounds.centre());
         let orientation = if signed_volume < 0.0 { -1.0 } else { 1.0 };
-        let (border, tree) = (Border::new(surface), WindingTree::new(surface));
+        let border = Border::new(surface);
+        let options = WindingOptions {
+            beta: if border.is_empty() { CLOSED_BETA } else { WindingOptions::default().beta },
+        };
+        let tree = WindingTree::with_options(surface, &options).expect("both betas are allowed");
         Self { surface, corners, boxes, bounds, border, tree, signed_volume, orientation, test }
     }
 
@@ -83,8 +91,15 @@ impl<'a> MuscleShape<'a> {
         self.border.is_empty().then_some(self.signed_volume.abs())
     }
 
-    /// Winding number at `p`, positive inside whichever way the triangles turn.
+    /// Winding number at `p`, positive inside whichever way the triangles turn; whole where the surface has
+    /// no border.
     pub fn winding(&self, p: &Vec3) -> f64 {
+        let w = self.unrounded_winding(p);
+        if self.border.is_empty() { w.round() } else { w }
+    }
+
+    /// The same as the tree gives it.
+    pub fn unrounded_winding(&self, p: &Vec3) -> f64 {
         self.orientation * self.tree.winding_number_one((*p).into())
     }
 

@@ -9,18 +9,34 @@ const SOFTENING: f64 = 0.01;
 /// A line whose ends are nearer than this to each other, relative to its length, is closed.
 const CLOSED: f64 = 1e-6;
 
+/// Margin of a distance within which a segment counts as near, relative to it: far above rounding.
+const NEAR_MARGIN: f64 = 1e-9;
+
 /// Fibre lines with a unit tangent at each point.
 #[derive(Debug, Clone)]
 pub(super) struct Courses {
-    lines: Vec<Vec<Knot>>,
+    all: Segments,
     /// mm².
     softening: f64,
 }
 
+/// Segments of fibre lines, line after line.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Segments {
+    list: Vec<Segment>,
+    /// Where each line ends in the list; no line is without a segment.
+    ends: Vec<usize>,
+}
+
+/// A piece of a fibre line between two of its points.
 #[derive(Debug, Clone, Copy)]
-struct Knot {
-    point: Vec3,
-    tangent: Vec3,
+struct Segment {
+    start: Vec3,
+    step: Vec3,
+    /// Squared length, mm².
+    square: f64,
+    /// Unit tangents at both ends.
+    tangents: [Vec3; 2],
 }
 
 impl Courses {
@@ -28,22 +44,75 @@ impl Courses {
     pub fn new(lines: &[Vec<Vec3>]) -> Self {
         let length = |line: &Vec<Vec3>| line.windows(2).map(|w| (w[1] - w[0]).norm()).sum::<f64>();
         let mean = lines.iter().map(length).sum::<f64>() / lines.len() as f64;
-        let lines = lines.iter().map(|line| knots(line, length(line))).collect();
-        Self { lines, softening: (SOFTENING * mean).powi(2) }
+        let mut all = Segments::default();
+        for line in lines {
+            let tangents = tangents(line, length(line));
+            all.list.extend(line.windows(2).zip(tangents.windows(2)).map(|(ends, tangents)| {
+                let step = ends[1] - ends[0];
+                let tangents = [tangents[0], tangents[1]];
+                Segment { start: ends[0], step, square: step.norm_squared(), tangents }
+            }));
+            all.ends.push(all.list.len());
+        }
+        Self { all, softening: (SOFTENING * mean).powi(2) }
+    }
+
+    /// All segments of all lines.
+    pub fn segments(&self) -> &Segments {
+        &self.all
+    }
+
+    /// Writes into `near` the segments that may be the nearest of their line to a point of a ball.
+    ///
+    /// One farther from the centre than the nearest by more than the ball's diameter is none.
+    pub fn segments_near(&self, centre: &Vec3, radius: f64, near: &mut Segments) {
+        near.list.clear();
+        near.ends.clear();
+        for line in self.all.lines() {
+            let least =
+                line.iter().map(|s| s.squared_distance(centre)).fold(f64::INFINITY, f64::min);
+            let reach = (least.sqrt() + 2.0 * radius) * (1.0 + NEAR_MARGIN);
+            let may_be = |s: &&Segment| s.squared_distance(centre) <= reach * reach;
+            near.list.extend(line.iter().filter(may_be));
+            near.ends.push(near.list.len());
+        }
     }
 
     /// The tangent of each line where it is nearest to `x`, with its weight: the inverse fourth
-    /// power of the distance.
-    pub fn tangents(&self, x: &Vec3) -> impl Iterator<Item = (Vec3, f64)> {
-        self.lines.iter().map(|line| {
+    /// power of the distance. `segments` are all, or those near a ball that holds `x`.
+    pub fn tangents<'a>(
+        &'a self,
+        segments: &'a Segments,
+        x: &'a Vec3,
+    ) -> impl Iterator<Item = (Vec3, f64)> + 'a {
+        segments.lines().map(|line| {
             let (squared, tangent) = nearest(line, x);
             (tangent, (squared + self.softening).powi(-2))
         })
     }
 }
 
+impl Segments {
+    fn lines(&self) -> impl Iterator<Item = &[Segment]> {
+        let starts = std::iter::once(0).chain(self.ends.iter().copied());
+        starts.zip(&self.ends).map(|(start, &end)| &self.list[start..end])
+    }
+}
+
+impl Segment {
+    /// Part of the way along the segment at which it is nearest to a point.
+    fn part(&self, from: &Vec3) -> f64 {
+        (from.dot(&self.step) / self.square).clamp(0.0, 1.0)
+    }
+
+    fn squared_distance(&self, x: &Vec3) -> f64 {
+        let from = x - self.start;
+        (from - self.step * self.part(&from)).norm_squared()
+    }
+}
+
 /// Tangents by the parabola through three points; a closed line goes on beyond its ends.
-fn knots(line: &[Vec3], length: f64) -> Vec<Knot> {
+fn tangents(line: &[Vec3], length: f64) -> Vec<Vec3> {
     let last = line.len() - 1;
     let closed = last > 2 && (line[last] - line[0]).norm() <= CLOSED * length;
     let slope = |a: Vec3, b: Vec3, c: Vec3| {
@@ -72,22 +141,22 @@ fn knots(line: &[Vec3], length: f64) -> Vec<Knot> {
             (line[(i + 1).min(last)] - line[i.min(last - 1)]).normalize()
         }
     };
-    (0..=last).map(|i| Knot { point: line[i], tangent: tangent(i) }).collect()
+    (0..=last).map(tangent).collect()
 }
 
-/// Squared distance to the line and its unit tangent there.
-fn nearest(line: &[Knot], x: &Vec3) -> (f64, Vec3) {
-    let (mut best, mut tangent) = (f64::INFINITY, line[0].tangent);
-    for pair in line.windows(2) {
-        let step = pair[1].point - pair[0].point;
-        let from = x - pair[0].point;
-        let t = (from.dot(&step) / step.norm_squared()).clamp(0.0, 1.0);
-        let squared = (from - step * t).norm_squared();
+/// Squared distance to the nearest of a line's segments and the unit tangent there.
+fn nearest(line: &[Segment], x: &Vec3) -> (f64, Vec3) {
+    let (mut best, mut at, mut part) = (f64::INFINITY, 0, 0.0);
+    for (i, segment) in line.iter().enumerate() {
+        let from = x - segment.start;
+        let t = segment.part(&from);
+        let squared = (from - segment.step * t).norm_squared();
         if squared < best {
-            best = squared;
-            tangent = pair[0].tangent * (1.0 - t) + pair[1].tangent * t;
+            (best, at, part) = (squared, i, t);
         }
     }
+    let [first, second] = line[at].tangents;
+    let tangent = first * (1.0 - part) + second * part;
     let size = tangent.norm();
-    (best, if size > 0.0 { tangent / size } else { line[0].tangent })
+    (best, if size > 0.0 { tangent / size } else { first })
 }

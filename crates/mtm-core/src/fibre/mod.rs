@@ -17,7 +17,7 @@ use rayon::prelude::*;
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
 use crate::surface::Surface;
 use crate::triangle::Vec3;
-use course::Courses;
+use course::{Courses, Segments};
 use parts::Part;
 use region::Region;
 
@@ -104,6 +104,10 @@ pub struct MuscleFibres {
     kind: Option<MuscleKind>,
     extents: Option<[f64; 3]>,
 }
+
+/// The parts of fibre lines that decide the directions in a ball; a buffer that is filled anew for each.
+#[derive(Debug, Clone, Default)]
+pub struct NearFibres(Segments);
 
 /// A box as its weights need it.
 #[derive(Debug, Clone, Copy)]
@@ -274,16 +278,37 @@ impl MuscleFibres {
     /// Unit direction of the fibres at `point` (mm, finite); its sign means nothing.
     pub fn direction(&self, point: [f64; 3]) -> [f64; 3] {
         let x = Vec3::from(point);
-        if let Some(courses) = &self.courses {
-            return blended(courses.tangents(&x)).into();
+        match &self.courses {
+            Some(courses) => blended(courses.tangents(courses.segments(), &x)).into(),
+            None => self.direction_of_boxes(&x).into(),
         }
+    }
+
+    /// Writes into `near` what the directions in a ball (mm) depend on.
+    pub fn near(&self, centre: [f64; 3], radius: f64, near: &mut NearFibres) {
+        if let Some(courses) = &self.courses {
+            courses.segments_near(&Vec3::from(centre), radius, &mut near.0);
+        }
+    }
+
+    /// Unit direction of the fibres at `point` of the ball that `near` was made for: that of
+    /// [`MuscleFibres::direction`], for less.
+    pub fn direction_near(&self, near: &NearFibres, point: [f64; 3]) -> [f64; 3] {
+        let x = Vec3::from(point);
+        match &self.courses {
+            Some(courses) => blended(courses.tangents(&near.0, &x)).into(),
+            None => self.direction_of_boxes(&x).into(),
+        }
+    }
+
+    fn direction_of_boxes(&self, x: &Vec3) -> Vec3 {
         let distance = |reach: &Reach| (reach.scaled * (x - reach.centre)).norm_squared();
         let least = self.reaches.iter().map(distance).fold(f64::INFINITY, f64::min);
         let near = self.reaches.iter().filter_map(|reach| {
             let beyond = distance(reach) - least;
             (beyond < NEGLIGIBLE).then(|| (reach.direction, (-DECAY * beyond).exp()))
         });
-        blended(near).into()
+        blended(near)
     }
 
     /// Unit directions at `points` (mm, finite), in their order.

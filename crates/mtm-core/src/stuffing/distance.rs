@@ -6,40 +6,60 @@ use rayon::prelude::*;
 
 use super::level::Grid;
 
-/// Squared distance of a voxel from which no target was seen.
+/// Squared distance of a voxel that sees no target near enough.
 const FAR: f32 = f32::INFINITY;
 
-/// Squared distance of every voxel centre to the nearest centre that is a target, mm²; infinite without targets.
-pub fn squared_distance(grid: &Grid, target: impl Fn(usize) -> bool + Sync) -> Vec<f32> {
+/// Lines that are taken through memory together: a cache line of them.
+const TILE: usize = 16;
+
+/// Squared distance of every voxel centre to the nearest centre that is a target, mm².
+///
+/// Infinite without targets, and where it is above `most` (mm²): what lies far from all targets then costs
+/// little. Parallel; the result does not depend on the number of threads.
+pub fn squared_distance(grid: &Grid, most: f32, target: impl Fn(usize) -> bool + Sync) -> Vec<f32> {
     let [nx, ny, nz] = grid.shape;
     let plane = ny * nz;
     let mut squared = vec![FAR; grid.len()];
     squared.par_chunks_mut(plane).enumerate().for_each(|(i, slab)| {
-        let mut envelope = Envelope::new(ny.max(nz));
         for (j, row) in slab.chunks_mut(nz).enumerate() {
-            scan(row, grid.spacing[2] as f32, |k| target(i * plane + j * nz + k));
+            scan(row, grid.spacing[2] as f32, most, |k| target(i * plane + j * nz + k));
         }
-        for k in 0..nz {
-            envelope.transform(grid.spacing[1], ny, |j| slab[j * nz + k]);
-            for j in 0..ny {
-                slab[j * nz + k] = envelope.result[j];
+        let mut lines = Lines::new(ny, grid.spacing[1], most);
+        for k in (0..nz).step_by(TILE) {
+            let width = TILE.min(nz - k);
+            if lines.load(|j| &slab[j * nz + k..][..width]) == Distances::Some {
+                lines.transform(width);
+                for j in 0..ny {
+                    lines.store(j, &mut slab[j * nz + k..][..width]);
+                }
             }
         }
     });
     // Along i: one slab per j is made beside the array, then written back plane by plane.
     let slabs: Vec<Vec<f32>> = (0..ny)
         .into_par_iter()
-        .map(|j| {
-            let mut envelope = Envelope::new(nx);
-            let mut slab = vec![0.0; nx * nz];
-            for k in 0..nz {
-                envelope.transform(grid.spacing[0], nx, |i| squared[i * plane + j * nz + k]);
-                for i in 0..nx {
-                    slab[i * nz + k] = envelope.result[i];
+        .map_init(
+            || Lines::new(nx, grid.spacing[0], most),
+            |lines, j| {
+                let mut slab = vec![FAR; nx * nz];
+                for k in (0..nz).step_by(TILE) {
+                    let width = TILE.min(nz - k);
+                    match lines.load(|i| &squared[i * plane + j * nz + k..][..width]) {
+                        Distances::Far => {}
+                        Distances::Zero => {
+                            (0..nx).for_each(|i| slab[i * nz + k..][..width].fill(0.0));
+                        }
+                        Distances::Some => {
+                            lines.transform(width);
+                            for i in 0..nx {
+                                lines.store(i, &mut slab[i * nz + k..][..width]);
+                            }
+                        }
+                    }
                 }
-            }
-            slab
-        })
+                slab
+            },
+        )
         .collect();
     squared.par_chunks_mut(plane).enumerate().for_each(|(i, out)| {
         for (j, row) in out.chunks_mut(nz).enumerate() {
@@ -51,15 +71,14 @@ pub fn squared_distance(grid: &Grid, target: impl Fn(usize) -> bool + Sync) -> V
 
 /// Voxels of the shape that no ball of `radius` inside it comes near: its sheets and spikes.
 ///
-/// `squared` is the squared distance of each voxel to the complement. A voxel is thin if it lies farther
+/// `squared` is the squared distance of each voxel to the complement, at least where it is below
+/// [`core_squared`]. A voxel is thin if it lies farther
 /// than (1 + `slack`) · radius from every place where such a ball has its centre; a slack of 0.5 leaves edges
 /// and corners of 90° alone.
 pub fn thin_parts(grid: &Grid, squared: &[f32], radius: f64, slack: f64) -> Vec<bool> {
-    // Distances run from centre to centre: the surface lies about half a voxel nearer.
-    let half = 0.5 * grid.spacing.iter().copied().fold(f64::INFINITY, f64::min);
-    let core = (radius + half).powi(2) as f32;
-    let reach = ((1.0 + slack) * radius + half).powi(2) as f32;
-    let to_core = squared_distance(grid, |index| squared[index] >= core);
+    let core = core_squared(grid, radius);
+    let reach = ((1.0 + slack) * radius + half_voxel(grid)).powi(2) as f32;
+    let to_core = squared_distance(grid, reach, |index| squared[index] >= core);
     squared
         .par_iter()
         .zip(to_core.par_iter())
@@ -67,83 +86,180 @@ pub fn thin_parts(grid: &Grid, squared: &[f32], radius: f64, slack: f64) -> Vec<
         .collect()
 }
 
-/// Squared distances along one row to its own targets.
-fn scan(row: &mut [f32], spacing: f32, target: impl Fn(usize) -> bool) {
+/// Squared distance to the complement from which on a voxel is the centre of a ball of `radius`, mm².
+pub fn core_squared(grid: &Grid, radius: f64) -> f32 {
+    (radius + half_voxel(grid)).powi(2) as f32
+}
+
+/// Distances run from centre to centre: the surface lies about this much nearer.
+fn half_voxel(grid: &Grid) -> f64 {
+    0.5 * grid.spacing.iter().copied().fold(f64::INFINITY, f64::min)
+}
+
+/// Squared distances along one row to its own targets, up to `most`; the others are far already.
+fn scan(row: &mut [f32], spacing: f32, most: f32, target: impl Fn(usize) -> bool) {
+    let n = row.len();
+    // From each target up to `most` or half of the way to the next one.
+    let spread = |row: &mut [f32], from: usize, to: usize| {
+        for (k, value) in row[from..to].iter_mut().enumerate() {
+            *value = (k as f32 * spacing).powi(2);
+            if *value > most {
+                *value = FAR;
+                break;
+            }
+        }
+    };
+    let spread_back = |row: &mut [f32], from: usize, to: usize| {
+        for (k, value) in row[from..to].iter_mut().rev().enumerate() {
+            *value = ((k + 1) as f32 * spacing).powi(2);
+            if *value > most {
+                *value = FAR;
+                break;
+            }
+        }
+    };
     let mut last: Option<usize> = None;
-    for k in 0..row.len() {
-        if target(k) {
-            last = Some(k);
+    for k in (0..n).filter(|&k| target(k)) {
+        match last {
+            Some(last) if last + 1 == k => row[last] = 0.0,
+            Some(last) => {
+                let middle = (last + k) / 2 + 1;
+                spread(row, last, middle);
+                spread_back(row, middle, k);
+            }
+            None => spread_back(row, 0, k),
         }
-        row[k] = last.map_or(FAR, |l| ((k - l) as f32 * spacing).powi(2));
+        last = Some(k);
     }
-    last = None;
-    for k in (0..row.len()).rev() {
-        if row[k] == 0.0 {
-            last = Some(k);
+    if let Some(last) = last {
+        spread(row, last, n);
+    }
+}
+
+/// What the lines of a tile hold.
+#[derive(PartialEq)]
+enum Distances {
+    /// No distance at all.
+    Far,
+    /// Targets alone.
+    Zero,
+    /// Distances, which are loaded.
+    Some,
+}
+
+/// Lines of one length, side by side, whose squared distances go on along them.
+struct Lines {
+    /// Line after line.
+    values: Vec<f32>,
+    n: usize,
+    most: f32,
+    envelope: Envelope,
+}
+
+impl Lines {
+    fn new(n: usize, spacing: f64, most: f32) -> Self {
+        Self { values: vec![FAR; TILE * n], n, most, envelope: Envelope::new(n, spacing) }
+    }
+
+    /// Takes lines from rows across them, unless all are of one value.
+    fn load<'a>(&mut self, row: impl Fn(usize) -> &'a [f32]) -> Distances {
+        let (mut least, mut greatest) = ([FAR; TILE], [0.0; TILE]);
+        for q in 0..self.n {
+            for ((low, high), &value) in least.iter_mut().zip(&mut greatest).zip(row(q)) {
+                *low = value.min(*low);
+                *high = value.max(*high);
+            }
         }
-        if let Some(l) = last {
-            row[k] = row[k].min(((l - k) as f32 * spacing).powi(2));
+        if least.iter().all(|&low| low == FAR) {
+            return Distances::Far;
+        }
+        if greatest.iter().all(|&high| high == 0.0) {
+            return Distances::Zero;
+        }
+        for q in 0..self.n {
+            for (line, &value) in row(q).iter().enumerate() {
+                self.values[line * self.n + q] = value;
+            }
+        }
+        Distances::Some
+    }
+
+    fn transform(&mut self, width: usize) {
+        for line in self.values.chunks_exact_mut(self.n).take(width) {
+            self.envelope.transform(line);
+            line.iter_mut().filter(|d| **d > self.most).for_each(|d| *d = FAR);
+        }
+    }
+
+    /// Writes what the lines have at place `q`.
+    fn store(&self, q: usize, row: &mut [f32]) {
+        for (line, value) in row.iter_mut().enumerate() {
+            *value = self.values[line * self.n + q];
         }
     }
 }
 
-/// Work space of the lower envelope of parabolas along one line.
+/// Lower envelope of parabolas along one line.
 struct Envelope {
+    spacing: f64,
     heights: Vec<f32>,
-    apex: Vec<u32>,
-    start: Vec<f64>,
-    result: Vec<f32>,
+    /// The parabolas on the envelope.
+    parabolas: Vec<Parabola>,
+}
+
+/// A parabola of unit curvature, in squared steps of the line.
+#[derive(Clone, Copy)]
+struct Parabola {
+    apex: usize,
+    /// Its height above 0 at place 0.
+    at_zero: f64,
+    /// Place from which on it is the lowest.
+    start: f64,
 }
 
 impl Envelope {
-    fn new(n: usize) -> Self {
-        Self {
-            heights: vec![0.0; n],
-            apex: vec![0; n],
-            start: vec![0.0; n + 1],
-            result: vec![0.0; n],
-        }
+    fn new(n: usize, spacing: f64) -> Self {
+        Self { spacing, heights: vec![FAR; n], parabolas: Vec::with_capacity(n) }
     }
 
-    fn transform(&mut self, spacing: f64, n: usize, height: impl Fn(usize) -> f32) {
+    fn transform(&mut self, line: &mut [f32]) {
+        let (n, square) = (line.len(), self.spacing * self.spacing);
+        self.heights.copy_from_slice(line);
+        let heights = &self.heights;
+        self.parabolas.clear();
         for q in 0..n {
-            self.heights[q] = height(q);
-        }
-        let square = spacing * spacing;
-        let mut count = 0;
-        for q in 0..n {
-            if self.heights[q] == FAR {
+            let height = heights[q];
+            // Between targets a target is the nearest to itself alone.
+            let is_enclosed = height == 0.0
+                && (q == 0 || heights[q - 1] == 0.0)
+                && (q + 1 == n || heights[q + 1] == 0.0);
+            if height == FAR || is_enclosed {
                 continue;
             }
-            let fq = f64::from(self.heights[q]) / square + (q * q) as f64;
-            let mut from = f64::NEG_INFINITY;
-            while count > 0 {
-                let p = self.apex[count - 1] as usize;
-                let fp = f64::from(self.heights[p]) / square + (p * p) as f64;
-                from = (fq - fp) / (2 * (q - p)) as f64;
-                if from > self.start[count - 1] {
+            let at_zero = f64::from(height) / square + (q * q) as f64;
+            let mut start = f64::NEG_INFINITY;
+            while let Some(last) = self.parabolas.last() {
+                start = (at_zero - last.at_zero) / (2 * (q - last.apex)) as f64;
+                if start > last.start {
                     break;
                 }
-                count -= 1;
-                from = f64::NEG_INFINITY;
+                self.parabolas.pop();
+                start = f64::NEG_INFINITY;
             }
-            self.apex[count] = q as u32;
-            self.start[count] = from;
-            count += 1;
+            self.parabolas.push(Parabola { apex: q, at_zero, start });
         }
-        if count == 0 {
-            self.result[..n].fill(FAR);
-            return;
-        }
-        let mut current = 0;
-        for q in 0..n {
-            while current + 1 < count && self.start[current + 1] < q as f64 {
-                current += 1;
+        let mut from = 0;
+        for (at, parabola) in self.parabolas.iter().enumerate() {
+            // A place on the border of two belongs to the first.
+            let next = self.parabolas.get(at + 1).map_or(f64::INFINITY, |next| next.start);
+            let end = if next < 0.0 { 0 } else { n.min((next as usize).saturating_add(1)) };
+            for q in from..end {
+                let step = q.abs_diff(parabola.apex) as f64;
+                line[q] = (step * step * square) as f32 + heights[parabola.apex];
             }
-            let p = self.apex[current] as usize;
-            let step = q.abs_diff(p) as f64;
-            self.result[q] = (step * step * square) as f32 + self.heights[p];
+            from = from.max(end);
         }
+        line.iter_mut().zip(heights).filter(|(_, h)| **h == 0.0).for_each(|(d, _)| *d = 0.0);
     }
 }
 
@@ -155,7 +271,7 @@ mod tests {
     fn distances_equal_those_of_brute_force() {
         let grid = Grid::new([7, 5, 9], [1.0, 2.5, 0.7], [0.0; 3]).expect("a grid");
         let targets = [3_usize, 40, 200, 310];
-        let fast = squared_distance(&grid, |index| targets.contains(&index));
+        let fast = squared_distance(&grid, f32::INFINITY, |index| targets.contains(&index));
         for (index, &found) in fast.iter().enumerate() {
             let x = grid.centre(index);
             let exact = targets
@@ -167,7 +283,36 @@ mod tests {
                 .fold(f64::INFINITY, f64::min);
             assert!((f64::from(found) - exact).abs() <= 1e-5 * exact.max(1.0), "voxel {index}");
         }
-        assert!(squared_distance(&grid, |_| false).iter().all(|d| d.is_infinite()));
+        assert!(squared_distance(&grid, f32::INFINITY, |_| false).iter().all(|d| d.is_infinite()));
+    }
+
+    #[test]
+    fn distances_up_to_a_bound_are_the_same_bits_and_the_others_infinite() {
+        let grid = Grid::new([21, 19, 40], [1.0, 1.3, 0.7], [0.0; 3]).expect("a grid");
+        // Single voxels, a solid block and whole rows.
+        let is_target = |index: usize| {
+            let [i, j, k] = [index / 760, index / 40 % 19, index % 40];
+            index % 1117 == 5 || (i < 4 && j < 5 && k < 9) || (i == 15 && j == 12)
+        };
+        let all = squared_distance(&grid, f32::INFINITY, is_target);
+        for most in [0.0, 2.0, 9.0, 60.0] {
+            let near = squared_distance(&grid, most, is_target);
+            for (index, (&found, &whole)) in near.iter().zip(&all).enumerate() {
+                let expected = if whole <= most { whole } else { FAR };
+                assert_eq!(found.to_bits(), expected.to_bits(), "voxel {index}, up to {most}");
+            }
+        }
+        for (index, &found) in all.iter().enumerate().step_by(13) {
+            let x = grid.centre(index);
+            let exact = (0..grid.len())
+                .filter(|&t| is_target(t))
+                .map(|t| {
+                    let y = grid.centre(t);
+                    (0..3).map(|a| (x[a] - y[a]).powi(2)).sum::<f64>()
+                })
+                .fold(f64::INFINITY, f64::min);
+            assert!((f64::from(found) - exact).abs() <= 1e-5 * exact.max(1.0), "voxel {index}");
+        }
     }
 
     #[test]
@@ -175,7 +320,7 @@ mod tests {
         let grid = Grid::new([30, 30, 30], [1.0; 3], [0.0; 3]).expect("a grid");
         let i_of = |index: usize| index / 900;
         let inside = |index: usize| (5..8).contains(&i_of(index)) || i_of(index) >= 15;
-        let squared = squared_distance(&grid, |index| !inside(index));
+        let squared = squared_distance(&grid, f32::INFINITY, |index| !inside(index));
         let thin = thin_parts(&grid, &squared, 3.0, 0.5);
         for (index, &found) in thin.iter().enumerate() {
             assert_eq!(found, (5..8).contains(&i_of(index)), "voxel {index}");

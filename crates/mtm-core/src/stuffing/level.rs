@@ -10,6 +10,9 @@ const OUTSIDE: f32 = -1.0;
 /// voxels, but it must not take a voxel its label: sheets and gaps one voxel thick stay.
 const LABEL_FLOOR: f32 = 0.1;
 
+/// A voxel and its 26 neighbours.
+const NEIGHBOURHOOD: u8 = 27;
+
 /// Regular grid of voxels; value [i, j, k] lies at origin + (i, j, k) · spacing, k runs fastest.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Grid {
@@ -217,40 +220,98 @@ impl LevelImage {
     ///
     /// A voxel whose neighbours all have its sign counts whole; the others by eight sub-samples.
     pub fn volume(&self) -> f64 {
-        let [_, ny, nz] = self.grid.shape;
+        let [nx, ny, nz] = self.grid.shape;
         let voxel = self.grid.spacing.iter().product::<f64>();
-        let eighths: u64 = (0..self.values.len())
+        let eighths: u64 = (0..nx * ny)
             .into_par_iter()
-            .map(|index| {
-                let (i, j, k) = (index / (ny * nz), index / nz % ny, index % nz);
-                if self.is_surrounded(i, j, k) {
-                    return if self.values[index] > 0.0 { 8 } else { 0 };
-                }
-                let centre = self.grid.centre(index);
-                (0..8_u64)
-                    .filter(|corner| {
-                        let point = [0, 1, 2].map(|a| {
-                            let side = if corner >> a & 1 == 1 { 0.25 } else { -0.25 };
-                            centre[a] + side * self.grid.spacing[a]
-                        });
-                        self.value(point) > 0.0
-                    })
-                    .count() as u64
-            })
+            .map_init(
+                || vec![0_u8; nz],
+                |inside, row| {
+                    self.count_inside(row / ny, row % ny, inside);
+                    let eighths = |k: usize| match self.neighbours_inside(row, k, inside) {
+                        Some(0) => 0,
+                        Some(NEIGHBOURHOOD) => 8,
+                        _ => self.eighths_inside(row * nz + k),
+                    };
+                    (0..nz).map(eighths).sum::<u64>()
+                },
+            )
             .sum();
         eighths as f64 / 8.0 * voxel
     }
 
-    fn is_surrounded(&self, i: usize, j: usize, k: usize) -> bool {
+    /// Writes how many of the nine voxels in and beside each of row (i, j) lie inside.
+    fn count_inside(&self, i: usize, j: usize, inside: &mut [u8]) {
         let [nx, ny, nz] = self.grid.shape;
-        if i == 0 || j == 0 || k == 0 || i + 1 == nx || j + 1 == ny || k + 1 == nz {
-            return false;
+        inside.fill(0);
+        for i in i.saturating_sub(1)..nx.min(i + 2) {
+            for j in j.saturating_sub(1)..ny.min(j + 2) {
+                let row = &self.values[(i * ny + j) * nz..][..nz];
+                inside.iter_mut().zip(row).for_each(|(n, &value)| *n += u8::from(value > 0.0));
+            }
         }
-        let here = self.values[(i * ny + j) * nz + k] > 0.0;
-        (i - 1..=i + 1).all(|i| {
-            (j - 1..=j + 1).all(|j| {
-                (k - 1..=k + 1).all(|k| (self.values[(i * ny + j) * nz + k] > 0.0) == here)
+    }
+
+    /// How many of a voxel and its 26 neighbours lie inside; none at the border of the image.
+    fn neighbours_inside(&self, row: usize, k: usize, inside: &[u8]) -> Option<u8> {
+        let [nx, ny, nz] = self.grid.shape;
+        let (i, j) = (row / ny, row % ny);
+        let at_border = i == 0 || j == 0 || k == 0 || i + 1 == nx || j + 1 == ny || k + 1 == nz;
+        (!at_border).then(|| inside[k - 1] + inside[k] + inside[k + 1])
+    }
+
+    /// How many of a voxel's eight sub-samples lie inside.
+    fn eighths_inside(&self, index: usize) -> u64 {
+        let centre = self.grid.centre(index);
+        (0..8_u64)
+            .filter(|corner| {
+                let point = [0, 1, 2].map(|a| {
+                    let side = if corner >> a & 1 == 1 { 0.25 } else { -0.25 };
+                    centre[a] + side * self.grid.spacing[a]
+                });
+                self.value(point) > 0.0
             })
-        })
+            .count() as u64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every voxel by its eight sub-samples, and whole only where all 27 signs agree.
+    #[test]
+    fn volume_counts_surrounded_voxels_whole_and_the_others_by_eighths() {
+        let grid = Grid::new([13, 11, 17], [1.0, 1.2, 0.8], [-3.0, 2.0, 1.0]).expect("a grid");
+        let [nx, ny, nz] = grid.shape.map(|n| n as isize);
+        let value = |i: usize| ((i * 7919 % 1013) as f32 / 300.0 - 1.0) + (i % 17) as f32 * 0.1;
+        let near = |x: [f64; 3]| (x[0] - 3.0).hypot(x[1] - 8.0).hypot(x[2] - 8.0);
+        let ball = |i: usize| (4.3 - near(grid.centre(i))) as f32;
+        let noise: Vec<f32> = (0..grid.len()).map(value).collect();
+        let smooth: Vec<f32> = (0..grid.len()).map(ball).collect();
+        for values in [noise, smooth] {
+            let level = LevelImage::new(grid, values).expect("finite");
+            let is_inside =
+                |at: [isize; 3]| level.values[((at[0] * ny + at[1]) * nz + at[2]) as usize] > 0.0;
+            let mut eighths = 0;
+            for i in 0..nx {
+                for j in 0..ny {
+                    for k in 0..nz {
+                        let border =
+                            [(i, nx), (j, ny), (k, nz)].iter().any(|&(a, n)| a == 0 || a + 1 == n);
+                        let here = is_inside([i, j, k]);
+                        let same = !border
+                            && (0..27).all(|d| {
+                                is_inside([i + d / 9 - 1, j + d / 3 % 3 - 1, k + d % 3 - 1]) == here
+                            });
+                        let index = ((i * ny + j) * nz + k) as usize;
+                        let whole = if here { 8 } else { 0 };
+                        eighths += if same { whole } else { level.eighths_inside(index) };
+                    }
+                }
+            }
+            let voxel: f64 = grid.spacing.iter().product();
+            assert_eq!(level.volume(), eighths as f64 / 8.0 * voxel);
+        }
     }
 }

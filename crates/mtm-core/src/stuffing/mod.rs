@@ -17,7 +17,7 @@ use crate::error::{ErrorKind, MtmError, Result};
 use crate::mesh::{TetMesh, add, cross, norm, scaled, sub};
 
 use cut::cut;
-use distance::{squared_distance, thin_parts};
+use distance::{core_squared, squared_distance, thin_parts};
 use improve::improve;
 use lattice::{Lattice, Octree};
 use level::LevelImage;
@@ -227,8 +227,10 @@ impl Cover {
         }
         let grid = level.grid();
         let values = level.values();
-        let to_outside = squared_distance(grid, |index| values[index] <= 0.0);
-        let to_inside = squared_distance(grid, |index| values[index] > 0.0);
+        // The longest edge asks farthest.
+        let most = core_squared(grid, THIN_RADIUS * self.edge);
+        let to_outside = squared_distance(grid, most, |index| values[index] <= 0.0);
+        let to_inside = squared_distance(grid, most, |index| values[index] > 0.0);
         let voxel = grid.spacing.iter().product::<f64>().cbrt();
         for refinement in 0..options.refinements {
             let edge = self.edge / f64::from(1_u32 << refinement);

@@ -15,8 +15,8 @@ from cmfsim.io import Case
 from cmfsim.model import PatientModel
 from cmfsim.musculature import Musculature
 from cmfsim.patient import CaseMuscles
+from cmfsim.patient_prediction import predict_patient
 from cmfsim.prediction import Prediction
-from cmfsim.simulation import predict_patient
 from cmfsim.study.prediction import build_patient
 
 __all__ = ["LandmarkTrial", "SensitivityReport", "landmark_trials", "sensitivity"]

@@ -1,0 +1,324 @@
+//! Sweeps through the part of the factor that a few rows reach: their columns and all ancestors in the
+//! elimination tree (Gilbert & Peierls 1988).
+//!
+//! A force on those rows changes L⁻¹ b there alone, and their displacements depend on nothing else. So
+//! forces on sliding nodes become displacements of sliding nodes without the rest of the body.
+
+use faer::linalg::matmul::matmul;
+use faer::linalg::matmul::triangular::{self, BlockStructure};
+use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
+use faer::sparse::linalg::cholesky::supernodal::SymbolicSupernodalCholesky;
+use faer::{Accum, Mat, MatMut, MatRef, Par};
+
+use super::symmetric::{DenseSymmetric, add_scaled, dot};
+
+/// Supernodes of a factor: structure, and values column by column.
+pub type Columns<'a> = (&'a SymbolicSupernodalCholesky<usize>, &'a [f64]);
+
+/// Entries of a product from which its dense kernels gain from threads.
+const LEAST_WORK_FOR_THREADS: usize = 1 << 22;
+
+/// One supernode: its columns of L, and the rows below them.
+struct Supernode<'a> {
+    begin: usize,
+    width: usize,
+    pattern: &'a [usize],
+    /// Columns of `width + pattern.len()` rows; what stands above the diagonal is not read.
+    values: &'a [f64],
+}
+
+impl<'a> Supernode<'a> {
+    fn new((structure, values): Columns<'a>, s: usize) -> Self {
+        let (begin, start) = (structure.supernode_begin()[s], structure.col_ptr_for_val());
+        Self {
+            begin,
+            width: structure.supernode_end()[s] - begin,
+            pattern: structure.supernode(s).pattern(),
+            values: &values[start[s]..start[s + 1]],
+        }
+    }
+
+    fn rows(&self) -> usize {
+        self.width + self.pattern.len()
+    }
+
+    /// Column `c` from the diagonal down.
+    fn column(&self, c: usize) -> &'a [f64] {
+        &self.values[c * self.rows() + c..(c + 1) * self.rows()]
+    }
+}
+
+/// The supernodes that a set of rows reaches, in elimination order.
+pub struct Reach {
+    supernodes: Vec<usize>,
+    /// First unknown of each row of the set in elimination order, in the caller's order.
+    places: Vec<usize>,
+}
+
+impl Reach {
+    /// The reach of unknowns that begin at `places` in elimination order, three a row.
+    pub fn new(structure: &SymbolicSupernodalCholesky<usize>, places: Vec<usize>) -> Self {
+        let of = supernode_of(structure);
+        let mut reached = vec![false; structure.n_supernodes()];
+        for &place in &places {
+            reached[of[place]] = true;
+        }
+        for s in 0..reached.len() {
+            if let (true, Some(&row)) = (reached[s], structure.supernode(s).pattern().first()) {
+                reached[of[row]] = true;
+            }
+        }
+        let supernodes = (0..reached.len()).filter(|&s| reached[s]).collect();
+        Self { supernodes, places }
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        8 * (self.supernodes.len() + self.places.len())
+    }
+
+    /// Adds a force on each row of the set to `x`, in elimination order.
+    pub fn scatter(&self, forces: &[[f64; 3]], x: &mut [f64]) {
+        for (&place, f) in self.places.iter().zip(forces) {
+            for i in 0..3 {
+                x[place + i] += f[i];
+            }
+        }
+    }
+
+    /// The values of `x` on the rows of the set.
+    pub fn gather(&self, x: &[f64]) -> Vec<[f64; 3]> {
+        self.places.iter().map(|&p| [x[p], x[p + 1], x[p + 2]]).collect()
+    }
+
+    /// Zeros in `x` wherever the rows of the set reach.
+    pub fn clear(&self, structure: &SymbolicSupernodalCholesky<usize>, x: &mut [f64]) {
+        for &s in &self.supernodes {
+            x[structure.supernode_begin()[s]..structure.supernode_end()[s]].fill(0.0);
+        }
+    }
+
+    /// x ← L⁻¹ x where x is zero but for the rows of the set.
+    pub fn forward(&self, l: Columns<'_>, x: &mut [f64]) {
+        let mut front = Vec::new();
+        for &s in &self.supernodes {
+            let node = Supernode::new(l, s);
+            let own = node.begin..node.begin + node.width;
+            front.clear();
+            front.extend_from_slice(&x[own.clone()]);
+            front.resize(node.rows(), 0.0);
+            for c in 0..node.width {
+                let column = node.column(c);
+                front[c] /= column[0];
+                let weight = -front[c];
+                add_scaled(&column[1..], weight, &mut front[c + 1..]);
+            }
+            x[own].copy_from_slice(&front[..node.width]);
+            for (&row, v) in node.pattern.iter().zip(&front[node.width..]) {
+                x[row] += v;
+            }
+        }
+    }
+
+    /// x ← L⁻ᵀ x on the reach; the rest of x stays as it is.
+    pub fn backward(&self, l: Columns<'_>, x: &mut [f64]) {
+        let mut front = Vec::new();
+        for &s in self.supernodes.iter().rev() {
+            let node = Supernode::new(l, s);
+            let own = node.begin..node.begin + node.width;
+            front.clear();
+            front.extend_from_slice(&x[own.clone()]);
+            front.extend(node.pattern.iter().map(|&row| x[row]));
+            for c in (0..node.width).rev() {
+                let column = node.column(c);
+                front[c] = (front[c] - dot(&column[1..], &front[c + 1..])) / column[0];
+            }
+            x[own].copy_from_slice(&front[..node.width]);
+        }
+    }
+
+    /// Flexibility n_iᵀ A⁻¹ n_j of the rows of the set along one unit normal each, mm/N, and the row of
+    /// the set that each of its rows is.
+    ///
+    /// With Y = L⁻¹ N it is YᵀY. In elimination order the columns of Y that a supernode's subtree holds
+    /// are a run, so each supernode works on a dense block and hands what is left to its parent.
+    pub fn normal_flexibility(
+        &self,
+        l: Columns<'_>,
+        normals: &[[f64; 3]],
+    ) -> (DenseSymmetric, Vec<usize>) {
+        let mut rows: Vec<usize> = (0..self.places.len()).collect();
+        rows.sort_unstable_by_key(|&i| self.places[i]);
+        let n = rows.len();
+        let mut gram = vec![0.0; n * n];
+        let of = supernode_of(l.0);
+        let mut left: Vec<(usize, Left)> = Vec::new();
+        let mut next = 0;
+        for &s in &self.supernodes {
+            let node = Supernode::new(l, s);
+            let Supernode { begin, width, pattern, .. } = node;
+            let first_child = left.iter().position(|(parent, _)| *parent == s);
+            let children = left.split_off(first_child.unwrap_or(left.len()));
+            let first = children.first().map_or(next, |(_, child)| child.first);
+            let own = next;
+            while next < n && self.places[rows[next]] < begin + width {
+                next += 1;
+            }
+            let mut front = Mat::<f64>::zeros(node.rows(), next - first);
+            for k in own..next {
+                for i in 0..3 {
+                    front[(self.places[rows[k]] + i - begin, k - first)] = normals[rows[k]][i];
+                }
+            }
+            for (_, child) in children {
+                let child_pattern = l.0.supernode(child.supernode).pattern();
+                let places = places_in(child_pattern, begin, width, pattern);
+                for c in 0..child.values.ncols() {
+                    let to = child.first - first + c;
+                    for (r, &place) in places.iter().enumerate() {
+                        front[(place, to)] += child.values[(r, c)];
+                    }
+                }
+            }
+            let work = node.rows() * width * front.ncols();
+            let par = if work < LEAST_WORK_FOR_THREADS { Par::Seq } else { Par::rayon(0) };
+            let columns = MatRef::from_column_major_slice(node.values, node.rows(), width);
+            let (l_top, l_bottom) = columns.split_at_row(width);
+            let (mut top, mut bottom) = front.as_mut().split_at_row_mut(width);
+            solve_lower_triangular_in_place(l_top, top.as_mut(), par);
+            matmul(bottom.as_mut(), Accum::Add, l_bottom, top.as_ref(), -1.0, par);
+            let target = MatMut::from_column_major_slice_mut(&mut gram, n, n);
+            triangular::matmul(
+                target.submatrix_mut(first, first, next - first, next - first),
+                BlockStructure::TriangularLower,
+                Accum::Add,
+                top.as_ref().transpose(),
+                BlockStructure::Rectangular,
+                top.as_ref(),
+                BlockStructure::Rectangular,
+                1.0,
+                par,
+            );
+            if let Some(&row) = pattern.first() {
+                let values = bottom.to_owned();
+                left.push((of[row], Left { supernode: s, first, values }));
+            }
+        }
+        (DenseSymmetric::from_lower(n, gram), rows)
+    }
+}
+
+/// What a supernode leaves to its parent: columns from `first` on, on the rows of its pattern.
+struct Left {
+    supernode: usize,
+    first: usize,
+    values: Mat<f64>,
+}
+
+/// The supernode that each column belongs to.
+fn supernode_of(structure: &SymbolicSupernodalCholesky<usize>) -> Vec<usize> {
+    let (begin, end) = (structure.supernode_begin(), structure.supernode_end());
+    let mut of = vec![0; structure.nrows()];
+    for s in 0..structure.n_supernodes() {
+        of[begin[s]..end[s]].fill(s);
+    }
+    of
+}
+
+/// Where the rows of a child's pattern stand in the front of its parent: `width` columns from `begin`,
+/// then `pattern`, which holds the rest of them.
+fn places_in(child: &[usize], begin: usize, width: usize, pattern: &[usize]) -> Vec<usize> {
+    let mut at = 0;
+    let place = |&row: &usize| {
+        if row < begin + width {
+            return row - begin;
+        }
+        while pattern[at] < row {
+            at += 1;
+        }
+        width + at
+    };
+    child.iter().map(place).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use crate::blocks::BlockMatrix;
+    use crate::cholesky::Symbolic;
+
+    /// A grid of nodes coupled to their neighbours: positive definite, with 3×3 blocks that differ.
+    fn grid(n: usize) -> BlockMatrix {
+        let (mut start, mut columns) = (vec![0], Vec::new());
+        for j in 0..n * n {
+            let (r, c) = (j / n, j % n);
+            let near = |a: usize, b: usize| a.abs_diff(r) <= 1 && b.abs_diff(c) <= 1;
+            columns.extend((0..n * n).filter(|k| near(k / n, k % n)).map(|k| k as u32));
+            start.push(columns.len());
+        }
+        let mut matrix = BlockMatrix::from_pattern(start, columns);
+        for j in 0..n * n {
+            for at in matrix.row_start[j]..matrix.row_start[j + 1] {
+                let k = matrix.columns[at] as usize;
+                let (low, high) = (j.min(k), j.max(k));
+                let mut block = [0, 1, 2, 3, 4, 5, 6, 7, 8]
+                    .map(|e| -1.0 / 3.0 + 0.1 * ((low * 31 + high * 7 + e) as f64).sin());
+                if j > k {
+                    block = [0, 3, 6, 1, 4, 7, 2, 5, 8].map(|e: usize| block[e]);
+                }
+                if j == k {
+                    block = [11.0, 0.5, 0.2, 0.5, 12.0, -0.3, 0.2, -0.3, 13.0];
+                }
+                matrix.blocks[at] = block;
+            }
+        }
+        matrix
+    }
+
+    #[test]
+    fn sweeps_through_the_reach_equal_whole_solves() {
+        let matrix = grid(23);
+        let symbolic = Symbolic::new(&matrix, &[]).unwrap();
+        let factor = symbolic.factor(&matrix).unwrap();
+        let rows: Vec<u32> = (0..23).map(|i| 23 * i + (i * i) % 5).rev().collect();
+        let reach = symbolic.reach(&rows);
+        let forces: Vec<[f64; 3]> =
+            (0..rows.len()).map(|i| [0, 1, 2].map(|a| ((3 * i + a) as f64).cos())).collect();
+        let mut b = vec![[0.0; 3]; matrix.n_rows()];
+        for (&row, &f) in rows.iter().zip(&forces) {
+            b[row as usize] = f;
+        }
+        let whole = symbolic.solve(&factor, &b);
+        let mut x = vec![0.0; 3 * matrix.n_rows()];
+        let found = symbolic.respond(&factor, &reach, &forces, &mut x);
+        let largest = whole.as_flattened().iter().fold(0.0_f64, |m, v| m.max(v.abs()));
+        for (&row, v) in rows.iter().zip(&found) {
+            for i in 0..3 {
+                assert!((whole[row as usize][i] - v[i]).abs() <= 1e-13 * largest);
+            }
+        }
+        // The workspace comes back as it was lent.
+        assert!(x.iter().all(|&v| v == 0.0));
+    }
+
+    #[test]
+    fn normal_flexibility_equals_that_of_whole_solves() {
+        let matrix = grid(23);
+        let symbolic = Symbolic::new(&matrix, &[]).unwrap();
+        let factor = symbolic.factor(&matrix).unwrap();
+        let rows: Vec<u32> = (0..23).map(|i| 23 * i + (i * i) % 5).rev().collect();
+        let normals: Vec<[f64; 3]> =
+            (0..rows.len()).map(|i| [(i as f64).sin(), (i as f64).cos(), 0.5]).collect();
+        let reach = symbolic.reach(&rows);
+        let (found, order) = symbolic.reach_flexibility(&factor, &reach, &normals);
+        for (c, &j) in order.iter().enumerate() {
+            let mut b = vec![[0.0; 3]; matrix.n_rows()];
+            b[rows[j] as usize] = normals[j];
+            let u = symbolic.solve(&factor, &b);
+            for (&i, v) in order[c..].iter().zip(found.column(c)) {
+                let exact = crate::mesh::dot(normals[i], u[rows[i] as usize]);
+                assert!((exact - v).abs() <= 1e-13, "{i} {j}: {exact:e} {v:e}");
+            }
+        }
+    }
+}

@@ -1,0 +1,302 @@
+//! How sliding nodes answer to constraints where the factor of the body without them is kept.
+//!
+//! Contact forces λ along the normals N follow from (Nᵀ A⁻¹ N) λ = g − Nᵀ u_free. Few sliding nodes have
+//! their whole flexibility at hand, so that the matrix is written down for each set of normals, and factored
+//! anew where the factor of an earlier one makes too poor a start for conjugate gradients. Where they are
+//! many, its products come from sweeps through the part of the factor that they reach: less to make and to
+//! keep, but springs and second walls, which the factor at rest knows nothing of, can take a hundred of them.
+
+use crate::cholesky::{
+    DenseSymmetric, Factor, NormalFactor, Progress, Reach, RowKey, Symbolic, TailFactor,
+    conjugate_gradients, solve_normal,
+};
+use crate::contact::{Constraints, Response, Sliding};
+use crate::crease::ContactRow;
+use crate::error::{MtmError, Result};
+use crate::mesh::{add, dot, scaled};
+
+/// Steps of sweeps after which contact gives up: ten on smooth bone, a hundred on teeth.
+const MOST_SWEEPS: usize = 1000;
+/// Relative error of the contact forces that sweeps go down to, as errors quote it.
+const SWEEP_TOLERANCE: f64 = 1e-14;
+
+/// What is kept for sliding nodes: their flexibility, and the factor of its part along the normals at
+/// rest.
+pub(crate) struct ContactFactor {
+    flexibility: Flexibility,
+    rest: NormalFactor,
+}
+
+/// Displacements of sliding nodes under forces on them.
+enum Flexibility {
+    /// Written down.
+    Dense(TailFactor),
+    /// By sweeps.
+    Sweeps {
+        reach: Reach,
+        /// Row of the system of each sliding node.
+        rows: Vec<u32>,
+        /// Flexibility of each by itself along its normal at rest, mm/N.
+        own: Vec<f64>,
+    },
+}
+
+impl ContactFactor {
+    /// The whole flexibility of the sliding nodes, which the structure keeps last.
+    pub fn dense(symbolic: &Symbolic, factor: &Factor, sliding: &Sliding) -> Result<Self> {
+        let tail = symbolic.tail_flexibility(factor);
+        let row = |(node, &normal)| ContactRow { node, normal, point: [0.0; 3] };
+        let rows: Vec<ContactRow> = sliding.rest_normals().iter().enumerate().map(row).collect();
+        let offsets = vec![0.0; rows.len()];
+        let rows = Rows::new(&Constraints { rows: &rows, offsets: &offsets, springs: &[] });
+        let rest = rows.factor(&tail)?;
+        Ok(Self { flexibility: Flexibility::Dense(tail), rest })
+    }
+
+    /// The flexibility along the normals at rest, and what sweeps need for the rest of it.
+    pub fn by_sweeps(symbolic: &Symbolic, factor: &Factor, sliding: &Sliding) -> Result<Self> {
+        let rows: Vec<u32> = sliding.nodes().iter().map(|n| n.row).collect();
+        let reach = symbolic.reach(&rows);
+        let (normal, order) = symbolic.reach_flexibility(factor, &reach, sliding.rest_normals());
+        let mut own = vec![0.0; rows.len()];
+        for (c, &i) in order.iter().enumerate() {
+            own[i] = normal.column(c)[0];
+        }
+        let keys = order.iter().map(|&i| (i, 0)).collect();
+        let rest = NormalFactor::new(normal, keys).map_err(|at| singular(rows[order[at]]))?;
+        Ok(Self { flexibility: Flexibility::Sweeps { reach, rows, own }, rest })
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        let flexibility = match &self.flexibility {
+            Flexibility::Dense(tail) => tail.bytes(),
+            Flexibility::Sweeps { reach, rows, .. } => reach.bytes() + 12 * rows.len(),
+        };
+        flexibility + self.rest.bytes()
+    }
+
+    /// Answers to one plan's constraints; `x` is L⁻¹ P b of its forces.
+    pub fn answers<'a>(
+        &'a self,
+        symbolic: &'a Symbolic,
+        factor: &'a Factor,
+        x: &[f64],
+    ) -> Answers<'a> {
+        let free = match &self.flexibility {
+            Flexibility::Dense(tail) => tail.free_displacements(x),
+            Flexibility::Sweeps { reach, .. } => {
+                symbolic.reach_displacements(factor, reach, &mut x.to_vec())
+            }
+        };
+        let work = match &self.flexibility {
+            Flexibility::Dense(_) => Vec::new(),
+            Flexibility::Sweeps { .. } => vec![0.0; x.len()],
+        };
+        Answers { contact: self, symbolic, factor, free, work, made: None, last: Vec::new() }
+    }
+
+    /// Answers to constraints that stay the same for several right-hand sides.
+    pub fn frozen<'a>(
+        &self,
+        rows: &'a [ContactRow],
+        offsets: &'a [Vec<f64>],
+    ) -> Result<FrozenAnswers<'a>> {
+        let normal = match &self.flexibility {
+            Flexibility::Dense(tail) => {
+                let none = vec![0.0; rows.len()];
+                let c = Constraints { rows, offsets: &none, springs: &[] };
+                Some(Rows::new(&c).factor(tail)?)
+            }
+            Flexibility::Sweeps { .. } => None,
+        };
+        Ok(FrozenAnswers { rows, offsets, normal })
+    }
+}
+
+/// Constraints that stay the same for several right-hand sides.
+pub(crate) struct FrozenAnswers<'a> {
+    rows: &'a [ContactRow],
+    /// Offset of every row, for each right-hand side.
+    offsets: &'a [Vec<f64>],
+    /// The factor of their flexibility, where it is written down.
+    normal: Option<NormalFactor>,
+}
+
+impl FrozenAnswers<'_> {
+    /// Force on each sliding node for right-hand side `k`, whose answers are `answers`.
+    pub fn forces(&self, answers: &mut Answers<'_>, k: usize) -> Result<Vec<[f64; 3]>> {
+        let c = Constraints { rows: self.rows, offsets: &self.offsets[k], springs: &[] };
+        let rows = Rows::new(&c);
+        let forces = match &self.normal {
+            Some(normal) => {
+                let mut forces = rows.missing(&answers.free);
+                normal.solve(&mut forces);
+                forces
+            }
+            None => answers.forces(&rows)?,
+        };
+        Ok(pushes(answers.free.len(), &rows.rows, &forces))
+    }
+}
+
+/// Answers of the sliding nodes to one plan's constraints, each begun from the one before.
+pub(crate) struct Answers<'a> {
+    contact: &'a ContactFactor,
+    symbolic: &'a Symbolic,
+    factor: &'a Factor,
+    /// Displacements of the sliding nodes without contact forces, mm.
+    free: Vec<[f64; 3]>,
+    /// Zeros for the sweeps.
+    work: Vec<f64>,
+    /// The factor made last in this plan, once the one at rest did not serve.
+    made: Option<NormalFactor>,
+    /// Rows of the last answer, ascending, with their forces.
+    last: Vec<(RowKey, f64)>,
+}
+
+impl Answers<'_> {
+    /// Displacements of the sliding nodes and contact forces under constraints `c`.
+    ///
+    /// How exact the forces are shows in the gaps that the displacements leave, which `settle` measures.
+    pub fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
+        let rows = Rows::new(c);
+        let mut forces = self.forces(&rows)?;
+        let pushes = pushes(self.free.len(), &rows.rows, &forces);
+        let moved = match &self.contact.flexibility {
+            Flexibility::Dense(tail) => tail.respond(&pushes),
+            Flexibility::Sweeps { reach, .. } => {
+                self.symbolic.respond(self.factor, reach, &pushes, &mut self.work)
+            }
+        };
+        let displacements = moved.iter().zip(&self.free).map(|(r, f)| add(*r, *f)).collect();
+        forces.truncate(c.rows.len());
+        Ok(Response { displacements, forces, solved: true })
+    }
+
+    /// Contact forces along `rows`, N.
+    fn forces(&mut self, rows: &Rows) -> Result<Vec<f64>> {
+        let before = |key: &RowKey| {
+            self.last.binary_search_by(|(k, _)| k.cmp(key)).map_or(0.0, |at| self.last[at].1)
+        };
+        let start = rows.keys.iter().map(before).collect();
+        let goals = rows.missing(&self.free);
+        let forces = match &self.contact.flexibility {
+            Flexibility::Dense(tail) => {
+                let kept = self.made.as_ref().unwrap_or(&self.contact.rest);
+                let matrix = rows.flexibility(tail);
+                let found = solve_normal(matrix, rows.keys.clone(), &goals, start, kept)
+                    .map_err(|at| rows.singular(tail, at))?;
+                self.made = found.made.or(self.made.take());
+                found.forces
+            }
+            Flexibility::Sweeps { reach, own, .. } => {
+                let work = &mut self.work;
+                let product = |x: &[f64]| {
+                    let pushes = pushes(self.free.len(), &rows.rows, x);
+                    let u = self.symbolic.respond(self.factor, reach, &pushes, work);
+                    let along =
+                        |((r, s), f): ((&ContactRow, &f64), &f64)| dot(r.normal, u[r.node]) + s * f;
+                    rows.rows.iter().zip(&rows.softness).zip(x).map(along).collect()
+                };
+                let diagonal =
+                    rows.rows.iter().zip(&rows.softness).map(|(r, s)| own[r.node] + s).collect();
+                let (keys, kept) = (&rows.keys, &self.contact.rest);
+                let give_up = |progress: &Progress| progress.step >= MOST_SWEEPS;
+                conjugate_gradients(product, diagonal, keys, &goals, start, kept, give_up).map_err(
+                    |error| MtmError::NotConverged {
+                        method: "contact by sweeps",
+                        iterations: MOST_SWEEPS,
+                        error,
+                        tolerance: SWEEP_TOLERANCE,
+                        advice: "use method=\"pcg\"; contact normals or walls may be degenerate",
+                    },
+                )?
+            }
+        };
+        self.last = rows.keys.iter().copied().zip(forces.iter().copied()).collect();
+        self.last.sort_unstable_by_key(|(key, _)| *key);
+        Ok(forces)
+    }
+
+    /// Adds forces on the sliding nodes to `x` = L⁻¹ P b, so that a backward sweep gives the displacements
+    /// with those forces.
+    pub fn add_forces(&mut self, x: &mut [f64], forces: &[[f64; 3]]) {
+        match &self.contact.flexibility {
+            Flexibility::Dense(tail) => tail.add_forces(x, forces),
+            Flexibility::Sweeps { reach, .. } => {
+                self.symbolic.add_reach_forces(self.factor, reach, forces, &mut self.work, x);
+            }
+        }
+    }
+}
+
+/// Constraint rows, and after them one for each spring: a spring of stiffness k adds a column along its
+/// axis, with 1/k on the diagonal.
+struct Rows {
+    rows: Vec<ContactRow>,
+    /// Displacement that each row asks for, mm.
+    goals: Vec<f64>,
+    /// What is added to the diagonal, mm/N.
+    softness: Vec<f64>,
+    keys: Vec<RowKey>,
+}
+
+impl Rows {
+    fn new(c: &Constraints<'_>) -> Self {
+        let (mut rows, mut goals) = (c.rows.to_vec(), c.offsets.to_vec());
+        let mut softness = vec![0.0; rows.len()];
+        for spring in c.springs {
+            rows.push(ContactRow { node: spring.node, normal: spring.axis, point: [0.0; 3] });
+            goals.push(spring.goal);
+            softness.push(1.0 / spring.stiffness);
+        }
+        let most = rows.iter().map(|r| r.node + 1).max().unwrap_or(0);
+        let mut count = vec![0; most];
+        let key = |r: &ContactRow| {
+            count[r.node] += 1;
+            (r.node, count[r.node] - 1)
+        };
+        let keys = rows.iter().map(key).collect();
+        Self { rows, goals, softness, keys }
+    }
+
+    /// What contact forces have to add to displacements `free`, mm.
+    fn missing(&self, free: &[[f64; 3]]) -> Vec<f64> {
+        self.rows.iter().zip(&self.goals).map(|(r, g)| g - dot(r.normal, free[r.node])).collect()
+    }
+
+    /// Nᵀ S⁻¹ N with the softness.
+    fn flexibility(&self, tail: &TailFactor) -> DenseSymmetric {
+        let nodes: Vec<usize> = self.rows.iter().map(|r| r.node).collect();
+        let normals: Vec<[f64; 3]> = self.rows.iter().map(|r| r.normal).collect();
+        tail.normal_flexibility(&nodes, &normals, &self.softness)
+    }
+
+    /// The factor of the flexibility.
+    fn factor(&self, tail: &TailFactor) -> Result<NormalFactor> {
+        NormalFactor::new(self.flexibility(tail), self.keys.clone())
+            .map_err(|at| self.singular(tail, at))
+    }
+
+    fn singular(&self, tail: &TailFactor, at: usize) -> MtmError {
+        singular(tail.row(self.rows[at].node) as u32)
+    }
+}
+
+/// That the flexibility has no positive pivot at a row of the system.
+fn singular(row: u32) -> MtmError {
+    MtmError::NotPositiveDefinite {
+        node: row as usize,
+        detail: "the flexibility of the sliding nodes is singular".into(),
+    }
+}
+
+/// Force vector of each of `n` sliding nodes from the forces along the rows.
+fn pushes(n: usize, rows: &[ContactRow], forces: &[f64]) -> Vec<[f64; 3]> {
+    let mut out = vec![[0.0; 3]; n];
+    for (r, &force) in rows.iter().zip(forces) {
+        out[r.node] = add(out[r.node], scaled(r.normal, force));
+    }
+    out
+}

@@ -1,0 +1,57 @@
+"""What the figures of a mesh and of its muscles are called in a report, with their units."""
+
+from collections.abc import Mapping
+
+__all__ = ["MESH", "MUSCLES", "labelled"]
+
+# mm³ in a cm³, and one in a hundred.
+CUBIC, PERCENT = 1e-3, 100.0
+
+# Label and factor of each figure, by its key in the summary.
+Labels = Mapping[str, tuple[str, float]]
+
+MESH: Labels = {
+    "n_nodes": ("nodes", 1),
+    "n_tets": ("tets", 1),
+    "mean_edge": ("edge on average, mm", 1.0),
+    "volume": ("volume, cm³", CUBIC),
+    "volume_error": ("volume beside that of the tissue, %", PERCENT),
+    "boundary_error_mean": ("distance from the surface on average, mm", 1.0),
+    "boundary_error_max": ("distance from the surface at most, mm", 1.0),
+    "min_dihedral": ("smallest dihedral angle, °", 1.0),
+    "max_dihedral": ("largest dihedral angle, °", 1.0),
+    "edge_ratio": ("longest over shortest edge of the worst tet", 1.0),
+    "dropped_parts": ("bodies too small to keep", 1),
+    "dropped_volume": ("volume of these, cm³", CUBIC),
+    "dropped_tets": ("poor tets at the surface left out", 1),
+}
+MUSCLES: Labels = {
+    "template": ("template", 1),
+    "smoothing": ("smoothing of the spline", 1.0),
+    "preset": ("constants of fat and muscle", 1),
+    "mixing": ("what is mixed in a tet", 1),
+    "inside": ("inside test", 1),
+    "muscles": ("muscles", 1),
+    "muscle_volume": ("volume of all muscles in the tissue, cm³", CUBIC),
+    "muscle_tets": ("tets that hold muscle", 1),
+    "pairs": ("pairs of a tet and a muscle looked at", 1),
+    "crossed": ("tets that a muscle's surface crosses", 1),
+    "samples": ("points in each of these", 1),
+    "samples_per_crossed_tet": ("points in each of these", 1),
+    "points": ("points in all", 1),
+    "seed": ("seed of the points", 1),
+}
+
+
+def labelled(values: Mapping[str, object], labels: Labels) -> dict[str, object]:
+    """Numbers and names of a summary by label, in the order of the labels; others by key."""
+    out: dict[str, object] = {}
+    keys = [*(k for k in labels if k in values), *(k for k in values if k not in labels)]
+    for key in keys:
+        value = values[key]
+        label, factor = labels.get(key, (key.replace("_", " "), 1))
+        if isinstance(value, str | bool) or (isinstance(value, int) and factor == 1):
+            out[label] = value
+        elif isinstance(value, int | float):
+            out[label] = value * factor
+    return out
