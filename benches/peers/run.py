@@ -58,6 +58,7 @@ class Peer:
 
 
 PEERS = {
+    "cmfsim": Peer("cmfsim_", "auto"),
     "cmfsim-cholesky": Peer("cmfsim_", "cholesky"),
     "cmfsim-pcg": Peer("cmfsim_", "pcg"),
     "skfem-cholmod": Peer("skfem_", "cholmod"),

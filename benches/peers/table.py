@@ -21,6 +21,8 @@ HEADINGS = (
     "difference mm",
 )
 DASH = "–"
+DEFAULT = "cmfsim"
+"""The row that the times of others are divided by; where it did not run, the reference."""
 IDLE = 0.1
 """Cores that others may keep busy on a machine that still counts as idle."""
 
@@ -43,7 +45,7 @@ def stage_median(runs: list[dict], stage: str) -> float | None:
     return median(values) if values else None
 
 
-def row(name: str, runs: list[dict], reference: list[dict]) -> list[str]:
+def row(name: str, runs: list[dict], base: list[dict]) -> list[str]:
     """One peer's line of a size's table."""
     good = [run for run in runs if run["status"] == "ok"]
     if not good:
@@ -51,7 +53,7 @@ def row(name: str, runs: list[dict], reference: list[dict]) -> list[str]:
         return [name, status, *[""] * (len(HEADINGS) - 2)]
     totals = [total(run) for run in good]
     # a round's ratio sees the same state of the machine above and below the line
-    ratios = [total(a) / total(b) for a, b in zip(good, reference, strict=False)]
+    ratios = [total(a) / total(b) for a, b in zip(good, base, strict=False)]
     differences = [run["difference_mm"] for run in good if "difference_mm" in run]
     return [
         name,
@@ -106,13 +108,15 @@ def markdown(study: dict) -> str:
             text += ["", "The machine was not idle: wall times are disturbed, CPU times less so."]
     for size in study["sizes"]:
         mesh, reference = size["mesh"], size["reference"]
-        base = [r for r in size["rounds"].get(reference, []) if r["status"] == "ok"]
+        good = {n: [r for r in runs if r["status"] == "ok"] for n, runs in size["rounds"].items()}
+        timed = DEFAULT if good.get(DEFAULT) else reference
+        base = good.get(timed, [])
         text += [
             "",
             f"### {mesh['tets']} tets, {mesh['nodes']} nodes, {mesh['fixed']} fixed, "
             + f"{mesh['joined']} joined",
             "",
-            f"Ratio and difference against {reference}."
+            f"Ratio: total over that of {timed}. Difference: from {reference}."
             if reference
             else "No direct solver ran, so there is no ratio and no difference.",
             "",
