@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from cmfsim.bench import frontier_run as bench
 from cmfsim.bench.measure import run_job
 from cmfsim.bench.rows import FrontierRow, with_front
 from cmfsim.cli import main
+from cmfsim.cli.bench_command import SCRIPTS
 from cmfsim.errors import CaseInputError
 from cmfsim.prediction import carried_points
 from head_case import HeadCase
@@ -293,12 +295,14 @@ def test_the_command_writes_table_page_picture_and_figures(case, swept, capsys):
     assert float(lines[0]["mean_mm"]) == first["mean_mm"]
 
 
-def test_peers_run_from_a_checkout_with_its_words(tmp_path, monkeypatch, capfd):
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_benches_of_a_checkout_run_with_their_words(name, tmp_path, monkeypatch, capfd):
+    assert (Path(__file__).parents[2] / SCRIPTS[name][-1]).is_file()
     monkeypatch.chdir(tmp_path)
-    assert main(["bench", "peers"]) == 2
+    assert main(["bench", name]) == 2
     assert "--checkout" in capfd.readouterr().err
-    script = tmp_path / "benches/peers/run.py"
+    script = tmp_path / SCRIPTS[name][-1]
     script.parent.mkdir(parents=True)
     script.write_text("import sys\nprint(sys.argv[1:])\nsys.exit(3)\n", encoding="utf-8")
-    assert main(["bench", "peers", "--", "--tets", "20000"]) == 3
+    assert main(["bench", name, "--", "--tets", "20000"]) == 3
     assert "['--tets', '20000']" in capfd.readouterr().out

@@ -1,4 +1,4 @@
-"""`cmfsim bench frontier` and `cmfsim bench peers`: what accuracy costs, here and elsewhere."""
+"""`cmfsim bench`: what accuracy costs, here and elsewhere, and where methods end."""
 
 import argparse
 import json
@@ -26,10 +26,27 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.phantom import make_head
 
-__all__ = ["FRONTIER_FOLDER", "frontier", "peers"]
+__all__ = ["FRONTIER_FOLDER", "SCRIPTS", "frontier", "script"]
 
 FRONTIER_FOLDER = Path("cmfsim-frontier")
-PEERS_SCRIPT = Path("benches/peers/run.py")
+# Benches of a source checkout by name: what they tell, words to try, and where they are.
+SCRIPTS = {
+    "peers": (
+        "compare with other finite-element programs",
+        "--tets 20000 --peers ngsolve",
+        Path("benches/peers/run.py"),
+    ),
+    "stability": (
+        "stiff and extreme cases: residual, error, verdict",
+        "--markdown table.md",
+        Path("benches/stability.py"),
+    ),
+    "elements": (
+        "elements and kinematics on a shell: error against time",
+        "--level 1 --layers 2",
+        Path("benches/elements.py"),
+    ),
+}
 # Of the made head's CT, mm.
 PHANTOM_SPACING = 1.0
 
@@ -119,26 +136,26 @@ def _text(found: Frontier) -> str:
     return "\n".join(lines)
 
 
-def peers(options: argparse.Namespace) -> int:
-    """Runs the comparison with other programs of a source checkout; its exit code is its own."""
-    script = _checkout(options.checkout) / PEERS_SCRIPT
-    command = [sys.executable, str(script), *options.words]
+def script(options: argparse.Namespace) -> int:
+    """Runs a bench of a source checkout; its exit code is its own."""
+    path = SCRIPTS[options.action][-1]
+    command = [sys.executable, str(_checkout(options.checkout, path) / path), *options.words]
     return subprocess.run(command, check=False).returncode  # noqa: S603 (the checkout's own script)
 
 
-def _checkout(given: Path | None) -> Path:
-    """The source checkout: as given, or the first at or above the working directory."""
+def _checkout(given: Path | None, path: Path) -> Path:
+    """The checkout that has `path`: as given, or the first at or above the working directory."""
     if given is not None:
-        if not (given / PEERS_SCRIPT).is_file():
+        if not (given / path).is_file():
             raise CaseInputError(
-                f"{given}: has no {PEERS_SCRIPT}: give the folder of a checkout of cmfsim's source"
+                f"{given}: has no {path}: give the folder of a checkout of cmfsim's source"
             )
         return given
     here = Path.cwd()
     for folder in (here, *here.parents):
-        if (folder / PEERS_SCRIPT).is_file():
+        if (folder / path).is_file():
             return folder
     raise CaseInputError(
-        f"{here}: neither it nor a folder above it has {PEERS_SCRIPT}: other programs are compared "
-        "from a checkout of cmfsim's source; work in it, or name it by --checkout"
+        f"{here}: neither it nor a folder above it has {path}, which is part of cmfsim's source: "
+        "work in a checkout, or name it by --checkout"
     )

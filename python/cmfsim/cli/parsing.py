@@ -346,14 +346,15 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     frontier.add_argument("--fresh", action="store_true", help="do finished runs again")
     frontier.set_defaults(run=bench_command.frontier)
 
-    peers = actions.add_parser(
-        "peers",
-        help="compare with other programs; needs a checkout of the source",
-        epilog="Words after -- go to benches/peers/run.py: -- --tets 20000 --peers ngsolve",
-    )
-    peers.add_argument(
-        "--checkout", metavar="FOLDER", type=Path, help="(default the working directory's)"
-    )
-    peers.add_argument("-q", "--quiet", action="store_true", help="no progress lines")
-    peers.add_argument("words", metavar="WORD", nargs="*", help="for benches/peers/run.py")
-    peers.set_defaults(run=bench_command.peers)
+    for name, (purpose, words, path) in bench_command.SCRIPTS.items():
+        command = actions.add_parser(
+            name,
+            help=f"{purpose}; needs a checkout of the source",
+            epilog=f"Words after -- go to {path}: -- {words}",
+        )
+        command.add_argument(
+            "--checkout", metavar="FOLDER", type=Path, help="(default the working directory's)"
+        )
+        command.add_argument("-q", "--quiet", action="store_true", help="no progress lines")
+        command.add_argument("words", metavar="WORD", nargs="*", help=f"for {path}")
+        command.set_defaults(run=bench_command.script)
