@@ -50,7 +50,7 @@ fn meshing(c: &mut Criterion) {
         });
     }
     group.bench_function("distance transform", |b| {
-        b.iter(|| black_box(squared_distance(&grid, |i| !inside[i])));
+        b.iter(|| black_box(squared_distance(&grid, f32::INFINITY, |i| !inside[i])));
     });
     let mesh = stuff(&level, &StuffingOptions { refinements: 0, ..Default::default() }, None)
         .expect("a mesh")
