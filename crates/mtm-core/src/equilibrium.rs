@@ -21,7 +21,8 @@ use crate::method::{Interrupt, Method, StaticOptions};
 use crate::multigrid::{Multigrid, MultigridOptions};
 use crate::reduction::Reduction;
 use crate::solution::Clock;
-use crate::strain_energy::{StrainEnergy, TangentKind};
+use crate::strain_energy::StrainEnergy;
+use crate::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::tensors::MassTensors;
 
 /// Newton steps after which a share of the plan counts as too large.
@@ -36,6 +37,13 @@ const SHORTEST: f64 = 1.0 / 1024.0;
 const ENERGY_ROUNDING: f64 = 1e-12;
 /// Error that conjugate gradients may leave in a step, over the tolerance of the solution.
 const STEP_TOLERANCE: f64 = 0.1;
+/// The same over the length of the step before, which its own error outweighs until the last steps
+/// (Dembo, Eisenstat & Steihaug 1982).
+const STEP_SHARE: f64 = 1e-3;
+
+/// Length of a step over all displacements, from which conjugate gradients take the exact tangent: at rest
+/// it is positive definite, and on the way they would notice only by chance where it is not.
+const NEAR_REST: f64 = 0.1;
 
 /// How tangent systems are solved.
 enum TangentSolver {
@@ -229,8 +237,16 @@ impl Equilibrium {
             .iter()
             .map(|c| Constraint { offset: part * (c.offset - along(c)), ..*c })
             .collect();
-        let (step, _) =
-            self.step(reduction, &start, target, &constraints, Some(&change), interrupted)?;
+        let allowed = self.allowed(&start, target, f64::INFINITY);
+        let (step, _) = self.step(
+            reduction,
+            &start,
+            target,
+            &constraints,
+            Some(&change),
+            (Exact, allowed),
+            interrupted,
+        )?;
         let mut ahead = start.u;
         for (value, d) in ahead.iter_mut().zip(&change) {
             *value = add(*value, *d);
@@ -245,13 +261,17 @@ impl Equilibrium {
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
-            let (step, slope) = self.step(reduction, &pose, target, &still, None, interrupted)?;
+            let allowed = self.allowed(&pose, target, length);
+            let near = length <= NEAR_REST * reach(&pose, target);
+            let by_factor = matches!(self.solver, TangentSolver::Cholesky(_));
+            let how = (if near || by_factor { Exact } else { Definite }, allowed);
+            let (step, slope) =
+                self.step(reduction, &pose, target, &still, None, how, interrupted)?;
             effort.iterations += 1;
             length = step.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
             effort.history.push(length);
-            let reach = pose.u.iter().fold(target.scale, |m, v| m.max(norm(*v)));
-            if length <= self.options.tolerance * reach {
-                effort.error_bound = length;
+            if length + allowed <= self.options.tolerance * reach(&pose, target) {
+                effort.error_bound = length + allowed;
                 return Ok(moved_by(reduction, &pose.u, &step, 1.0));
             }
             pose = self.search(reduction, pose, target, &step, slope)?;
@@ -278,6 +298,16 @@ impl Equilibrium {
             share *= 0.5;
         }
         Err(self.lost(step.iter().fold(0.0_f64, |m, v| m.max(norm(*v))), target.scale))
+    }
+
+    /// Error that the next step from `pose` may have, mm, after one of `length`; 0 by a factor.
+    fn allowed(&self, pose: &Pose, target: &Target<'_>, length: f64) -> f64 {
+        if matches!(self.solver, TangentSolver::Cholesky(_)) {
+            return 0.0;
+        }
+        let reach = reach(pose, target);
+        let least = STEP_TOLERANCE * self.options.tolerance * reach;
+        (STEP_SHARE * length.min(reach)).max(least)
     }
 
     fn lost(&self, length: f64, scale: f64) -> MtmError {
@@ -319,7 +349,7 @@ impl Equilibrium {
     /// Newton step from `pose` on the rows and the slope of the merit along it.
     ///
     /// `constraints` say how far each constrained row goes along its normal, `change` how far the other
-    /// nodes go.
+    /// nodes go. `how`: the tangent to try first, and the error that the step may have, mm.
     fn step(
         &self,
         reduction: &Reduction,
@@ -327,6 +357,7 @@ impl Equilibrium {
         target: &Target<'_>,
         constraints: &[Constraint],
         change: Option<&[[f64; 3]]>,
+        (kind, allowed): (TangentKind, f64),
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, f64)> {
         let solve = |kind: TangentKind| {
@@ -347,17 +378,16 @@ impl Equilibrium {
                 matrix = projected(&matrix, constraints);
             }
             let mut x =
-                self.solve_rows(reduction, &matrix, &rhs, constraints, pose, target, interrupted)?;
+                self.solve_rows(reduction, &matrix, &rhs, constraints, allowed, interrupted)?;
             add_offsets(&mut x, constraints);
             Ok(x)
         };
-        // Conjugate gradients would only notice an indefinite matrix by chance.
-        let exact = match self.solver {
-            TangentSolver::Cholesky(_) => solve(TangentKind::Exact),
-            TangentSolver::Pcg => solve(TangentKind::Definite),
-        };
-        let step = match exact {
-            Err(MtmError::NotPositiveDefinite { .. }) => solve(TangentKind::Definite)?,
+        let step = match solve(kind) {
+            Err(MtmError::NotPositiveDefinite { .. } | MtmError::NotConverged { .. })
+                if kind == Exact =>
+            {
+                solve(Definite)?
+            }
             other => other?,
         };
         let slope = step.iter().zip(&pose.slope).map(|(&d, &s)| dot(d, s)).sum();
@@ -370,8 +400,7 @@ impl Equilibrium {
         matrix: &BlockMatrix,
         rhs: &[[f64; 3]],
         constraints: &[Constraint],
-        pose: &Pose,
-        target: &Target<'_>,
+        allowed: f64,
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         if let TangentSolver::Cholesky(symbolic) = &self.solver {
@@ -381,16 +410,16 @@ impl Equilibrium {
         let normals: Vec<(usize, [f64; 3])> =
             constraints.iter().map(|c| (c.row, c.normal)).collect();
         let multigrid = Multigrid::new(matrix, &positions, &normals, &MultigridOptions::default())?;
-        // Loads move the body where bone does not: one cycle tells how far, to the order of magnitude.
+        // Where loads alone move the body nothing tells how far: one cycle does, to the order of magnitude.
         let mut first = vec![[0.0; 3]; rhs.len()];
         multigrid.apply(rhs, &mut first);
-        let reach = first.iter().chain(&pose.u).fold(target.scale, |m, v| m.max(norm(*v)));
-        if reach == 0.0 {
+        let far = first.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
+        if far == 0.0 {
             return Ok(first);
         }
         let defaults = PcgOptions::default();
         let options = PcgOptions {
-            tolerance: STEP_TOLERANCE * self.options.tolerance * reach,
+            tolerance: allowed.max(STEP_TOLERANCE * self.options.tolerance * far),
             max_iterations: self.options.max_iterations.unwrap_or(defaults.max_iterations),
             ..defaults
         };
@@ -414,6 +443,11 @@ fn on_rows(sliding: &Sliding, c: &Constraints<'_>) -> (Vec<Constraint>, Vec<RowS
         .map(|s| RowSpring { row: row(s.node), axis: s.axis, stiffness: s.stiffness, goal: s.goal })
         .collect();
     (asked, springs)
+}
+
+/// Length that the tolerance refers to, mm.
+fn reach(pose: &Pose, target: &Target<'_>) -> f64 {
+    pose.u.iter().fold(target.scale, |m, v| m.max(norm(*v)))
 }
 
 /// `u` with the unknowns moved by `share` of `step`.
