@@ -23,8 +23,6 @@ const LEAST_STRETCH_SUM: f64 = 1e-2;
 /// Stiffness added to a tangent over its largest entry, so that its zeros, as those of turning a body at
 /// rest, do not count as negative by rounding. Newton's method converges as without.
 const DEFINITE_LIFT: f64 = 1e-10;
-/// Least stiffness that a point is given in place of a negative one, over its largest.
-const SOFTEST: f64 = 1e-2;
 /// Rows and columns of strain components in Voigt order.
 const PAIRS: [(usize, usize); 6] = [(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)];
 /// Place in Voigt order of each entry of a tensor, row by row.
@@ -171,8 +169,7 @@ pub(crate) fn volumetric(f: &Matrix3<f64>, kinematics: Kinematics) -> Volumetric
     Volumetric { value: polar.stretch.sum() - 3.0, slope: polar.rotation() }
 }
 
-/// `tangent` with a little stiffness for its negative eigenvalues (after Teran et al. 2005, who leave
-/// none: a tet turned inside out then follows its step anywhere).
+/// `tangent` without its negative eigenvalues (Teran et al. 2005).
 ///
 /// Most points have none: a factor of it with a trifle added shows that, and that sum is then the answer.
 pub(crate) fn definite(tangent: Tangent) -> Tangent {
@@ -187,10 +184,9 @@ pub(crate) fn definite(tangent: Tangent) -> Tangent {
     }
     let eigen = SymmetricEigen::new(symmetric);
     let mut out = Tangent::zeros();
-    let least = SOFTEST * eigen.eigenvalues.amax();
-    for i in 0..9 {
+    for i in (0..9).filter(|&i| eigen.eigenvalues[i] > 0.0) {
         let mode = eigen.eigenvectors.column(i);
-        out += mode * mode.transpose() * eigen.eigenvalues[i].max(least);
+        out += mode * mode.transpose() * eigen.eigenvalues[i];
     }
     out
 }
