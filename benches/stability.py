@@ -188,6 +188,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="file for the rows")
     parser.add_argument("--quick", action="store_true", help="leave the larger cases out")
     parser.add_argument("--only", default="", help="run the cases whose name holds this text")
+    parser.add_argument("-q", "--quiet", action="store_true", help="no line per solve")
     options = parser.parse_args(arguments)
     rows: list[Row] = []
     tables = []
@@ -199,6 +200,8 @@ def main(arguments: list[str] | None = None) -> int:
             for method in case.methods:
                 row = suite.judge(case, method)
                 found.append(row)
+                if options.quiet:
+                    continue
                 figures = " ".join(
                     f"{heading} {_figure(row, heading)}" for heading in suite.COLUMNS
                 )
