@@ -113,8 +113,9 @@ rest.
 - **p1**: bending tissue with ν above 0.45: it locks, silently. `anp` and `p2` do not (theory,
   *Elements*), though `anp` keeps only two thirds of its share on a beam two boxes thick.
 - **corotational**: a body pressed to about half its length. Its energy is finite where a tet
-  inverts, so it may come to rest with tets turned over, and does not say so; `hyperelastic` resists
-  longer, or is refused. Look at the sign of the volumes.
+  inverts, so it may come to rest with tets turned over; `hyperelastic` resists longer, or is
+  refused. `solve_scene` and `predict` warn of it (`inverted-tets`: how many, which is worst) and
+  count them in the summary; after `StaticSolver.solve` look for `tensors.volume_change(u) <= -1`.
 - **contact** in a gutter of 10° across which the body is pushed may find no rest: `ContactError`
   with the nodes. A body that only walls hold is refused where they leave a motion free. Where such
   walls carry it along without stress, `result.residual` compares rounding with rounding and is
