@@ -61,7 +61,7 @@ test-python: $(DEVELOP_STAMP)
 
 lint: $(DEVELOP_STAMP) ## rustfmt, clippy, ruff, mypy, stubtest and the import rules
 	cargo fmt --all --check
-	cargo clippy --workspace --all-targets $(CARGO_FLAGS) $(CORE_FEATURES) -- -D warnings
+	cargo clippy --profile lint --workspace --all-targets $(CARGO_FLAGS) $(CORE_FEATURES) -- -D warnings
 	"$(BIN)/ruff" check $(PYTHON_DIRS)
 	"$(BIN)/ruff" format --check $(PYTHON_DIRS)
 	"$(BIN)/mypy" --strict

@@ -13,6 +13,7 @@ tets in linear kinematics.
 
 import argparse
 import json
+import sys
 import time
 from pathlib import Path
 
@@ -60,8 +61,10 @@ def reference(level: int, layers: int, outer: Floats, poisson: float) -> Floats:
     return solution.displacements[at]
 
 
-def rows(level: int, layers: int, poisson: float) -> list[dict[str, float | str | int]]:
-    """Error and time of each choice."""
+def rows(
+    level: int, layers: int, poisson: float, *, quiet: bool = True
+) -> list[dict[str, float | str | int]]:
+    """Error and time of each choice; a line of progress for each unless `quiet`."""
     mesh, boundary, outer = shell(level, layers)
     exact = reference(level, layers, mesh.nodes[outer], poisson)
     out: list[dict[str, float | str | int]] = []
@@ -73,6 +76,9 @@ def rows(level: int, layers: int, poisson: float) -> list[dict[str, float | str 
                 solution = solved(mesh, boundary, element, kinematics, poisson)
                 seconds.append(time.process_time() - begun)
             error = np.linalg.norm(solution.displacements[outer] - exact, axis=1)
+            if not quiet:
+                said = f"{poisson} {element} {kinematics} {min(seconds):.2f} s"
+                print(said, file=sys.stderr, flush=True)
             out.append(
                 {
                     "poisson": poisson,
@@ -113,8 +119,13 @@ def main() -> None:
     parser.add_argument("--poisson", type=float, nargs="+", default=[POISSON, 0.499])
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path, help="page whose table of elements is replaced")
+    parser.add_argument("-q", "--quiet", action="store_true", help="no line per choice")
     options = parser.parse_args()
-    found = [row for nu in options.poisson for row in rows(options.level, options.layers, nu)]
+    found = [
+        row
+        for nu in options.poisson
+        for row in rows(options.level, options.layers, nu, quiet=options.quiet)
+    ]
     text = f"{found[0]['n_tets']} tets.\n\n{table(found)}"
     print(text)
     if options.json:

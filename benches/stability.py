@@ -113,8 +113,9 @@ rest.
 - **p1**: bending tissue with ν above 0.45: it locks, silently. `anp` and `p2` do not (theory,
   *Elements*), though `anp` keeps only two thirds of its share on a beam two boxes thick.
 - **corotational**: a body pressed to about half its length. Its energy is finite where a tet
-  inverts, so it may come to rest with tets turned over, and does not say so; `hyperelastic` resists
-  longer, or is refused. Look at the sign of the volumes.
+  inverts, so it may come to rest with tets turned over; `hyperelastic` resists longer, or is
+  refused. `solve_scene` and `predict` warn of it (`inverted-tets`: how many, which is worst) and
+  count them in the summary; after `StaticSolver.solve` look for `tensors.volume_change(u) <= -1`.
 - **contact** in a gutter of 10° across which the body is pushed may find no rest: `ContactError`
   with the nodes. A body that only walls hold is refused where they leave a motion free. Where such
   walls carry it along without stress, `result.residual` compares rounding with rounding and is
@@ -188,6 +189,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="file for the rows")
     parser.add_argument("--quick", action="store_true", help="leave the larger cases out")
     parser.add_argument("--only", default="", help="run the cases whose name holds this text")
+    parser.add_argument("-q", "--quiet", action="store_true", help="no line per solve")
     options = parser.parse_args(arguments)
     rows: list[Row] = []
     tables = []
@@ -199,6 +201,8 @@ def main(arguments: list[str] | None = None) -> int:
             for method in case.methods:
                 row = suite.judge(case, method)
                 found.append(row)
+                if options.quiet:
+                    continue
                 figures = " ".join(
                     f"{heading} {_figure(row, heading)}" for heading in suite.COLUMNS
                 )

@@ -154,6 +154,8 @@ def measure_size(n_tets: int, args: argparse.Namespace, cores: list[int], folder
             rounds[name].append(run)
             if run["status"] == "ok":
                 results[name].append(out.with_suffix(".npz"))
+            if args.quiet:
+                continue
             seconds = {stage: round(s, 3) for stage, s in run.get("wall", {}).items()}
             print(n_tets, name, turn + 1, run["status"], seconds, file=sys.stderr, flush=True)
     reference = next((name for name in REFERENCES if results.get(name)), None)
@@ -206,6 +208,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="every measurement, as JSON")
     parser.add_argument("--markdown", type=Path, help="the tables")
     parser.add_argument("--debian-python", default=DEBIAN_PYTHON)
+    parser.add_argument("-q", "--quiet", action="store_true", help="no line per measurement")
     args = parser.parse_args()
     available = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))(0)
     cores = sorted(available)[: args.threads]

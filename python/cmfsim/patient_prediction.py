@@ -101,6 +101,7 @@ def predict_patient(patient: PatientModel, model: str = "M+S") -> Prediction:
             "p95": float(np.percentile(moved, 95)),
             "largest": float(moved.max()),
         },
+        "findings": [*patient.summary.get("findings", []), *result.summary["findings"]],
         "solution": dict(result.summary),
         "timings": timings,
         "left_out": _left_out(patient, scene, model),

@@ -158,5 +158,6 @@ class Prediction:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What every stage noticed."""
-        return self.patient.findings
+        """What every stage noticed, the solution included."""
+        solved = self.result.summary.get("findings", ())
+        return (*self.patient.findings, *(Finding(**entry) for entry in solved))

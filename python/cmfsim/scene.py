@@ -529,8 +529,9 @@ class SceneResult:
     contact_forces : (s,) float64, N
     contact_gaps : (s,) float64, mm
     summary : dict
-        Method, residual, error bound, iterations, largest contact gap, timings, versions and the
-        SHA-256 of the scene's content.
+        Method, residual, error bound, iterations, largest contact gap, tets that large deformation
+        leaves inverted (None in linear kinematics, where the count means nothing), findings of the
+        solution, timings, versions and the SHA-256 of the scene's content.
     """
 
     nodes: Floats

@@ -3,6 +3,7 @@
 import logging
 import math
 import platform
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from cmfsim._core import (
     Boundary,
     MassTensors,
+    Solution,
     StaticSolver,
     Surface,
     SurfaceMotion,
@@ -109,6 +111,9 @@ def solve_scene(scene: Scene) -> SceneResult:
     Returns
     -------
     SceneResult
+        Where large deformation leaves tets inverted, `summary["inverted_tets"]` counts them and
+        `summary["findings"]` says which is worst and what to do. In linear kinematics the count is
+        None: it would mean nothing there.
 
     Raises
     ------
@@ -134,6 +139,7 @@ def solve_scene(scene: Scene) -> SceneResult:
     solver = scene_solver(scene)
     solution = solver.solve(scene_plan(scene), loads=scene.loads)
     _log.info("solved: residual %.2e, error bound %.2e mm", solution.residual, solution.error_bound)
+    inverted, findings = _inverted(solver, solution)
     summary: dict[str, Any] = {
         "scene_sha256": scene.sha256(),
         "n_nodes": scene.n_nodes,
@@ -149,6 +155,8 @@ def solve_scene(scene: Scene) -> SceneResult:
         "iterations": solution.iterations,
         "contact_gap": _finite(solution.contact_gap),
         "contact_iterations": solution.contact_iterations,
+        "inverted_tets": inverted,
+        "findings": findings,
         "factor_bytes": solver.factor_bytes,
         "timings": {"set_up": dict(solver.timings), "solve": dict(solution.timings)},
         "versions": {
@@ -172,6 +180,20 @@ def solve_scene(scene: Scene) -> SceneResult:
         contact_gaps=solution.contact_gaps,
         summary=summary,
     )
+
+
+def _inverted(solver: StaticSolver, solution: Solution) -> tuple[int | None, list[dict[str, str]]]:
+    """Tets that rest inverted, and what to say of them; linear kinematics has none to count."""
+    if solver.kinematics == "linear":
+        return None, []
+    # A linear scene does not pay for it.
+    from cmfsim.inversion import inversion_finding  # noqa: PLC0415
+
+    count, found = inversion_finding(solver.tensors, solution.all_displacements)
+    if found is None:
+        return count, []
+    _log.warning("%s: %s, %s: %s; %s", found.code, found.what, found.where, found.why, found.mend)
+    return count, [asdict(found)]
 
 
 def _finite(value: float) -> float | None:

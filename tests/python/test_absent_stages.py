@@ -32,6 +32,7 @@ STAGES = {
     "cmfsim.doctor",
     "cmfsim.evaluation",
     "cmfsim.insilico",
+    "cmfsim.inversion",
     "cmfsim.io",
     "cmfsim.meshing",
     "cmfsim.node_kinds",

@@ -366,7 +366,7 @@ FULL = OSError(errno.ENOSPC, "No space left on device")
     ],
 )
 @pytest.mark.parametrize(
-    "stage", ["read_anatomy", "cut_bones", "mesh_from_level", "segment_data", "write_model"]
+    "stage", ["read_anatomy", "cut_bones", "tissue_mesh", "segment_data", "write_model"]
 )
 def test_a_stage_that_fails_leaves_the_old_results(
     stage, error, code, said, ellipsoids, before, monkeypatch, small_model
@@ -374,7 +374,7 @@ def test_a_stage_that_fails_leaves_the_old_results(
     def fail(*_, **__):
         raise error
 
-    if stage in {"mesh_from_level", "segment_data"}:
+    if stage in {"tissue_mesh", "segment_data"}:
         # The stages before it have been seen to work.
         monkeypatch.setattr(case_model, "read_anatomy", lambda *_: (small_model.anatomy, ()))
     if stage == "write_model":

@@ -1,5 +1,6 @@
 """`cmfsim build` reads the case, asks the doctor first, and names its stages."""
 
+import argparse
 import dataclasses
 import io
 import json
@@ -11,6 +12,7 @@ import pytest
 
 import cmfsim
 from cmfsim.cli import main
+from cmfsim.cli.parsing import make_parser
 from cmfsim.cli.terminal import StageProgress, in_colour
 from head_case import HeadCase
 
@@ -126,3 +128,30 @@ def test_colours_follow_the_terminal_and_no_color(monkeypatch):
     assert not in_colour(Terminal())
     finding = cmfsim.Finding("error", "x", "something")
     assert "\x1b[31;1merror\x1b[0m" in cmfsim.doctor.findings_text([finding], colour=True)
+
+
+def leaves(parser, name="cmfsim"):
+    """Every command with a function of its own, by its words."""
+    below = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    if not below:
+        return {name: parser}
+    return {
+        words: leaf
+        for action in below
+        for word, command in action.choices.items()
+        for words, leaf in leaves(command, f"{name} {word}").items()
+    }
+
+
+@pytest.mark.parametrize("words", leaves(make_parser()))
+def test_every_command_can_be_quiet(words):
+    """`main` asks each for it."""
+    flags = {
+        flag for action in leaves(make_parser())[words]._actions for flag in action.option_strings
+    }
+    assert {"-q", "--quiet"} <= flags
+
+
+def test_a_folder_without_results_has_no_report(tmp_path, capsys):
+    assert main(["report", str(tmp_path)]) == 2
+    assert "holds no prediction.json" in capsys.readouterr().err

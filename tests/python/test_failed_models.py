@@ -46,6 +46,12 @@ def test_the_others_are_evaluated_and_the_failed_one_is_named(unsettled, capsys)
     assert "report.html" in written["files"]
     assert (out / "H" / "prediction.json").exists()
     assert not (out / "H+S").exists()
+    # The report made anew is of the models that are there.
+    (out / "report.html").unlink()
+    assert main(["report", str(out), "-q", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer == {"output": str(out), "report": "report.html"}
+    assert (out / "report.html").stat().st_size > 0
 
 
 def test_a_model_alone_that_fails_is_an_error(unsettled, capsys):

@@ -306,3 +306,5 @@ def test_benches_of_a_checkout_run_with_their_words(name, tmp_path, monkeypatch,
     script.write_text("import sys\nprint(sys.argv[1:])\nsys.exit(3)\n", encoding="utf-8")
     assert main(["bench", name, "--", "--tets", "20000"]) == 3
     assert "['--tets', '20000']" in capfd.readouterr().out
+    assert main(["bench", name, "-q", "--", "--tets", "20000"]) == 3
+    assert "['--quiet', '--tets', '20000']" in capfd.readouterr().out

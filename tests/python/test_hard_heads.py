@@ -1,5 +1,7 @@
 """Hard CTs and given surfaces of real heads through the whole build, at coarse settings."""
 
+import contextlib
+import io
 import json
 
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 import cmfsim
 import ct_variants as variants
+from cmfsim.build import case_model
 from cmfsim.cli import main
 from real_heads import data_folder
 
@@ -98,12 +101,18 @@ def landmarks_of(head, folder):
     (folder / "skull.mrk.json").write_text(text, encoding="utf-8")
 
 
-def built(folder, capsys):
-    """The summary of a case that the command line builds."""
-    code = main(["build", str(folder / "case.toml"), "--json", "-q"])
-    out, err = capsys.readouterr()
-    assert code == 0, err
-    summary = json.loads(out)
+def built(folder):
+    """The summary of a case that the command line builds.
+
+    Without pictures, which are a third of the time; test_build.py looks at those of a head.
+    """
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(case_model, "_draw", lambda *_: [])
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            code = main(["build", str(folder / "case.toml"), "--json", "-q"])
+    assert code == 0, err.getvalue()
+    summary = json.loads(out.getvalue())
     mesh = summary["mesh"]
     assert mesh["min_dihedral"] >= 10.0
     assert mesh["boundary_error_mean"] <= 8.0 / 4.0
@@ -115,12 +124,12 @@ def built(folder, capsys):
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_a_hard_ct_builds_and_says_what_was_hard(name, coarse, tmp_path, capsys):
+def test_a_hard_ct_builds_and_says_what_was_hard(name, coarse, tmp_path):
     make, expected, (least, most) = HARD[name]
     cmfsim.write_image(make(coarse), tmp_path / "ct.nrrd")
     landmarks_of("ct_phantom", tmp_path)
     (tmp_path / "case.toml").write_text(CASE + IMAGE, encoding="utf-8")
-    summary = built(tmp_path, capsys)
+    summary = built(tmp_path)
     assert expected <= {f["code"] for f in summary["findings"]}
     assert least < summary["mesh"]["volume"] / ORDINARY < most
 
@@ -136,17 +145,28 @@ def test_a_flipped_ct_is_refused(coarse, tmp_path, capsys):
     assert "error" in capsys.readouterr().err
 
 
-def test_sliding_settles_on_a_real_dental_arch(tmp_path, capsys):
+@pytest.fixture(scope="module")
+def from_surfaces(tmp_path_factory):
+    """The atlas head by its closed skin and by its open one: folder and summary of each."""
+    found = {}
+    for skin in ("skin", "skin_open"):
+        folder = tmp_path_factory.mktemp(skin)
+        for name in (skin, "cranium", "mandible"):
+            (folder / f"{name}.ply").symlink_to(data_folder() / "atlas_head" / f"{name}.ply")
+        landmarks_of("atlas_head", folder)
+        text = (CASE + SURFACES).replace("skin.ply", f"{skin}.ply")
+        (folder / "case.toml").write_text(text, encoding="utf-8")
+        found[skin] = (folder, built(folder))
+    return found
+
+
+def test_sliding_settles_on_a_real_dental_arch(from_surfaces):
     """The upper jaw of the atlas head moves: all sliding nodes end on their surfaces, soon.
 
     Up by 3 mm: by 4 mm and more, on tissue this coarse, some nodes find no rest between the cusps.
     """
-    for name in ("skin", "cranium", "mandible"):
-        (tmp_path / f"{name}.ply").symlink_to(data_folder() / "atlas_head" / f"{name}.ply")
-    landmarks_of("atlas_head", tmp_path)
-    (tmp_path / "case.toml").write_text(CASE + SURFACES, encoding="utf-8")
-    built(tmp_path, capsys)
-    scene = cmfsim.read_scene(tmp_path / "out" / "scene.npz")
+    folder, _ = from_surfaces["skin"]
+    scene = cmfsim.read_scene(folder / "out" / "scene.npz")
     solver = cmfsim.scene_solver(scene)
     middle = np.asarray(scene.nodes)[scene.segments["maxilla"].sliding].mean(axis=0)
     for motion in (
@@ -162,18 +182,8 @@ def test_sliding_settles_on_a_real_dental_arch(tmp_path, capsys):
         assert result.residual < 1e-6
 
 
-def test_open_and_closed_skin_give_the_same_tissue(tmp_path, capsys):
-    found = {}
-    for skin in ("skin", "skin_open"):
-        text = (CASE + SURFACES).replace("skin.ply", f"{skin}.ply")
-        for name in (skin, "cranium", "mandible"):
-            path = tmp_path / f"{name}.ply"
-            if not path.exists():
-                path.symlink_to(data_folder() / "atlas_head" / f"{name}.ply")
-        landmarks_of("atlas_head", tmp_path)
-        (tmp_path / "case.toml").write_text(text, encoding="utf-8")
-        found[skin] = built(tmp_path, capsys)
-    closed, opened = (found[n]["mesh"]["volume"] for n in ("skin", "skin_open"))
+def test_open_and_closed_skin_give_the_same_tissue(from_surfaces):
+    closed, opened = (from_surfaces[n][1]["mesh"]["volume"] for n in ("skin", "skin_open"))
     assert opened == pytest.approx(closed, rel=0.005)
     assert 0.5e6 < closed < 2.5e6
-    assert "surface-closed" in {f["code"] for f in found["skin_open"]["findings"]}
+    assert "surface-closed" in {f["code"] for f in from_surfaces["skin_open"][1]["findings"]}

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from html import escape
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import pytest
 import cmfsim
 import phantom_case
 from cmfsim.cli import main
+from cmfsim.report import case_document, render_page
+from cmfsim.study.evaluation import evaluation_key
 
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")
@@ -159,7 +162,9 @@ def test_evaluation_finds_the_model_that_made_the_truth(with_truth, predictions)
     values = found.as_dict()
     json.dumps(values, allow_nan=False)
     assert set(values["models"]["M"]["regions"]) >= {"whole", "chin", "upper lip", "nose"}
-    assert values["key"] == cmfsim.evaluate(with_truth, ["M", "H"], check=False).key
+    # Another order of the models is the same question, and fewer models another one.
+    assert values["key"] == evaluation_key(with_truth, ["M", "H"])
+    assert values["key"] != evaluation_key(with_truth, ["H"])
     del predictions
 
 
@@ -204,3 +209,20 @@ def test_a_study_keeps_what_is_finished_and_reports_what_fails(with_truth, tmp_p
     assert main(["study", str(cohort), "-q"]) == 1
     again = json.loads((tmp_path / "study" / "study.json").read_text(encoding="utf-8"))
     assert [entry["status"] for entry in again["cases"]] == ["kept", "failed"]
+
+
+def test_what_the_solution_notices_is_a_finding_of_the_prediction(predictions, monkeypatch):
+    pytest.importorskip("jinja2")
+    made = predictions["H"]
+    noticed = cmfsim.Finding("warning", "inverted-tets", "3 of 9 tets rest inverted", "here")
+    summary = {**made.result.summary, "findings": [dataclasses.asdict(noticed)]}
+    result = dataclasses.replace(made.result, summary=summary)
+    monkeypatch.setattr("cmfsim.patient_prediction.solve_scene", lambda _: result)
+    prediction = cmfsim.predict_patient(made.patient, "H")
+    assert prediction.findings == (*made.patient.findings, noticed)
+    assert prediction.summary["findings"][-1] == dataclasses.asdict(noticed)
+    # The report says what any of its models noticed, and what all did once.
+    page = render_page(case_document([made.summary, prediction.summary]))
+    assert page.count("3 of 9 tets rest inverted") == 1
+    for finding in made.patient.findings:
+        assert page.count(escape(finding.what)) == 1

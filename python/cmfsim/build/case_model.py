@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import TetMesh, __version__
 from cmfsim.build.clefts import without_clefts
@@ -24,20 +23,14 @@ from cmfsim.build.inputs import (
 from cmfsim.build.motions import planned_bones
 from cmfsim.build.postoperative import Postoperative
 from cmfsim.build.skin_part import on_skin
-from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, ImageData, NodeKinds
+from cmfsim.build.tissue_mesh import end_planes, region_of, tissue_mesh
+from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, NodeKinds
 from cmfsim.checks import Floats
 from cmfsim.doctor import diagnose
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io import Case, read_surface, read_tet_mesh, write_model
+from cmfsim.io import Case, write_model
 from cmfsim.meshing import (
-    MeshOptions,
     MeshReport,
-    TissueRegion,
-    mesh_findings,
-    mesh_from_level,
-    mesh_report,
-    near_skin,
-    part_mesh,
     report_of_part,
     tissue_level,
 )
@@ -59,25 +52,6 @@ __all__ = ["build_case", "build_model"]
 _log = logging.getLogger(__name__)
 
 Progress = Callable[[str], None]
-
-# Bodies of tissue below this volume are specks between bones, mm³.
-LEAST_BODY = 1000.0
-# Depth below the skin to which thin tissue is refined, mm: lips, nose and lids, not the walls of
-# the nasal cavity.
-THIN_DEPTH = 12.0
-# Halvings of the edge at gaps between skin and skin: lips a millimetre apart stay two.
-GAP_REFINEMENTS = 2
-# A head ends in a cut, not a crown, where its cross-section near the end is above this share of the
-# largest, and above the other share of that twice as far in: under a crown they grow with depth.
-CUT_SHARE = 0.15
-CUT_GROWTH = 0.75
-# How far from the end the cross-section is taken, mm, and in voxels at least: the very last layer
-# may be the rim of a cap.
-CUT_DEPTH = 5.0
-CUT_LAYERS = 2
-# Voxels between the end of a head that was cut and the plane that closes its tissue there: the
-# image's own end is ragged where the neck is tilted or a cap was sewn in.
-CUT_MARGIN = 1.5
 
 
 def build_case(
@@ -187,12 +161,12 @@ def build_model(
     moved = [*dict.fromkeys([*_cut_segments(case), *bones.motions])]
 
     stages.begin("finding the soft tissue")
-    region = _region(case, anatomy, skull)
+    region = region_of(case, anatomy, skull)
     level, noticed = tissue_level(anatomy, region)
     findings += noticed
 
     stages.begin("filling the tissue with tets")
-    mesh, report, noticed = _mesh(case, level, anatomy)
+    mesh, report, noticed = tissue_mesh(case, level, anatomy)
     findings += noticed
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
 
@@ -204,7 +178,7 @@ def build_model(
         bones.segments,
         moved=moved,
         landmarks=skull,
-        fixed_planes=_planes(region),
+        fixed_planes=end_planes(region),
         options=KindOptions(**case.node_kinds),
     )
     findings += classified.findings
@@ -308,66 +282,6 @@ def _procedures(case: Case, landmarks: Mapping[str, Floats]) -> list[Procedure]:
 
 def _cut_segments(case: Case) -> list[str]:
     return [name for osteotomy in case.osteotomies for name in osteotomy.segments]
-
-
-def _region(case: Case, anatomy: Anatomy, landmarks: Mapping[str, Floats]) -> TissueRegion:
-    """The region of the case; where the head was cut off below or above, tissue ends on a plane."""
-    inside = np.asarray(anatomy.skin.values) > 0.0
-    lowest, spacing = anatomy.skin.lowest, np.asarray(anatomy.skin.spacing)
-    rows = np.flatnonzero(inside.any(axis=(0, 2)))
-    foremost, hindmost = (lowest[1] + spacing[1] * rows[[0, -1]]).tolist()
-    plane = case.region.plane(landmarks, foremost, hindmost)
-    areas = np.count_nonzero(inside, axis=(0, 1))
-    slices = np.flatnonzero(areas)
-    bounds = [case.region.lower, case.region.upper]
-    for which, end, inwards in ((0, slices[0], 1), (1, slices[-1], -1)):
-        if bounds[which] is None and _is_cut(areas[slices][::inwards], float(spacing[2])):
-            height = lowest[2] + spacing[2] * (end - 0.5 * inwards)
-            bounds[which] = float(height + inwards * CUT_MARGIN * spacing[2])
-    return TissueRegion(plane.point, plane.normal, lower=bounds[0], upper=bounds[1])
-
-
-def _is_cut(areas: NDArray[np.intp], step: float) -> bool:
-    """Whether a head whose cross-sections, from one end on, have these areas was cut off there."""
-    layers = max(CUT_LAYERS, round(CUT_DEPTH / step))
-    if len(areas) <= 2 * layers:
-        return True
-    near, farther = int(areas[layers]), int(areas[2 * layers])
-    return near > CUT_SHARE * int(areas.max()) and near > CUT_GROWTH * farther
-
-
-def _planes(region: TissueRegion) -> dict[str, tuple[ArrayLike, ArrayLike]]:
-    planes: dict[str, tuple[ArrayLike, ArrayLike]] = {"posterior": (region.point, region.normal)}
-    for name, side in (("lower", -1.0), ("upper", 1.0)):
-        height = getattr(region, name)
-        if height is not None:
-            planes[name] = ((0.0, 0.0, height), (0.0, 0.0, side))
-    return planes
-
-
-def _mesh(
-    case: Case, level: ImageData, anatomy: Anatomy
-) -> tuple[TetMesh, MeshReport, tuple[Finding, ...]]:
-    if case.mesh.file is not None:
-        mesh = TetMesh(*read_tet_mesh(case.mesh.file))
-        report = mesh_report(mesh)
-        return mesh, report, mesh_findings(report)
-    options = MeshOptions(
-        edge_length=case.mesh.edge_length,
-        refinements=GAP_REFINEMENTS if case.mesh.refine else 0,
-        least_body=LEAST_BODY,
-    )
-    allowed = near_skin(anatomy, THIN_DEPTH).astype(np.uint8)
-    allowed[anatomy.skin.values <= 0.0] = GAP_REFINEMENTS
-    made = mesh_from_level(level, options, allowed=allowed)
-    if case.mesh.parting is None:
-        return made.mesh, made.report, made.findings
-    units, frame = ("mm", "LPS")
-    if case.surfaces is not None:
-        units, frame = case.surfaces.units, case.surfaces.frame
-    parted = part_mesh(made.mesh, read_surface(case.mesh.parting, units=units, frame=frame))
-    # A crack parts tets and changes none: what was said of the whole holds.
-    return parted, replace(made.report, n_nodes=parted.n_nodes), made.findings
 
 
 def _untouched(case: Case, kinds: NodeKinds, motions: Iterable[str]) -> list[Finding]:

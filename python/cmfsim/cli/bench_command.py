@@ -139,7 +139,10 @@ def _text(found: Frontier) -> str:
 def script(options: argparse.Namespace) -> int:
     """Runs a bench of a source checkout; its exit code is its own."""
     path = SCRIPTS[options.action][-1]
-    command = [sys.executable, str(_checkout(options.checkout, path) / path), *options.words]
+    command = [sys.executable, str(_checkout(options.checkout, path) / path)]
+    if options.quiet:
+        command.append("--quiet")
+    command += options.words
     return subprocess.run(command, check=False).returncode  # noqa: S603 (the checkout's own script)
 
 

@@ -38,7 +38,8 @@ def demo(options: argparse.Namespace) -> int:
         made = write_demo_case(options.folder, edge_length=options.edge_length)
         _work(made, models, progress)
         progress.stage("writing the report")
-        name = write_case_report(made.case.output, models)
+        places = [folder_of(made.case.output, model, len(models)) for model in models]
+        name = write_case_report(made.case.output, places)
     if name is None:
         return FAILED
     page = made.case.output / name

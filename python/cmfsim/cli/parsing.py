@@ -194,7 +194,9 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     study.add_argument("--fresh", action="store_true", help="work on finished cases again")
     study.set_defaults(run=study_commands.study)
 
-    report = commands.add_parser("report", help="make the report of a folder of results anew")
+    report = commands.add_parser(
+        "report", parents=[common], help="make the report of a folder of results anew"
+    )
     report.add_argument("folder", metavar="FOLDER", type=Path, help="what predict wrote")
     report.set_defaults(run=study_commands.report)
 

@@ -141,14 +141,10 @@ def _by_region(evaluation: CaseEvaluation) -> dict[str, dict[str, Any]]:
     }
 
 
-def write_case_report(folder: Path, models: Sequence[str], n_models: int = 0) -> str | None:
-    """The name of the report made from the results in a folder; none without Jinja2.
-
-    `n_models` were asked for, of which `models` have results.
-    """
+def write_case_report(folder: Path, places: Sequence[Path]) -> str | None:
+    """The name of the report made of the predictions in `places`; none without Jinja2."""
     finish_writing(folder)
     evaluation = _json(folder / EVALUATION_FILE) if (folder / EVALUATION_FILE).exists() else None
-    places = [folder_of(folder, model, n_models or len(models)) for model in models]
     return _write_report(folder, _document(places, evaluation, folder))
 
 

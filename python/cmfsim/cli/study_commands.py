@@ -58,8 +58,7 @@ def predict(options: argparse.Namespace) -> int:
         if not written:
             raise next(iter(failed.values()))
         progress.stage("writing the report")
-        solved = [entry["model"] for entry in written]
-        made = write_case_report(case.output, solved, len(models))
+        made = write_case_report(case.output, [Path(entry["output"]) for entry in written])
     if options.json:
         reasons = {model: str(error) for model, error in failed.items()}
         answer = {"case": case.name, "predictions": written, "failed": reasons, "report": made}
@@ -191,16 +190,20 @@ def study(options: argparse.Namespace) -> int:
 def report(options: argparse.Namespace) -> int:
     """Makes the report of a folder of results anew."""
     folder: Path = options.folder
-    models = [m for m in MODELS if (folder / m / "prediction.json").exists()]
-    if not models:
-        if not (folder / "prediction.json").exists():
-            raise CaseInputError(
-                f"{folder}: holds no prediction.json: run cmfsim predict or evaluate first"
-            )
-        models = [json.loads((folder / "prediction.json").read_text("utf-8"))["model"]]
-    if write_case_report(folder, models) is None:
+    places = [folder / m for m in MODELS if (folder / m / "prediction.json").exists()] or [folder]
+    if not (places[0] / "prediction.json").exists():
+        raise CaseInputError(
+            f"{folder}: holds no prediction.json: run cmfsim predict or evaluate first"
+        )
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        progress.stage("writing the report")
+        name = write_case_report(folder, places)
+    if name is None:
         return FAILED
-    print(folder / "report.html")
+    if options.json:
+        print(json.dumps({"output": str(folder), "report": name}))
+    else:
+        _print_report(folder, name)
     return DONE
 
 

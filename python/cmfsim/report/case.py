@@ -67,7 +67,7 @@ def case_document(
         *_muscle_section(predictions, pictures),
         _model_section(predictions, pictures),
         _time_section(predictions),
-        _finding_section(first),
+        _finding_section(predictions),
         _input_section(first),
     ]
     versions = ", ".join(f"{name} {version}" for name, version in first["versions"].items())
@@ -287,8 +287,11 @@ def _time_section(predictions: Sequence[Values]) -> Section:
     return Section("Time", (table, *([note] if len(predictions) > 1 else [])))
 
 
-def _finding_section(prediction: Values) -> Section:
-    found = prediction["findings"]
+def _finding_section(predictions: Sequence[Values]) -> Section:
+    """What the stages noticed, and the solution of any model; what all share once."""
+    found: list[Values] = []
+    for prediction in predictions:
+        found += [finding for finding in prediction["findings"] if finding not in found]
     kinds = {"error": "error", "warning": "warning"}
     blocks = [
         Note(
