@@ -84,13 +84,15 @@ CORE: Mapping[str, frozenset[str]] = {
         "cholesky/workspace": "",
         "cholesky/structure": "blocks ordering cholesky/workspace",
         "cholesky/numeric": "blocks cholesky/structure",
-        "cholesky/symmetric": "cholesky/workspace",
-        "cholesky/dense": "cholesky/symmetric cholesky/workspace",
+        "cholesky/symmetric": "simd cholesky/workspace",
+        "cholesky/sweep": "simd cholesky/numeric cholesky/symmetric",
+        "cholesky/dense": "cholesky/symmetric",
+        "cholesky/grid": "blocks",
         "cholesky/normal": "cholesky/symmetric",
-        "cholesky/reach": "cholesky/symmetric",
+        "cholesky/reach": "cholesky/sweep cholesky/symmetric",
         "cholesky": (
             "blocks ordering cholesky/dense cholesky/normal cholesky/numeric cholesky/reach "
-            "cholesky/structure cholesky/symmetric cholesky/workspace"
+            "cholesky/structure cholesky/sweep cholesky/symmetric cholesky/workspace"
         ),
         "row_sums": "blocks",
         "error_bound": "",

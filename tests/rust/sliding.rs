@@ -660,6 +660,32 @@ fn node_in_a_groove_rests_on_both_walls() {
     }
 }
 
+/// Three walls that carry a block about, and nothing else: it is not strained, and its residual is rounding
+/// over what the walls' way would cost each node alone, though no force acts in the end.
+#[test]
+fn block_that_walls_alone_carry_has_a_residual_of_rounding() {
+    let shape = BoxShape::cube(3);
+    let segments = [0, 1, 2].map(|axis| {
+        let (mut vertices, triangles) = plane(4, 6.0, 0.0);
+        for v in &mut vertices {
+            v.rotate_right((axis + 1) % 3);
+        }
+        // A node of two walls would be held by both: each edge goes to the first of its walls.
+        let own = |p: [usize; 3]| p[axis] == 0 && p[..axis].iter().all(|&i| i > 0);
+        let wall = surface((vertices, triangles));
+        sliding(["x", "y", "z"][axis], shape.nodes_where(own), &wall, Gap::Uniform(0.0))
+    });
+    let tensors = tensors(&shape.mesh(), &isotropic(0.01, POISSON));
+    let way = rigid([0.0, 0.0, 1.0], 0.0, [0.0; 3], [0.3, -0.2, 0.5]);
+    let motion = plan(["x", "y", "z"].map(|name| (name, Motion::Rigid(way))));
+    let bounds = boundary(vec![], segments.to_vec());
+    let found = solve(&tensors, &bounds, with_method(Method::Cholesky), &motion, None).unwrap();
+    let away = vec![[0.3, -0.2, 0.5]; found.displacements.len()];
+    assert!(largest_difference(&found.displacements, &away) <= 1e-9);
+    assert!(found.contact.forces.iter().all(|f| f.abs() <= 1e-9));
+    assert!(found.residual <= 1e-9, "{:e}", found.residual);
+}
+
 /// Three walls that meet in a pit: a node drawn into it rests in the corner, whatever the direction.
 #[test]
 fn node_in_a_corner_rests_on_three_walls() {

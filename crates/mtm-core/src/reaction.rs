@@ -1,14 +1,17 @@
 //! How sliding nodes answer to constraints where the factor of the body without them is kept.
 //!
-//! Contact forces λ along the normals N follow from (Nᵀ A⁻¹ N) λ = g − Nᵀ u_free. Few sliding nodes have
-//! their whole flexibility at hand, so that the matrix is written down for each set of normals, and factored
-//! anew where the factor of an earlier one makes too poor a start for conjugate gradients. Where they are
-//! many, its products come from sweeps through the part of the factor that they reach: less to make and to
-//! keep, but springs and second walls, which the factor at rest knows nothing of, can take a hundred of them.
+//! Contact forces λ along the normals N follow from (Nᵀ A⁻¹ N) λ = g − Nᵀ u_free, by conjugate gradients that
+//! the matrix at rest preconditions. Until closest points settle they stop early, and begin where the last
+//! displacements put them: two or three products for each set of normals.
+//!
+//! Few sliding nodes have their whole flexibility A⁻¹ at hand for the products, and the matrix of other
+//! normals is written down and factored where too many are needed. Where nodes are many, products come from
+//! sweeps through the part of the factor that they reach: less to make and to keep, but springs and second
+//! walls, which the matrix at rest knows nothing of, can take a hundred of them.
 
 use crate::cholesky::{
-    DenseSymmetric, Factor, NormalFactor, Progress, Reach, RowKey, Symbolic, TailFactor,
-    conjugate_gradients, solve_normal,
+    DenseSymmetric, Factor, Moved, NormalFactor, NormalForces, Preconditioner, Progress, Reach,
+    RowKey, Symbolic, TailFlexibility, Wanted, conjugate_gradients, hopeless,
 };
 use crate::contact::{Constraints, Response, Sliding};
 use crate::crease::ContactRow;
@@ -17,10 +20,12 @@ use crate::mesh::{add, dot, scaled};
 
 /// Steps of sweeps after which contact gives up: ten on smooth bone, a hundred on teeth.
 const MOST_SWEEPS: usize = 1000;
-/// Relative error of the contact forces that sweeps go down to, as errors quote it.
-const SWEEP_TOLERANCE: f64 = 1e-14;
+/// Relative error of contact forces, in the energy norm, at which only rounding is left.
+const ROUNDING: f64 = 1e-14;
+/// Share of the contact tolerance that the forces of settled contact may be off, relative to all of them.
+const EXACT_SHARE: f64 = 1e-2;
 
-/// What is kept for sliding nodes: their flexibility, and the factor of its part along the normals at
+/// What is kept for sliding nodes: their flexibility, and the inverse of its part along the normals at
 /// rest.
 pub(crate) struct ContactFactor {
     flexibility: Flexibility,
@@ -30,7 +35,7 @@ pub(crate) struct ContactFactor {
 /// Displacements of sliding nodes under forces on them.
 enum Flexibility {
     /// Written down.
-    Dense(TailFactor),
+    Dense(TailFlexibility),
     /// By sweeps.
     Sweeps {
         reach: Reach,
@@ -49,7 +54,7 @@ impl ContactFactor {
         let rows: Vec<ContactRow> = sliding.rest_normals().iter().enumerate().map(row).collect();
         let offsets = vec![0.0; rows.len()];
         let rows = Rows::new(&Constraints { rows: &rows, offsets: &offsets, springs: &[] });
-        let rest = rows.factor(&tail)?;
+        let rest = rows.factor(&tail)?.inverse();
         Ok(Self { flexibility: Flexibility::Dense(tail), rest })
     }
 
@@ -64,6 +69,7 @@ impl ContactFactor {
         }
         let keys = order.iter().map(|&i| (i, 0)).collect();
         let rest = NormalFactor::new(normal, keys).map_err(|at| singular(rows[order[at]]))?;
+        let rest = rest.inverse();
         Ok(Self { flexibility: Flexibility::Sweeps { reach, rows, own }, rest })
     }
 
@@ -84,7 +90,7 @@ impl ContactFactor {
         x: &[f64],
     ) -> Answers<'a> {
         let free = match &self.flexibility {
-            Flexibility::Dense(tail) => tail.free_displacements(x),
+            Flexibility::Dense(_) => symbolic.tail_displacements(factor, x),
             Flexibility::Sweeps { reach, .. } => {
                 symbolic.reach_displacements(factor, reach, &mut x.to_vec())
             }
@@ -93,7 +99,8 @@ impl ContactFactor {
             Flexibility::Dense(_) => Vec::new(),
             Flexibility::Sweeps { .. } => vec![0.0; x.len()],
         };
-        Answers { contact: self, symbolic, factor, free, work, made: None, last: Vec::new() }
+        let moved = vec![[0.0; 3]; free.len()];
+        Answers { contact: self, symbolic, factor, free, moved, work, made: None, last: Vec::new() }
     }
 
     /// Answers to constraints that stay the same for several right-hand sides.
@@ -129,12 +136,8 @@ impl FrozenAnswers<'_> {
         let c = Constraints { rows: self.rows, offsets: &self.offsets[k], springs: &[] };
         let rows = Rows::new(&c);
         let forces = match &self.normal {
-            Some(normal) => {
-                let mut forces = rows.missing(&answers.free);
-                normal.solve(&mut forces);
-                forces
-            }
-            None => answers.forces(&rows)?,
+            Some(normal) => normal.solve(rows.missing(&answers.free)),
+            None => answers.forces(&rows, 0.0, ROUNDING)?.forces,
         };
         Ok(pushes(answers.free.len(), &rows.rows, &forces))
     }
@@ -147,6 +150,8 @@ pub(crate) struct Answers<'a> {
     factor: &'a Factor,
     /// Displacements of the sliding nodes without contact forces, mm.
     free: Vec<[f64; 3]>,
+    /// What the contact forces of the last answer added to them, mm.
+    moved: Vec<[f64; 3]>,
     /// Zeros for the sweeps.
     work: Vec<f64>,
     /// The factor made last in this plan, once the one at rest did not serve.
@@ -156,74 +161,95 @@ pub(crate) struct Answers<'a> {
 }
 
 impl Answers<'_> {
-    /// Displacements of the sliding nodes and contact forces under constraints `c`.
+    /// Displacements of the sliding nodes and contact forces under constraints `c`, to `share` of what these
+    /// change, as long as `tolerance` of contact asks for no less.
     ///
     /// How exact the forces are shows in the gaps that the displacements leave, which `settle` measures.
-    pub fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
+    pub fn respond(&mut self, c: &Constraints<'_>, share: f64, tolerance: f64) -> Result<Response> {
         let rows = Rows::new(c);
-        let mut forces = self.forces(&rows)?;
-        let pushes = pushes(self.free.len(), &rows.rows, &forces);
-        let moved = match &self.contact.flexibility {
-            Flexibility::Dense(tail) => tail.respond(&pushes),
-            Flexibility::Sweeps { reach, .. } => {
-                self.symbolic.respond(self.factor, reach, &pushes, &mut self.work)
-            }
-        };
-        let displacements = moved.iter().zip(&self.free).map(|(r, f)| add(*r, *f)).collect();
+        let exact = ROUNDING.max(EXACT_SHARE * tolerance);
+        let NormalForces { mut forces, solved, .. } = self.forces(&rows, share, exact)?;
+        let displacements = self.moved.iter().zip(&self.free).map(|(r, f)| add(*r, *f)).collect();
         forces.truncate(c.rows.len());
-        Ok(Response { displacements, forces, solved: true })
+        Ok(Response { displacements, forces, solved })
     }
 
-    /// Contact forces along `rows`, N.
-    fn forces(&mut self, rows: &Rows) -> Result<Vec<f64>> {
+    /// Contact forces along `rows`, and what they add to the displacements: to `share` of what the rows change,
+    /// or to `exact` of all.
+    fn forces(&mut self, rows: &Rows, share: f64, exact: f64) -> Result<NormalForces> {
+        let kept = self.made.as_ref().unwrap_or(&self.contact.rest);
+        let preconditioner = Preconditioner::new(self.diagonal(rows), &rows.keys, kept);
         let before = |key: &RowKey| {
             self.last.binary_search_by(|(k, _)| k.cmp(key)).map_or(0.0, |at| self.last[at].1)
         };
-        let start = rows.keys.iter().map(before).collect();
+        let mut start: Vec<f64> = rows.keys.iter().map(before).collect();
+        // What the last displacements leave open, were its forces not to turn with the normals.
         let goals = rows.missing(&self.free);
-        let forces = match &self.contact.flexibility {
+        let there = rows.along(&self.moved, &start);
+        let open: Vec<f64> = goals.iter().zip(there).map(|(g, v)| g - v).collect();
+        let (change, measure) = preconditioner.measure(&open);
+        for (x, v) in start.iter_mut().zip(change) {
+            *x += v;
+        }
+        let (n, work) = (self.free.len(), &mut self.work);
+        let product = |x: &[f64]| {
+            let pushes = pushes(n, &rows.rows, x);
+            let nodes = match &self.contact.flexibility {
+                Flexibility::Dense(tail) => tail.respond(&pushes),
+                Flexibility::Sweeps { reach, .. } => {
+                    self.symbolic.respond(self.factor, reach, &pushes, work)
+                }
+            };
+            Moved { along: rows.along(&nodes, x), nodes }
+        };
+        let wanted = Wanted { exact, enough: share * measure };
+        let found = match &self.contact.flexibility {
             Flexibility::Dense(tail) => {
-                let kept = self.made.as_ref().unwrap_or(&self.contact.rest);
-                let matrix = rows.flexibility(tail);
-                let found = solve_normal(matrix, rows.keys.clone(), &goals, start, kept)
-                    .map_err(|at| rows.singular(tail, at))?;
-                self.made = found.made.or(self.made.take());
-                found.forces
+                let near =
+                    conjugate_gradients(product, &preconditioner, &goals, start, wanted, hopeless);
+                match near {
+                    Ok(found) => found,
+                    Err(_) => {
+                        let made = rows.factor(tail)?;
+                        let forces = made.solve(goals);
+                        let nodes = tail.respond(&pushes(n, &rows.rows, &forces));
+                        self.made = Some(made);
+                        NormalForces { forces, nodes, solved: true }
+                    }
+                }
             }
-            Flexibility::Sweeps { reach, own, .. } => {
-                let work = &mut self.work;
-                let product = |x: &[f64]| {
-                    let pushes = pushes(self.free.len(), &rows.rows, x);
-                    let u = self.symbolic.respond(self.factor, reach, &pushes, work);
-                    let along =
-                        |((r, s), f): ((&ContactRow, &f64), &f64)| dot(r.normal, u[r.node]) + s * f;
-                    rows.rows.iter().zip(&rows.softness).zip(x).map(along).collect()
-                };
-                let diagonal =
-                    rows.rows.iter().zip(&rows.softness).map(|(r, s)| own[r.node] + s).collect();
-                let (keys, kept) = (&rows.keys, &self.contact.rest);
+            Flexibility::Sweeps { .. } => {
                 let give_up = |progress: &Progress| progress.step >= MOST_SWEEPS;
-                conjugate_gradients(product, diagonal, keys, &goals, start, kept, give_up).map_err(
-                    |error| MtmError::NotConverged {
+                conjugate_gradients(product, &preconditioner, &goals, start, wanted, give_up)
+                    .map_err(|error| MtmError::NotConverged {
                         method: "contact by sweeps",
                         iterations: MOST_SWEEPS,
                         error,
-                        tolerance: SWEEP_TOLERANCE,
+                        tolerance: exact,
                         advice: "use method=\"pcg\"; contact normals or walls may be degenerate",
-                    },
-                )?
+                    })?
             }
         };
-        self.last = rows.keys.iter().copied().zip(forces.iter().copied()).collect();
+        self.moved.clone_from(&found.nodes);
+        self.last = rows.keys.iter().copied().zip(found.forces.iter().copied()).collect();
         self.last.sort_unstable_by_key(|(key, _)| *key);
-        Ok(forces)
+        Ok(found)
+    }
+
+    /// Flexibility of each row by itself, mm/N.
+    fn diagonal(&self, rows: &Rows) -> Vec<f64> {
+        let own = |r: &ContactRow| match &self.contact.flexibility {
+            Flexibility::Dense(tail) => tail.own(r.node, r.normal),
+            Flexibility::Sweeps { own, .. } => own[r.node],
+        };
+        rows.rows.iter().zip(&rows.softness).map(|(r, s)| own(r) + s).collect()
     }
 
     /// Adds forces on the sliding nodes to `x` = L⁻¹ P b, so that a backward sweep gives the displacements
     /// with those forces.
     pub fn add_forces(&mut self, x: &mut [f64], forces: &[[f64; 3]]) {
         match &self.contact.flexibility {
-            Flexibility::Dense(tail) => tail.add_forces(x, forces),
+            Flexibility::Dense(_) => self.symbolic.add_tail_forces(self.factor, forces, x),
             Flexibility::Sweeps { reach, .. } => {
                 self.symbolic.add_reach_forces(self.factor, reach, forces, &mut self.work, x);
             }
@@ -266,20 +292,26 @@ impl Rows {
         self.rows.iter().zip(&self.goals).map(|(r, g)| g - dot(r.normal, free[r.node])).collect()
     }
 
+    /// Displacement along each row where nodes move by `nodes` and the forces along the rows are `forces`.
+    fn along(&self, nodes: &[[f64; 3]], forces: &[f64]) -> Vec<f64> {
+        let along = |((r, s), f): ((&ContactRow, &f64), &f64)| dot(r.normal, nodes[r.node]) + s * f;
+        self.rows.iter().zip(&self.softness).zip(forces).map(along).collect()
+    }
+
     /// Nᵀ S⁻¹ N with the softness.
-    fn flexibility(&self, tail: &TailFactor) -> DenseSymmetric {
+    fn flexibility(&self, tail: &TailFlexibility) -> DenseSymmetric {
         let nodes: Vec<usize> = self.rows.iter().map(|r| r.node).collect();
         let normals: Vec<[f64; 3]> = self.rows.iter().map(|r| r.normal).collect();
         tail.normal_flexibility(&nodes, &normals, &self.softness)
     }
 
     /// The factor of the flexibility.
-    fn factor(&self, tail: &TailFactor) -> Result<NormalFactor> {
+    fn factor(&self, tail: &TailFlexibility) -> Result<NormalFactor> {
         NormalFactor::new(self.flexibility(tail), self.keys.clone())
             .map_err(|at| self.singular(tail, at))
     }
 
-    fn singular(&self, tail: &TailFactor, at: usize) -> MtmError {
+    fn singular(&self, tail: &TailFlexibility, at: usize) -> MtmError {
         singular(tail.row(self.rows[at].node) as u32)
     }
 }

@@ -32,7 +32,8 @@ pub struct Solution {
     pub displacements: Vec<[f64; 3]>,
     /// Internal force K u of every node, N; zero at free nodes, the bone's load at the others.
     pub forces: Vec<[f64; 3]>,
-    /// ‖f − loads − contact‖ over the unknown nodes, relative to the forces that the plan brings in.
+    /// ‖f − loads − contact‖ over the unknown nodes, relative to the forces that the plan brings in: loads,
+    /// those of joined nodes, and of walls both their push and what each node alone would take to follow.
     pub residual: f64,
     /// Largest nodal error of the linear solve, mm: the bound that stopped an iterative method; for
     /// Cholesky ten times the error with which the factor recovered a known solution. Against the exact

@@ -298,7 +298,9 @@ impl StaticSolver {
         found.map_err(|e| by_node(e, &self.reduction.unknowns))
     }
 
-    /// Force out of balance at the unknown nodes over the forces that the plan brings in.
+    /// Force out of balance at the unknown nodes over the forces that the plan brings in: those of joined
+    /// nodes and loads on the unknown rows, contact forces, and what each held node alone would take to go
+    /// where its walls ask. Without the last, walls that carry a body about unstrained bring in nothing.
     fn residual(
         &self,
         forces: &[[f64; 3]],
@@ -321,6 +323,13 @@ impl StaticSolver {
                 let push = scaled(state.normals[i], state.forces[i]);
                 rest[node.row as usize] = sub(rest[node.row as usize], push);
                 scale += dot(push, push);
+            }
+            for row in &state.rows {
+                let j = sliding.nodes()[row.node].node as usize;
+                let k = self.tensors.matrix().diagonal_block(j);
+                let way = scaled(row.normal, dot(row.normal, state.displacements[row.node]));
+                let alone = [0, 1, 2].map(|i| dot([k[3 * i], k[3 * i + 1], k[3 * i + 2]], way));
+                scale += dot(alone, alone);
             }
         }
         let sum: f64 = rest.iter().map(|v| dot(*v, *v)).sum();

@@ -160,24 +160,26 @@ impl System {
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, ContactState, f64)> {
         let clock = Clock::new();
+        let share = match options.contact.mode {
+            ContactMode::Bilateral => STEP_SHARE,
+            ContactMode::Unilateral => LIFTING_STEP_SHARE,
+        };
         if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
             let mut x = symbolic.permuted(b);
-            symbolic.forward(factor, &mut x, 1);
+            symbolic.forward(factor, &mut x);
             let mut answers = contact.answers(symbolic, factor, &x);
-            let state =
-                sliding.settle(motions, &options.contact, interrupted, |c| answers.respond(c))?;
+            let state = sliding.settle(motions, &options.contact, interrupted, |c| {
+                answers.respond(c, share, options.contact.tolerance)
+            })?;
             answers.add_forces(&mut x, &pushes(&state.normals, &state.forces));
             let seconds = clock.total();
-            symbolic.backward(factor, &mut x, 1);
+            symbolic.backward(factor, &mut x);
             let x = symbolic.unpermuted(&x);
             effort.error_bound = direct_error(factor, &x);
             return Ok((x, state, seconds));
         }
         let mut trail = Trail::default();
-        let share = Some(match options.contact.mode {
-            ContactMode::Bilateral => STEP_SHARE,
-            ContactMode::Unilateral => LIFTING_STEP_SHARE,
-        });
+        let share = Some(share);
         let state = sliding.settle(motions, &options.contact, interrupted, |c| {
             self.solve_projected(b, sliding, c, scale, share, &mut trail, effort, interrupted)
         })?;
@@ -208,11 +210,11 @@ impl System {
                     return Err(MtmError::Interrupted);
                 }
                 let mut x = symbolic.permuted(b);
-                symbolic.forward(factor, &mut x, 1);
+                symbolic.forward(factor, &mut x);
                 let mut answers = contact.answers(symbolic, factor, &x);
                 let forces = frozen.forces(&mut answers, k)?;
                 answers.add_forces(&mut x, &forces);
-                symbolic.backward(factor, &mut x, 1);
+                symbolic.backward(factor, &mut x);
                 Ok(symbolic.unpermuted(&x))
             };
             return columns.iter().enumerate().map(solve).collect();
@@ -252,36 +254,38 @@ impl System {
             .map(|(r, &offset)| Constraint { row: row(r.node), normal: r.normal, offset })
             .collect();
         let constraints = orthonormal(&asked);
-        let matrix = match &self.kept {
-            Kept::Refactored { matrix, .. } => matrix,
-            Kept::Iterative(iterative) => iterative.matrix(),
-            Kept::Direct { .. } => unreachable!("the factor without contact serves there"),
-        };
         let springs: Vec<(usize, Spring)> = c.springs.iter().map(|&s| (row(s.node), s)).collect();
-        let mut rhs = projected_rhs(matrix, b, &constraints);
-        for (row, s) in &springs {
-            rhs[*row] = add(rhs[*row], scaled(s.axis, s.stiffness * s.goal));
-        }
-        let (mut x, solved) = match &self.kept {
-            Kept::Iterative(iterative) => iterative.solve_projected(
-                &rhs,
-                &constraints,
-                &springs,
-                scale,
-                share,
-                trail,
-                effort,
-                interrupted,
-            )?,
-            Kept::Refactored { symbolic, .. } => {
+        let pushed = |matrix: &BlockMatrix| {
+            let mut rhs = projected_rhs(matrix, b, &constraints);
+            for (row, s) in &springs {
+                rhs[*row] = add(rhs[*row], scaled(s.axis, s.stiffness * s.goal));
+            }
+            rhs
+        };
+        let (matrix, (mut x, solved)) = match &self.kept {
+            Kept::Iterative(iterative) => {
+                let matrix = iterative.matrix();
+                let found = iterative.solve_projected(
+                    &pushed(matrix),
+                    &constraints,
+                    &springs,
+                    scale,
+                    share,
+                    trail,
+                    effort,
+                    interrupted,
+                )?;
+                (matrix, found)
+            }
+            Kept::Refactored { symbolic, matrix } => {
                 let mut system = projected(matrix, &constraints);
                 for (row, s) in &springs {
                     system.add_to_diagonal(*row, s.axis, s.stiffness);
                 }
                 let factor = symbolic.factor(&system)?;
-                let x = symbolic.solve(&factor, &rhs);
+                let x = symbolic.solve(&factor, &pushed(matrix));
                 effort.error_bound = direct_error(&factor, &x);
-                (x, true)
+                (matrix, (x, true))
             }
             Kept::Direct { .. } => unreachable!("the factor without contact serves there"),
         };

@@ -1,49 +1,20 @@
-//! The dense end of the factor for sliding contact: the flexibility of the sliding nodes and its normal part.
+//! Sliding contact by the dense end of the factor: the flexibility of the sliding nodes and its normal part.
 
-use faer::linalg::matmul::triangular::{self, BlockStructure};
-use faer::linalg::triangular_inverse::invert_lower_triangular;
-use faer::linalg::triangular_solve::{
-    solve_lower_triangular_in_place, solve_upper_triangular_in_place,
-};
-use faer::{Accum, Mat, MatMut, Par};
+use super::symmetric::{DenseFactor, DenseSymmetric};
 
-use super::symmetric::DenseSymmetric;
-use super::workspace::parallelism;
-
-/// The end of the factor and its inverse, for contact: everything that sliding nodes do to one another.
-pub struct TailFactor {
-    /// L_SS.
-    lower: Mat<f64>,
+/// The flexibility of the tail nodes: everything that sliding nodes do to one another.
+pub struct TailFlexibility {
     /// S⁻¹, mm/N.
     flexibility: DenseSymmetric,
-    /// First tail unknown in elimination order.
-    first: usize,
     /// Row of the system of each tail node.
     rows: Vec<u32>,
 }
 
-impl TailFactor {
-    /// The flexibility of the tail from `lower`, its part of the factor; `first` is the first tail unknown
-    /// in elimination order, `rows` the row of the system of each tail node.
-    pub(super) fn new(lower: Mat<f64>, first: usize, rows: Vec<u32>) -> Self {
-        let size = lower.nrows();
-        let par = parallelism(size);
-        let mut inverse = Mat::<f64>::zeros(size, size);
-        invert_lower_triangular(inverse.as_mut(), lower.as_ref(), par);
-        let mut flexibility = vec![0.0; size * size];
-        triangular::matmul(
-            MatMut::from_column_major_slice_mut(&mut flexibility, size, size),
-            BlockStructure::TriangularLower,
-            Accum::Replace,
-            inverse.as_ref().transpose(),
-            BlockStructure::TriangularUpper,
-            inverse.as_ref(),
-            BlockStructure::TriangularLower,
-            1.0,
-            par,
-        );
-        let flexibility = DenseSymmetric::from_lower(size, flexibility);
-        Self { lower, flexibility, first, rows }
+impl TailFlexibility {
+    /// The flexibility of the tail from `lower`, its part of the factor; `rows` is the row of the system of
+    /// each tail node.
+    pub(super) fn new(lower: &DenseFactor, rows: Vec<u32>) -> Self {
+        Self { flexibility: lower.inverse(), rows }
     }
 
     /// Row of the system of tail node `i`.
@@ -53,34 +24,17 @@ impl TailFactor {
 
     /// Bytes held.
     pub fn bytes(&self) -> usize {
-        8 * self.lower.nrows() * self.lower.nrows() + self.flexibility.bytes()
+        self.flexibility.bytes()
     }
 
-    /// Displacements of the tail nodes without contact forces, from x = L⁻¹ P b.
-    pub fn free_displacements(&self, forward: &[f64]) -> Vec<[f64; 3]> {
-        let mut y = forward[self.first..].to_vec();
-        let size = y.len();
-        solve_upper_triangular_in_place(
-            self.lower.as_ref().transpose(),
-            MatMut::from_column_major_slice_mut(&mut y, size, 1),
-            Par::Seq,
-        );
-        y.chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect()
-    }
-
-    /// Adds L_SS⁻¹ f for forces on the tail nodes to x = L⁻¹ P b, so that a backward sweep gives the
-    /// displacements with those forces.
-    pub fn add_forces(&self, forward: &mut [f64], forces: &[[f64; 3]]) {
-        let mut f = forces.as_flattened().to_vec();
-        let size = f.len();
-        solve_lower_triangular_in_place(
-            self.lower.as_ref(),
-            MatMut::from_column_major_slice_mut(&mut f, size, 1),
-            Par::Seq,
-        );
-        for (x, v) in forward[self.first..].iter_mut().zip(f) {
-            *x += v;
-        }
+    /// Flexibility of tail node `i` by itself along the unit vector `axis`, mm/N.
+    pub fn own(&self, i: usize, axis: [f64; 3]) -> f64 {
+        let [c0, c1, c2] = [0, 1, 2].map(|b| self.flexibility.column(3 * i + b));
+        let [x, y, z] = axis;
+        x * x * c0[0]
+            + y * y * c1[0]
+            + z * z * c2[0]
+            + 2.0 * (x * y * c0[1] + x * z * c0[2] + y * z * c1[1])
     }
 
     /// Displacements of the tail nodes under forces on them alone, S⁻¹ f.

@@ -2,21 +2,28 @@
 //! The only folder that names faer.
 
 mod dense;
+#[cfg(test)]
+mod grid;
 mod normal;
 mod numeric;
 mod reach;
 mod structure;
+mod sweep;
 mod symmetric;
 mod workspace;
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::sparse::linalg::cholesky::supernodal;
-use faer::{Conj, Mat, MatMut, Par};
+use faer::{Conj, MatMut};
 
-pub use dense::TailFactor;
-pub use normal::{NormalFactor, NormalForces, Progress, RowKey, conjugate_gradients, solve_normal};
+pub use dense::TailFlexibility;
+pub use normal::{
+    Moved, NormalFactor, NormalForces, Preconditioner, Progress, RowKey, Wanted,
+    conjugate_gradients, hopeless,
+};
 pub use reach::Reach;
 use structure::{minimum_degree, supernodal_structure};
+use sweep::Sweep;
 pub use symmetric::{DenseFactor, DenseSymmetric};
 use workspace::{out_of_memory, parallelism};
 
@@ -169,8 +176,8 @@ impl Symbolic {
     /// A⁻¹ b.
     pub fn solve(&self, factor: &Factor, b: &[[f64; 3]]) -> Vec<[f64; 3]> {
         let mut x = self.permuted(b);
-        self.forward(factor, &mut x, 1);
-        self.backward(factor, &mut x, 1);
+        self.forward(factor, &mut x);
+        self.backward(factor, &mut x);
         self.unpermuted(&x)
     }
 
@@ -180,9 +187,16 @@ impl Symbolic {
             return;
         }
         let mut x: Vec<f64> = columns.iter().flat_map(|b| self.permuted(b)).collect();
-        let k = columns.len();
-        self.forward(factor, &mut x, k);
-        self.backward(factor, &mut x, k);
+        let (n, k) = (3 * self.order.len(), columns.len());
+        let par = parallelism(n);
+        let mut memory = MemBuffer::new(self.structure.solve_in_place_scratch::<f64>(k, par));
+        supernodal::SupernodalLltRef::new(&self.structure, &factor.values)
+            .solve_in_place_with_conj(
+                Conj::No,
+                MatMut::from_column_major_slice_mut(&mut x, n, k),
+                par,
+                MemStack::new(&mut memory),
+            );
         for (column, x) in columns.iter_mut().zip(x.chunks_exact(3 * self.order.len())) {
             *column = self.unpermuted(x);
         }
@@ -202,38 +216,39 @@ impl Symbolic {
         out
     }
 
-    /// x ← L⁻¹ x for `k` columns in elimination order.
-    pub fn forward(&self, factor: &Factor, x: &mut [f64], k: usize) {
-        self.sweep(factor, x, k, |l, x, par, stack| l.l_solve_with_conj(Conj::No, x, par, stack));
+    /// x ← L⁻¹ x in elimination order.
+    pub fn forward(&self, factor: &Factor, x: &mut [f64]) {
+        self.sweep(factor).forward(x);
     }
 
-    /// x ← L⁻ᵀ x for `k` columns in elimination order.
-    pub fn backward(&self, factor: &Factor, x: &mut [f64], k: usize) {
-        self.sweep(factor, x, k, |l, x, par, stack| {
-            l.l_transpose_solve_with_conj(Conj::No, x, par, stack);
-        });
+    /// x ← L⁻ᵀ x in elimination order.
+    pub fn backward(&self, factor: &Factor, x: &mut [f64]) {
+        self.sweep(factor).backward(x);
     }
 
-    fn sweep(
-        &self,
-        factor: &Factor,
-        x: &mut [f64],
-        k: usize,
-        solve: impl FnOnce(
-            &supernodal::SupernodalLltRef<'_, usize, f64>,
-            MatMut<'_, f64>,
-            Par,
-            &mut MemStack,
-        ),
-    ) {
-        let n = 3 * self.order.len();
-        // One column is bound by memory bandwidth: threads made it two to three times slower.
-        let par = if k == 1 { Par::Seq } else { parallelism(n) };
-        let need = self.structure.solve_in_place_scratch::<f64>(k, par);
-        let mut memory = MemBuffer::new(need);
-        let l = supernodal::SupernodalLltRef::new(&self.structure, &factor.values);
-        let x = MatMut::from_column_major_slice_mut(x, n, k);
-        solve(&l, x, par, MemStack::new(&mut memory));
+    fn sweep<'a>(&'a self, factor: &'a Factor) -> Sweep<'a> {
+        Sweep::new((&self.structure, &factor.values), &self.tree)
+    }
+
+    /// Displacements of the tail rows, given x = L⁻¹ P b.
+    pub fn tail_displacements(&self, factor: &Factor, x: &[f64]) -> Vec<[f64; 3]> {
+        let sweep = self.sweep(factor);
+        let mut tail = x[sweep.base()..].to_vec();
+        sweep.backward_tail(&mut tail);
+        let own = tail.len() - 3 * self.n_tail;
+        tail[own..].chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect()
+    }
+
+    /// Adds L⁻¹ P f for forces on the tail rows to x = L⁻¹ P b.
+    pub fn add_tail_forces(&self, factor: &Factor, forces: &[[f64; 3]], x: &mut [f64]) {
+        let sweep = self.sweep(factor);
+        let x = &mut x[sweep.base()..];
+        let mut tail = vec![0.0; x.len()];
+        tail[x.len() - 3 * self.n_tail..].copy_from_slice(forces.as_flattened());
+        sweep.forward_tail(&mut tail);
+        for (x, v) in x.iter_mut().zip(tail) {
+            *x += v;
+        }
     }
 
     /// What the given rows of the system reach in the factor.
@@ -302,9 +317,9 @@ impl Symbolic {
     }
 
     /// Flexibility S⁻¹ of the tail rows, S = L_SS L_SSᵀ their Schur complement, order 3·n_tail, mm/N.
-    pub fn tail_flexibility(&self, factor: &Factor) -> TailFactor {
+    pub fn tail_flexibility(&self, factor: &Factor) -> TailFlexibility {
         let (size, first) = (3 * self.n_tail, 3 * (self.order.len() - self.n_tail));
-        let mut lower = Mat::<f64>::zeros(size, size);
+        let mut lower = vec![0.0; size * size];
         let l = supernodal::SupernodalLltRef::new(&self.structure, &factor.values);
         for s in 0..self.structure.n_supernodes() {
             let node = l.supernode(s);
@@ -313,14 +328,14 @@ impl Symbolic {
             for c in (0..width).filter(|c| start + c >= first) {
                 let column = start + c - first;
                 for r in c..width {
-                    lower[(start + r - first, column)] = val[(r, c)];
+                    lower[column * size + start + r - first] = val[(r, c)];
                 }
                 for (r, &row) in pattern.iter().enumerate() {
-                    lower[(row - first, column)] = val[(width + r, c)];
+                    lower[column * size + row - first] = val[(width + r, c)];
                 }
             }
         }
         let rows = self.order[self.order.len() - self.n_tail..].to_vec();
-        TailFactor::new(lower, first, rows)
+        TailFlexibility::new(&DenseFactor::from_lower(size, lower), rows)
     }
 }

@@ -1,13 +1,11 @@
 //! Contact forces under normals that change from one solve to the next.
 //!
 //! The normal flexibility Nᵀ S⁻¹ N of a solve differs from that of an earlier one by how far the normals
-//! turned in between. Its own Cholesky factor costs m³/3; conjugate gradients that the earlier factor
-//! preconditions need a few products of m². Where they need many, the factor is made anew and kept.
+//! turned in between: conjugate gradients that the earlier one preconditions need a few products. Each
+//! brings the displacements along, so that the matrix need not be written down.
 
 use super::symmetric::{DenseFactor, DenseSymmetric, dot};
 
-/// Error in the energy norm, relative to the solution, at which conjugate gradients end: rounding.
-const ENERGY_ERROR: f64 = 1e-14;
 /// Steps after which a new factor is cheaper than more of them.
 const MOST_STEPS: usize = 12;
 /// Steps that tell how many it will take: later ones gain no less.
@@ -18,64 +16,81 @@ const NO_ROW: u32 = u32::MAX;
 /// A constraint row: tail node, and how many rows of the same node stand before it.
 pub type RowKey = (usize, usize);
 
-/// Factor of the normal flexibility of some constraint rows, for these and others like them.
+/// What answers for the normal flexibility of some constraint rows, and for others like them.
 pub struct NormalFactor {
-    factor: DenseFactor,
+    answer: Answer,
     keys: Vec<RowKey>,
 }
 
-/// Forces along the rows, N, and what it took to find them.
-pub struct NormalForces {
-    /// Force of each row.
-    pub forces: Vec<f64>,
-    /// The factor of this matrix, where one was made.
-    pub made: Option<NormalFactor>,
+/// How a right-hand side is answered.
+enum Answer {
+    /// By the factor: soon made.
+    Factor(DenseFactor),
+    /// By the inverse: soon applied.
+    Inverse(DenseSymmetric),
 }
 
 impl NormalFactor {
     /// The factor of `flexibility`, whose rows are `keys`; the first row without a positive pivot on
     /// failure.
     pub fn new(flexibility: DenseSymmetric, keys: Vec<RowKey>) -> Result<Self, usize> {
-        Ok(Self { factor: flexibility.factor()?, keys })
+        Ok(Self { answer: Answer::Factor(flexibility.factor()?), keys })
+    }
+
+    /// The same by its inverse, for many right-hand sides.
+    pub fn inverse(self) -> Self {
+        let answer = match self.answer {
+            Answer::Factor(factor) => Answer::Inverse(factor.inverse()),
+            inverse @ Answer::Inverse(_) => inverse,
+        };
+        Self { answer, ..self }
     }
 
     /// Bytes held.
     pub fn bytes(&self) -> usize {
-        self.factor.bytes()
+        match &self.answer {
+            Answer::Factor(factor) => factor.bytes(),
+            Answer::Inverse(inverse) => inverse.bytes(),
+        }
     }
 
-    /// A⁻¹ b of the matrix that was factored, in place.
-    pub fn solve(&self, b: &mut [f64]) {
-        self.factor.solve(b);
+    /// A⁻¹ b of the matrix that was factored.
+    pub fn solve(&self, mut b: Vec<f64>) -> Vec<f64> {
+        match &self.answer {
+            Answer::Factor(factor) => {
+                factor.solve(&mut b);
+                b
+            }
+            Answer::Inverse(inverse) => inverse.multiply(&b),
+        }
     }
 }
 
-/// Solution of `flexibility` f = `goals`, begun at `start`, with the factor `kept` of another matrix as
-/// preconditioner; the first row without a positive pivot where the matrix is not positive definite.
-pub fn solve_normal(
-    flexibility: DenseSymmetric,
-    keys: Vec<RowKey>,
-    goals: &[f64],
-    start: Vec<f64>,
-    kept: &NormalFactor,
-) -> Result<NormalForces, usize> {
-    let diagonal = (0..flexibility.size()).map(|c| flexibility.column(c)[0]).collect();
-    let product = |x: &[f64]| flexibility.multiply(x);
-    let near = conjugate_gradients(product, diagonal, &keys, goals, start, kept, hopeless);
-    if let Ok(forces) = near {
-        return Ok(NormalForces { forces, made: None });
-    }
-    let made = NormalFactor::new(flexibility, keys)?;
-    let mut forces = goals.to_vec();
-    made.solve(&mut forces);
-    Ok(NormalForces { forces, made: Some(made) })
+/// What forces along the rows do.
+pub struct Moved {
+    /// Displacement along each row, mm.
+    pub along: Vec<f64>,
+    /// Displacement of every node, mm.
+    pub nodes: Vec<[f64; 3]>,
 }
 
-/// Whether more steps cost more than a factor, judged by how the error has fallen so far.
-fn hopeless(progress: &Progress) -> bool {
-    let Progress { step, fallen, error } = *progress;
-    let rest = (MOST_STEPS as f64 - step as f64) / step.max(1) as f64;
-    step >= MOST_STEPS || step >= TRIAL_STEPS && error * fallen.powf(rest) > ENERGY_ERROR
+/// Forces along the rows, N, and what they do.
+pub struct NormalForces {
+    /// Force of each row.
+    pub forces: Vec<f64>,
+    /// Displacement of every node under them, mm.
+    pub nodes: Vec<[f64; 3]>,
+    /// Whether they are [`Wanted::exact`].
+    pub solved: bool,
+}
+
+/// How good a solution is to be.
+#[derive(Clone, Copy)]
+pub struct Wanted {
+    /// Relative error in the energy norm that is as good as none.
+    pub exact: f64,
+    /// Measure of the residual, see [`Preconditioner::measure`], that will do for now; 0 where none does.
+    pub enough: f64,
 }
 
 /// How far conjugate gradients have come.
@@ -86,47 +101,53 @@ pub struct Progress {
     pub fallen: f64,
     /// Relative error in the energy norm.
     pub error: f64,
+    /// The error at which they end.
+    pub goal: f64,
 }
 
-/// x with A x = `goals` by conjugate gradients from `start`, preconditioned by `kept` on the rows that it
-/// has and by `diagonal` (above 0) on the others.
+/// Whether more steps cost more than a factor, judged by how the error has fallen so far.
+pub fn hopeless(progress: &Progress) -> bool {
+    let Progress { step, fallen, error, goal } = *progress;
+    let rest = (MOST_STEPS as f64 - step as f64) / step.max(1) as f64;
+    step >= MOST_STEPS || step >= TRIAL_STEPS && error * fallen.powf(rest) > goal
+}
+
+/// x with A x = `goals` by conjugate gradients from `start`.
+///
+/// `product`: what forces along the rows do, A x along them.
 ///
 /// # Errors
 /// The relative error in the energy norm that was left where `give_up` held, or where `product` proved
 /// not to be that of a positive definite matrix.
 pub fn conjugate_gradients(
-    mut product: impl FnMut(&[f64]) -> Vec<f64>,
-    diagonal: Vec<f64>,
-    keys: &[RowKey],
+    mut product: impl FnMut(&[f64]) -> Moved,
+    preconditioner: &Preconditioner<'_>,
     goals: &[f64],
     start: Vec<f64>,
-    kept: &NormalFactor,
+    wanted: Wanted,
     give_up: impl Fn(&Progress) -> bool,
-) -> Result<Vec<f64>, f64> {
-    let preconditioner = Preconditioner::new(diagonal, keys, kept);
+) -> Result<NormalForces, f64> {
     let mut x = start;
-    let mut r = goals.to_vec();
-    if x.iter().any(|&v| v != 0.0) {
-        for (r, v) in r.iter_mut().zip(product(&x)) {
-            *r -= v;
-        }
-    }
+    let Moved { along, mut nodes } = product(&x);
+    let mut r: Vec<f64> = goals.iter().zip(along).map(|(g, v)| g - v).collect();
     let mut z = preconditioner.apply(&r);
     let mut p = z.clone();
     let mut rz = dot(&r, &z);
-    let first = rz;
-    for step in 0.. {
+    let (first, mut step) = (rz, 0);
+    loop {
         // xᵀA x = xᵀ(g − r): how large the solution is in the same norm.
         let size: f64 = x.iter().zip(goals.iter().zip(&r)).map(|(x, (g, r))| x * (g - r)).sum();
         let error = (rz / size).sqrt();
-        if rz == 0.0 || error <= ENERGY_ERROR {
-            break;
+        let solved = rz == 0.0 || error <= wanted.exact;
+        if solved || rz.sqrt() <= wanted.enough {
+            return Ok(NormalForces { forces: x, nodes, solved });
         }
-        if give_up(&Progress { step, fallen: (rz / first).sqrt(), error }) {
+        let goal = wanted.exact.max(wanted.enough / size.sqrt());
+        if give_up(&Progress { step, fallen: (rz / first).sqrt(), error, goal }) {
             return Err(error);
         }
-        let ap = product(&p);
-        let curvature = dot(&p, &ap);
+        let Moved { along, nodes: moved } = product(&p);
+        let curvature = dot(&p, &along);
         // Also false for NaN.
         if !(curvature > 0.0 && rz.is_finite()) {
             return Err(error);
@@ -134,7 +155,10 @@ pub fn conjugate_gradients(
         let alpha = rz / curvature;
         for i in 0..x.len() {
             x[i] += alpha * p[i];
-            r[i] -= alpha * ap[i];
+            r[i] -= alpha * along[i];
+        }
+        for (to, v) in nodes.as_flattened_mut().iter_mut().zip(moved.as_flattened()) {
+            *to += alpha * v;
         }
         z = preconditioner.apply(&r);
         let next = dot(&r, &z);
@@ -143,12 +167,12 @@ pub fn conjugate_gradients(
         for (p, z) in p.iter_mut().zip(&z) {
             *p = z + beta * *p;
         }
+        step += 1;
     }
-    Ok(x)
 }
 
 /// The kept factor on the rows it has, the diagonal on the others: positive definite for any rows.
-struct Preconditioner<'a> {
+pub struct Preconditioner<'a> {
     kept: &'a NormalFactor,
     /// Row of the factor that stands for each row of the matrix.
     row: Vec<u32>,
@@ -156,7 +180,8 @@ struct Preconditioner<'a> {
 }
 
 impl<'a> Preconditioner<'a> {
-    fn new(diagonal: Vec<f64>, keys: &[RowKey], kept: &'a NormalFactor) -> Self {
+    /// `kept` on those of `keys` that it has, `diagonal` (above 0) on the others.
+    pub fn new(diagonal: Vec<f64>, keys: &[RowKey], kept: &'a NormalFactor) -> Self {
         let mut places: Vec<(RowKey, u32)> =
             kept.keys.iter().enumerate().map(|(row, &key)| (key, row as u32)).collect();
         places.sort_unstable();
@@ -167,12 +192,19 @@ impl<'a> Preconditioner<'a> {
         Self { kept, row, diagonal }
     }
 
+    /// About A⁻¹ r, and its measure √(rᵀz).
+    pub fn measure(&self, r: &[f64]) -> (Vec<f64>, f64) {
+        let z = self.apply(r);
+        let measure = dot(r, &z).sqrt();
+        (z, measure)
+    }
+
     fn apply(&self, r: &[f64]) -> Vec<f64> {
         let mut own = vec![0.0; self.kept.keys.len()];
         for (&row, &v) in self.row.iter().zip(r).filter(|(row, _)| **row != NO_ROW) {
             own[row as usize] = v;
         }
-        self.kept.solve(&mut own);
+        let own = self.kept.solve(own);
         let of = |(i, &row): (usize, &u32)| match row {
             NO_ROW => r[i] / self.diagonal[i],
             row => own[row as usize],
@@ -209,12 +241,35 @@ mod tests {
         (0..n).map(|i| (i, 0)).collect()
     }
 
-    /// Rows that the kept factor has, rows it lacks, and rows that have gone: the dense solution each time.
+    /// To rounding, as the tests compare it.
+    const EXACT: Wanted = Wanted { exact: 1e-14, enough: 0.0 };
+
+    /// Forces by conjugate gradients from zero that `kept` preconditions.
+    fn found(
+        now: &DMatrix<f64>,
+        keys: &[RowKey],
+        goals: &[f64],
+        kept: &NormalFactor,
+        wanted: Wanted,
+    ) -> Result<NormalForces, f64> {
+        let matrix = lower(now);
+        let diagonal = (0..now.nrows()).map(|i| now[(i, i)]).collect();
+        let product = |x: &[f64]| {
+            let along = matrix.multiply(x);
+            Moved { nodes: along.iter().map(|&v| [v, 2.0 * v, 0.0]).collect(), along }
+        };
+        let preconditioner = Preconditioner::new(diagonal, keys, kept);
+        let zero = vec![0.0; goals.len()];
+        conjugate_gradients(product, &preconditioner, goals, zero, wanted, hopeless)
+    }
+
+    /// Rows that the kept factor has, rows it lacks, and rows that have gone: the dense solution each time,
+    /// and the displacements that it makes.
     #[test]
     fn forces_by_another_factor_equal_the_dense_ones() {
         let n = 60;
         let (rest, now) = (turned(n, 0.0), turned(n, 0.5));
-        let kept = NormalFactor::new(lower(&rest), keys(n)).unwrap();
+        let factor = || NormalFactor::new(lower(&rest), keys(n)).unwrap();
         let goals = DVector::from_fn(n, |i, _| (i as f64 * 0.7).cos());
         let some: Vec<usize> = (0..n).filter(|i| i % 7 != 3).collect();
         let all: Vec<usize> = (0..n).collect();
@@ -225,37 +280,51 @@ mod tests {
             if second_wall {
                 keys[5].1 = 1;
             }
-            let zero = vec![0.0; rows.len()];
-            let found = solve_normal(lower(&picked), keys, b.as_slice(), zero, &kept).unwrap();
-            assert!(found.made.is_none());
-            let exact = picked.cholesky().unwrap().solve(&b);
-            let error = (DVector::from_vec(found.forces) - &exact).amax();
-            assert!(error <= 1e-12 * exact.amax(), "{error:e}");
+            let exact = picked.clone().cholesky().unwrap().solve(&b);
+            for kept in [factor(), factor().inverse()] {
+                let found = found(&picked, &keys, b.as_slice(), &kept, EXACT).unwrap();
+                assert!(found.solved);
+                let error = (DVector::from_vec(found.forces) - &exact).amax();
+                assert!(error <= 1e-12 * exact.amax(), "{error:e}");
+                for (v, g) in found.nodes.iter().zip(&b) {
+                    assert!((v[0] - g).abs() <= 1e-12 && (v[1] - 2.0 * g).abs() <= 1e-12);
+                }
+            }
         }
     }
 
-    /// A factor that is no help is replaced, and the new one is handed back.
+    /// What will do for now is not exact, and says so; its residual is as small as was asked.
     #[test]
-    fn factor_that_does_not_help_is_made_anew() {
+    fn forces_are_as_good_as_wanted() {
         let n = 60;
-        let other =
-            DMatrix::from_fn(
-                n,
-                n,
-                |i, j| {
-                    if i == j { 10.0_f64.powi((i % 9) as i32 - 4) } else { 0.0 }
-                },
-            );
+        let (now, b) = (turned(n, 0.5), DVector::from_fn(n, |i, _| (i as f64 * 0.7).cos()));
+        let kept = NormalFactor::new(lower(&turned(n, 0.0)), keys(n)).unwrap();
+        let preconditioner = Preconditioner::new(vec![1.0; n], &keys(n), &kept);
+        let (_, first) = preconditioner.measure(b.as_slice());
+        let wanted = Wanted { enough: 1e-3 * first, ..EXACT };
+        let found = found(&now, &keys(n), b.as_slice(), &kept, wanted).unwrap();
+        let left = &b - &now * DVector::from_vec(found.forces);
+        let (_, measure) = preconditioner.measure(left.as_slice());
+        assert!(!found.solved && measure <= 1.001 * wanted.enough, "{measure:e}");
+    }
+
+    /// A factor that is no help is given up; one made anew answers, as its inverse does.
+    #[test]
+    fn factor_that_does_not_help_is_given_up() {
+        let n = 60;
+        let size = |i: usize| 10.0_f64.powi((i % 9) as i32 - 4);
+        let other = DMatrix::from_fn(n, n, |i, j| if i == j { size(i) } else { 0.0 });
         let kept = NormalFactor::new(lower(&other), keys(n)).unwrap();
         let now = turned(n, 0.5);
         let b = DVector::from_element(n, 1.0);
-        let found = solve_normal(lower(&now), keys(n), b.as_slice(), vec![0.0; n], &kept).unwrap();
-        let made = found.made.unwrap();
+        assert!(found(&now, &keys(n), b.as_slice(), &kept, EXACT).is_err());
+        let made = NormalFactor::new(lower(&now), keys(n)).unwrap();
         let exact = now.cholesky().unwrap().solve(&b);
-        assert!((DVector::from_vec(found.forces) - &exact).amax() <= 1e-12 * exact.amax());
-        let mut again = b.as_slice().to_vec();
-        made.solve(&mut again);
-        assert!((DVector::from_vec(again) - &exact).amax() <= 1e-12 * exact.amax());
+        let by_factor = DVector::from_vec(made.solve(b.as_slice().to_vec()));
+        let by_inverse = DVector::from_vec(made.inverse().solve(b.as_slice().to_vec()));
+        for found in [by_factor, by_inverse] {
+            assert!((found - &exact).amax() <= 1e-12 * exact.amax());
+        }
     }
 
     #[test]
@@ -263,7 +332,7 @@ mod tests {
         let kept = NormalFactor::new(lower(&DMatrix::identity(3, 3)), keys(3)).unwrap();
         let mut now = DMatrix::identity(3, 3);
         now[(2, 2)] = -1.0;
-        let found = solve_normal(lower(&now), keys(3), &[1.0; 3], vec![0.0; 3], &kept);
-        assert_eq!(found.err(), Some(2));
+        assert!(found(&now, &keys(3), &[1.0; 3], &kept, EXACT).is_err());
+        assert_eq!(NormalFactor::new(lower(&now), keys(3)).err(), Some(2));
     }
 }

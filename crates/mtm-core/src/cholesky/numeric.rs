@@ -26,15 +26,15 @@ const LEAST_ROWS_FOR_THREADS: usize = 384;
 
 /// Elimination tree of the supernodes.
 pub struct Tree {
-    children: Vec<Vec<usize>>,
+    pub(super) children: Vec<Vec<usize>>,
     /// First supernode of each subtree; the subtree is the run from there to its root.
-    first: Vec<usize>,
+    pub(super) first: Vec<usize>,
     /// Multiplications of each subtree.
     work: Vec<f64>,
     /// Roots among the supernodes before the tail, ascending.
-    roots: Vec<usize>,
+    pub(super) roots: Vec<usize>,
     /// First supernode that holds a tail column: from there on the order is no postorder.
-    tail: usize,
+    pub(super) tail: usize,
 }
 
 impl Tree {

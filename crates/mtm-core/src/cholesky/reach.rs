@@ -10,43 +10,11 @@ use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
 use faer::sparse::linalg::cholesky::supernodal::SymbolicSupernodalCholesky;
 use faer::{Accum, Mat, MatMut, MatRef, Par};
 
-use super::symmetric::{DenseSymmetric, add_scaled, dot};
-
-/// Supernodes of a factor: structure, and values column by column.
-pub type Columns<'a> = (&'a SymbolicSupernodalCholesky<usize>, &'a [f64]);
+use super::sweep::{Columns, Split, Supernode};
+use super::symmetric::DenseSymmetric;
 
 /// Entries of a product from which its dense kernels gain from threads.
 const LEAST_WORK_FOR_THREADS: usize = 1 << 22;
-
-/// One supernode: its columns of L, and the rows below them.
-struct Supernode<'a> {
-    begin: usize,
-    width: usize,
-    pattern: &'a [usize],
-    /// Columns of `width + pattern.len()` rows; what stands above the diagonal is not read.
-    values: &'a [f64],
-}
-
-impl<'a> Supernode<'a> {
-    fn new((structure, values): Columns<'a>, s: usize) -> Self {
-        let (begin, start) = (structure.supernode_begin()[s], structure.col_ptr_for_val());
-        Self {
-            begin,
-            width: structure.supernode_end()[s] - begin,
-            pattern: structure.supernode(s).pattern(),
-            values: &values[start[s]..start[s + 1]],
-        }
-    }
-
-    fn rows(&self) -> usize {
-        self.width + self.pattern.len()
-    }
-
-    /// Column `c` from the diagonal down.
-    fn column(&self, c: usize) -> &'a [f64] {
-        &self.values[c * self.rows() + c..(c + 1) * self.rows()]
-    }
-}
 
 /// The supernodes that a set of rows reaches, in elimination order.
 pub struct Reach {
@@ -100,40 +68,19 @@ impl Reach {
 
     /// x ← L⁻¹ x where x is zero but for the rows of the set.
     pub fn forward(&self, l: Columns<'_>, x: &mut [f64]) {
-        let mut front = Vec::new();
+        let base = x.len();
+        let (mut x, mut front) = (Split { own: x, origin: 0, above: &mut [][..], base }, vec![]);
         for &s in &self.supernodes {
-            let node = Supernode::new(l, s);
-            let own = node.begin..node.begin + node.width;
-            front.clear();
-            front.extend_from_slice(&x[own.clone()]);
-            front.resize(node.rows(), 0.0);
-            for c in 0..node.width {
-                let column = node.column(c);
-                front[c] /= column[0];
-                let weight = -front[c];
-                add_scaled(&column[1..], weight, &mut front[c + 1..]);
-            }
-            x[own].copy_from_slice(&front[..node.width]);
-            for (&row, v) in node.pattern.iter().zip(&front[node.width..]) {
-                x[row] += v;
-            }
+            Supernode::new(l, s).forward(&mut x, &mut front);
         }
     }
 
     /// x ← L⁻ᵀ x on the reach; the rest of x stays as it is.
     pub fn backward(&self, l: Columns<'_>, x: &mut [f64]) {
-        let mut front = Vec::new();
+        let base = x.len();
+        let (mut x, mut front) = (Split { own: x, origin: 0, above: &[][..], base }, vec![]);
         for &s in self.supernodes.iter().rev() {
-            let node = Supernode::new(l, s);
-            let own = node.begin..node.begin + node.width;
-            front.clear();
-            front.extend_from_slice(&x[own.clone()]);
-            front.extend(node.pattern.iter().map(|&row| x[row]));
-            for c in (0..node.width).rev() {
-                let column = node.column(c);
-                front[c] = (front[c] - dot(&column[1..], &front[c + 1..])) / column[0];
-            }
-            x[own].copy_from_slice(&front[..node.width]);
+            Supernode::new(l, s).backward(&mut x, &mut front);
         }
     }
 
@@ -244,36 +191,7 @@ fn places_in(child: &[usize], begin: usize, width: usize, pattern: &[usize]) -> 
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
-    use crate::blocks::BlockMatrix;
-    use crate::cholesky::Symbolic;
-
-    /// A grid of nodes coupled to their neighbours: positive definite, with 3×3 blocks that differ.
-    fn grid(n: usize) -> BlockMatrix {
-        let (mut start, mut columns) = (vec![0], Vec::new());
-        for j in 0..n * n {
-            let (r, c) = (j / n, j % n);
-            let near = |a: usize, b: usize| a.abs_diff(r) <= 1 && b.abs_diff(c) <= 1;
-            columns.extend((0..n * n).filter(|k| near(k / n, k % n)).map(|k| k as u32));
-            start.push(columns.len());
-        }
-        let mut matrix = BlockMatrix::from_pattern(start, columns);
-        for j in 0..n * n {
-            for at in matrix.row_start[j]..matrix.row_start[j + 1] {
-                let k = matrix.columns[at] as usize;
-                let (low, high) = (j.min(k), j.max(k));
-                let mut block = [0, 1, 2, 3, 4, 5, 6, 7, 8]
-                    .map(|e| -1.0 / 3.0 + 0.1 * ((low * 31 + high * 7 + e) as f64).sin());
-                if j > k {
-                    block = [0, 3, 6, 1, 4, 7, 2, 5, 8].map(|e: usize| block[e]);
-                }
-                if j == k {
-                    block = [11.0, 0.5, 0.2, 0.5, 12.0, -0.3, 0.2, -0.3, 13.0];
-                }
-                matrix.blocks[at] = block;
-            }
-        }
-        matrix
-    }
+    use super::super::{Symbolic, grid::grid};
 
     #[test]
     fn sweeps_through_the_reach_equal_whole_solves() {

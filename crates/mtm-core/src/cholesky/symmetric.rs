@@ -2,12 +2,15 @@
 
 use std::ops::Range;
 
-use faer::MatMut;
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt;
+use faer::linalg::matmul::triangular::{self, BlockStructure};
+use faer::linalg::triangular_inverse::invert_lower_triangular;
+use faer::{Accum, Mat, MatMut, MatRef};
 use rayon::prelude::*;
 
 use super::workspace::parallelism;
+use crate::simd::{Kernel, widest};
 
 /// Parts of a product that threads may share: fixed, so that the bits do not depend on the threads.
 const PARTS: usize = 16;
@@ -57,6 +60,7 @@ impl DenseSymmetric {
     }
 
     /// Column `c` from the diagonal down.
+    #[inline(always)]
     pub fn column(&self, c: usize) -> &[f64] {
         &self.values[c * self.size + c..(c + 1) * self.size]
     }
@@ -94,15 +98,7 @@ impl DenseSymmetric {
 
     /// Adds what `columns` bring to A x; `x` and `y` begin at the first of them.
     fn add_columns(&self, columns: Range<usize>, x: &[f64], y: &mut [f64]) {
-        let first = columns.start;
-        for c in columns {
-            let column = self.column(c);
-            let (x, y) = (&x[c - first..], &mut y[c - first..]);
-            let weight = x[0];
-            y[0] += column[0] * weight;
-            let below = dot_and_add(&column[1..], &x[1..], weight, &mut y[1..]);
-            y[0] += below;
-        }
+        widest(AddColumns { matrix: self, columns, x, y });
     }
 
     /// The Cholesky factor; the row of the first pivot that is not positive on failure.
@@ -126,7 +122,58 @@ impl DenseSymmetric {
     }
 }
 
+/// Some columns of a product.
+struct AddColumns<'a> {
+    matrix: &'a DenseSymmetric,
+    columns: Range<usize>,
+    x: &'a [f64],
+    y: &'a mut [f64],
+}
+
+impl Kernel for AddColumns<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        let first = self.columns.start;
+        for c in self.columns {
+            let column = self.matrix.column(c);
+            let (x, y) = (&self.x[c - first..], &mut self.y[c - first..]);
+            let weight = x[0];
+            y[0] += column[0] * weight;
+            let below = dot_and_add(&column[1..], &x[1..], weight, &mut y[1..]);
+            y[0] += below;
+        }
+    }
+}
+
 impl DenseFactor {
+    /// The lower triangle of `values`, `size` columns of `size` entries.
+    pub(super) fn from_lower(size: usize, values: Vec<f64>) -> Self {
+        Self { size, values }
+    }
+
+    /// A⁻¹ = L⁻ᵀ L⁻¹: for many products, each of which reads it once where a solution reads L twice.
+    pub fn inverse(&self) -> DenseSymmetric {
+        let size = self.size;
+        let par = parallelism(size);
+        let lower = MatRef::from_column_major_slice(&self.values, size, size);
+        let mut inverse = Mat::<f64>::zeros(size, size);
+        invert_lower_triangular(inverse.as_mut(), lower, par);
+        let mut values = vec![0.0; size * size];
+        triangular::matmul(
+            MatMut::from_column_major_slice_mut(&mut values, size, size),
+            BlockStructure::TriangularLower,
+            Accum::Replace,
+            inverse.as_ref().transpose(),
+            BlockStructure::TriangularUpper,
+            inverse.as_ref(),
+            BlockStructure::TriangularLower,
+            1.0,
+            par,
+        );
+        DenseSymmetric { size, values }
+    }
+
     /// Bytes held.
     pub fn bytes(&self) -> usize {
         8 * self.values.len()
@@ -150,6 +197,7 @@ impl DenseFactor {
 }
 
 /// aᵀx.
+#[inline(always)]
 pub(super) fn dot(a: &[f64], x: &[f64]) -> f64 {
     let mut sums = [0.0; LANES];
     let (a_lanes, a_rest) = a.as_chunks::<LANES>();
@@ -164,6 +212,7 @@ pub(super) fn dot(a: &[f64], x: &[f64]) -> f64 {
 }
 
 /// Adds `weight · a` to `y`.
+#[inline(always)]
 pub(super) fn add_scaled(a: &[f64], weight: f64, y: &mut [f64]) {
     for (y, a) in y.iter_mut().zip(a) {
         *y += weight * a;
@@ -171,6 +220,7 @@ pub(super) fn add_scaled(a: &[f64], weight: f64, y: &mut [f64]) {
 }
 
 /// Adds `weight · a` to `y` and gives aᵀx, in one pass over `a`.
+#[inline(always)]
 fn dot_and_add(a: &[f64], x: &[f64], weight: f64, y: &mut [f64]) -> f64 {
     let mut sums = [0.0; LANES];
     let (a_lanes, a_rest) = a.as_chunks::<LANES>();
