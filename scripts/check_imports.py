@@ -137,8 +137,12 @@ CORE: Mapping[str, frozenset[str]] = {
             "restraint solution"
         ),
         "equilibrium": (
-            "blocks boundary cholesky constraints contact iterative krylov mesh method multigrid "
+            "blocks cholesky constraints contact iterative krylov mesh method multigrid "
             "reduction solution strain_energy tensors"
+        ),
+        "equilibrium/sliding": (
+            "boundary contact equilibrium iterative mesh method reduction restraint solution "
+            "strain_energy system"
         ),
         "statics": (
             "blocks boundary contact equilibrium iterative kinematics mesh method reduction "

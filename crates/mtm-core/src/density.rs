@@ -169,7 +169,8 @@ pub(crate) fn volumetric(f: &Matrix3<f64>, kinematics: Kinematics) -> Volumetric
     Volumetric { value: polar.stretch.sum() - 3.0, slope: polar.rotation() }
 }
 
-/// `tangent` without its negative eigenvalues (Teran et al. 2005).
+/// `tangent` with the sizes of its eigenvalues: steps along negative curvature stay as short as along
+/// positive of that size, where leaving it out (Teran et al. 2005) lets them leap (Chen et al. 2024).
 ///
 /// Most points have none: a factor of it with a trifle added shows that, and that sum is then the answer.
 pub(crate) fn definite(tangent: Tangent) -> Tangent {
@@ -184,9 +185,9 @@ pub(crate) fn definite(tangent: Tangent) -> Tangent {
     }
     let eigen = SymmetricEigen::new(symmetric);
     let mut out = Tangent::zeros();
-    for i in (0..9).filter(|&i| eigen.eigenvalues[i] > 0.0) {
+    for i in 0..9 {
         let mode = eigen.eigenvectors.column(i);
-        out += mode * mode.transpose() * eigen.eigenvalues[i];
+        out += mode * mode.transpose() * eigen.eigenvalues[i].abs();
     }
     out
 }

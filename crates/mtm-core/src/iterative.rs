@@ -34,12 +34,19 @@ pub(crate) struct Effort {
 /// What the solves of one plan leave to the next, whose constraints differ a little.
 #[derive(Default)]
 pub(crate) struct Trail {
-    /// Displacements of the rows; none before the first solve.
+    /// Displacements of the rows; none before the first solve, unless some are known to be near.
     pub rows: Vec<[f64; 3]>,
     /// What the solves showed of the spectrum.
     seen: Spectrum,
-    /// Length that the tolerance refers to, mm.
-    reach: f64,
+    /// Length that the tolerance refers to, mm; none before the first solve.
+    reach: Option<f64>,
+}
+
+impl Trail {
+    /// A trail that begins at displacements of the rows, or at none.
+    pub fn starting(rows: Vec<[f64; 3]>) -> Self {
+        Self { rows, ..Self::default() }
+    }
 }
 
 /// A system without a factor: the matrix and a multigrid hierarchy for it.
@@ -143,10 +150,8 @@ impl Iterative {
         if is_zero(b) {
             return Ok((vec![[0.0; 3]; b.len()], true));
         }
-        if trail.rows.is_empty() {
-            trail.reach = self.reach(b, scale);
-        }
-        let reach = constraints.iter().fold(trail.reach, |m, c| m.max(c.offset.abs()));
+        let reach = *trail.reach.get_or_insert_with(|| self.reach(b, scale));
+        let reach = constraints.iter().fold(reach, |m, c| m.max(c.offset.abs()));
         let tolerance = self.tolerance * reach;
         if self.sweeps {
             let mut system = projected(&self.matrix, constraints);

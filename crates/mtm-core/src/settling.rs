@@ -32,12 +32,16 @@ const SLIGHT_TURN: f64 = 0.5;
 impl Sliding {
     /// Runs the outer loop for `motions` (one per segment), solving with `solve`.
     ///
+    /// `begin`: where contact was for the same motions and a body a little different; from where the nodes
+    /// would be if they clung to their segment if none.
+    ///
     /// # Errors
     /// `ContactCycle` where closest points or the set of held nodes do not settle, `ContactSurface`
     /// where a node ends past the border of its surface, whatever `solve` reports.
     pub fn settle(
         &self,
         motions: &[&Motion],
+        begin: Option<&ContactState>,
         options: &ContactOptions,
         interrupted: &(dyn Fn() -> bool + Sync),
         mut solve: impl FnMut(&Constraints<'_>) -> Result<Response>,
@@ -45,12 +49,20 @@ impl Sliding {
         let surfaces = self.moved_surfaces(motions)?;
         let n = self.nodes.len();
         let limit = options.tolerance * self.diagonal;
-        let (start, seats) = self.carried(motions, &surfaces);
+        let (mut start, seats) = self.carried(motions, &surfaces);
+        let mut forces = vec![0.0_f64; n];
+        if let Some(begin) = begin {
+            for (place, (x, u)) in
+                start.iter_mut().zip(self.positions.iter().zip(&begin.displacements))
+            {
+                *place = add(*x, *u);
+            }
+            forces.clone_from(&begin.forces);
+        }
         let mut walls: Vec<Walls> =
             self.feet(&surfaces, &seats, &start).into_iter().map(Walls::new).collect();
         let mut held = Held::new(n, options.mode);
         let rounding = self.force_rounding();
-        let mut forces = vec![0.0_f64; n];
         let mut anderson = Anderson::new(n);
         let edges = surfaces.iter().map(MovedSurface::mean_edge).filter(|&edge| edge > 0.0);
         let reach = edges.fold(f64::INFINITY, f64::min);

@@ -39,13 +39,14 @@ pub struct Solution {
     /// Cholesky ten times the error with which the factor recovered a known solution. Against the exact
     /// solution of K as stored: what rounding K itself costs is not in it.
     pub error_bound: f64,
-    /// Iterations of the linear solver (0 for Cholesky), over all contact iterations.
+    /// Iterations of the linear solver (0 for Cholesky), over all contact iterations; with large deformation
+    /// Newton's steps.
     pub iterations: usize,
     /// Residual measure of each linear iteration.
     pub residual_history: Vec<f64>,
     /// Contact at the sliding nodes.
     pub contact: ContactResult,
-    /// Outer iterations of the contact loop.
+    /// Outer iterations of the contact loop, over all of Newton's steps.
     pub contact_iterations: usize,
     /// Seconds by stage.
     pub timings: Timings,

@@ -6,14 +6,14 @@ use std::sync::Arc;
 use crate::blocks::{Block, BlockMatrix};
 use crate::boundary::{Boundary, Motion, NodeKind, Plan};
 use crate::contact::{ContactState, Sliding};
-use crate::equilibrium::Equilibrium;
+use crate::equilibrium::{Equilibrium, Slide};
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
 use crate::iterative::Effort;
 use crate::kinematics::Kinematics;
 use crate::mesh::{dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
 use crate::reduction::{NO_ROW, Reduction};
-use crate::restraint;
+use crate::restraint::{self, Held};
 use crate::solution::{Clock, ContactResult, Solution, Timings};
 use crate::system::{Frozen, System};
 use crate::tensors::MassTensors;
@@ -29,6 +29,7 @@ pub struct StaticSolver {
     pub(crate) reduction: Reduction,
     pub(crate) sliding: Option<Sliding>,
     mechanics: Mechanics,
+    held: Held,
     /// Coupling of unknown rows with joined nodes: (row, node, tensor).
     couplings: Vec<(u32, u32, Block)>,
     timings: Timings,
@@ -114,6 +115,7 @@ impl StaticSolver {
             reduction,
             sliding,
             mechanics,
+            held,
             couplings,
             timings: clock.laps,
         })
@@ -285,14 +287,24 @@ impl StaticSolver {
     ) -> Result<(Vec<[f64; 3]>, Option<ContactState>, f64)> {
         let found = match (&self.mechanics, &self.sliding) {
             (Mechanics::LargeRotation(body), sliding) => {
-                let sliding = sliding.as_ref().map(|s| (s, motions));
-                body.solve(&self.reduction, u, loads, sliding, scale, effort, interrupted)
+                let slide =
+                    sliding.as_ref().map(|sliding| Slide { sliding, motions, held: self.held });
+                body.solve(&self.reduction, u, loads, slide.as_ref(), scale, effort, interrupted)
             }
             (Mechanics::Linear(system), None) => {
                 system.solve(b, scale, effort, interrupted).map(|u| (u, None, 0.0))
             }
             (Mechanics::Linear(system), Some(sliding)) => system
-                .solve_with_contact(b, sliding, motions, &self.options, scale, effort, interrupted)
+                .solve_with_contact(
+                    b,
+                    sliding,
+                    motions,
+                    None,
+                    &self.options,
+                    scale,
+                    effort,
+                    interrupted,
+                )
                 .map(|(u, state, seconds)| (u, Some(state), seconds)),
         };
         found.map_err(|e| by_node(e, &self.reduction.unknowns))

@@ -22,7 +22,7 @@ const NODES_PER_TASK: usize = 256;
 pub enum TangentKind {
     /// The second derivatives of the energy.
     Exact,
-    /// Without the negative curvature of single points: positive semi-definite, with smaller steps.
+    /// With negative curvature of single points taken as positive: semi-definite, with smaller steps.
     Definite,
 }
 

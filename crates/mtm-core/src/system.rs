@@ -46,6 +46,13 @@ pub(crate) struct System {
     kept: Kept,
 }
 
+/// Where a solve with contact starts: the end of one for the same motions and a body a little different.
+pub(crate) struct Begin<'a> {
+    /// Displacements of the rows.
+    pub rows: &'a [[f64; 3]],
+    pub contact: &'a ContactState,
+}
+
 /// Contact constraints that do not change, for several right-hand sides.
 pub(crate) struct Frozen<'a> {
     /// Sliding node and normal of each constraint.
@@ -154,6 +161,7 @@ impl System {
         b: &[[f64; 3]],
         sliding: &Sliding,
         motions: &[&Motion],
+        begin: Option<Begin<'_>>,
         options: &StaticOptions,
         scale: f64,
         effort: &mut Effort,
@@ -164,11 +172,12 @@ impl System {
             ContactMode::Bilateral => STEP_SHARE,
             ContactMode::Unilateral => LIFTING_STEP_SHARE,
         };
+        let (first, rows) = begin.map_or((None, &[][..]), |b| (Some(b.contact), b.rows));
         if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
             let mut x = symbolic.permuted(b);
             symbolic.forward(factor, &mut x);
             let mut answers = contact.answers(symbolic, factor, &x);
-            let state = sliding.settle(motions, &options.contact, interrupted, |c| {
+            let state = sliding.settle(motions, first, &options.contact, interrupted, |c| {
                 answers.respond(c, share, options.contact.tolerance)
             })?;
             answers.add_forces(&mut x, &pushes(&state.normals, &state.forces));
@@ -178,9 +187,9 @@ impl System {
             effort.error_bound = direct_error(factor, &x);
             return Ok((x, state, seconds));
         }
-        let mut trail = Trail::default();
+        let mut trail = Trail::starting(rows.to_vec());
         let share = Some(share);
-        let state = sliding.settle(motions, &options.contact, interrupted, |c| {
+        let state = sliding.settle(motions, first, &options.contact, interrupted, |c| {
             self.solve_projected(b, sliding, c, scale, share, &mut trail, effort, interrupted)
         })?;
         Ok((trail.rows, state, clock.total()))

@@ -4,10 +4,11 @@
 //! whose points have lost their negative curvature; so every step goes downhill. Sliding constraints n·u = g
 //! are kept by projection, as in the linear system.
 
+mod sliding;
+
 use std::sync::Arc;
 
 use crate::blocks::BlockMatrix;
-use crate::boundary::Motion;
 use crate::cholesky::Symbolic;
 use crate::constraints::{
     Constraint, add_offsets, along_normals, orthonormal, projected, projected_rhs,
@@ -24,6 +25,8 @@ use crate::solution::Clock;
 use crate::strain_energy::StrainEnergy;
 use crate::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::tensors::MassTensors;
+
+pub(crate) use sliding::Slide;
 
 /// Newton steps after which a share of the plan counts as too large.
 const MAX_STEPS: usize = 40;
@@ -152,7 +155,7 @@ impl Equilibrium {
         reduction: &Reduction,
         prescribed: &[[f64; 3]],
         loads: Option<&[[f64; 3]]>,
-        sliding: Option<(&Sliding, &[&Motion])>,
+        slide: Option<&Slide<'_>>,
         scale: f64,
         effort: &mut Effort,
         interrupted: Interrupt<'_>,
@@ -161,11 +164,22 @@ impl Equilibrium {
         let target =
             |constraints, springs| Target { prescribed, loads, constraints, springs, scale };
         let mut u = vec![[0.0; 3]; prescribed.len()];
-        let Some((sliding, motions)) = sliding else {
+        let Some(slide) = slide else {
             u = self.follow(reduction, u, &target(vec![], vec![]), effort, interrupted)?;
             return Ok((reduction.rows(&u), None, 0.0));
         };
-        let state = sliding.settle(motions, &self.options.contact, interrupted, |c| {
+        match self.slide(reduction, &target(vec![], vec![]), slide, effort, interrupted) {
+            Ok((u, state)) => return Ok((reduction.rows(&u), Some(state), clock.total())),
+            // Too far for one go: shares of the way for every set of normals.
+            Err(
+                MtmError::NotConverged { .. }
+                | MtmError::NotPositiveDefinite { .. }
+                | MtmError::ContactCycle { .. },
+            ) => {}
+            Err(error) => return Err(error),
+        }
+        let Slide { sliding, motions, .. } = slide;
+        let state = sliding.settle(motions, None, &self.options.contact, interrupted, |c| {
             let (asked, springs) = on_rows(sliding, c);
             let target = target(orthonormal(&asked), springs);
             let begin = std::mem::take(&mut u);
@@ -274,12 +288,12 @@ impl Equilibrium {
                 effort.error_bound = length + allowed;
                 return Ok(moved_by(reduction, &pose.u, &step, 1.0));
             }
-            pose = self.search(reduction, pose, target, &step, slope)?;
+            pose = self.search(reduction, pose, target, &step, slope, 0.0)?;
         }
         Err(self.lost(length, target.scale))
     }
 
-    /// The state at the end of `step`, shortened until it lies downhill.
+    /// The state at the end of `step`, shortened until it lies downhill but for `slack`, N mm.
     fn search(
         &self,
         reduction: &Reduction,
@@ -287,12 +301,13 @@ impl Equilibrium {
         target: &Target<'_>,
         step: &[[f64; 3]],
         slope: f64,
+        slack: f64,
     ) -> Result<Pose> {
         let mut share = 1.0;
         while share >= SHORTEST {
             let next = self.pose(reduction, moved_by(reduction, &pose.u, step, share), target)?;
             let rounding = ENERGY_ROUNDING * pose.size.max(next.size);
-            if next.merit <= pose.merit + DESCENT * share * slope + rounding {
+            if next.merit <= pose.merit + DESCENT * share * slope + slack + rounding {
                 return Ok(next);
             }
             share *= 0.5;
