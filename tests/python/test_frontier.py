@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import cmfsim
 from cmfsim.bench import (
     FACTORS,
+    SKIN,
     WHOLE,
     Spread,
     frontier_page,
@@ -26,6 +27,7 @@ from cmfsim.bench import frontier as bench_frontier
 from cmfsim.bench import frontier_run as bench
 from cmfsim.bench.measure import run_job
 from cmfsim.bench.rows import FrontierRow, with_front
+from cmfsim.bench.sweep import EARLY
 from cmfsim.cli import main
 from cmfsim.cli.bench_command import SCRIPTS
 from cmfsim.errors import CaseInputError
@@ -104,8 +106,16 @@ def test_a_sweep_has_the_grid_and_each_factor_by_itself():
     alone = {next(iter(names)) for names in changed if len(names) == 1}
     assert alone >= set(FACTORS) - {"tolerance"}
     for choice, names in zip(choices, changed, strict=True):
-        # The direct factor has no tolerance.
-        assert "tolerance" not in names or choice.method == "pcg"
+        # The direct factor has no tolerance; Newton's method has one whatever solves its steps.
+        large = choice.kinematics != "linear"
+        assert "tolerance" not in names or large or choice.method == "pcg"
+        assert names - {"kinematics", "tolerance"} or choice.tolerance in {base.tolerance, *EARLY}
+    early = {(c.kinematics, c.tolerance) for c in choices if c.tolerance in EARLY}
+    assert early == {(k, t) for k in ("corotational", "hyperelastic") for t in EARLY} | {
+        ("linear", 1e-2)
+    }
+    few = sweep_choices(base, edges=[6.0], kinematics=["linear"], factors={"tolerance": (1e-4,)})
+    assert {c.kinematics for c in few} == {"linear"}
     with pytest.raises(CaseInputError, match="'poisson' is unknown"):
         sweep_choices(base, factors={"poisson": (0.3,)})
     with pytest.raises(CaseInputError, match="p9"):
@@ -207,6 +217,7 @@ def test_the_error_is_the_distance_of_independent_predictions(case, swept):
     on_tissue = moved[1][1] <= 2.0
     apart = np.linalg.norm(moved[0][0] - moved[1][0], axis=1)[on_tissue]
     assert found.n_points == on_tissue.sum()
+    assert found.base.error[SKIN] == found.base.error[WHOLE]
     assert found.base.error[WHOLE].mean == pytest.approx(apart.mean(), rel=1e-9)
     assert found.base.error[WHOLE].max == pytest.approx(apart.max(), rel=1e-9)
 

@@ -18,24 +18,26 @@ from cmfsim.evaluation import (
 from cmfsim.io.archives import member_of, read_archive, write_archive
 from cmfsim.model import PatientModel
 
-__all__ = ["WHOLE", "read_points", "skin_errors", "skin_points", "write_points"]
+__all__ = ["SKIN", "WHOLE", "read_points", "skin_errors", "skin_points", "write_points"]
 
 Regions = dict[str, NDArray[np.bool_]]
 
 POINTS_FORMAT = "cmfsim-bench-points"
-# All points together; with landmarks on the skin it is the face.
+# The region that figures speak of: by landmarks on the skin, without them all points.
 WHOLE = "face"
-# Points on the face at most: beyond, figures do not change any more.
+# All points: the skin of the simulated tissue, the face and what lies round it.
+SKIN = "skin"
+# Points at most: beyond, figures do not change any more.
 MOST_POINTS = 20_000
-# Without landmarks: points up to this far from the mesh's skin are on the tissue, mm.
+# Points up to this far from the mesh's skin are on the tissue, mm.
 ON_TISSUE = 2.0
 
 
 def skin_points(patient: PatientModel) -> tuple[Floats, Regions]:
-    """Points of a patient's skin in the region of the face, and which lie in each region.
+    """Points of the skin of a patient's simulated tissue, and which lie in each region of the face.
 
     They are vertices of the detailed face, so that they are the same however the tissue is meshed.
-    Without all of the skin's landmarks the face is what covers the simulated tissue, in one part.
+    Without all of the skin's landmarks the face is all of them, in one part.
 
     Raises
     ------
@@ -51,16 +53,17 @@ def skin_points(patient: PatientModel) -> tuple[Floats, Regions]:
         )
     vertices = np.asarray(face.vertices)
     landmarks = patient.landmarks.get("skin", {})
+    on_tissue = _on_tissue(patient, vertices)
+    regions = {WHOLE: on_tissue}
     if set(SKIN_LANDMARKS) <= set(landmarks):
         regions = skin_regions(vertices, landmarks)
-    else:
-        regions = {WHOLE: _on_tissue(patient, vertices)}
-    chosen = np.flatnonzero(regions[WHOLE])
-    if not len(chosen):
+    regions = {**regions, SKIN: on_tissue | regions[WHOLE]}
+    if not regions[WHOLE].any():
         raise CaseInputError(
             f"{patient.name}: no point of the skin lies on the face: are the skin landmarks in the "
             "frame of the image?"
         )
+    chosen = np.flatnonzero(regions[SKIN])
     chosen = chosen[:: -(-len(chosen) // MOST_POINTS)]
     return vertices[chosen], {name: inside[chosen] for name, inside in regions.items()}
 

@@ -26,6 +26,8 @@ FACTORS: Mapping[str, tuple[Any, ...]] = MappingProxyType(
         "model": MODELS,
     }
 )
+# Tolerances at which Newton's method is stopped early, over the largest motion.
+EARLY = (1e-1, 1e-2)
 # A reference is sampled beyond what the sweep tells apart. Its tolerances are the base's: 1e-8 of
 # the largest motion is a hundred-thousandth of the errors in question.
 REFERENCE_SAMPLES = 256
@@ -71,7 +73,8 @@ def sweep_choices(
         With `edges` the grid.
     factors : mapping of str to sequence
         Values of each attribute of `Choice` that is varied by itself. `tolerance` is that of
-        iterative methods: it is varied with `method="pcg"`.
+        iterative methods: it is varied with `method="pcg"`, and with it kinematics of large
+        deformation are stopped early.
 
     Returns
     -------
@@ -98,6 +101,7 @@ def sweep_choices(
         base,
         *_grid(base, edges, elements, kinematics),
         *(choice for name, values in factors.items() for choice in _varied(base, name, values)),
+        *(_early(base, kinematics) if "tolerance" in factors else ()),
     ]
     return list(dict.fromkeys(choices))
 
@@ -117,3 +121,11 @@ def _varied(base: Choice, name: str, values: Sequence[Any]) -> Iterator[Choice]:
         yield base
     for value in values:
         yield replace(base, **{name: value})
+
+
+def _early(base: Choice, kinematics: Sequence[str]) -> Iterator[Choice]:
+    """Large deformation that stops early: what the last steps mend is a few tets, not the face."""
+    for name in kinematics:
+        if name != "linear":
+            for tolerance in EARLY:
+                yield replace(base, kinematics=name, tolerance=tolerance)
