@@ -23,6 +23,7 @@ from cmfsim.build.inputs import (
 )
 from cmfsim.build.motions import planned_bones
 from cmfsim.build.postoperative import Postoperative
+from cmfsim.build.refinement import GAP_REFINEMENTS, allowed_halvings, needed_halvings
 from cmfsim.build.skin_part import on_skin
 from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, ImageData, NodeKinds
 from cmfsim.checks import Floats
@@ -36,7 +37,6 @@ from cmfsim.meshing import (
     mesh_findings,
     mesh_from_level,
     mesh_report,
-    near_skin,
     part_mesh,
     report_of_part,
     tissue_level,
@@ -62,11 +62,6 @@ Progress = Callable[[str], None]
 
 # Bodies of tissue below this volume are specks between bones, mm³.
 LEAST_BODY = 1000.0
-# Depth below the skin to which thin tissue is refined, mm: lips, nose and lids, not the walls of
-# the nasal cavity.
-THIN_DEPTH = 12.0
-# Halvings of the edge at gaps between skin and skin: lips a millimetre apart stay two.
-GAP_REFINEMENTS = 2
 # A head ends in a cut, not a crown, where its cross-section near the end is above this share of the
 # largest, and above the other share of that twice as far in: under a crown they grow with depth.
 CUT_SHARE = 0.15
@@ -352,14 +347,13 @@ def _mesh(
         mesh = TetMesh(*read_tet_mesh(case.mesh.file))
         report = mesh_report(mesh)
         return mesh, report, mesh_findings(report)
-    options = MeshOptions(
-        edge_length=case.mesh.edge_length,
-        refinements=GAP_REFINEMENTS if case.mesh.refine else 0,
-        least_body=LEAST_BODY,
-    )
-    allowed = near_skin(anatomy, THIN_DEPTH).astype(np.uint8)
-    allowed[anatomy.skin.values <= 0.0] = GAP_REFINEMENTS
-    made = mesh_from_level(level, options, allowed=allowed)
+    options = MeshOptions(case.mesh.edge_length, refinements=0, least_body=LEAST_BODY)
+    allowed = needed = None
+    if case.mesh.refine:
+        options = replace(options, refinements=GAP_REFINEMENTS)
+        allowed = allowed_halvings(anatomy)
+        needed = needed_halvings(level, anatomy)
+    made = mesh_from_level(level, options, allowed=allowed, needed=needed)
     if case.mesh.parting is None:
         return made.mesh, made.report, made.findings
     units, frame = ("mm", "LPS")
