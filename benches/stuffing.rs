@@ -14,7 +14,7 @@ use mtm_core::Surface;
 use mtm_core::signed_distance::signed_distance;
 use mtm_core::stuffing::distance::squared_distance;
 use mtm_core::stuffing::level::{Grid, LevelImage};
-use mtm_core::stuffing::{StuffingOptions, stuff};
+use mtm_core::stuffing::{Halvings, StuffingOptions, stuff};
 
 /// The image of the claim: 200 × 130 × 180 voxels of 1 mm.
 const SHAPE: [usize; 3] = [200, 130, 180];
@@ -40,21 +40,25 @@ fn meshing(c: &mut Criterion) {
     group.sample_size(10);
     for refinements in [0, 1] {
         let options = StuffingOptions { edge_length: 3.0, refinements, least_body: 0.0 };
-        let made = stuff(&level, &options, None).expect("a mesh").mesh;
+        let made = stuff(&level, &options, &Halvings::default()).expect("a mesh").mesh;
         println!("refinements {refinements}: {} tets", made.n_tets());
         group.bench_function(format!("labels to tets, {refinements} refinements"), |b| {
             b.iter(|| {
                 let level = LevelImage::from_labels(grid, &inside).expect("a level");
-                black_box(stuff(&level, &options, None).expect("a mesh"))
+                black_box(stuff(&level, &options, &Halvings::default()).expect("a mesh"))
             });
         });
     }
     group.bench_function("distance transform", |b| {
         b.iter(|| black_box(squared_distance(&grid, f32::INFINITY, |i| !inside[i])));
     });
-    let mesh = stuff(&level, &StuffingOptions { refinements: 0, ..Default::default() }, None)
-        .expect("a mesh")
-        .mesh;
+    let mesh = stuff(
+        &level,
+        &StuffingOptions { refinements: 0, ..Default::default() },
+        &Halvings::default(),
+    )
+    .expect("a mesh")
+    .mesh;
     let surface = Surface::new(mesh.nodes().to_vec(), mesh.boundary_triangles());
     let surface = surface.expect("a surface");
     println!("surface: {} triangles", surface.triangles().len());

@@ -442,6 +442,7 @@ def stuff_image(
     refinements: int,
     least_body: float,
     allowed: ArrayLike | None = None,
+    needed: ArrayLike | None = None,
 ) -> tuple[TetMesh, dict[str, float]]: ...
 def distance_image(
     targets: ArrayLike, spacing: tuple[float, float, float], *, within: float = ...

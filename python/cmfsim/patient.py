@@ -219,7 +219,7 @@ class CaseMesh:
     ----------
     edge_length : float, mm
     refine : bool
-        Smaller tets where tissue is thin.
+        Smaller tets where tissue is thin, and at the mouth.
     parting : Path or None
         A surface that parts the lips where the image or skin shows them as one.
     cleft : float, mm

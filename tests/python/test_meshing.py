@@ -107,6 +107,26 @@ def test_a_sheet_thinner_than_the_edge_is_kept_by_refinement():
             cmfsim.mesh_from_level(sheet, options or cmfsim.MeshOptions(4.0, 2), allowed=allowed)
 
 
+def test_tets_are_small_where_it_is_needed_and_nothing_is_thin():
+    level = ball()
+    upper = np.broadcast_to(level.axes()[2] > 2.0, level.values.shape)
+    options = cmfsim.MeshOptions(4.0, refinements=1)
+    made = cmfsim.mesh_from_level(level, options, needed=upper.astype(np.uint8))
+    lengths, heights = edges_and_heights(made.mesh)
+    whole, _ = edges_and_heights(cmfsim.mesh_from_level(level, options).mesh)
+    assert lengths[heights > 6.0].mean() == pytest.approx(0.5 * whole.mean(), rel=0.1)
+    assert lengths[heights < -4.0].mean() == pytest.approx(whole.mean(), rel=0.1)
+    assert made.report.min_dihedral >= LEAST
+
+
+def edges_and_heights(mesh):
+    """The mean edge of each tet, and the height of its centroid."""
+    corners = np.asarray(mesh.nodes)[np.asarray(mesh.tets)]
+    pairs = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    edges = [np.linalg.norm(corners[:, a] - corners[:, b], axis=1) for a, b in pairs]
+    return np.mean(edges, axis=0), corners[:, :, 2].mean(axis=1)
+
+
 def test_lips_with_a_gap_between_them_are_two_bodies():
     """A gap of 1.5 mm at an edge of 4 mm; closed, they are one."""
     grid = cmfsim.ImageData(np.zeros((49, 37, 49), np.float32), (0.5,) * 3, (-12, -9, -12))
@@ -245,6 +265,13 @@ def test_a_level_that_is_not_finite_or_holds_nothing_is_named():
         cmfsim.mesh_from_level(ball().with_values(np.full_like(ball().values, -1.0)))
     with pytest.raises(ValueError, match="allowed"):
         cmfsim.mesh_from_level(ball(), allowed=np.ones((2, 2, 2), dtype=bool))
+    with pytest.raises(ValueError, match="needed"):
+        cmfsim.mesh_from_level(ball(), needed=np.ones((2, 2, 2), dtype=bool))
+    twice = np.full(ball().values.shape, 2)
+    with pytest.raises(cmfsim.MeshError, match=r"needed refinements\[0\] is 2: .*allow more"):
+        cmfsim.mesh_from_level(ball(), cmfsim.MeshOptions(refinements=1), needed=twice)
+    with pytest.raises(cmfsim.MeshError, match="needed has real numbers"):
+        cmfsim.mesh_from_level(ball(), needed=np.full(twice.shape, 0.5))
     with pytest.raises(ValueError, match="least_body"):
         cmfsim.MeshOptions(least_body=-1.0)
 

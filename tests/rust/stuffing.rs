@@ -3,7 +3,7 @@
 use mtm_core::parting::part;
 use mtm_core::signed_distance::signed_distance;
 use mtm_core::stuffing::level::{Grid, LevelImage};
-use mtm_core::stuffing::{Stuffed, StuffingOptions, stuff};
+use mtm_core::stuffing::{Halvings, Stuffed, StuffingOptions, stuff};
 use mtm_core::{MtmError, Surface, TetMesh};
 use proptest::prelude::*;
 
@@ -60,7 +60,7 @@ fn a_ball_has_its_volume_and_its_surface() {
     // A sphere of radius r is met to h²/8r by chords of length h.
     let level = ball(20.0);
     let Stuffed { mesh, boundary_error_mean, boundary_error_max, level_volume, .. } =
-        stuff(&level, &options(3.0, 1), None).expect("a mesh");
+        stuff(&level, &options(3.0, 1), &Halvings::default()).expect("a mesh");
     let exact = 4.0 / 3.0 * std::f64::consts::PI * 20.0_f64.powi(3);
     assert!((volume(&mesh) / exact - 1.0).abs() < 0.01, "volume {}", volume(&mesh));
     assert!((level_volume / exact - 1.0).abs() < 0.002, "level volume {level_volume}");
@@ -74,7 +74,7 @@ fn a_ball_has_its_volume_and_its_surface() {
 fn the_volume_error_falls_with_the_square_of_the_edge() {
     let level = ball(20.0);
     let error = |edge: f64| {
-        let mesh = stuff(&level, &options(edge, 0), None).expect("a mesh").mesh;
+        let mesh = stuff(&level, &options(edge, 0), &Halvings::default()).expect("a mesh").mesh;
         (volume(&mesh) / (4.0 / 3.0 * std::f64::consts::PI * 8000.0) - 1.0).abs()
     };
     let (coarse, fine) = (error(6.0), error(3.0));
@@ -90,7 +90,8 @@ fn a_lattice_of_one_size_keeps_the_bound_of_the_paper_on_noise() {
         s - s.floor() - 0.5
     });
     for refinements in 0..2 {
-        let mesh = stuff(&level, &options(3.0, refinements), None).expect("a mesh").mesh;
+        let mesh =
+            stuff(&level, &options(3.0, refinements), &Halvings::default()).expect("a mesh").mesh;
         assert!(least_dihedral(&mesh) >= 10.7, "{}", least_dihedral(&mesh));
         assert_conforming(&mesh);
     }
@@ -100,7 +101,9 @@ fn a_lattice_of_one_size_keeps_the_bound_of_the_paper_on_noise() {
 fn a_sheet_thinner_than_the_edge_is_kept_by_refinement_and_lost_without() {
     let sheet = image(50, 1.0, |x| 1.0 - (radius(x, CENTRE) - 18.0).abs());
     let exact = 4.0 / 3.0 * std::f64::consts::PI * (19.0_f64.powi(3) - 17.0_f64.powi(3));
-    let share = |r| volume(&stuff(&sheet, &options(3.0, r), None).expect("a mesh").mesh) / exact;
+    let share = |r| {
+        volume(&stuff(&sheet, &options(3.0, r), &Halvings::default()).expect("a mesh").mesh) / exact
+    };
     assert!(share(0) < 0.5);
     assert!((share(1) - 1.0).abs() < 0.02, "{}", share(1));
 }
@@ -109,7 +112,7 @@ fn a_sheet_thinner_than_the_edge_is_kept_by_refinement_and_lost_without() {
 fn a_gap_thinner_than_the_edge_parts_two_bodies() {
     // Two half balls, one voxel apart: the lips of a face.
     let lips = image(50, 1.0, |x| (18.0 - radius(x, CENTRE)).min((x[2] - CENTRE[2]).abs() - 0.7));
-    let made = stuff(&lips, &options(3.0, 2), None).expect("a mesh");
+    let made = stuff(&lips, &options(3.0, 2), &Halvings::default()).expect("a mesh");
     let upper = made.mesh.nodes().iter().map(|x| x[2] > CENTRE[2]).collect::<Vec<_>>();
     let bridging =
         made.mesh.tets().iter().filter(|t| {
@@ -120,6 +123,10 @@ fn a_gap_thinner_than_the_edge_parts_two_bodies() {
     assert_conforming(&made.mesh);
 }
 
+fn at_most(allowed: &[u8]) -> Halvings<'_> {
+    Halvings { allowed: Some(allowed), needed: None }
+}
+
 #[test]
 fn only_what_is_allowed_is_refined() {
     let sheets = image(60, 1.0, |x| {
@@ -127,7 +134,7 @@ fn only_what_is_allowed_is_refined() {
         sheet(15.2).max(sheet(44.7))
     });
     let allowed: Vec<u8> = (0..216_000).map(|i| u8::from(i % 60 < 30)).collect();
-    let mesh = stuff(&sheets, &options(3.0, 1), Some(&allowed)).expect("a mesh").mesh;
+    let mesh = stuff(&sheets, &options(3.0, 1), &at_most(&allowed)).expect("a mesh").mesh;
     let volume_of = |low: bool| -> f64 {
         let at = |t: &[u32; 4]| (mesh.nodes()[t[0] as usize][2] < 30.0) == low;
         mesh.tets().iter().zip(mesh.volumes()).filter(|(t, _)| at(t)).map(|(_, v)| v).sum()
@@ -135,8 +142,42 @@ fn only_what_is_allowed_is_refined() {
     let exact = std::f64::consts::PI * 24.0_f64.powi(2) * 2.0;
     assert!(volume_of(true) > 0.95 * exact, "{}", volume_of(true));
     assert!(volume_of(false) < 0.6 * exact, "{}", volume_of(false));
-    let short = stuff(&sheets, &options(3.0, 1), Some(&allowed[1..]));
+    let short = stuff(&sheets, &options(3.0, 1), &at_most(&allowed[1..]));
     assert!(matches!(short, Err(MtmError::Length { .. })));
+}
+
+#[test]
+fn what_needs_it_is_refined_where_nothing_is_thin() {
+    let level = ball(20.0);
+    let needed: Vec<u8> = (0..125_000).map(|i| if i % 50 >= 30 { 2 } else { 0 }).collect();
+    let at_least = |needed: &[u8], refinements| {
+        let halvings = Halvings { allowed: None, needed: Some(needed) };
+        stuff(&level, &options(4.0, refinements), &halvings)
+    };
+    let mesh = at_least(&needed, 2).expect("a mesh").mesh;
+    let one_size = stuff(&level, &options(4.0, 0), &Halvings::default()).expect("a mesh").mesh;
+    let mean_volume = |mesh: &TetMesh, low: f64, high: f64| {
+        let at =
+            |t: &[u32; 4]| t.iter().all(|&v| (low..high).contains(&mesh.nodes()[v as usize][2]));
+        let inside = mesh.tets().iter().zip(mesh.volumes()).filter(|(t, _)| at(t));
+        let (sum, count) = inside.fold((0.0, 0), |(sum, n), (_, volume)| (sum + volume, n + 1));
+        sum / f64::from(count)
+    };
+    let upper = mean_volume(&one_size, 31.0, 50.0) / mean_volume(&mesh, 31.0, 50.0);
+    let lower = mean_volume(&one_size, 0.0, 20.0) / mean_volume(&mesh, 0.0, 20.0);
+    assert!((55.0..75.0).contains(&upper), "a quarter of the edge, 1/{upper} of the volume");
+    assert!((0.99..1.01).contains(&lower), "untouched, 1/{lower} of the volume");
+    assert!(least_dihedral(&mesh) >= 10.0, "{}", least_dihedral(&mesh));
+    assert_conforming(&mesh);
+
+    let short = at_least(&needed[1..], 2);
+    assert!(matches!(short, Err(MtmError::Length { .. })));
+    let first = needed.iter().position(|&n| n > 1).expect("one that needs two");
+    let two_of_one = at_least(&needed, 1).expect_err("two are needed, one is allowed");
+    assert!(matches!(
+        two_of_one,
+        MtmError::OutOfRange { index, value: 2.0, .. } if index == first
+    ));
 }
 
 #[test]
@@ -169,7 +210,7 @@ fn every_voxel_of_a_label_image_keeps_its_side() {
 fn tissue_ends_where_its_image_ends() {
     let grid = Grid::new([10, 10, 10], [1.0; 3], [0.0; 3]).expect("a grid");
     let level = LevelImage::from_labels(grid, &[true; 1000]).expect("a level");
-    let mesh = stuff(&level, &options(2.0, 0), None).expect("a mesh").mesh;
+    let mesh = stuff(&level, &options(2.0, 0), &Halvings::default()).expect("a mesh").mesh;
     assert!((volume(&mesh) / 1000.0 - 1.0).abs() < 0.05, "{}", volume(&mesh));
     assert_conforming(&mesh);
 }
@@ -181,9 +222,13 @@ fn specks_go_and_bodies_stay() {
             [([20.0, 20.0, 20.0], 12.0), ([45.0, 45.0, 45.0], 8.0), ([45.0, 15.0, 45.0], 3.0)];
         balls.iter().map(|&(c, r)| r - radius(x, c)).fold(f64::NEG_INFINITY, f64::max)
     });
-    let all = stuff(&level, &options(3.0, 0), None).expect("a mesh");
+    let all = stuff(&level, &options(3.0, 0), &Halvings::default()).expect("a mesh");
     assert_eq!(all.dropped.parts, 0);
-    let kept = stuff(&level, &StuffingOptions { least_body: 500.0, ..options(3.0, 0) }, None);
+    let kept = stuff(
+        &level,
+        &StuffingOptions { least_body: 500.0, ..options(3.0, 0) },
+        &Halvings::default(),
+    );
     let kept = kept.expect("a mesh");
     assert_eq!(kept.dropped.parts, 1);
     assert!((volume(&all.mesh) - volume(&kept.mesh) - kept.dropped.volume).abs() < 1e-9);
@@ -196,7 +241,7 @@ fn the_mesh_has_the_same_bits_for_any_number_of_threads() {
     });
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
-        pool.install(|| stuff(&level, &options(3.0, 2), None).expect("a mesh").mesh)
+        pool.install(|| stuff(&level, &options(3.0, 2), &Halvings::default()).expect("a mesh").mesh)
     };
     let (one, three) = (run(1), run(3));
     assert_eq!(one.nodes(), three.nodes());
@@ -206,7 +251,7 @@ fn the_mesh_has_the_same_bits_for_any_number_of_threads() {
 #[test]
 fn the_signed_distance_of_a_surface_is_that_of_brute_force() {
     let surface = {
-        let mesh = stuff(&ball(15.0), &options(4.0, 0), None).expect("a mesh").mesh;
+        let mesh = stuff(&ball(15.0), &options(4.0, 0), &Halvings::default()).expect("a mesh").mesh;
         Surface::new(mesh.nodes().to_vec(), mesh.boundary_triangles()).expect("a surface")
     };
     let grid = Grid::new([25, 24, 26], [2.0, 2.1, 1.9], [0.0; 3]).expect("a grid");
@@ -225,7 +270,7 @@ fn the_signed_distance_of_a_surface_is_that_of_brute_force() {
 fn a_parting_surface_parts_the_mesh_and_leaves_its_rim_joined() {
     let grid = Grid::new([20, 20, 20], [1.0; 3], [0.0; 3]).expect("a grid");
     let level = LevelImage::from_labels(grid, &[true; 8000]).expect("a level");
-    let mesh = stuff(&level, &options(3.0, 0), None).expect("a mesh").mesh;
+    let mesh = stuff(&level, &options(3.0, 0), &Halvings::default()).expect("a mesh").mesh;
     let sheet = |to: f64| {
         let corners = vec![[-5.0, -5.0, 9.3], [to, -5.0, 9.3], [to, 25.0, 9.3], [-5.0, 25.0, 9.3]];
         Surface::new(corners, vec![[0, 1, 2], [0, 2, 3]]).expect("a sheet")
@@ -278,15 +323,24 @@ fn bad_input_is_named() {
     values[5] = f32::NAN;
     assert!(matches!(LevelImage::new(grid, values), Err(MtmError::NotFinite { index: 5, .. })));
     let empty = LevelImage::new(grid, vec![-1.0; 64]).expect("a level");
-    assert!(matches!(stuff(&empty, &options(3.0, 0), None), Err(MtmError::Empty { .. })));
+    assert!(matches!(
+        stuff(&empty, &options(3.0, 0), &Halvings::default()),
+        Err(MtmError::Empty { .. })
+    ));
     let level = LevelImage::new(grid, vec![1.0; 64]).expect("a level");
     for bad in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e-4] {
         assert!(
-            matches!(stuff(&level, &options(bad, 0), None), Err(MtmError::OutOfRange { .. })),
+            matches!(
+                stuff(&level, &options(bad, 0), &Halvings::default()),
+                Err(MtmError::OutOfRange { .. })
+            ),
             "{bad}"
         );
     }
-    assert!(matches!(stuff(&level, &options(3.0, 9), None), Err(MtmError::OutOfRange { .. })));
+    assert!(matches!(
+        stuff(&level, &options(3.0, 9), &Halvings::default()),
+        Err(MtmError::OutOfRange { .. })
+    ));
 }
 
 proptest! {
@@ -302,7 +356,7 @@ proptest! {
         let level = image(32, 1.0, |x| {
             centres.iter().zip(&radii).map(|(&c, r)| r - radius(x, c)).fold(f64::NEG_INFINITY, f64::max)
         });
-        if let Ok(Stuffed { mesh, .. }) = stuff(&level, &options(edge, refinements), None) {
+        if let Ok(Stuffed { mesh, .. }) = stuff(&level, &options(edge, refinements), &Halvings::default()) {
             prop_assert!(least_dihedral(&mesh) >= 10.0, "{}", least_dihedral(&mesh));
             assert_conforming(&mesh);
         }

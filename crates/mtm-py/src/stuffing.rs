@@ -7,7 +7,7 @@ use mtm_core::parting::part;
 use mtm_core::signed_distance::signed_distance;
 use mtm_core::stuffing::distance::squared_distance;
 use mtm_core::stuffing::level::{Grid, LevelImage};
-use mtm_core::stuffing::{Stuffed, StuffingOptions, stuff};
+use mtm_core::stuffing::{Halvings, Stuffed, StuffingOptions, stuff};
 use numpy::PyArray3;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -22,12 +22,13 @@ const MESH: ErrorKind = ErrorKind::Mesh;
 /// Mesh of the tissue in a label image or inside a level image, and a dict of what its making says.
 ///
 /// `values`: (nx, ny, nz); bool or whole numbers are labels (non-zero is tissue), real numbers a level
-/// (positive inside). `spacing`, `origin`: (3,) mm. `allowed`: (nx, ny, nz), how often the edge may be
-/// halved there; `refinements` times if none. The dict has `dropped_parts`, `dropped_volume` (mm³),
+/// (positive inside). `spacing`, `origin`: (3,) mm. `allowed`, `needed`: (nx, ny, nz), how often the edge may
+/// be halved for what is thin there (`refinements` times if none), and how often it is at least (0 if none).
+/// The dict has `dropped_parts`, `dropped_volume` (mm³),
 /// `dropped_tets`, `level_volume` (mm³), `boundary_error_mean` and `boundary_error_max` (mm).
 #[pyfunction]
 #[pyo3(signature = (
-    values, spacing, edge_length, origin, *, refinements, least_body, allowed = None
+    values, spacing, edge_length, origin, *, refinements, least_body, allowed = None, needed = None
 ))]
 #[allow(clippy::too_many_arguments)] // as many as its Python caller names
 pub fn stuff_image<'py>(
@@ -39,12 +40,13 @@ pub fn stuff_image<'py>(
     refinements: u32,
     least_body: f64,
     allowed: Option<&Bound<'py, PyAny>>,
+    needed: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<(PyTetMesh, Bound<'py, PyDict>)> {
     let image = arrays::image(values, Named("image", MESH))?;
-    let allowed = match allowed {
-        Some(counts) => Some(arrays::counts(counts, Named("allowed", MESH))?),
-        None => None,
+    let counts = |value: Option<&Bound<'py, PyAny>>, name| {
+        value.map(|value| arrays::counts(value, Named(name, MESH))).transpose()
     };
+    let (allowed, needed) = (counts(allowed, "allowed")?, counts(needed, "needed")?);
     let options = StuffingOptions { edge_length, refinements, least_body };
     let made: Stuffed = interruptible(py, move |_| {
         let level = match image {
@@ -55,7 +57,8 @@ pub fn stuff_image<'py>(
                 LevelImage::new(Grid::new(shape, spacing, origin)?, values)?
             }
         };
-        stuff(&level, &options, allowed.as_deref())
+        let halvings = Halvings { allowed: allowed.as_deref(), needed: needed.as_deref() };
+        stuff(&level, &options, &halvings)
     })?;
     let report = PyDict::new(py);
     report.set_item("dropped_parts", made.dropped.parts)?;

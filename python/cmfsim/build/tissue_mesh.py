@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import TetMesh
+from cmfsim.build.refinement import GAP_REFINEMENTS, allowed_halvings, needed_halvings
 from cmfsim.case import Anatomy, Finding, ImageData
 from cmfsim.checks import Floats
 from cmfsim.io import Case, read_surface, read_tet_mesh
@@ -17,7 +18,6 @@ from cmfsim.meshing import (
     mesh_findings,
     mesh_from_level,
     mesh_report,
-    near_skin,
     part_mesh,
 )
 
@@ -25,11 +25,6 @@ __all__ = ["end_planes", "region_of", "tissue_mesh"]
 
 # Bodies of tissue below this volume are specks between bones, mm³.
 LEAST_BODY = 1000.0
-# Depth below the skin to which thin tissue is refined, mm: lips, nose and lids, not the walls of
-# the nasal cavity.
-THIN_DEPTH = 12.0
-# Halvings of the edge at gaps between skin and skin: lips a millimetre apart stay two.
-GAP_REFINEMENTS = 2
 # A head ends in a cut, not a crown, where its cross-section near the end is above this share of the
 # largest, and above the other share of that twice as far in: under a crown they grow with depth.
 CUT_SHARE = 0.15
@@ -87,14 +82,13 @@ def tissue_mesh(
         mesh = TetMesh(*read_tet_mesh(case.mesh.file))
         report = mesh_report(mesh)
         return mesh, report, mesh_findings(report)
-    options = MeshOptions(
-        edge_length=case.mesh.edge_length,
-        refinements=GAP_REFINEMENTS if case.mesh.refine else 0,
-        least_body=LEAST_BODY,
-    )
-    allowed = near_skin(anatomy, THIN_DEPTH).astype(np.uint8)
-    allowed[anatomy.skin.values <= 0.0] = GAP_REFINEMENTS
-    made = mesh_from_level(level, options, allowed=allowed)
+    options = MeshOptions(case.mesh.edge_length, refinements=0, least_body=LEAST_BODY)
+    allowed = needed = None
+    if case.mesh.refine:
+        options = replace(options, refinements=GAP_REFINEMENTS)
+        allowed = allowed_halvings(anatomy)
+        needed = needed_halvings(level, anatomy)
+    made = mesh_from_level(level, options, allowed=allowed, needed=needed)
     if case.mesh.parting is None:
         return made.mesh, made.report, made.findings
     units, frame = ("mm", "LPS")

@@ -128,7 +128,11 @@ def mesh_from_labels(
 
 
 def mesh_from_level(
-    level: ImageData, options: MeshOptions | None = None, *, allowed: ArrayLike | None = None
+    level: ImageData,
+    options: MeshOptions | None = None,
+    *,
+    allowed: ArrayLike | None = None,
+    needed: ArrayLike | None = None,
 ) -> TissueMesh:
     """The tets inside a level image, with the report of their quality.
 
@@ -140,6 +144,9 @@ def mesh_from_level(
     allowed : (nx, ny, nz) array of whole numbers, optional
         How often the edge may be halved for what is thin at each voxel; as often as the options
         say if left out.
+    needed : (nx, ny, nz) array of whole numbers, optional
+        How often it is halved at least, thin or not, in the cube that holds each voxel's centre:
+        no more often than the options say.
 
     Returns
     -------
@@ -148,7 +155,8 @@ def mesh_from_level(
     Raises
     ------
     MeshError
-        (also `ValueError`) No tissue, NaN or infinity, tissue too thin for any tet.
+        (also `ValueError`) No tissue, NaN or infinity, tissue too thin for any tet, more halvings
+        needed than the options allow.
 
     Examples
     --------
@@ -161,7 +169,7 @@ def mesh_from_level(
     """
     options = options or MeshOptions()
     values = np.asarray(level.values, dtype=np.float32)
-    mesh, making = _stuffed(values, level.spacing, level.origin, options, allowed)
+    mesh, making = _stuffed(values, level.spacing, level.origin, options, allowed, needed)
     report = mesh_report(mesh, making)
     return TissueMesh(mesh, report, mesh_findings(report))
 
@@ -204,6 +212,7 @@ def _stuffed(
     origin: ArrayLike,
     options: MeshOptions,
     allowed: ArrayLike | None = None,
+    needed: ArrayLike | None = None,
 ) -> tuple[TetMesh, dict[str, float]]:
     steps = np.asarray(spacing, dtype=np.float64)
     steps = np.full(3, steps) if steps.ndim == 0 else steps
@@ -217,4 +226,5 @@ def _stuffed(
         refinements=options.refinements,
         least_body=options.least_body,
         allowed=allowed,
+        needed=needed,
     )

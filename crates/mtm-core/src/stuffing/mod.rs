@@ -55,6 +55,15 @@ impl Default for StuffingOptions {
     }
 }
 
+/// How often the edge is halved at each voxel of a level image, in the order of its values.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Halvings<'a> {
+    /// At most, for what is thin there; as the options say if none.
+    pub allowed: Option<&'a [u8]>,
+    /// At least, thin or not, in the cubes that hold the voxel's centre; not at all if none.
+    pub needed: Option<&'a [u8]>,
+}
+
 /// A mesh with what its making left out and how near it came to its level.
 #[derive(Debug, Clone)]
 pub struct Stuffed {
@@ -74,28 +83,18 @@ pub struct Stuffed {
 
 /// The mesh of `level`, with dihedral angles of at least 10°.
 ///
-/// `allowed`: how often the edge may be halved for what is thin at each voxel; as the options say if none.
-///
 /// # Errors
-/// Options out of range, no tissue in the image, or none that the lattice catches, an edge length so small
-/// that the lattice has no end.
+/// Options or halvings out of range, no tissue in the image, or none that the lattice catches, an edge
+/// length so small that the lattice has no end.
 pub fn stuff(
     level: &LevelImage,
     options: &StuffingOptions,
-    allowed: Option<&[u8]>,
+    halvings: &Halvings<'_>,
 ) -> Result<Stuffed> {
     check(options)?;
-    if let Some(allowed) = allowed.filter(|a| a.len() != level.values().len()) {
-        return Err(MtmError::Length {
-            what: "allowed refinements".into(),
-            found: allowed.len(),
-            expected: level.values().len(),
-            why: "one per voxel of the level image",
-            kind: ErrorKind::Mesh,
-        });
-    }
+    check_halvings(halvings, level.values().len(), options.refinements)?;
     let cover = Cover::new(level, options)?;
-    let lattice = Lattice::new(&cover.tree(level, options, allowed));
+    let lattice = Lattice::new(&cover.tree(level, options, halvings));
     let mut stuffed = cut(&lattice, level, cover.origin, cover.unit);
     drop(lattice);
     if stuffed.tets.is_empty() {
@@ -182,6 +181,32 @@ fn check(options: &StuffingOptions) -> Result<()> {
     Ok(())
 }
 
+fn check_halvings(halvings: &Halvings<'_>, n_voxels: usize, refinements: u32) -> Result<()> {
+    let kind = ErrorKind::Mesh;
+    for (what, counts) in [("allowed", halvings.allowed), ("needed", halvings.needed)] {
+        if let Some(counts) = counts.filter(|counts| counts.len() != n_voxels) {
+            return Err(MtmError::Length {
+                what: format!("{what} refinements"),
+                found: counts.len(),
+                expected: n_voxels,
+                why: "one per voxel of the level image",
+                kind,
+            });
+        }
+    }
+    let needed = halvings.needed.unwrap_or_default();
+    if let Some(index) = needed.iter().position(|&count| u32::from(count) > refinements) {
+        return Err(MtmError::OutOfRange {
+            what: "needed refinements".into(),
+            index,
+            value: f64::from(needed[index]),
+            allowed: "0 to the refinements of the options: ask for fewer there or allow more",
+            kind,
+        });
+    }
+    Ok(())
+}
+
 /// Coarse cubes over the inside of an image.
 struct Cover {
     origin: [f64; 3],
@@ -213,12 +238,12 @@ impl Cover {
         Ok(Self { origin, counts: counts.map(|c| c as usize), edge, unit })
     }
 
-    /// The octree over the cubes near tissue, refined where tissue or a gap in it is thin.
+    /// The octree over the cubes near tissue, refined where tissue or a gap in it is thin or it is needed.
     fn tree(
         &self,
         level: &LevelImage,
         options: &StuffingOptions,
-        allowed: Option<&[u8]>,
+        halvings: &Halvings<'_>,
     ) -> Octree {
         let active = self.active(level);
         let mut tree = Octree::new(self.counts, options.refinements, &active);
@@ -226,6 +251,11 @@ impl Cover {
             return tree;
         }
         let grid = level.grid();
+        for (index, &count) in halvings.needed.unwrap_or_default().iter().enumerate() {
+            if count > 0 {
+                tree.refine(self.place(grid.centre(index)), tree.coarse_size() >> count);
+            }
+        }
         let values = level.values();
         // The longest edge asks farthest.
         let most = core_squared(grid, THIN_RADIUS * self.edge);
@@ -242,7 +272,8 @@ impl Cover {
             for squared in [&to_outside, &to_inside] {
                 let thin = thin_parts(grid, squared, THIN_RADIUS * edge, THIN_SLACK);
                 let may = |index: &usize| {
-                    thin[*index] && allowed.is_none_or(|a| u32::from(a[*index]) > refinement)
+                    thin[*index]
+                        && halvings.allowed.is_none_or(|a| u32::from(a[*index]) > refinement)
                 };
                 for index in (0..grid.len()).filter(may) {
                     self.refine_round(&mut tree, grid.centre(index), 0.5 * edge, size);
@@ -256,12 +287,14 @@ impl Cover {
     /// Refines the cubes at a point and at the corners of a box round it.
     fn refine_round(&self, tree: &mut Octree, point: [f64; 3], reach: f64, size: i32) {
         for corner in 0..8 {
-            let place = [0, 1, 2].map(|a| {
-                let side = if corner >> a & 1 == 1 { reach } else { -reach };
-                ((point[a] + side - self.origin[a]) / self.unit).floor() as i32
-            });
-            tree.refine(place, size);
+            let side = [0, 1, 2].map(|a| if corner >> a & 1 == 1 { reach } else { -reach });
+            tree.refine(self.place(add(point, side)), size);
         }
+    }
+
+    /// The unit cube that holds a point.
+    fn place(&self, point: [f64; 3]) -> [i32; 3] {
+        [0, 1, 2].map(|a| ((point[a] - self.origin[a]) / self.unit).floor() as i32)
     }
 
     /// Whether each cube, or one beside it, holds a voxel inside or next to one.
