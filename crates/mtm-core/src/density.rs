@@ -169,11 +169,14 @@ pub(crate) fn volumetric(f: &Matrix3<f64>, kinematics: Kinematics) -> Volumetric
     Volumetric { value: polar.stretch.sum() - 3.0, slope: polar.rotation() }
 }
 
-/// `tangent` with the sizes of its eigenvalues: steps along negative curvature stay as short as along
-/// positive of that size, where leaving it out (Teran et al. 2005) lets them leap (Chen et al. 2024).
+/// `tangent` without negative curvature: steps along it downhill.
+///
+/// Hyperelastic points keep its size, so that steps stay as short along it as along positive curvature (Chen et
+/// al. 2024), where without it they leap. Corotational points lose it (Teran et al. 2005): theirs is of turns
+/// that lie far from rest, and short steps would not come to their end.
 ///
 /// Most points have none: a factor of it with a trifle added shows that, and that sum is then the answer.
-pub(crate) fn definite(tangent: Tangent) -> Tangent {
+pub(crate) fn definite(tangent: Tangent, kinematics: Kinematics) -> Tangent {
     // The eigenvalue iteration would not end.
     if tangent.iter().any(|x| !x.is_finite()) {
         return tangent;
@@ -186,8 +189,10 @@ pub(crate) fn definite(tangent: Tangent) -> Tangent {
     let eigen = SymmetricEigen::new(symmetric);
     let mut out = Tangent::zeros();
     for i in 0..9 {
-        let mode = eigen.eigenvectors.column(i);
-        out += mode * mode.transpose() * eigen.eigenvalues[i].abs();
+        let (mode, value) = (eigen.eigenvectors.column(i), eigen.eigenvalues[i]);
+        let kept =
+            if kinematics == Kinematics::Hyperelastic { value.abs() } else { value.max(0.0) };
+        out += mode * mode.transpose() * kept;
     }
     out
 }

@@ -22,7 +22,7 @@ const NODES_PER_TASK: usize = 256;
 pub enum TangentKind {
     /// The second derivatives of the energy.
     Exact,
-    /// With negative curvature of single points taken as positive: semi-definite, with smaller steps.
+    /// Without the negative curvature of single points: positive semi-definite, with smaller steps.
     Definite,
 }
 
@@ -162,8 +162,10 @@ impl StrainEnergy {
                 self.gradients(t, u)
                     .map(|f| {
                         let tangent = density.tangent(&f, self.kinematics, pressure);
-                        let kept =
-                            if kind == TangentKind::Definite { definite(tangent) } else { tangent };
+                        let kept = match kind {
+                            TangentKind::Definite => definite(tangent, self.kinematics),
+                            TangentKind::Exact => tangent,
+                        };
                         kept * weight
                     })
                     .collect()
