@@ -89,9 +89,10 @@ def _head(found: Frontier) -> str:
     ]
     verdict = f"is {' and '.join(verdicts)}" if verdicts else "has no solution"
     return (
-        f"Error: |u − u_ref| at {found.n_points} points of the patient's skin, mm, mean, P95 and max "
-        f"over the face; the reference moves the face by {found.moved:.2f} mm on average. The base "
-        f"(the case's own settings) {verdict}. Time: build is one run from the files to the scene; solve is the median of "
+        f"Error: |u − u_ref| at {found.n_points} points of the patient's skin, mm; mean, P95 and "
+        f"max over the face, which the reference moves by {found.moved:.2f} mm on average. The "
+        f"base (the case's own settings) {verdict}. Time: build is one run from the files to the "
+        "scene; solve is the median of "
         "rounds that were interleaved, with the least and the most; “times base” is taken within "
         "each round. CPU and peak memory are those of the solve. The front: no other choice is as "
         f"near in as little time.\n\n{machine['processor']}, {machine['threads']} threads, "
