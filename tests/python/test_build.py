@@ -16,7 +16,7 @@ import pytest
 
 import cmfsim
 import phantom_case
-from cmfsim.build import case_model
+from cmfsim.build import case_model, tissue_mesh
 from cmfsim.cli import main
 from cmfsim.io import models
 from head_case import HeadCase
@@ -660,7 +660,7 @@ def test_a_crown_is_no_cut_and_a_cut_is(truth):
     whole = whole[whole > 0]
     for every in (1, 2):
         areas, spacing = whole[::every], 2.0 * every
-        assert case_model._is_cut(areas, spacing)
-        assert not case_model._is_cut(areas[::-1], spacing)
+        assert tissue_mesh._is_cut(areas, spacing)
+        assert not tissue_mesh._is_cut(areas[::-1], spacing)
         lower = areas[: -int(35.0 / spacing)]
-        assert case_model._is_cut(lower[::-1], spacing)
+        assert tissue_mesh._is_cut(lower[::-1], spacing)
