@@ -344,6 +344,48 @@ fn sliding_blocks_rest_on_the_moved_plane_with_forces_in_balance() {
     }
 }
 
+/// Nodes that slide over a moved dome: factor and conjugate gradients come to one rest, with forces along the
+/// normals; a solution that was stopped early lies on the dome all the same.
+#[test]
+fn large_deformation_over_a_dome_settles_alike_by_every_method() {
+    let shape = BoxShape { cells: [5, 4, 2], size: [5.0, 4.0, 2.0], jitter: 0.1 };
+    let mesh = shape.mesh();
+    let tissue = layered(&mesh);
+    let (mut vertices, triangles) = plane(24, 12.0, 0.0);
+    for v in &mut vertices {
+        v[2] = -(v[0] * v[0] + v[1] * v[1]) / 40.0;
+    }
+    let dome = surface((vertices, triangles));
+    let bounds = boundary(
+        shape.side(2, true),
+        vec![sliding("dome", shape.side(2, false), &dome, Gap::Rest)],
+    );
+    let tilt = rigid([1.0, 0.3, 0.0], 8.0, [2.5, 2.0, 0.0], [0.3, 0.0, 0.3]);
+    let motion = plan([("dome", Motion::Rigid(tilt))]);
+    for element in ELEMENTS {
+        let tensors = of_element(&mesh, &tissue, element);
+        for kinematics in LARGE {
+            let run = |method, tolerance| {
+                let options = StaticOptions { tolerance, kinematics, ..with_method(method) };
+                let found = solve(&tensors, &bounds, options, &motion, None).unwrap();
+                assert!(found.contact_gap() < 1e-6, "gap {}", found.contact_gap());
+                found
+            };
+            let name = format!("{element:?} {kinematics:?}");
+            let by_factor = run(Method::Cholesky, 1e-8);
+            assert!(by_factor.residual < 1e-7, "{name}: residual {}", by_factor.residual);
+            let moved = largest(&by_factor.displacements);
+            let by_cg = run(Method::Pcg, 1e-8);
+            let apart = largest_difference(&by_factor.displacements, &by_cg.displacements);
+            assert!(apart < 1e-6 * moved, "{name}: {apart} of {moved}");
+            let early = run(Method::Pcg, 0.1);
+            let apart = largest_difference(&by_factor.displacements, &early.displacements);
+            assert!(apart < 0.1 * moved, "{name}: stopped early {apart} of {moved}");
+            assert!(early.iterations < by_cg.iterations, "{name}: stopped no earlier");
+        }
+    }
+}
+
 #[test]
 fn bits_do_not_depend_on_threads() {
     let shape = BoxShape::cube(3);

@@ -26,6 +26,16 @@ pub(crate) struct Slide<'a> {
     pub held: Held,
 }
 
+impl Slide<'_> {
+    /// Largest motion of a sliding node that clings to its segment, mm.
+    fn far(&self) -> Result<f64> {
+        let surfaces = self.sliding.moved_surfaces(self.motions)?;
+        let (carried, _) = self.sliding.carried(self.motions, &surfaces);
+        let moved = carried.iter().zip(&self.sliding.positions).map(|(c, x)| norm(sub(*c, *x)));
+        Ok(moved.fold(0.0, f64::max))
+    }
+}
+
 impl Equilibrium {
     /// The state that `target` asks for with contact settled, from rest.
     ///
@@ -44,7 +54,9 @@ impl Equilibrium {
         for &j in &reduction.unknowns {
             change[j as usize] = [0.0; 3];
         }
-        let first = (Exact, STEP_SHARE * reach(&rest, target));
+        // Walls move the body also where no node is joined to one.
+        let far = slide.far()?.max(reach(&rest, target));
+        let first = (Exact, STEP_SHARE * far);
         let (step, mut contact) = self.settled_step(
             reduction,
             &rest,
@@ -131,7 +143,9 @@ impl Equilibrium {
                 *b = add(*b, f);
             }
             // Closest points settle no nearer than the solves are.
-            let mut options = self.step_options(allowed / reach(pose, target));
+            let far = reach(pose, target);
+            let share = if far > 0.0 { allowed / far } else { STEP_SHARE };
+            let mut options = self.step_options(share);
             let loose = allowed / slide.sliding.diagonal;
             options.contact.tolerance = options.contact.tolerance.max(loose);
             let (system, _) = System::new(
