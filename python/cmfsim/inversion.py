@@ -112,6 +112,6 @@ def inversion_finding(tensors: MassTensors, displacements: ArrayLike) -> tuple[i
         f"{ratios[worst]:.2g} of its volume",
         f"({x:.1f}, {y:.1f}, {z:.1f}) mm before the operation",
         "tissue cannot turn inside out: forces and displacements about these tets are wrong",
-        'take kinematics "hyperelastic", which resists inversion or refuses; a smaller motion; or '
-        "larger tets where bones squeeze a thin layer",
+        "a smaller motion, or larger tets where bones squeeze a thin layer; where kinematics is "
+        '"corotational" also "hyperelastic", which resists longer',
     )
