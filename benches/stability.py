@@ -117,9 +117,7 @@ rest.
   refused. `solve_scene` and `predict` warn of it (`inverted-tets`: how many, which is worst) and
   count them in the summary; after `StaticSolver.solve` look for `tensors.volume_change(u) <= -1`.
 - **contact** in a gutter of 10° across which the body is pushed may find no rest: `ContactError`
-  with the nodes. A body that only walls hold is refused where they leave a motion free. Where such
-  walls carry it along without stress, `result.residual` compares rounding with rounding and is
-  about 1; displacements and `error_bound` are right.
+  with the nodes. A body that only walls hold is refused where they leave a motion free.
 - **relaxation** and **plan_operator** with `corotational` or `hyperelastic`: they are of the linear
   model, and raise `SolverError`. So does a plan that Newton's method does not bring to rest in 64
   parts.
