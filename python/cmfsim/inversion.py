@@ -42,14 +42,15 @@ def least_volume_ratios(tensors: MassTensors, displacements: ArrayLike) -> Float
         return ratios
     tets = np.asarray(tensors.mesh.tets, dtype=np.int64)
     rest = 6.0 * np.asarray(tensors.mesh.volumes)
+    # Of each corner the other three, in the order that keeps the tet's orientation: (m, 4, 3).
+    all_others = tets[:, [(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)]]
+    all_middles = _middles(tensors, tets[:, :, None], all_others)
+    places = tensors.nodes
     for corner in range(4):
-        here = tets[:, corner]
-        # The other three corners in the order that keeps the tet's orientation.
-        others = tets[:, [(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)][corner]]
-        middles = _middles(tensors, here[:, None], others)
+        here, others = tets[:, corner], all_others[:, corner]
         # The quadratic through both ends and the middle of an edge starts with this slope.
-        slopes = -3.0 * u[here][:, None] + 4.0 * u[middles] - u[others]
-        edges = tensors.nodes[others] - tensors.nodes[here][:, None] + slopes
+        slopes = -3.0 * u[here][:, None] + 4.0 * u[all_middles[:, corner]] - u[others]
+        edges = places[others] - places[here][:, None] + slopes
         ratios = np.minimum(ratios, np.linalg.det(edges) / rest)
     return ratios
 
