@@ -10,14 +10,16 @@ use faer::{Accum, Mat, MatMut, MatRef};
 use rayon::prelude::*;
 
 use super::workspace::parallelism;
-use crate::simd::{Kernel, widest};
+use crate::simd::{Kernel, LANES, widest};
 
 /// Parts of a product that threads may share: fixed, so that the bits do not depend on the threads.
 const PARTS: usize = 16;
 /// Rows below which a product is not worth sharing.
 const ROWS_TO_SHARE: usize = 512;
+/// Columns that a product takes at once: one by one it would wait for its own vectors more than for the matrix.
+const COLUMNS_AT_ONCE: usize = 4;
 /// Sums that run side by side in a scalar product: the width of two vector registers.
-const LANES: usize = 8;
+const SUMS: usize = 8;
 
 /// Dense symmetric matrix, lower triangle by columns.
 pub struct DenseSymmetric {
@@ -134,14 +136,36 @@ impl Kernel for AddColumns<'_> {
     type Output = ();
     #[inline(always)]
     fn run(self) {
-        let first = self.columns.start;
-        for c in self.columns {
-            let column = self.matrix.column(c);
-            let (x, y) = (&self.x[c - first..], &mut self.y[c - first..]);
-            let weight = x[0];
-            y[0] += column[0] * weight;
-            let below = dot_and_add(&column[1..], &x[1..], weight, &mut y[1..]);
-            y[0] += below;
+        let Self { matrix, columns, x, y } = self;
+        let (first, mut c) = (columns.start, columns.start);
+        while c + COLUMNS_AT_ONCE <= columns.end {
+            let (x, y) = (&x[c - first..], &mut y[c - first..]);
+            // The triangle at the top of the columns, then the rows that all of them have.
+            for k in 0..COLUMNS_AT_ONCE {
+                let top = &matrix.column(c + k)[..COLUMNS_AT_ONCE - k];
+                y[k] += top[0] * x[k];
+                for (r, a) in (k + 1..).zip(&top[1..]) {
+                    y[k] += a * x[r];
+                    y[r] += a * x[k];
+                }
+            }
+            let below = std::array::from_fn(|k| &matrix.column(c + k)[COLUMNS_AT_ONCE - k..]);
+            let weights = std::array::from_fn(|k| x[k]);
+            let (own, rest) = y.split_at_mut(COLUMNS_AT_ONCE);
+            let sums = dots_and_add(below, &x[COLUMNS_AT_ONCE..], weights, rest);
+            for (y, sum) in own.iter_mut().zip(sums) {
+                *y += sum;
+            }
+            c += COLUMNS_AT_ONCE;
+        }
+        for c in c..columns.end {
+            let column = matrix.column(c);
+            let (x, y) = (&x[c - first..], &mut y[c - first..]);
+            y[0] += column[0] * x[0];
+            for (r, a) in (1..).zip(&column[1..]) {
+                y[0] += a * x[r];
+                y[r] += a * x[0];
+            }
         }
     }
 }
@@ -199,11 +223,11 @@ impl DenseFactor {
 /// aᵀx.
 #[inline(always)]
 pub(super) fn dot(a: &[f64], x: &[f64]) -> f64 {
-    let mut sums = [0.0; LANES];
-    let (a_lanes, a_rest) = a.as_chunks::<LANES>();
-    let (x_lanes, x_rest) = x.as_chunks::<LANES>();
+    let mut sums = [0.0; SUMS];
+    let (a_lanes, a_rest) = a.as_chunks::<SUMS>();
+    let (x_lanes, x_rest) = x.as_chunks::<SUMS>();
     for (a, x) in a_lanes.iter().zip(x_lanes) {
-        for i in 0..LANES {
+        for i in 0..SUMS {
             sums[i] += a[i] * x[i];
         }
     }
@@ -219,24 +243,35 @@ pub(super) fn add_scaled(a: &[f64], weight: f64, y: &mut [f64]) {
     }
 }
 
-/// Adds `weight · a` to `y` and gives aᵀx, in one pass over `a`.
+/// Adds Σ `weights` · `a` to `y` and gives each aᵀx, in one pass over all: x and y are read once for the four.
 #[inline(always)]
-fn dot_and_add(a: &[f64], x: &[f64], weight: f64, y: &mut [f64]) -> f64 {
-    let mut sums = [0.0; LANES];
-    let (a_lanes, a_rest) = a.as_chunks::<LANES>();
+fn dots_and_add(
+    a: [&[f64]; COLUMNS_AT_ONCE],
+    x: &[f64],
+    weights: [f64; COLUMNS_AT_ONCE],
+    y: &mut [f64],
+) -> [f64; COLUMNS_AT_ONCE] {
+    let mut sums = [[0.0; LANES]; COLUMNS_AT_ONCE];
+    let lanes = a.map(|a| a.as_chunks::<LANES>());
     let (x_lanes, x_rest) = x.as_chunks::<LANES>();
     let (y_lanes, y_rest) = y.as_chunks_mut::<LANES>();
-    for ((a, x), y) in a_lanes.iter().zip(x_lanes).zip(y_lanes) {
-        for i in 0..LANES {
-            sums[i] += a[i] * x[i];
-            y[i] += weight * a[i];
+    for (i, (x, y)) in x_lanes.iter().zip(y_lanes).enumerate() {
+        for k in 0..COLUMNS_AT_ONCE {
+            let a = &lanes[k].0[i];
+            for lane in 0..LANES {
+                sums[k][lane] += a[lane] * x[lane];
+                y[lane] += weights[k] * a[lane];
+            }
         }
     }
-    for ((a, x), y) in a_rest.iter().zip(x_rest).zip(y_rest) {
-        sums[0] += a * x;
-        *y += weight * a;
+    for (i, (x, y)) in x_rest.iter().zip(y_rest).enumerate() {
+        for k in 0..COLUMNS_AT_ONCE {
+            let a = lanes[k].1[i];
+            sums[k][0] += a * x;
+            *y += weights[k] * a;
+        }
     }
-    sums.iter().sum()
+    sums.map(|lanes| lanes.iter().sum())
 }
 
 #[cfg(test)]
