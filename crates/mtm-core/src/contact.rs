@@ -33,6 +33,9 @@ pub struct ContactOptions {
     pub mode: ContactMode,
     /// Largest gap over the diagonal of the mesh, and largest tangential share of the contact force.
     pub tolerance: f64,
+    /// Gap that is allowed whatever the tolerance says, and tangential force over the node's own stiffness, mm:
+    /// for a state that is only a step on the way.
+    pub allowed: f64,
     /// Outer iterations after which the loop gives up.
     pub max_iterations: usize,
     /// How far past the border of an open contact surface a node may end, over the surface's mean edge.
@@ -44,6 +47,7 @@ impl Default for ContactOptions {
         Self {
             mode: ContactMode::Bilateral,
             tolerance: 1e-9,
+            allowed: 0.0,
             max_iterations: 100,
             border_reach: 0.25,
         }

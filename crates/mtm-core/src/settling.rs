@@ -48,7 +48,8 @@ impl Sliding {
     ) -> Result<ContactState> {
         let surfaces = self.moved_surfaces(motions)?;
         let n = self.nodes.len();
-        let limit = options.tolerance * self.diagonal;
+        let limit = options.allowed.max(options.tolerance * self.diagonal);
+        let spared = |i: usize| options.allowed * self.stiffness[i];
         let (mut start, seats) = self.carried(motions, &surfaces);
         let mut forces = vec![0.0_f64; n];
         if let Some(begin) = begin {
@@ -99,14 +100,16 @@ impl Sliding {
             let mut gap =
                 (0..n).filter(|&i| held.active[i]).fold(0.0_f64, |m, i| m.max(gaps[i].abs()));
             let mut turned = springs.iter().fold(0.0_f64, |m, s| {
-                m.max(s.stiffness * (dot(s.axis, response.displacements[s.node]) - s.goal).abs())
+                let stretch = dot(s.axis, response.displacements[s.node]) - s.goal;
+                m.max(s.stiffness * stretch.abs() - spared(s.node))
             });
             let mut pushes = vec![Push::default(); n];
             for (row, &force) in rows.iter_mut().zip(&response.forces) {
                 let i = row.node;
                 let foot = &new_feet[i][pushes[i].forces.len()];
                 gap = gap.max(foot.height(reached[i]).abs());
-                turned = turned.max(force.abs() * norm(sub(foot.normal, row.normal)));
+                let turn = force.abs() * norm(sub(foot.normal, row.normal));
+                turned = turned.max(turn - spared(i));
                 row.point = foot.point;
                 pushes[i].add(row.normal, force);
             }

@@ -44,6 +44,11 @@ const STEP_TOLERANCE: f64 = 0.1;
 /// (Dembo, Eisenstat & Steihaug 1982).
 const STEP_SHARE: f64 = 1e-3;
 
+/// Longest step of the search over the full one.
+const LONGEST: f64 = 16.0;
+/// Length of a step, over that at which the exact tangent was not positive definite, from which it is tried
+/// again.
+const RETRY_EXACT: f64 = 0.5;
 /// Length of a step over all displacements, from which conjugate gradients take the exact tangent: at rest
 /// it is positive definite, and on the way they would notice only by chance where it is not.
 const NEAR_REST: f64 = 0.1;
@@ -92,6 +97,22 @@ struct Pose {
     size: f64,
     /// Its slope by each row.
     slope: Vec<[f64; 3]>,
+}
+
+/// A step of Newton's method.
+struct Step {
+    rows: Vec<[f64; 3]>,
+    /// Slope of the merit along it.
+    slope: f64,
+    /// What the merit may rise by all the same, N mm.
+    slack: f64,
+}
+
+impl Step {
+    /// Largest displacement, mm.
+    fn length(&self) -> f64 {
+        self.rows.iter().fold(0.0, |m, v| m.max(norm(*v)))
+    }
 }
 
 impl Equilibrium {
@@ -252,67 +273,120 @@ impl Equilibrium {
             .map(|c| Constraint { offset: part * (c.offset - along(c)), ..*c })
             .collect();
         let allowed = self.allowed(&start, target, f64::INFINITY);
-        let (step, _) = self.step(
-            reduction,
-            &start,
-            target,
-            &constraints,
-            Some(&change),
-            (Exact, allowed),
-            interrupted,
-        )?;
+        let (rows, _) = by_tangent(Exact, |kind| {
+            let change = Some(&change[..]);
+            self.step(reduction, &start, target, &constraints, change, (kind, allowed), interrupted)
+        })?;
         let mut ahead = start.u;
         for (value, d) in ahead.iter_mut().zip(&change) {
             *value = add(*value, *d);
         }
-        let mut pose = self.pose(reduction, moved_by(reduction, &ahead, &step, 1.0), target)?;
+        let pose = self.pose(reduction, moved_by(reduction, &ahead, &rows, 1.0), target)?;
         effort.iterations += 1;
 
         let still: Vec<Constraint> =
             constraints.iter().map(|c| Constraint { offset: 0.0, ..*c }).collect();
+        let step = |pose: &Pose, how: (TangentKind, f64)| {
+            let rows = self.step(reduction, pose, target, &still, None, how, interrupted)?;
+            Ok(Step { slope: along_slope(&rows, pose), slack: 0.0, rows })
+        };
+        self.descend(reduction, pose, target, (f64::INFINITY, &[]), step, effort, interrupted)
+    }
+
+    /// The end of Newton's steps from `pose`, each of which `solve` makes from a pose, the tangent, and the
+    /// error that it may have, mm.
+    ///
+    /// `last`: the error that the last step may have, mm, and the rows that no step carries further than it
+    /// says.
+    fn descend(
+        &self,
+        reduction: &Reduction,
+        mut pose: Pose,
+        target: &Target<'_>,
+        (finest, on_walls): (f64, &[u32]),
+        mut solve: impl FnMut(&Pose, (TangentKind, f64)) -> Result<Step>,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        let by_factor = matches!(self.solver, TangentSolver::Cholesky(_));
+        // Length from which the exact tangent is worth trying.
+        let mut near = if by_factor { f64::INFINITY } else { NEAR_REST * reach(&pose, target) };
         let mut length = f64::INFINITY;
+        // Error of the state once it is small enough and one step as fine as the last one may be is left.
+        let mut ending = None;
         for _ in 0..MAX_STEPS {
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
-            let allowed = self.allowed(&pose, target, length);
-            let near = length <= NEAR_REST * reach(&pose, target);
-            let by_factor = matches!(self.solver, TangentSolver::Cholesky(_));
-            let how = (if near || by_factor { Exact } else { Definite }, allowed);
-            let (step, slope) =
-                self.step(reduction, &pose, target, &still, None, how, interrupted)?;
-            effort.iterations += 1;
-            length = step.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
-            effort.history.push(length);
-            if length + allowed <= self.options.tolerance * reach(&pose, target) {
-                effort.error_bound = length + allowed;
-                return Ok(moved_by(reduction, &pose.u, &step, 1.0));
+            let mut allowed = self.allowed(&pose, target, length);
+            if ending.is_some() {
+                allowed = allowed.min(finest);
             }
-            pose = self.search(reduction, pose, target, &step, slope, 0.0)?;
+            let first = if length <= near { Exact } else { Definite };
+            let (step, kind) = by_tangent(first, |kind| solve(&pose, (kind, allowed)))?;
+            if kind != first {
+                near = RETRY_EXACT * length;
+            }
+            effort.iterations += 1;
+            let before = length;
+            length = step.length();
+            effort.history.push(length);
+            // A tangent that is not the energy's own gains as much each time as the last time.
+            let own = kind == Exact || length == 0.0;
+            let gain = if own { 1.0 } else { 1.0 - (length / before).min(1.0) };
+            let goal = self.options.tolerance * reach(&pose, target);
+            let bound = length / gain + allowed;
+            let bound = ending.filter(|_| length <= goal).unwrap_or(bound);
+            ending = (bound <= goal).then_some(bound);
+            if ending.is_some() && allowed <= finest {
+                effort.error_bound = bound;
+                return Ok(moved_by(reduction, &pose.u, &step.rows, 1.0));
+            }
+            pose = self.search(reduction, pose, target, &step, kind, on_walls)?;
         }
         Err(self.lost(length, target.scale))
     }
 
-    /// The state at the end of `step`, shortened until it lies downhill but for `slack`, N mm.
+    /// The state at the end of `step`, shortened until it lies downhill but for its slack.
+    ///
+    /// Where the tangent is not the energy's own, steps are lengthened as long as that leads further down: a
+    /// curvature whose sign was turned tells how far the energy is to be trusted, not where it ends. Rows
+    /// `on_walls` stay where the step puts them.
     fn search(
         &self,
         reduction: &Reduction,
         pose: Pose,
         target: &Target<'_>,
-        step: &[[f64; 3]],
-        slope: f64,
-        slack: f64,
+        step: &Step,
+        kind: TangentKind,
+        on_walls: &[u32],
     ) -> Result<Pose> {
+        let at = |share: f64| {
+            let mut u = moved_by(reduction, &pose.u, &step.rows, share);
+            for &row in on_walls.iter().filter(|_| share > 1.0) {
+                let j = reduction.unknowns[row as usize] as usize;
+                u[j] = add(pose.u[j], step.rows[row as usize]);
+            }
+            self.pose(reduction, u, target)
+        };
         let mut share = 1.0;
         while share >= SHORTEST {
-            let next = self.pose(reduction, moved_by(reduction, &pose.u, step, share), target)?;
+            let mut next = at(share)?;
             let rounding = ENERGY_ROUNDING * pose.size.max(next.size);
-            if next.merit <= pose.merit + DESCENT * share * slope + slack + rounding {
+            if next.merit <= pose.merit + DESCENT * share * step.slope + step.slack + rounding {
+                while kind == Definite && (1.0..LONGEST).contains(&share) {
+                    share *= 2.0;
+                    let further = at(share)?;
+                    if further.merit >= next.merit - rounding {
+                        break;
+                    }
+                    next = further;
+                }
                 return Ok(next);
             }
             share *= 0.5;
         }
-        Err(self.lost(step.iter().fold(0.0_f64, |m, v| m.max(norm(*v))), target.scale))
+        Err(self.lost(step.length(), target.scale))
     }
 
     /// Error that the next step from `pose` may have, mm, after one of `length`; 0 by a factor.
@@ -361,10 +435,29 @@ impl Equilibrium {
         Ok(Pose { u, merit, size, slope })
     }
 
-    /// Newton step from `pose` on the rows and the slope of the merit along it.
+    /// Tangent system at `pose` on the rows, without constraints and springs: its matrix, and the right-hand
+    /// side where the other nodes go by `change`.
+    fn tangent(
+        &self,
+        reduction: &Reduction,
+        pose: &Pose,
+        kind: TangentKind,
+        change: Option<&[[f64; 3]]>,
+    ) -> Result<(BlockMatrix, Vec<[f64; 3]>)> {
+        let full = self.energy.stiffness(&pose.u, kind)?;
+        let mut b: Vec<[f64; 3]> = pose.slope.iter().map(|&s| scaled(s, -1.0)).collect();
+        if let Some(change) = change {
+            for (b, f) in b.iter_mut().zip(reduction.rows(&full.multiply(change))) {
+                *b = sub(*b, f);
+            }
+        }
+        Ok((reduction.matrix(&full), b))
+    }
+
+    /// Newton step from `pose` on the rows.
     ///
     /// `constraints` say how far each constrained row goes along its normal, `change` how far the other
-    /// nodes go. `how`: the tangent to try first, and the error that the step may have, mm.
+    /// nodes go. `how`: the tangent, and the error that the step may have, mm.
     fn step(
         &self,
         reduction: &Reduction,
@@ -374,39 +467,18 @@ impl Equilibrium {
         change: Option<&[[f64; 3]]>,
         (kind, allowed): (TangentKind, f64),
         interrupted: Interrupt<'_>,
-    ) -> Result<(Vec<[f64; 3]>, f64)> {
-        let solve = |kind: TangentKind| {
-            let full = self.energy.stiffness(&pose.u, kind)?;
-            let mut b: Vec<[f64; 3]> = pose.slope.iter().map(|&s| scaled(s, -1.0)).collect();
-            if let Some(change) = change {
-                for (b, f) in b.iter_mut().zip(reduction.rows(&full.multiply(change))) {
-                    *b = sub(*b, f);
-                }
-            }
-            let mut matrix = reduction.matrix(&full);
-            drop(full);
-            for spring in &target.springs {
-                matrix.add_to_diagonal(spring.row, spring.axis, spring.stiffness);
-            }
-            let rhs = projected_rhs(&matrix, &b, constraints);
-            if !constraints.is_empty() {
-                matrix = projected(&matrix, constraints);
-            }
-            let mut x =
-                self.solve_rows(reduction, &matrix, &rhs, constraints, allowed, interrupted)?;
-            add_offsets(&mut x, constraints);
-            Ok(x)
-        };
-        let step = match solve(kind) {
-            Err(MtmError::NotPositiveDefinite { .. } | MtmError::NotConverged { .. })
-                if kind == Exact =>
-            {
-                solve(Definite)?
-            }
-            other => other?,
-        };
-        let slope = step.iter().zip(&pose.slope).map(|(&d, &s)| dot(d, s)).sum();
-        Ok((step, slope))
+    ) -> Result<Vec<[f64; 3]>> {
+        let (mut matrix, b) = self.tangent(reduction, pose, kind, change)?;
+        for spring in &target.springs {
+            matrix.add_to_diagonal(spring.row, spring.axis, spring.stiffness);
+        }
+        let rhs = projected_rhs(&matrix, &b, constraints);
+        if !constraints.is_empty() {
+            matrix = projected(&matrix, constraints);
+        }
+        let mut x = self.solve_rows(reduction, &matrix, &rhs, constraints, allowed, interrupted)?;
+        add_offsets(&mut x, constraints);
+        Ok(x)
     }
 
     fn solve_rows(
@@ -458,6 +530,27 @@ fn on_rows(sliding: &Sliding, c: &Constraints<'_>) -> (Vec<Constraint>, Vec<RowS
         .map(|s| RowSpring { row: row(s.node), axis: s.axis, stiffness: s.stiffness, goal: s.goal })
         .collect();
     (asked, springs)
+}
+
+/// What `solve` gives under the tangent `first`, or under the definite one where the exact one is not positive
+/// definite; and which it was.
+fn by_tangent<T>(
+    first: TangentKind,
+    mut solve: impl FnMut(TangentKind) -> Result<T>,
+) -> Result<(T, TangentKind)> {
+    match solve(first) {
+        Err(MtmError::NotPositiveDefinite { .. } | MtmError::NotConverged { .. })
+            if first == Exact =>
+        {
+            Ok((solve(Definite)?, Definite))
+        }
+        other => Ok((other?, first)),
+    }
+}
+
+/// Slope of the merit along `rows`.
+fn along_slope(rows: &[[f64; 3]], pose: &Pose) -> f64 {
+    rows.iter().zip(&pose.slope).map(|(&d, &s)| dot(d, s)).sum()
 }
 
 /// Length that the tolerance refers to, mm.

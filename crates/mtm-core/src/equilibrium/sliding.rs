@@ -5,16 +5,17 @@
 use crate::boundary::Motion;
 use crate::contact::{ContactState, Sliding};
 use crate::equilibrium::{
-    Equilibrium, MAX_STEPS, NEAR_REST, Pose, STEP_SHARE, TangentSolver, Target, moved_by, reach,
+    Equilibrium, Pose, STEP_SHARE, STEP_TOLERANCE, Step, TangentSolver, Target, along_slope,
+    by_tangent, moved_by, reach,
 };
-use crate::error::{MtmError, Result};
+use crate::error::Result;
 use crate::iterative::Effort;
-use crate::mesh::{add, dot, norm, scaled, sub};
+use crate::mesh::{add, norm, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
 use crate::reduction::Reduction;
 use crate::restraint::Held;
 use crate::solution::Clock;
-use crate::strain_energy::TangentKind::{self, Definite, Exact};
+use crate::strain_energy::TangentKind::{self, Exact};
 use crate::system::{Begin, System};
 
 /// Sliding nodes of a body with what their solver asks.
@@ -56,67 +57,39 @@ impl Equilibrium {
         }
         // Walls move the body also where no node is joined to one.
         let far = slide.far()?.max(reach(&rest, target));
-        let first = (Exact, STEP_SHARE * far);
-        let (step, mut contact) = self.settled_step(
-            reduction,
-            &rest,
-            target,
-            Some(&change),
-            slide,
-            None,
-            first,
-            interrupted,
-        )?;
+        let first = far * STEP_SHARE.max(STEP_TOLERANCE * self.options.tolerance);
+        let ((rows, mut contact), _) = by_tangent(Exact, |kind| {
+            let change = Some(&change[..]);
+            self.settled(reduction, &rest, target, change, slide, None, (kind, first), interrupted)
+        })?;
         effort.iterations += 1;
         let ahead: Vec<[f64; 3]> = rest.u.iter().zip(&change).map(|(a, b)| add(*a, *b)).collect();
-        let mut pose = self.pose(reduction, moved_by(reduction, &ahead, &step, 1.0), target)?;
+        let pose = self.pose(reduction, moved_by(reduction, &ahead, &rows, 1.0), target)?;
         // Error of a step that leaves contact as settled as it was asked for, mm.
         let fine = self.options.contact.tolerance * slide.sliding.diagonal;
-        let (mut length, mut last, mut before) = (f64::INFINITY, false, first.1);
-        for _ in 0..MAX_STEPS {
-            if interrupted() {
-                return Err(MtmError::Interrupted);
-            }
-            let mut allowed = self.allowed(&pose, target, length);
-            if last {
-                allowed = allowed.min(fine);
-            }
-            let near = length <= NEAR_REST * reach(&pose, target);
-            let by_factor = matches!(self.solver, TangentSolver::Cholesky(_));
-            let kind = if near || by_factor { Exact } else { Definite };
-            let (step, state) = self.settled_step(
-                reduction,
-                &pose,
-                target,
-                None,
-                slide,
-                Some(&contact),
-                (kind, allowed),
-                interrupted,
-            )?;
-            effort.iterations += 1;
+        let mut before = first;
+        let on_walls: Vec<u32> = slide.sliding.nodes().iter().map(|n| n.row).collect();
+        let step = |pose: &Pose, how: (TangentKind, f64)| {
+            let begin = Some(&contact);
+            let (rows, state) =
+                self.settled(reduction, pose, target, None, slide, begin, how, interrupted)?;
             contact = ContactState { iterations: contact.iterations + state.iterations, ..state };
-            length = step.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
-            effort.history.push(length);
-            last = length + allowed <= self.options.tolerance * reach(&pose, target);
-            if last && allowed <= fine {
-                effort.error_bound = length + allowed;
-                return Ok((moved_by(reduction, &pose.u, &step, 1.0), contact));
-            }
             // Walls do no work along themselves, and what they do through gaps is not of the body.
-            let slope: f64 = step.iter().zip(&pose.slope).map(|(&d, &s)| dot(d, s)).sum();
-            let gaps = 2.0 * allowed.max(before).max(fine);
-            let through: f64 = contact.forces.iter().map(|f| f.abs() * gaps).sum();
-            before = allowed;
-            pose = self.search(reduction, pose, target, &step, slope.min(0.0), through)?;
-        }
-        Err(self.lost(length, target.scale))
+            let gaps = 2.0 * how.1.max(before).max(fine);
+            before = how.1;
+            let slack = contact.forces.iter().map(|f| f.abs() * gaps).sum();
+            Ok(Step { slope: along_slope(&rows, pose).min(0.0), slack, rows })
+        };
+        let last = (fine, &on_walls[..]);
+        let u = self.descend(reduction, pose, target, last, step, effort, interrupted)?;
+        Ok((u, contact))
     }
 
     /// The step of the rows that solves the tangent system at `pose` with contact settled.
     ///
-    /// `change`: how far the other nodes go. `begin`: where contact was.
-    fn settled_step(
+    /// `change`: how far the other nodes go. `begin`: where contact was. `how`: the tangent, and the error
+    /// that the step may have, mm.
+    fn settled(
         &self,
         reduction: &Reduction,
         pose: &Pose,
@@ -128,58 +101,39 @@ impl Equilibrium {
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, ContactState)> {
         let here = reduction.rows(&pose.u);
-        let solve = |kind: TangentKind| {
-            let full = self.energy.stiffness(&pose.u, kind)?;
-            // K (x − u) = −slope: the contact conditions are on x, the whole displacement.
-            let mut b: Vec<[f64; 3]> = pose.slope.iter().map(|&s| scaled(s, -1.0)).collect();
-            if let Some(change) = change {
-                for (b, f) in b.iter_mut().zip(reduction.rows(&full.multiply(change))) {
-                    *b = sub(*b, f);
-                }
-            }
-            let matrix = reduction.matrix(&full);
-            drop(full);
-            for (b, f) in b.iter_mut().zip(matrix.multiply(&here)) {
-                *b = add(*b, f);
-            }
-            // Closest points settle no nearer than the solves are.
-            let far = reach(pose, target);
-            let share = if far > 0.0 { allowed / far } else { STEP_SHARE };
-            let mut options = self.step_options(share);
-            let loose = allowed / slide.sliding.diagonal;
-            options.contact.tolerance = options.contact.tolerance.max(loose);
-            let (system, _) = System::new(
-                matrix,
-                &reduction.rows(self.tensors.element_nodes().positions()),
-                Some(slide.sliding),
-                slide.held,
-                self.tensors.tissue().largest_lame_ratio(),
-                &options,
-                &mut Clock::new(),
-                interrupted,
-            )?;
-            let begin = begin.map(|contact| Begin { rows: &here, contact });
-            let (x, state, _) = system.solve_with_contact(
-                &b,
-                slide.sliding,
-                slide.motions,
-                begin,
-                &options,
-                target.scale,
-                &mut Effort::default(),
-                interrupted,
-            )?;
-            let step: Vec<[f64; 3]> = x.iter().zip(&here).map(|(x, u)| sub(*x, *u)).collect();
-            Ok((step, state))
-        };
-        match solve(kind) {
-            Err(MtmError::NotPositiveDefinite { .. } | MtmError::NotConverged { .. })
-                if kind == Exact =>
-            {
-                solve(Definite)
-            }
-            other => other,
+        let (matrix, mut b) = self.tangent(reduction, pose, kind, change)?;
+        // K (x − u) = −slope: the contact conditions are on x, the whole displacement.
+        for (b, f) in b.iter_mut().zip(matrix.multiply(&here)) {
+            *b = add(*b, f);
         }
+        // Closest points settle no nearer than the solves are.
+        let far = reach(pose, target);
+        let share = if far > 0.0 { allowed / far } else { STEP_SHARE };
+        let mut options = self.step_options(share);
+        options.contact.allowed = allowed;
+        let (system, _) = System::new(
+            matrix,
+            &reduction.rows(self.tensors.element_nodes().positions()),
+            Some(slide.sliding),
+            slide.held,
+            self.tensors.tissue().largest_lame_ratio(),
+            &options,
+            &mut Clock::new(),
+            interrupted,
+        )?;
+        let begin = begin.map(|contact| Begin { rows: &here, contact });
+        let (x, state, _) = system.solve_with_contact(
+            &b,
+            slide.sliding,
+            slide.motions,
+            begin,
+            &options,
+            target.scale,
+            &mut Effort::default(),
+            interrupted,
+        )?;
+        let step = x.iter().zip(&here).map(|(x, u)| sub(*x, *u)).collect();
+        Ok((step, state))
     }
 
     /// Options of the system of one step, whose error may be `share` of the reach.
