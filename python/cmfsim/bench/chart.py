@@ -48,7 +48,7 @@ def _draw(figure: Any, found: Frontier, rows: list[FrontierRow]) -> None:
     _panel(right, found, {row: row.solve_wall.median for row in rows if row.solve_wall})
     left.set_xlabel("from the files to the face, s")
     right.set_xlabel("from the scene to the face, s")
-    left.set_ylabel("mean distance on the skin from the reference, mm")
+    left.set_ylabel("mean distance on the face from the reference, mm")
     figure.legend(handles=_marks(found), loc="outside upper center", ncols=9, frameon=False)
 
 

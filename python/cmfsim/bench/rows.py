@@ -50,7 +50,7 @@ class FrontierRow:
     is_base, is_reference : bool
         Whether it is the case's own choice, or what the others are compared with.
     error : mapping of str to DistanceStatistics
-        |u - u_ref| on the skin, mm, by region ("face" is all of it); empty where it failed.
+        |u - u_ref|, mm, over the face, its regions and the whole skin; empty where it failed.
     build_wall, build_cpu : float or None, s
         From the files to the scene, of one run.
     solve_wall, solve_cpu : Spread or None, s

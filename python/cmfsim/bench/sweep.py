@@ -28,8 +28,8 @@ FACTORS: Mapping[str, tuple[Any, ...]] = MappingProxyType(
 )
 # Tolerances at which Newton's method is stopped early, over the largest motion.
 EARLY = (1e-1, 1e-2)
-# A reference is sampled beyond what the sweep tells apart, and its Newton's method ends where only a
-# few tets at the cuts still move: the face is then within thousandths of a millimetre of its end.
+# A reference is sampled beyond what the sweep tells apart. Its Newton's method ends where only some
+# tets at the cuts still move: the face is then within thousandths of a millimetre of its end.
 REFERENCE_SAMPLES = 256
 REFERENCE_TOLERANCE = 0.1
 

@@ -6,7 +6,7 @@ from cmfsim.bench.choice import Choice
 from cmfsim.bench.rows import Frontier, FrontierRow, Spread
 from cmfsim.bench.skin_points import SKIN, WHOLE
 
-__all__ = ["TARGET", "frontier_page", "row_label"]
+__all__ = ["TARGET", "base_verdict", "frontier_page", "row_label"]
 
 # Mean error on the skin that a default may have, mm: a tenth of what surgeons can see, and below
 # what a CT resolves.
@@ -16,6 +16,7 @@ TITLES = (
     "mean",
     "P95",
     "max",
+    "skin",
     "build s",
     "solve s (min–max)",
     "times base (min–max)",
@@ -79,23 +80,28 @@ def row_label(choice: Choice) -> str:
     )
 
 
-def _head(found: Frontier) -> str:
-    machine, base = found.machine, found.base
+def base_verdict(base: FrontierRow) -> str:
+    """How far the base is off on average over face and skin, and whether that will do."""
     verdicts = [
         f"{base.error[name].mean:.3f} mm off on average over the {name} "
         f"({'within' if base.error[name].mean <= TARGET else 'outside'} {TARGET:g} mm)"
         for name in (WHOLE, SKIN)
         if name in base.error
     ]
-    verdict = f"is {' and '.join(verdicts)}" if verdicts else "has no solution"
+    return f"is {' and '.join(verdicts)}" if verdicts else "has no solution"
+
+
+def _head(found: Frontier) -> str:
+    machine, verdict = found.machine, base_verdict(found.base)
     return (
         f"Error: |u − u_ref| at {found.n_points} points of the patient's skin, mm; mean, P95 and "
-        f"max over the face, which the reference moves by {found.moved:.2f} mm on average. The "
-        f"base (the case's own settings) {verdict}. Time: build is one run from the files to the "
-        "scene; solve is the median of "
-        "rounds that were interleaved, with the least and the most; “times base” is taken within "
-        "each round. CPU and peak memory are those of the solve. The front: no other choice is as "
-        f"near in as little time.\n\n{machine['processor']}, {machine['threads']} threads, "
+        f"max over the face, which the reference moves by {found.moved:.2f} mm on average, and the "
+        "mean over the whole skin of the simulated tissue. "
+        f"The base (the case's own settings) {verdict}. Time: build is one run from the files to "
+        "the scene; solve is the median of rounds that were interleaved, with the least and the "
+        "most; “times base” is taken within each round. CPU and peak memory are those of the "
+        "solve. The front: no other choice is as near in as little time.\n\n"
+        f"{machine['processor']}, {machine['threads']} threads, "
         f"cmfsim {machine['cmfsim']}, commit {machine['commit'] or DASH}."
     )
 
@@ -133,10 +139,11 @@ def _table(
 
 
 def _figures(row: FrontierRow) -> list[str]:
-    whole = row.error.get(WHOLE)
+    whole, skin = row.error.get(WHOLE), row.error.get(SKIN)
     errors = [DASH] * 3 if whole is None else [_mm(v) for v in (whole.mean, whole.p95, whole.max)]
     return [
         *errors,
+        DASH if skin is None else _mm(skin.mean),
         DASH if row.build_wall is None else f"{row.build_wall:.1f}",
         "failed" if row.failure else _spread(row.solve_wall),
         _spread(row.ratio),

@@ -18,7 +18,7 @@ from cmfsim.bench import (
 )
 from cmfsim.bench import frontier as run_frontier
 from cmfsim.bench.files import write_frontier
-from cmfsim.bench.table import GRID, TARGET
+from cmfsim.bench.table import GRID, base_verdict
 from cmfsim.build import write_phantom_case
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.terminal import StageProgress, escaped
@@ -130,9 +130,7 @@ def _text(found: Frontier) -> str:
         lines.append(
             f"  {failed} of {len(found.rows)} choices were refused or failed: see the page"
         )
-    if base.mean is not None:
-        where = "within" if base.mean <= TARGET else "outside"
-        lines.append(f"  base is {where} {TARGET:g} mm of the reference on average")
+    lines.append(f"  base {base_verdict(base)}")
     return "\n".join(lines)
 
 
