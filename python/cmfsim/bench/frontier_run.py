@@ -4,6 +4,7 @@ import hashlib
 import json
 import logging
 import os
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -160,6 +161,8 @@ class _Jobs:
     time_limit: float
     fresh: bool
     say: Progress
+    # Times of one run are of one state of the machine: only these are compared.
+    run: str = field(default_factory=lambda: f"{time.time():.0f}-{os.getpid()}")
     builds: dict[str, Answer] = field(default_factory=dict)
     answers: dict[Choice, list[Answer]] = field(default_factory=dict)
 
@@ -231,6 +234,7 @@ class _Jobs:
                     "points": str(self.points),
                     "moved": str(self.moved(choice)),
                     "answer": str(file),
+                    "run": self.run,
                 },
                 threads=self.threads,
                 time_limit=self.time_limit,
@@ -247,7 +251,7 @@ def _frontier(
     """The rows of what was built and solved."""
     _, regions = read_points(jobs.points)
     exact = _moved(jobs, reference)
-    paces = [answer.get("wall_s") for answer in jobs.answers.get(base, [])]
+    paces = jobs.answers.get(base, [])
     rows = []
     for choice in [*choices, reference]:
         answers = jobs.answers[choice]
@@ -267,7 +271,7 @@ def _frontier(
 
 
 def _row(
-    choice: Choice, built: Answer, answers: Sequence[Answer], paces: Sequence[float | None]
+    choice: Choice, built: Answer, answers: Sequence[Answer], paces: Sequence[Answer]
 ) -> FrontierRow:
     failures = [answer["error"] for answer in answers if "error" in answer]
     row = FrontierRow(
@@ -280,8 +284,12 @@ def _row(
     if failures:
         return replace(row, failure=failures[0])
     walls = [answer["wall_s"] for answer in answers]
-    # Rounds in which the base was timed too.
-    ratios = [wall / pace for wall, pace in zip(walls, paces, strict=False) if pace]
+    # Rounds in which the base was timed too, in the same run.
+    ratios = [
+        answer["wall_s"] / pace["wall_s"]
+        for answer, pace in zip(answers, paces, strict=False)
+        if "wall_s" in pace and answer.get("run") == pace.get("run")
+    ]
     solution = answers[0]["solution"]
     return replace(
         row,

@@ -37,7 +37,7 @@ def main(arguments: list[str]) -> int:
     job = json.loads(Path(arguments[0]).read_text(encoding="utf-8"))
     task = {"build": _build, "solve": _solve}[job["task"]]
     try:
-        answer = task(job)
+        answer = {**task(job), "run": job.get("run")}
     except (CmfsimError, MemoryError, OSError) as error:
         answer = {"error": f"{type(error).__name__}: {error}", "peak_mb": peak_memory()}
     with replacing(Path(job["answer"])) as file:
