@@ -134,7 +134,7 @@ CORE: Mapping[str, frozenset[str]] = {
         "reaction": "cholesky contact crease mesh",
         "system": (
             "blocks boundary cholesky constraints contact crease iterative mesh method reaction "
-            "restraint solution"
+            "restraint row_sums solution"
         ),
         "equilibrium": (
             "blocks cholesky constraints contact iterative krylov mesh method multigrid "

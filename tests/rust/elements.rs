@@ -381,6 +381,7 @@ fn large_deformation_over_a_dome_settles_alike_by_every_method() {
             let early = run(Method::Pcg, 0.1);
             let apart = largest_difference(&by_factor.displacements, &early.displacements);
             assert!(apart < 0.1 * moved, "{name}: stopped early {apart} of {moved}");
+            assert!(apart <= early.error_bound, "{name}: {apart} over {}", early.error_bound);
             assert!(early.iterations < by_cg.iterations, "{name}: stopped no earlier");
         }
     }

@@ -15,6 +15,7 @@ use crate::mesh::{add, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
 use crate::reaction::ContactFactor;
 use crate::restraint::Held;
+use crate::row_sums::in_pool;
 use crate::solution::Clock;
 
 /// Most sliding nodes whose whole flexibility is kept (three unknowns each, 8 bytes a pair, twice): with
@@ -144,7 +145,7 @@ impl System {
     ) -> Result<Vec<[f64; 3]>> {
         match &self.kept {
             Kept::Direct { symbolic, factor, .. } => {
-                let x = symbolic.solve(factor, b);
+                let x = in_pool(|| symbolic.solve(factor, b));
                 effort.error_bound = direct_error(factor, &x);
                 Ok(x)
             }
@@ -174,15 +175,21 @@ impl System {
         };
         let (first, rows) = begin.map_or((None, &[][..]), |b| (Some(b.contact), b.rows));
         if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
+            // Each on a thread of the pool, so that loops inside begin without a hand-over; not all at once:
+            // interrupts are of the calling thread.
             let mut x = symbolic.permuted(b);
-            symbolic.forward(factor, &mut x);
-            let mut answers = contact.answers(symbolic, factor, &x);
+            let mut answers = in_pool(|| {
+                symbolic.forward(factor, &mut x);
+                contact.answers(symbolic, factor, &x)
+            });
+            let loose = options.contact.allowed / sliding.diagonal;
+            let tolerance = options.contact.tolerance.max(loose);
             let state = sliding.settle(motions, first, &options.contact, interrupted, |c| {
-                answers.respond(c, share, options.contact.tolerance)
+                in_pool(|| answers.respond(c, share, tolerance))
             })?;
-            answers.add_forces(&mut x, &pushes(&state.normals, &state.forces));
+            in_pool(|| answers.add_forces(&mut x, &pushes(&state.normals, &state.forces)));
             let seconds = clock.total();
-            symbolic.backward(factor, &mut x);
+            in_pool(|| symbolic.backward(factor, &mut x));
             let x = symbolic.unpermuted(&x);
             effort.error_bound = direct_error(factor, &x);
             return Ok((x, state, seconds));
