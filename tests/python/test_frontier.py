@@ -298,7 +298,8 @@ def test_the_command_writes_table_page_picture_and_figures(case, swept, capsys):
     words = [*WORDS, "--factors", "--repeats", "2", "--reference-kinematics", "corotational"]
     assert main(["bench", "frontier", str(case.file), "-o", str(folder), "-q", *words]) == 0
     printed = capsys.readouterr().out
-    assert "of the reference on average" in printed
+    assert "off on average over the face" in printed
+    assert "off on average over the skin" in printed
     written = json.loads((folder / "frontier.json").read_text(encoding="utf-8"))
     assert written["files"] == ["frontier.csv", "frontier.md", "frontier.png", "frontier.json"]
     assert all((folder / name).stat().st_size for name in written["files"])
