@@ -48,7 +48,7 @@ impl Sliding {
     ) -> Result<ContactState> {
         let surfaces = self.moved_surfaces(motions)?;
         let n = self.nodes.len();
-        let limit = options.allowed.max(options.tolerance * self.diagonal);
+        let limit = self.gap_limit(options);
         let spared = |i: usize| options.allowed * self.stiffness[i];
         let (mut start, seats) = self.carried(motions, &surfaces);
         let mut forces = vec![0.0_f64; n];
@@ -189,6 +189,11 @@ impl Sliding {
                 kind: ErrorKind::Solver,
             }),
         }
+    }
+
+    /// Gap up to which a held node counts as on its surface, mm.
+    pub fn gap_limit(&self, options: &ContactOptions) -> f64 {
+        options.allowed.max(options.tolerance * self.diagonal)
     }
 
     /// Force that rounding of the positions alone may bring, N: at rest all forces are smaller.

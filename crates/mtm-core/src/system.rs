@@ -182,8 +182,7 @@ impl System {
                 symbolic.forward(factor, &mut x);
                 contact.answers(symbolic, factor, &x)
             });
-            let loose = options.contact.allowed / sliding.diagonal;
-            let tolerance = options.contact.tolerance.max(loose);
+            let tolerance = sliding.gap_limit(&options.contact) / sliding.diagonal;
             let state = sliding.settle(motions, first, &options.contact, interrupted, |c| {
                 in_pool(|| answers.respond(c, share, tolerance))
             })?;

@@ -363,9 +363,11 @@ impl Equilibrium {
     ) -> Result<Pose> {
         let at = |share: f64| {
             let mut u = moved_by(reduction, &pose.u, &step.rows, share);
-            for &row in on_walls.iter().filter(|_| share > 1.0) {
-                let j = reduction.unknowns[row as usize] as usize;
-                u[j] = add(pose.u[j], step.rows[row as usize]);
+            if share > 1.0 {
+                for &row in on_walls {
+                    let j = reduction.unknowns[row as usize] as usize;
+                    u[j] = add(pose.u[j], step.rows[row as usize]);
+                }
             }
             self.pose(reduction, u, target)
         };

@@ -66,7 +66,7 @@ impl Equilibrium {
         let ahead: Vec<[f64; 3]> = rest.u.iter().zip(&change).map(|(a, b)| add(*a, *b)).collect();
         let pose = self.pose(reduction, moved_by(reduction, &ahead, &rows, 1.0), target)?;
         // Error of a step that leaves contact as settled as it was asked for, mm.
-        let fine = self.options.contact.tolerance * slide.sliding.diagonal;
+        let fine = slide.sliding.gap_limit(&self.options.contact);
         let mut before = first;
         let on_walls: Vec<u32> = slide.sliding.nodes().iter().map(|n| n.row).collect();
         let step = |pose: &Pose, how: (TangentKind, f64)| {
