@@ -2,7 +2,7 @@
 //!
 //! Contact forces λ along the normals N follow from (Nᵀ A⁻¹ N) λ = g − Nᵀ u_free, by conjugate gradients that
 //! the matrix at rest preconditions. Until closest points settle they stop early, and begin where the last
-//! displacements put them: two or three products for each set of normals.
+//! displacements put them: two or three products for each set of normals, rough ones but for two in a plan.
 //!
 //! Few sliding nodes have their whole flexibility A⁻¹ at hand for the products, and the matrix of other
 //! normals is written down and factored where too many are needed. Where nodes are many, products come from
@@ -10,16 +10,19 @@
 //! walls, which the matrix at rest knows nothing of, can take a hundred of them.
 
 use crate::cholesky::{
-    DenseSymmetric, Factor, Moved, NormalFactor, NormalForces, Preconditioner, Progress, Reach,
-    RowKey, Symbolic, TailFlexibility, Wanted, conjugate_gradients, hopeless,
+    Begun, DenseSymmetric, Factor, Moved, NormalFactor, NormalForces, Precision, Preconditioner,
+    Progress, ROUGH, Reach, RowKey, Symbolic, TailFlexibility, Wanted, conjugate_gradients,
+    hopeless,
 };
 use crate::contact::{Constraints, Response, Sliding};
 use crate::crease::ContactRow;
 use crate::error::{MtmError, Result};
-use crate::mesh::{add, dot, scaled};
+use crate::mesh::{add, dot, scaled, sub};
 
 /// Steps of sweeps after which contact gives up: ten on smooth bone, a hundred on teeth.
 const MOST_SWEEPS: usize = 1000;
+/// Share of what is left to change that rough products may have left open before one that is exact.
+const DOUBT_SHARE: f64 = 0.1;
 /// Relative error of contact forces, in the energy norm, at which only rounding is left.
 const ROUNDING: f64 = 1e-14;
 /// Share of the contact tolerance that the forces of settled contact may be off, relative to all of them.
@@ -82,25 +85,43 @@ impl ContactFactor {
         flexibility + self.rest.bytes()
     }
 
-    /// Answers to one plan's constraints; `x` is L⁻¹ P b of its forces.
+    /// Answers to one plan's constraints, whose forces are `b`.
     pub fn answers<'a>(
         &'a self,
         symbolic: &'a Symbolic,
         factor: &'a Factor,
-        x: &[f64],
+        b: &[[f64; 3]],
     ) -> Answers<'a> {
-        let free = match &self.flexibility {
-            Flexibility::Dense(_) => symbolic.tail_displacements(factor, x),
+        let (free, swept) = match &self.flexibility {
+            Flexibility::Dense(tail) => {
+                let (forces, swept) = symbolic.on_tail(factor, b);
+                (tail.respond(&forces), swept)
+            }
             Flexibility::Sweeps { reach, .. } => {
-                symbolic.reach_displacements(factor, reach, &mut x.to_vec())
+                let mut swept = symbolic.permuted(b);
+                symbolic.forward(factor, &mut swept);
+                (symbolic.reach_displacements(factor, reach, &mut swept.clone()), swept)
             }
         };
         let work = match &self.flexibility {
             Flexibility::Dense(_) => Vec::new(),
-            Flexibility::Sweeps { .. } => vec![0.0; x.len()],
+            Flexibility::Sweeps { .. } => vec![0.0; swept.len()],
         };
-        let moved = vec![[0.0; 3]; free.len()];
-        Answers { contact: self, symbolic, factor, free, moved, work, made: None, last: Vec::new() }
+        let (moved, pushed) = (vec![[0.0; 3]; free.len()], vec![[0.0; 3]; free.len()]);
+        Answers {
+            contact: self,
+            symbolic,
+            factor,
+            swept,
+            free,
+            pushed,
+            moved,
+            precision: Precision::Exact,
+            doubt: 0.0,
+            work,
+            made: None,
+            last: Vec::new(),
+        }
     }
 
     /// Answers to constraints that stay the same for several right-hand sides.
@@ -148,10 +169,17 @@ pub(crate) struct Answers<'a> {
     contact: &'a ContactFactor,
     symbolic: &'a Symbolic,
     factor: &'a Factor,
+    /// The forces after the sweep to the sliding nodes, in elimination order.
+    swept: Vec<f64>,
     /// Displacements of the sliding nodes without contact forces, mm.
     free: Vec<[f64; 3]>,
-    /// What the contact forces of the last answer added to them, mm.
+    /// Forces of the last answer on each.
+    pushed: Vec<[f64; 3]>,
+    /// What they added to the displacements, mm, and how exactly.
     moved: Vec<[f64; 3]>,
+    precision: Precision,
+    /// What rough products may have left open, in the measure of the preconditioner.
+    doubt: f64,
     /// Zeros for the sweeps.
     work: Vec<f64>,
     /// The factor made last in this plan, once the one at rest did not serve.
@@ -192,21 +220,39 @@ impl Answers<'_> {
             *x += v;
         }
         let (n, work) = (self.free.len(), &mut self.work);
-        let product = |x: &[f64]| {
-            let pushes = pushes(n, &rows.rows, x);
-            let nodes = match &self.contact.flexibility {
-                Flexibility::Dense(tail) => tail.respond(&pushes),
-                Flexibility::Sweeps { reach, .. } => {
-                    self.symbolic.respond(self.factor, reach, &pushes, work)
-                }
-            };
-            Moved { along: rows.along(&nodes, x), nodes }
+        let mut respond = |pushes: &[[f64; 3]], precision| match &self.contact.flexibility {
+            Flexibility::Dense(tail) if precision == Precision::Rough => {
+                (tail.respond_roughly(pushes), precision)
+            }
+            Flexibility::Dense(tail) => (tail.respond(pushes), precision),
+            Flexibility::Sweeps { reach, .. } => {
+                (self.symbolic.respond(self.factor, reach, pushes, work), Precision::Exact)
+            }
+        };
+        // What is rough of a change is little of the whole, until that little is what is left to change.
+        let now = pushes(n, &rows.rows, &start);
+        let (nodes, precision) = if self.doubt > DOUBT_SHARE * measure {
+            self.doubt = 0.0;
+            respond(&now, Precision::Exact)
+        } else {
+            let change: Vec<_> = now.iter().zip(&self.pushed).map(|(a, b)| sub(*a, *b)).collect();
+            let (change, precision) = respond(&change, Precision::Rough);
+            let nodes = self.moved.iter().zip(change).map(|(a, b)| add(*a, b)).collect();
+            (nodes, precision.min(self.precision))
+        };
+        let begun = Begun {
+            moved: Moved { along: rows.along(&nodes, &start), nodes, precision },
+            forces: start,
+        };
+        let product = |x: &[f64], precision| {
+            let (nodes, precision) = respond(&pushes(n, &rows.rows, x), precision);
+            Moved { along: rows.along(&nodes, x), nodes, precision }
         };
         let wanted = Wanted { exact, enough: share * measure };
         let found = match &self.contact.flexibility {
             Flexibility::Dense(tail) => {
                 let near =
-                    conjugate_gradients(product, &preconditioner, &goals, start, wanted, hopeless);
+                    conjugate_gradients(product, &preconditioner, &goals, begun, wanted, hopeless);
                 match near {
                     Ok(found) => found,
                     Err(_) => {
@@ -214,13 +260,14 @@ impl Answers<'_> {
                         let forces = made.solve(goals);
                         let nodes = tail.respond(&pushes(n, &rows.rows, &forces));
                         self.made = Some(made);
-                        NormalForces { forces, nodes, solved: true }
+                        let precision = Precision::Exact;
+                        NormalForces { forces, nodes, precision, solved: true }
                     }
                 }
             }
             Flexibility::Sweeps { .. } => {
                 let give_up = |progress: &Progress| progress.step >= MOST_SWEEPS;
-                conjugate_gradients(product, &preconditioner, &goals, start, wanted, give_up)
+                conjugate_gradients(product, &preconditioner, &goals, begun, wanted, give_up)
                     .map_err(|error| MtmError::NotConverged {
                         method: "contact by sweeps",
                         iterations: MOST_SWEEPS,
@@ -231,6 +278,12 @@ impl Answers<'_> {
             }
         };
         self.moved.clone_from(&found.nodes);
+        self.precision = found.precision;
+        self.doubt = match found.precision {
+            Precision::Rough => self.doubt + ROUGH * measure,
+            Precision::Exact => 0.0,
+        };
+        self.pushed = pushes(n, &rows.rows, &found.forces);
         self.last = rows.keys.iter().copied().zip(found.forces.iter().copied()).collect();
         self.last.sort_unstable_by_key(|(key, _)| *key);
         Ok(found)
@@ -245,13 +298,20 @@ impl Answers<'_> {
         rows.rows.iter().zip(&rows.softness).map(|(r, s)| own(r) + s).collect()
     }
 
-    /// Adds forces on the sliding nodes to `x` = L⁻¹ P b, so that a backward sweep gives the displacements
-    /// with those forces.
-    pub fn add_forces(&mut self, x: &mut [f64], forces: &[[f64; 3]]) {
+    /// Displacements of all rows of the system with `forces` on the sliding nodes.
+    pub fn displacements(self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let Self { symbolic, factor, mut swept, mut work, .. } = self;
         match &self.contact.flexibility {
-            Flexibility::Dense(_) => self.symbolic.add_tail_forces(self.factor, forces, x),
+            Flexibility::Dense(tail) => {
+                let moved = tail.respond(forces);
+                let there: Vec<_> =
+                    moved.iter().zip(&self.free).map(|(r, f)| add(*r, *f)).collect();
+                symbolic.above_tail(factor, swept, &there)
+            }
             Flexibility::Sweeps { reach, .. } => {
-                self.symbolic.add_reach_forces(self.factor, reach, forces, &mut self.work, x);
+                symbolic.add_reach_forces(factor, reach, forces, &mut work, &mut swept);
+                symbolic.backward(factor, &mut swept);
+                symbolic.unpermuted(&swept)
             }
         }
     }

@@ -177,19 +177,13 @@ impl System {
         if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
             // Each on a thread of the pool, so that loops inside begin without a hand-over; not all at once:
             // interrupts are of the calling thread.
-            let mut x = symbolic.permuted(b);
-            let mut answers = in_pool(|| {
-                symbolic.forward(factor, &mut x);
-                contact.answers(symbolic, factor, &x)
-            });
+            let mut answers = in_pool(|| contact.answers(symbolic, factor, b));
             let tolerance = sliding.gap_limit(&options.contact) / sliding.diagonal;
             let state = sliding.settle(motions, first, &options.contact, interrupted, |c| {
                 in_pool(|| answers.respond(c, share, tolerance))
             })?;
-            in_pool(|| answers.add_forces(&mut x, &pushes(&state.normals, &state.forces)));
             let seconds = clock.total();
-            in_pool(|| symbolic.backward(factor, &mut x));
-            let x = symbolic.unpermuted(&x);
+            let x = in_pool(|| answers.displacements(&pushes(&state.normals, &state.forces)));
             effort.error_bound = direct_error(factor, &x);
             return Ok((x, state, seconds));
         }
@@ -224,13 +218,9 @@ impl System {
                 if interrupted() {
                     return Err(MtmError::Interrupted);
                 }
-                let mut x = symbolic.permuted(b);
-                symbolic.forward(factor, &mut x);
-                let mut answers = contact.answers(symbolic, factor, &x);
+                let mut answers = contact.answers(symbolic, factor, b);
                 let forces = frozen.forces(&mut answers, k)?;
-                answers.add_forces(&mut x, &forces);
-                symbolic.backward(factor, &mut x);
-                Ok(symbolic.unpermuted(&x))
+                Ok(answers.displacements(&forces))
             };
             return columns.iter().enumerate().map(solve).collect();
         }

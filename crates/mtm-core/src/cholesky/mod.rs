@@ -18,8 +18,8 @@ use faer::{Conj, MatMut};
 
 pub use dense::TailFlexibility;
 pub use normal::{
-    Moved, NormalFactor, NormalForces, Preconditioner, Progress, RowKey, Wanted,
-    conjugate_gradients, hopeless,
+    Begun, Moved, NormalFactor, NormalForces, Precision, Preconditioner, Progress, ROUGH, RowKey,
+    Wanted, conjugate_gradients, hopeless,
 };
 pub use reach::Reach;
 use structure::{minimum_degree, supernodal_structure};
@@ -230,25 +230,25 @@ impl Symbolic {
         Sweep::new((&self.structure, &factor.values), &self.tree)
     }
 
-    /// Displacements of the tail rows, given x = L⁻¹ P b.
-    pub fn tail_displacements(&self, factor: &Factor, x: &[f64]) -> Vec<[f64; 3]> {
-        let sweep = self.sweep(factor);
-        let mut tail = x[sweep.base()..].to_vec();
-        sweep.backward_tail(&mut tail);
-        let own = tail.len() - 3 * self.n_tail;
-        tail[own..].chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect()
+    /// Forces on the tail rows that `b` is to them once all others are eliminated, and what is left of the
+    /// elimination for [`Self::above_tail`].
+    pub fn on_tail(&self, factor: &Factor, b: &[[f64; 3]]) -> (Vec<[f64; 3]>, Vec<f64>) {
+        let (mut x, first) = (self.permuted(b), self.first_of_tail());
+        self.sweep(factor).forward_to(first, &mut x);
+        (x[first..].chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect(), x)
     }
 
-    /// Adds L⁻¹ P f for forces on the tail rows to x = L⁻¹ P b.
-    pub fn add_tail_forces(&self, factor: &Factor, forces: &[[f64; 3]], x: &mut [f64]) {
-        let sweep = self.sweep(factor);
-        let x = &mut x[sweep.base()..];
-        let mut tail = vec![0.0; x.len()];
-        tail[x.len() - 3 * self.n_tail..].copy_from_slice(forces.as_flattened());
-        sweep.forward_tail(&mut tail);
-        for (x, v) in x.iter_mut().zip(tail) {
-            *x += v;
-        }
+    /// Displacements of all rows, given those of the tail rows.
+    pub fn above_tail(&self, factor: &Factor, mut x: Vec<f64>, tail: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let first = self.first_of_tail();
+        x[first..].copy_from_slice(tail.as_flattened());
+        self.sweep(factor).backward_from(first, &mut x);
+        self.unpermuted(&x)
+    }
+
+    /// First unknown of the tail.
+    fn first_of_tail(&self) -> usize {
+        3 * (self.order.len() - self.n_tail)
     }
 
     /// What the given rows of the system reach in the factor.
@@ -318,7 +318,7 @@ impl Symbolic {
 
     /// Flexibility S⁻¹ of the tail rows, S = L_SS L_SSᵀ their Schur complement, order 3·n_tail, mm/N.
     pub fn tail_flexibility(&self, factor: &Factor) -> TailFlexibility {
-        let (size, first) = (3 * self.n_tail, 3 * (self.order.len() - self.n_tail));
+        let (size, first) = (3 * self.n_tail, self.first_of_tail());
         let mut lower = vec![0.0; size * size];
         let l = supernodal::SupernodalLltRef::new(&self.structure, &factor.values);
         for s in 0..self.structure.n_supernodes() {

@@ -3,13 +3,18 @@
 //! The normal flexibility Nᵀ S⁻¹ N of a solve differs from that of an earlier one by how far the normals
 //! turned in between: conjugate gradients that the earlier one preconditions need a few products. Each
 //! brings the displacements along, so that the matrix need not be written down.
+//!
+//! Products may be rough: what they leave open shows in one that is not, from where the steps go on
+//! (iterative refinement; Wilkinson 1963).
 
-use super::symmetric::{DenseFactor, DenseSymmetric, dot};
+use super::symmetric::{DenseFactor, DenseSymmetric, Rough, dot};
 
 /// Steps after which a new factor is cheaper than more of them.
 const MOST_STEPS: usize = 12;
 /// Steps that tell how many it will take: later ones gain no less.
 const TRIAL_STEPS: usize = 5;
+/// Share of the residual that rough products may be trusted to reach.
+pub const ROUGH: f64 = 1e-6;
 /// Row of the kept factor that a constraint has none in.
 const NO_ROW: u32 = u32::MAX;
 
@@ -26,8 +31,8 @@ pub struct NormalFactor {
 enum Answer {
     /// By the factor: soon made.
     Factor(DenseFactor),
-    /// By the inverse: soon applied.
-    Inverse(DenseSymmetric),
+    /// By the inverse, to single precision: soon applied.
+    Inverse(Rough),
 }
 
 impl NormalFactor {
@@ -37,10 +42,11 @@ impl NormalFactor {
         Ok(Self { answer: Answer::Factor(flexibility.factor()?), keys })
     }
 
-    /// The same by its inverse, for many right-hand sides.
+    /// The same by its inverse, for many right-hand sides: to single precision, as is enough for a
+    /// [`Preconditioner`].
     pub fn inverse(self) -> Self {
         let answer = match self.answer {
-            Answer::Factor(factor) => Answer::Inverse(factor.inverse()),
+            Answer::Factor(factor) => Answer::Inverse(Rough::of(&factor.inverse())),
             inverse @ Answer::Inverse(_) => inverse,
         };
         Self { answer, ..self }
@@ -66,12 +72,31 @@ impl NormalFactor {
     }
 }
 
+/// How exact a product is to be.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Precision {
+    /// To six digits.
+    Rough,
+    /// To rounding.
+    Exact,
+}
+
 /// What forces along the rows do.
 pub struct Moved {
     /// Displacement along each row, mm.
     pub along: Vec<f64>,
     /// Displacement of every node, mm.
     pub nodes: Vec<[f64; 3]>,
+    /// How exact they are.
+    pub precision: Precision,
+}
+
+/// Where conjugate gradients begin.
+pub struct Begun {
+    /// Force of each row.
+    pub forces: Vec<f64>,
+    /// What they do.
+    pub moved: Moved,
 }
 
 /// Forces along the rows, N, and what they do.
@@ -80,7 +105,9 @@ pub struct NormalForces {
     pub forces: Vec<f64>,
     /// Displacement of every node under them, mm.
     pub nodes: Vec<[f64; 3]>,
-    /// Whether they are [`Wanted::exact`].
+    /// How exact these displacements are.
+    pub precision: Precision,
+    /// Whether the forces are [`Wanted::exact`] under exact products.
     pub solved: bool,
 }
 
@@ -112,7 +139,7 @@ pub fn hopeless(progress: &Progress) -> bool {
     step >= MOST_STEPS || step >= TRIAL_STEPS && error * fallen.powf(rest) > goal
 }
 
-/// x with A x = `goals` by conjugate gradients from `start`.
+/// x with A x = `goals` by conjugate gradients from `begun`.
 ///
 /// `product`: what forces along the rows do, A x along them.
 ///
@@ -120,33 +147,48 @@ pub fn hopeless(progress: &Progress) -> bool {
 /// The relative error in the energy norm that was left where `give_up` held, or where `product` proved
 /// not to be that of a positive definite matrix.
 pub fn conjugate_gradients(
-    mut product: impl FnMut(&[f64]) -> Moved,
+    mut product: impl FnMut(&[f64], Precision) -> Moved,
     preconditioner: &Preconditioner<'_>,
     goals: &[f64],
-    start: Vec<f64>,
+    begun: Begun,
     wanted: Wanted,
     give_up: impl Fn(&Progress) -> bool,
 ) -> Result<NormalForces, f64> {
-    let mut x = start;
-    let Moved { along, mut nodes } = product(&x);
-    let mut r: Vec<f64> = goals.iter().zip(along).map(|(g, v)| g - v).collect();
+    let Begun { forces: mut x, moved: Moved { along, mut nodes, mut precision } } = begun;
+    let open = |along: Vec<f64>| goals.iter().zip(along).map(|(g, v)| g - v).collect();
+    let mut r: Vec<f64> = open(along);
     let mut z = preconditioner.apply(&r);
     let mut p = z.clone();
     let mut rz = dot(&r, &z);
-    let (first, mut step) = (rz, 0);
+    let (first, mut renewed, mut step) = (rz, rz, 0);
+    let mut enough = wanted.enough;
     loop {
         // xᵀA x = xᵀ(g − r): how large the solution is in the same norm.
         let size: f64 = x.iter().zip(goals.iter().zip(&r)).map(|(x, (g, r))| x * (g - r)).sum();
         let error = (rz / size).sqrt();
         let solved = rz == 0.0 || error <= wanted.exact;
-        if solved || rz.sqrt() <= wanted.enough {
-            return Ok(NormalForces { forces: x, nodes, solved });
+        if !solved && rz.sqrt() <= enough || solved && precision == Precision::Exact {
+            return Ok(NormalForces { forces: x, nodes, precision, solved });
         }
-        let goal = wanted.exact.max(wanted.enough / size.sqrt());
+        let goal = wanted.exact.max(enough / size.sqrt());
         if give_up(&Progress { step, fallen: (rz / first).sqrt(), error, goal }) {
             return Err(error);
         }
-        let Moved { along, nodes: moved } = product(&p);
+        let doubtful = solved || rz.sqrt() <= ROUGH * renewed.sqrt();
+        if doubtful && precision == Precision::Rough {
+            let there = product(&x, Precision::Exact);
+            (nodes, precision) = (there.nodes, there.precision);
+            r = open(there.along);
+            z = preconditioner.apply(&r);
+            rz = dot(&r, &z);
+            renewed = rz;
+            // So near the end it is not left for another set of normals.
+            enough = 0.0;
+            p.clone_from(&z);
+            continue;
+        }
+        let Moved { along, nodes: moved, precision: of_step } = product(&p, Precision::Rough);
+        precision = precision.min(of_step);
         let curvature = dot(&p, &along);
         // Also false for NaN.
         if !(curvature > 0.0 && rz.is_finite()) {
@@ -241,8 +283,8 @@ mod tests {
         (0..n).map(|i| (i, 0)).collect()
     }
 
-    /// To rounding, as the tests compare it.
-    const EXACT: Wanted = Wanted { exact: 1e-14, enough: 0.0 };
+    /// As exact as contact asks for at its end, and more.
+    const EXACT: Wanted = Wanted { exact: 1e-12, enough: 0.0 };
 
     /// Forces by conjugate gradients from zero that `kept` preconditions.
     fn found(
@@ -254,13 +296,19 @@ mod tests {
     ) -> Result<NormalForces, f64> {
         let matrix = lower(now);
         let diagonal = (0..now.nrows()).map(|i| now[(i, i)]).collect();
-        let product = |x: &[f64]| {
-            let along = matrix.multiply(x);
-            Moved { nodes: along.iter().map(|&v| [v, 2.0 * v, 0.0]).collect(), along }
+        let rough = Rough::of(&matrix);
+        let product = |x: &[f64], precision| {
+            let along = match precision {
+                Precision::Rough => rough.multiply(x),
+                Precision::Exact => matrix.multiply(x),
+            };
+            let nodes = along.iter().map(|&v| [v, 2.0 * v, 0.0]).collect();
+            Moved { nodes, along, precision }
         };
         let preconditioner = Preconditioner::new(diagonal, keys, kept);
-        let zero = vec![0.0; goals.len()];
-        conjugate_gradients(product, &preconditioner, goals, zero, wanted, hopeless)
+        let forces = vec![0.0; goals.len()];
+        let begun = Begun { moved: product(&forces, Precision::Exact), forces };
+        conjugate_gradients(product, &preconditioner, goals, begun, wanted, hopeless)
     }
 
     /// Rows that the kept factor has, rows it lacks, and rows that have gone: the dense solution each time,
@@ -284,10 +332,11 @@ mod tests {
             for kept in [factor(), factor().inverse()] {
                 let found = found(&picked, &keys, b.as_slice(), &kept, EXACT).unwrap();
                 assert!(found.solved);
-                let error = (DVector::from_vec(found.forces) - &exact).amax();
-                assert!(error <= 1e-12 * exact.amax(), "{error:e}");
-                for (v, g) in found.nodes.iter().zip(&b) {
-                    assert!((v[0] - g).abs() <= 1e-12 && (v[1] - 2.0 * g).abs() <= 1e-12);
+                let error = (DVector::from_vec(found.forces.clone()) - &exact).amax();
+                assert!(error <= 1e-10 * exact.amax(), "{error:e}");
+                let moved = &picked * DVector::from_vec(found.forces);
+                for (v, g) in found.nodes.iter().zip(&moved) {
+                    assert!((v[0] - g).abs() <= 1e-14 && (v[1] - 2.0 * g).abs() <= 1e-14);
                 }
             }
         }
@@ -322,8 +371,8 @@ mod tests {
         let exact = now.cholesky().unwrap().solve(&b);
         let by_factor = DVector::from_vec(made.solve(b.as_slice().to_vec()));
         let by_inverse = DVector::from_vec(made.inverse().solve(b.as_slice().to_vec()));
-        for found in [by_factor, by_inverse] {
-            assert!((found - &exact).amax() <= 1e-12 * exact.amax());
+        for (found, digits) in [(by_factor, 1e-12), (by_inverse, 1e-5)] {
+            assert!((found - &exact).amax() <= digits * exact.amax());
         }
     }
 

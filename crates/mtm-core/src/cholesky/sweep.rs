@@ -24,6 +24,8 @@ pub struct Supernode<'a> {
     pub begin: usize,
     /// Number of columns.
     pub width: usize,
+    /// How many of them, from the first on, sweeps take.
+    swept: usize,
     /// Rows below the columns, ascending.
     pub pattern: &'a [usize],
     /// Columns of `rows()` entries; what stands above the diagonal is not read.
@@ -34,12 +36,19 @@ impl<'a> Supernode<'a> {
     /// Supernode `s` of a factor.
     pub fn new((structure, values): Columns<'a>, s: usize) -> Self {
         let (begin, start) = (structure.supernode_begin()[s], structure.col_ptr_for_val());
+        let width = structure.supernode_end()[s] - begin;
         Self {
             begin,
-            width: structure.supernode_end()[s] - begin,
+            width,
+            swept: width,
             pattern: structure.supernode(s).pattern(),
             values: &values[start[s]..start[s + 1]],
         }
+    }
+
+    /// The same, with sweeps through its columns before `end` alone.
+    fn before(self, end: usize) -> Self {
+        Self { swept: self.width.min(end.saturating_sub(self.begin)), ..self }
     }
 
     /// Rows of its columns.
@@ -51,13 +60,13 @@ impl<'a> Supernode<'a> {
     /// rows costs what these reach (Gilbert & Peierls 1988).
     pub fn forward(&self, x: &mut Split<'_, &mut [f64]>, front: &mut Vec<f64>) {
         let own = self.begin - x.origin;
-        if x.own[own..own + self.width].iter().all(|&v| v == 0.0) {
+        if x.own[own..own + self.swept].iter().all(|&v| v == 0.0) {
             return;
         }
         front.clear();
         front.extend_from_slice(&x.own[own..own + self.width]);
         front.resize(self.rows(), 0.0);
-        widest(Eliminate { values: self.values, width: self.width, front });
+        widest(Eliminate { values: self.values, columns: self.swept, front });
         x.own[own..own + self.width].copy_from_slice(&front[..self.width]);
         for (&row, v) in self.pattern.iter().zip(&front[self.width..]) {
             if row < x.base {
@@ -77,7 +86,7 @@ impl<'a> Supernode<'a> {
             if row < x.base { x.own[row - x.origin] } else { x.above[row - x.base] }
         };
         front.extend(self.pattern.iter().map(known));
-        widest(Substitute { values: self.values, width: self.width, front });
+        widest(Substitute { values: self.values, columns: self.swept, front });
         x.own[own..own + self.width].copy_from_slice(&front[..self.width]);
     }
 }
@@ -95,10 +104,10 @@ pub struct Split<'a, Above> {
     pub base: usize,
 }
 
-/// front ← what the columns leave of it, and what they bring to the rows below.
+/// front ← what the first columns leave of it, and what they bring to the rows below.
 struct Eliminate<'a> {
     values: &'a [f64],
-    width: usize,
+    columns: usize,
     front: &'a mut [f64],
 }
 
@@ -107,7 +116,7 @@ impl Kernel for Eliminate<'_> {
     #[inline(always)]
     fn run(self) {
         let rows = self.front.len();
-        for c in 0..self.width {
+        for c in 0..self.columns {
             let column = &self.values[c * rows + c..(c + 1) * rows];
             let (own, below) = self.front[c..].split_at_mut(1);
             own[0] /= column[0];
@@ -116,10 +125,10 @@ impl Kernel for Eliminate<'_> {
     }
 }
 
-/// The columns of front ← L⁻ᵀ of them, given the rows below.
+/// The first columns of front ← L⁻ᵀ of them, given the rows below.
 struct Substitute<'a> {
     values: &'a [f64],
-    width: usize,
+    columns: usize,
     front: &'a mut [f64],
 }
 
@@ -128,7 +137,7 @@ impl Kernel for Substitute<'_> {
     #[inline(always)]
     fn run(self) {
         let rows = self.front.len();
-        for c in (0..self.width).rev() {
+        for c in (0..self.columns).rev() {
             let column = &self.values[c * rows + c..(c + 1) * rows];
             let (own, below) = self.front[c..].split_at_mut(1);
             own[0] = (own[0] - dot(&column[1..], below)) / column[0];
@@ -151,45 +160,55 @@ impl<'a> Sweep<'a> {
         Self { l, tree, least: LEAST_ENTRIES_FOR_A_THREAD.max(share as usize) }
     }
 
-    /// First column of the supernodes that hold the tail; past the last where there is none.
-    pub fn base(&self) -> usize {
-        let begin = self.l.0.supernode_begin();
-        begin.get(self.tree.tail).copied().unwrap_or(self.l.0.nrows())
-    }
-
     /// x ← L⁻¹ x.
     pub fn forward(&self, x: &mut [f64]) {
-        let base = self.base();
-        let (inner, rest) = x.split_at_mut(base);
-        let brought = self.forward_below(&self.tree.roots, inner, base);
-        add(rest, &brought);
-        self.forward_tail(rest);
+        self.forward_to(self.l.0.nrows(), x);
     }
 
     /// x ← L⁻ᵀ x.
     pub fn backward(&self, x: &mut [f64]) {
-        let base = self.base();
+        self.backward_from(self.l.0.nrows(), x);
+    }
+
+    /// Eliminates the columns before `end`, the first of the tail or past the last: what it leaves from
+    /// there on is the right-hand side of their Schur complement.
+    pub fn forward_to(&self, end: usize, x: &mut [f64]) {
+        let (n, base) = (self.l.0.nrows(), self.base());
         let (inner, rest) = x.split_at_mut(base);
-        self.backward_tail(rest);
+        let brought = self.forward_below(&self.tree.roots, inner, base);
+        add(rest, &brought);
+        let mut front = Vec::new();
+        let mut x = Split { own: rest, origin: base, above: &mut [][..], base: n };
+        for node in self.tail_before(end) {
+            node.forward(&mut x, &mut front);
+        }
+    }
+
+    /// Columns before `end`, as in [`Self::forward_to`], from those that are known from there on.
+    pub fn backward_from(&self, end: usize, x: &mut [f64]) {
+        let (n, base) = (self.l.0.nrows(), self.base());
+        let (inner, rest) = x.split_at_mut(base);
+        let mut front = Vec::new();
+        let mut x = Split { own: &mut *rest, origin: base, above: &[][..], base: n };
+        for node in self.tail_before(end).rev() {
+            node.backward(&mut x, &mut front);
+        }
         self.backward_below(&self.tree.roots, inner, rest, base);
     }
 
-    /// x ← L⁻¹ x on the columns from the base on.
-    pub fn forward_tail(&self, x: &mut [f64]) {
-        let (n, origin) = (self.l.0.nrows(), self.base());
-        let (mut x, mut front) = (Split { own: x, origin, above: &mut [][..], base: n }, vec![]);
-        for s in self.tree.tail..self.l.0.n_supernodes() {
-            Supernode::new(self.l, s).forward(&mut x, &mut front);
-        }
+    /// First column of the supernodes that hold the tail; past the last where there is none.
+    fn base(&self) -> usize {
+        let begin = self.l.0.supernode_begin();
+        begin.get(self.tree.tail).copied().unwrap_or(self.l.0.nrows())
     }
 
-    /// x ← L⁻ᵀ x on the columns from the base on.
-    pub fn backward_tail(&self, x: &mut [f64]) {
-        let (n, origin) = (self.l.0.nrows(), self.base());
-        let (mut x, mut front) = (Split { own: x, origin, above: &[][..], base: n }, vec![]);
-        for s in (self.tree.tail..self.l.0.n_supernodes()).rev() {
-            Supernode::new(self.l, s).backward(&mut x, &mut front);
-        }
+    /// Supernodes that hold the tail, as far as they begin before column `end`.
+    fn tail_before(&self, end: usize) -> impl DoubleEndedIterator<Item = Supernode<'a>> {
+        let begin = &self.l.0.supernode_begin()[self.tree.tail..];
+        let count =
+            begin.partition_point(|&b| b < end).min(self.l.0.n_supernodes() - self.tree.tail);
+        let l = self.l;
+        (self.tree.tail..self.tree.tail + count).map(move |s| Supernode::new(l, s).before(end))
     }
 
     /// Forward through the subtrees of `roots`, whose columns are `own`; what they bring to the columns

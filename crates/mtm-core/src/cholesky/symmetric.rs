@@ -1,6 +1,7 @@
 //! Dense symmetric matrices by their lower triangle: product with a vector, and Cholesky factor.
 
-use std::ops::Range;
+use std::iter::Sum;
+use std::ops::{AddAssign, Mul, Range};
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt;
@@ -21,11 +22,31 @@ const COLUMNS_AT_ONCE: usize = 4;
 /// Sums that run side by side in a scalar product: the width of two vector registers.
 const SUMS: usize = 8;
 
+/// Numbers of a product: doubles, or floats where reading half as much counts for more.
+pub trait Number:
+    Copy + Default + Send + Sync + AddAssign + Mul<Output = Self> + Sum + 'static
+{
+    /// Runs [`DotsAndAdd`] in as many lanes as a register has.
+    fn dots_and_add(pass: DotsAndAdd<'_, Self>) -> [Self; COLUMNS_AT_ONCE];
+}
+
+impl Number for f64 {
+    fn dots_and_add(pass: DotsAndAdd<'_, Self>) -> [Self; COLUMNS_AT_ONCE] {
+        pass.in_lanes::<LANES>()
+    }
+}
+
+impl Number for f32 {
+    fn dots_and_add(pass: DotsAndAdd<'_, Self>) -> [Self; COLUMNS_AT_ONCE] {
+        pass.in_lanes::<{ 2 * LANES }>()
+    }
+}
+
 /// Dense symmetric matrix, lower triangle by columns.
-pub struct DenseSymmetric {
+pub struct DenseSymmetric<T = f64> {
     size: usize,
     /// Column by column, `size` each; what stands above the diagonal is not read.
-    values: Vec<f64>,
+    values: Vec<T>,
 }
 
 /// L of A = L Lᵀ.
@@ -56,53 +77,6 @@ impl DenseSymmetric {
         self.size
     }
 
-    /// Bytes held.
-    pub fn bytes(&self) -> usize {
-        8 * self.values.len()
-    }
-
-    /// Column `c` from the diagonal down.
-    #[inline(always)]
-    pub fn column(&self, c: usize) -> &[f64] {
-        &self.values[c * self.size + c..(c + 1) * self.size]
-    }
-
-    /// A x: each entry below the diagonal is read once and used twice.
-    pub fn multiply(&self, x: &[f64]) -> Vec<f64> {
-        let n = self.size;
-        if n < ROWS_TO_SHARE {
-            let mut y = vec![0.0; n];
-            self.add_columns(0..n, x, &mut y);
-            return y;
-        }
-        // Column c holds n − c entries: parts of equal area end where (n − c)² falls evenly.
-        let end = |part: usize| {
-            let left = (PARTS - part) as f64 / PARTS as f64;
-            n - (n as f64 * left.sqrt()).round() as usize
-        };
-        let parts: Vec<(usize, Vec<f64>)> = (0..PARTS)
-            .into_par_iter()
-            .map(|part| {
-                let (first, last) = (end(part), end(part + 1));
-                let mut y = vec![0.0; n - first];
-                self.add_columns(first..last, &x[first..], &mut y);
-                (first, y)
-            })
-            .collect();
-        let mut y = vec![0.0; n];
-        for (first, part) in parts {
-            for (y, v) in y[first..].iter_mut().zip(part) {
-                *y += v;
-            }
-        }
-        y
-    }
-
-    /// Adds what `columns` bring to A x; `x` and `y` begin at the first of them.
-    fn add_columns(&self, columns: Range<usize>, x: &[f64], y: &mut [f64]) {
-        widest(AddColumns { matrix: self, columns, x, y });
-    }
-
     /// The Cholesky factor; the row of the first pivot that is not positive on failure.
     pub fn factor(self) -> Result<DenseFactor, usize> {
         let Self { size: n, mut values } = self;
@@ -124,49 +98,119 @@ impl DenseSymmetric {
     }
 }
 
-/// Some columns of a product.
-struct AddColumns<'a> {
-    matrix: &'a DenseSymmetric,
-    columns: Range<usize>,
-    x: &'a [f64],
-    y: &'a mut [f64],
-}
+impl<T: Number> DenseSymmetric<T> {
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        size_of_val(&self.values[..])
+    }
 
-impl Kernel for AddColumns<'_> {
-    type Output = ();
+    /// Column `c` from the diagonal down.
     #[inline(always)]
-    fn run(self) {
-        let Self { matrix, columns, x, y } = self;
+    pub fn column(&self, c: usize) -> &[T] {
+        &self.values[c * self.size + c..(c + 1) * self.size]
+    }
+
+    /// A x: each entry below the diagonal is read once and used twice.
+    pub fn multiply(&self, x: &[T]) -> Vec<T> {
+        let n = self.size;
+        if n < ROWS_TO_SHARE {
+            let mut y = vec![T::default(); n];
+            self.add_columns(0..n, x, &mut y);
+            return y;
+        }
+        // Column c holds n − c entries: parts of equal area end where (n − c)² falls evenly.
+        let end = |part: usize| {
+            let left = (PARTS - part) as f64 / PARTS as f64;
+            n - (n as f64 * left.sqrt()).round() as usize
+        };
+        let parts: Vec<(usize, Vec<T>)> = (0..PARTS)
+            .into_par_iter()
+            .map(|part| {
+                let (first, last) = (end(part), end(part + 1));
+                let mut y = vec![T::default(); n - first];
+                self.add_columns(first..last, &x[first..], &mut y);
+                (first, y)
+            })
+            .collect();
+        let mut y = vec![T::default(); n];
+        for (first, part) in parts {
+            for (y, v) in y[first..].iter_mut().zip(part) {
+                *y += v;
+            }
+        }
+        y
+    }
+
+    /// Adds what `columns` bring to A x; `x` and `y` begin at the first of them.
+    fn add_columns(&self, columns: Range<usize>, x: &[T], y: &mut [T]) {
         let (first, mut c) = (columns.start, columns.start);
         while c + COLUMNS_AT_ONCE <= columns.end {
             let (x, y) = (&x[c - first..], &mut y[c - first..]);
             // The triangle at the top of the columns, then the rows that all of them have.
             for k in 0..COLUMNS_AT_ONCE {
-                let top = &matrix.column(c + k)[..COLUMNS_AT_ONCE - k];
+                let top = &self.column(c + k)[..COLUMNS_AT_ONCE - k];
                 y[k] += top[0] * x[k];
-                for (r, a) in (k + 1..).zip(&top[1..]) {
+                for (r, &a) in (k + 1..).zip(&top[1..]) {
                     y[k] += a * x[r];
                     y[r] += a * x[k];
                 }
             }
-            let below = std::array::from_fn(|k| &matrix.column(c + k)[COLUMNS_AT_ONCE - k..]);
+            let a = std::array::from_fn(|k| &self.column(c + k)[COLUMNS_AT_ONCE - k..]);
             let weights = std::array::from_fn(|k| x[k]);
-            let (own, rest) = y.split_at_mut(COLUMNS_AT_ONCE);
-            let sums = dots_and_add(below, &x[COLUMNS_AT_ONCE..], weights, rest);
+            let (own, y) = y.split_at_mut(COLUMNS_AT_ONCE);
+            let sums = T::dots_and_add(DotsAndAdd { a, x: &x[COLUMNS_AT_ONCE..], weights, y });
             for (y, sum) in own.iter_mut().zip(sums) {
                 *y += sum;
             }
             c += COLUMNS_AT_ONCE;
         }
         for c in c..columns.end {
-            let column = matrix.column(c);
+            let column = self.column(c);
             let (x, y) = (&x[c - first..], &mut y[c - first..]);
             y[0] += column[0] * x[0];
-            for (r, a) in (1..).zip(&column[1..]) {
+            for (r, &a) in (1..).zip(&column[1..]) {
                 y[0] += a * x[r];
                 y[r] += a * x[0];
             }
         }
+    }
+}
+
+/// A positive definite matrix in single precision: half as much to read.
+pub struct Rough {
+    /// With ones on the diagonal: its numbers fit whatever the units.
+    matrix: DenseSymmetric<f32>,
+    /// Square root of each diagonal entry.
+    scale: Vec<f64>,
+}
+
+impl Rough {
+    /// `matrix` to seven digits.
+    pub fn of(matrix: &DenseSymmetric) -> Self {
+        let n = matrix.size;
+        let scale: Vec<f64> = (0..n).map(|c| matrix.column(c)[0].sqrt()).collect();
+        let mut values = vec![0.0; n * n];
+        values.par_chunks_mut(n.max(1)).enumerate().for_each(|(c, column)| {
+            let entries = column[c..].iter_mut().zip(matrix.column(c)).zip(&scale[c..]);
+            for ((to, v), s) in entries {
+                *to = (v / (s * scale[c])) as f32;
+            }
+        });
+        Self { matrix: DenseSymmetric { size: n, values }, scale }
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        self.matrix.bytes() + size_of_val(&self.scale[..])
+    }
+
+    /// A x to six or seven digits of what the largest entries bring.
+    pub fn multiply(&self, x: &[f64]) -> Vec<f64> {
+        let scaled = || x.iter().zip(&self.scale).map(|(x, s)| x * s);
+        let largest = scaled().fold(f64::MIN_POSITIVE, |m, v| m.max(v.abs()));
+        let x: Vec<f32> = scaled().map(|v| (v / largest) as f32).collect();
+        let y = self.matrix.multiply(&x);
+        y.iter().zip(&self.scale).map(|(&y, s)| f64::from(y) * (s * largest)).collect()
     }
 }
 
@@ -244,34 +288,64 @@ pub(super) fn add_scaled(a: &[f64], weight: f64, y: &mut [f64]) {
 }
 
 /// Adds Σ `weights` · `a` to `y` and gives each aᵀx, in one pass over all: x and y are read once for the four.
-#[inline(always)]
-fn dots_and_add(
-    a: [&[f64]; COLUMNS_AT_ONCE],
-    x: &[f64],
-    weights: [f64; COLUMNS_AT_ONCE],
-    y: &mut [f64],
-) -> [f64; COLUMNS_AT_ONCE] {
-    let mut sums = [[0.0; LANES]; COLUMNS_AT_ONCE];
-    let lanes = a.map(|a| a.as_chunks::<LANES>());
-    let (x_lanes, x_rest) = x.as_chunks::<LANES>();
-    let (y_lanes, y_rest) = y.as_chunks_mut::<LANES>();
-    for (i, (x, y)) in x_lanes.iter().zip(y_lanes).enumerate() {
-        for k in 0..COLUMNS_AT_ONCE {
-            let a = &lanes[k].0[i];
-            for lane in 0..LANES {
-                sums[k][lane] += a[lane] * x[lane];
-                y[lane] += weights[k] * a[lane];
+pub struct DotsAndAdd<'a, T> {
+    a: [&'a [T]; COLUMNS_AT_ONCE],
+    x: &'a [T],
+    weights: [T; COLUMNS_AT_ONCE],
+    y: &'a mut [T],
+}
+
+impl<T: Number> DotsAndAdd<'_, T> {
+    fn in_lanes<const LANES: usize>(self) -> [T; COLUMNS_AT_ONCE] {
+        let Self { a, x, weights, y } = self;
+        let whole = x.len() / LANES * LANES;
+        let (y_lanes, y_rest) = y.as_chunks_mut::<LANES>();
+        let lanes =
+            InLanes { a: a.map(|a| a.as_chunks().0), x: x.as_chunks().0, weights, y: y_lanes };
+        let mut sums = widest(lanes).map(|lanes| lanes.into_iter().sum());
+        for (i, y) in (whole..).zip(y_rest) {
+            for k in 0..COLUMNS_AT_ONCE {
+                sums[k] += a[k][i] * x[i];
+                *y += weights[k] * a[k][i];
             }
         }
+        sums
     }
-    for (i, (x, y)) in x_rest.iter().zip(y_rest).enumerate() {
-        for k in 0..COLUMNS_AT_ONCE {
-            let a = lanes[k].1[i];
-            sums[k][0] += a * x;
-            *y += weights[k] * a;
+}
+
+/// The rows of a pass that fill registers.
+///
+/// What it reads is copied before what it writes, and the lanes are summed outside: both keep the sums in
+/// registers, which makes it three times as fast.
+struct InLanes<'a, T, const LANES: usize> {
+    a: [&'a [[T; LANES]]; COLUMNS_AT_ONCE],
+    x: &'a [[T; LANES]],
+    weights: [T; COLUMNS_AT_ONCE],
+    y: &'a mut [[T; LANES]],
+}
+
+impl<T: Number, const LANES: usize> Kernel for InLanes<'_, T, LANES> {
+    type Output = [[T; LANES]; COLUMNS_AT_ONCE];
+    #[inline(always)]
+    fn run(self) -> Self::Output {
+        let Self { a: [a0, a1, a2, a3], x, weights, y } = self;
+        let mut sums = [[T::default(); LANES]; COLUMNS_AT_ONCE];
+        for (((((x, y), a0), a1), a2), a3) in x.iter().zip(y).zip(a0).zip(a1).zip(a2).zip(a3) {
+            let (x, a, mut there) = (*x, [*a0, *a1, *a2, *a3], *y);
+            for k in 0..COLUMNS_AT_ONCE {
+                for lane in 0..LANES {
+                    sums[k][lane] += a[k][lane] * x[lane];
+                }
+            }
+            for k in 0..COLUMNS_AT_ONCE {
+                for lane in 0..LANES {
+                    there[lane] += weights[k] * a[k][lane];
+                }
+            }
+            *y = there;
         }
+        sums
     }
-    sums.map(|lanes| lanes.iter().sum())
 }
 
 #[cfg(test)]
@@ -302,6 +376,24 @@ mod tests {
             let mut found = exact.as_slice().to_vec();
             lower.factor().unwrap().solve(&mut found);
             assert!((DVector::from_vec(found) - &x).amax() <= 1e-12, "{n}");
+        }
+    }
+
+    /// Six digits, also where the rows are of very different size.
+    #[test]
+    fn rough_product_equals_the_dense_one_to_single_precision() {
+        let (dense, ..) = example(ROWS_TO_SHARE + 13);
+        let size = |i: usize| 10.0_f64.powi(17 * (i % 5) as i32 - 40);
+        let lower = DenseSymmetric::from_columns(dense.nrows(), |c, column| {
+            for (r, v) in (c..).zip(column.iter_mut()) {
+                *v = dense[(r, c)] * size(r) * size(c);
+            }
+        });
+        let x: Vec<f64> = (0..dense.nrows()).map(|i| (i as f64).cos() / size(i)).collect();
+        let (exact, rough) = (lower.multiply(&x), Rough::of(&lower).multiply(&x));
+        let own = |i: usize| dense[(i, i)] * size(i);
+        for (i, (a, b)) in exact.iter().zip(&rough).enumerate() {
+            assert!((a - b).abs() <= 1e-6 * own(i), "{a:e} {b:e}");
         }
     }
 
