@@ -81,7 +81,7 @@ peers: $(BUILD_STAMP) ## compare with the peers that are installed (benches/peer
 
 frontier: $(BUILD_STAMP) ## measure error against run time (hours), and put it into docs/frontier.md
 	"$(PY)" -m cmfsim bench frontier -o target/frontier
-	"$(PY)" scripts/fill_frontier.py target/frontier
+	"$(PY)" benches/fill_frontier.py target/frontier head
 
 demo: $(BUILD_STAMP) ## predict a face after surgery, and open its report
 	"$(BIN)/cmfsim" demo

@@ -1,0 +1,39 @@
+"""Puts what `cmfsim bench frontier` measured into the documentation.
+
+    python benches/fill_frontier.py FOLDER NAME
+
+`docs/frontier.md` has two marks around the tables of each NAME (head, ct_phantom); the picture
+stands beside the others.
+"""
+
+import re
+import shutil
+import sys
+from pathlib import Path
+
+from marked import replace_marked
+
+DOCS = Path(__file__).parents[1] / "docs"
+PICTURE = "![Error on the skin against run time](figures/frontier-{}.png)"
+
+
+def main(folder: Path, name: str) -> None:
+    """Fills the page with the tables in `folder`.
+
+    Raises
+    ------
+    SystemExit
+        No sweep was finished there, or the page has no place for it.
+    """
+    page = folder / "frontier.md"
+    if not page.exists():
+        raise SystemExit(f"{page} is missing: run cmfsim bench frontier -o {folder} first")
+    # The page's own title gives way to that of the documentation, its sections become parts of one.
+    measured = re.sub(r"\A# .*\n+", "", page.read_text(encoding="utf-8"))
+    measured = re.sub(r"^## ", "#### ", measured, flags=re.MULTILINE)
+    replace_marked(DOCS / "frontier.md", name, f"{PICTURE.format(name)}\n\n{measured}")
+    shutil.copyfile(folder / "frontier.png", DOCS / "figures" / f"frontier-{name}.png")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2])
