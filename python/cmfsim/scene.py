@@ -268,7 +268,8 @@ class SolverOptions:
     tolerance : float
         Relative error bound of the iterative methods.
     max_iterations : int or None
-    contact_tolerance : float, mm
+    contact_tolerance : float
+        Largest gap over the diagonal of the mesh, and largest tangential share of contact forces.
     contact_iterations : int
     memory_limit : float or None, MB
     element : str

@@ -154,6 +154,28 @@ fn methods_settle_on_the_same_answer() {
     assert!(e <= 1e-5, "{e:e} mm");
 }
 
+/// Solved loosely, contact settles as loosely: it is not asked to settle nearer than the solves repeat, and
+/// takes no longer than where they are exact.
+#[test]
+fn contact_settles_as_far_as_the_solves_are() {
+    let bone = molar(20);
+    let (mesh, _, bounds) = block_on(&bone, Gap::Uniform(0.0));
+    let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
+    for (name, motion) in moves() {
+        let exact = solve(&tensors, &bounds, with_method(Method::Pcg), &motion, None).unwrap();
+        let far = meshes::largest(&exact.displacements);
+        for tolerance in [1e-2, 1e-4] {
+            let options = StaticOptions { tolerance, ..with_method(Method::Pcg) };
+            let found = solve(&tensors, &bounds, options, &motion, None)
+                .unwrap_or_else(|e| panic!("{name}, {tolerance:e}: {e}"));
+            let e = largest_difference(&exact.displacements, &found.displacements);
+            assert!(e <= 3.0 * tolerance * far, "{name}: {e:e} mm");
+            assert!(found.contact_gap() <= 0.2 * tolerance * far, "{name}");
+            assert!(found.contact_iterations <= exact.contact_iterations, "{name}");
+        }
+    }
+}
+
 /// A pit whose walls fall at 55°, between plateaus: nodes pressed in and pushed across end on the walls, at
 /// the bottom or on the rims, never on the extension of a wall.
 #[test]

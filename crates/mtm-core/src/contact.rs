@@ -250,6 +250,13 @@ impl Sliding {
         (out, seats)
     }
 
+    /// Largest motion of a sliding node that clings to its segment, mm.
+    pub(crate) fn farthest(&self, motions: &[&Motion]) -> Result<f64> {
+        let (carried, _) = self.carried(motions, &self.moved_surfaces(motions)?);
+        let moved = carried.iter().zip(&self.positions).map(|(c, x)| norm(sub(*c, *x)));
+        Ok(moved.fold(0.0, f64::max))
+    }
+
     pub(crate) fn moved_surfaces(&self, motions: &[&Motion]) -> Result<Vec<MovedSurface>> {
         self.surfaces
             .iter()

@@ -29,6 +29,9 @@ const MAX_KEPT_SLIDING: usize = 6000;
 const STEP_SHARE: f64 = 1e-2;
 /// The same where nodes may lift off: small forces decide which.
 const LIFTING_STEP_SHARE: f64 = 1e-4;
+/// Share of the error allowed to an iterative solve that contact may have as well: it cannot settle nearer
+/// than the solves repeat.
+const CONTACT_SHARE: f64 = 0.1;
 /// Multiple of a factor's trial error that stands for the error of any solution by it.
 const TRIAL_SAFETY: f64 = 10.0;
 
@@ -189,7 +192,12 @@ impl System {
         }
         let mut trail = Trail::starting(rows.to_vec());
         let share = Some(share);
-        let state = sliding.settle(motions, first, &options.contact, interrupted, |c| {
+        let mut contact = options.contact;
+        if let Kept::Iterative(_) = self.kept {
+            let far = scale.max(sliding.farthest(motions)?);
+            contact.allowed = contact.allowed.max(CONTACT_SHARE * options.tolerance * far);
+        }
+        let state = sliding.settle(motions, first, &contact, interrupted, |c| {
             self.solve_projected(b, sliding, c, scale, share, &mut trail, effort, interrupted)
         })?;
         Ok((trail.rows, state, clock.total()))

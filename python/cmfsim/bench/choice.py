@@ -33,7 +33,8 @@ class Choice:
         As `SolverOptions` takes them.
     tolerance : float
         Relative error bound of iterative methods.
-    contact_tolerance : float, mm
+    contact_tolerance : float
+        Largest gap over the diagonal of the mesh.
     samples : int
         Points in a tet that a muscle's surface crosses.
     mixing : str

@@ -19,7 +19,7 @@ FACTORS: Mapping[str, tuple[Any, ...]] = MappingProxyType(
     {
         "method": tuple(name for name in METHODS if name != "auto"),
         "tolerance": (1e-2, 1e-4, 1e-6, 1e-10),
-        "contact_tolerance": (1e-1, 1e-3, 1e-6),
+        "contact_tolerance": (1e-3, 1e-5, 1e-7),
         "contact": CONTACTS,
         "samples": (1, 4, 16, 256),
         "mixing": MIXINGS,

@@ -10,7 +10,7 @@ use crate::equilibrium::{
 };
 use crate::error::Result;
 use crate::iterative::Effort;
-use crate::mesh::{add, norm, sub};
+use crate::mesh::{add, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
 use crate::reduction::Reduction;
 use crate::restraint::Held;
@@ -25,16 +25,6 @@ pub(crate) struct Slide<'a> {
     pub motions: &'a [&'a Motion],
     /// How the body is held.
     pub held: Held,
-}
-
-impl Slide<'_> {
-    /// Largest motion of a sliding node that clings to its segment, mm.
-    fn far(&self) -> Result<f64> {
-        let surfaces = self.sliding.moved_surfaces(self.motions)?;
-        let (carried, _) = self.sliding.carried(self.motions, &surfaces);
-        let moved = carried.iter().zip(&self.sliding.positions).map(|(c, x)| norm(sub(*c, *x)));
-        Ok(moved.fold(0.0, f64::max))
-    }
 }
 
 impl Equilibrium {
@@ -56,7 +46,7 @@ impl Equilibrium {
             change[j as usize] = [0.0; 3];
         }
         // Walls move the body also where no node is joined to one.
-        let far = slide.far()?.max(reach(&rest, target));
+        let far = slide.sliding.farthest(slide.motions)?.max(reach(&rest, target));
         let first = far * STEP_SHARE.max(STEP_TOLERANCE * self.options.tolerance);
         let ((rows, mut contact), _) = by_tangent(Exact, |kind| {
             let change = Some(&change[..]);
