@@ -205,8 +205,7 @@ impl<'a> Sweep<'a> {
     /// Supernodes that hold the tail, as far as they begin before column `end`.
     fn tail_before(&self, end: usize) -> impl DoubleEndedIterator<Item = Supernode<'a>> {
         let begin = &self.l.0.supernode_begin()[self.tree.tail..];
-        let count =
-            begin.partition_point(|&b| b < end).min(self.l.0.n_supernodes() - self.tree.tail);
+        let count = begin.partition_point(|&b| b < end);
         let l = self.l;
         (self.tree.tail..self.tree.tail + count).map(move |s| Supernode::new(l, s).before(end))
     }
@@ -356,6 +355,26 @@ mod tests {
             for (v, w) in answers[0].as_flattened().iter().zip(several[0].as_flattened()) {
                 assert!((v - w).abs() <= 1e-13 * largest, "{v:e} {w:e}");
             }
+        }
+    }
+
+    /// What reaches the rows kept last, through their flexibility, and back to the rest: the whole solution.
+    #[test]
+    fn sweeps_to_the_tail_and_back_equal_whole_ones() {
+        let n = 40;
+        let matrix = grid(n);
+        let tail: Vec<u32> = (0..n as u32).map(|i| n as u32 * i + 7).collect();
+        let symbolic = Symbolic::new(&matrix, &tail).unwrap();
+        let factor = symbolic.factor(&matrix).unwrap();
+        let b: Vec<[f64; 3]> =
+            (0..n * n).map(|j| [(j as f64).cos(), 1.0, (2.0 * j as f64).sin()]).collect();
+        let (forces, swept) = symbolic.on_tail(&factor, &b);
+        let there = symbolic.tail_flexibility(&factor).respond(&forces);
+        let found = symbolic.above_tail(&factor, swept, &there);
+        let whole = symbolic.solve(&factor, &b);
+        let largest = whole.as_flattened().iter().fold(0.0_f64, |m, v| m.max(v.abs()));
+        for (v, w) in found.as_flattened().iter().zip(whole.as_flattened()) {
+            assert!((v - w).abs() <= 1e-12 * largest, "{v:e} {w:e}");
         }
     }
 }
