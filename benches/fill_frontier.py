@@ -6,9 +6,9 @@
 stands beside the others.
 """
 
+import argparse
 import re
 import shutil
-import sys
 from pathlib import Path
 
 from marked import replace_marked
@@ -36,4 +36,8 @@ def main(folder: Path, name: str) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2])
+    parser = argparse.ArgumentParser(description="Puts a finished sweep into docs/frontier.md.")
+    parser.add_argument("folder", type=Path, help="the -o of cmfsim bench frontier")
+    parser.add_argument("name", help="its part of the page: head, ct_phantom")
+    found = parser.parse_args()
+    main(found.folder, found.name)

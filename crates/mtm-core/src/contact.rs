@@ -217,6 +217,21 @@ impl Sliding {
         motions: &[&Motion],
         surfaces: &[MovedSurface],
     ) -> (Vec<[f64; 3]>, Vec<Seat>) {
+        let out = self.clinging(motions);
+        let seats = (0..self.nodes.len())
+            .map(|i| match self.gaps[i] {
+                Some(gap) => Seat { offset: [0.0; 3], gap },
+                None => {
+                    let foot = surfaces[self.nodes[i].segment].carried(&self.rest[i]);
+                    Seat { offset: sub(out[i], foot), gap: 0.0 }
+                }
+            })
+            .collect();
+        (out, seats)
+    }
+
+    /// Where the sliding nodes would be if they clung to their segment.
+    fn clinging(&self, motions: &[&Motion]) -> Vec<[f64; 3]> {
         let mut out = self.positions.clone();
         for (s, motion) in motions.iter().enumerate() {
             let members: Vec<usize> =
@@ -238,23 +253,14 @@ impl Sliding {
                 Motion::Nodes(_) => {}
             }
         }
-        let seats = (0..self.nodes.len())
-            .map(|i| match self.gaps[i] {
-                Some(gap) => Seat { offset: [0.0; 3], gap },
-                None => {
-                    let foot = surfaces[self.nodes[i].segment].carried(&self.rest[i]);
-                    Seat { offset: sub(out[i], foot), gap: 0.0 }
-                }
-            })
-            .collect();
-        (out, seats)
+        out
     }
 
     /// Largest motion of a sliding node that clings to its segment, mm.
-    pub(crate) fn farthest(&self, motions: &[&Motion]) -> Result<f64> {
-        let (carried, _) = self.carried(motions, &self.moved_surfaces(motions)?);
-        let moved = carried.iter().zip(&self.positions).map(|(c, x)| norm(sub(*c, *x)));
-        Ok(moved.fold(0.0, f64::max))
+    pub(crate) fn farthest(&self, motions: &[&Motion]) -> f64 {
+        let clinging = self.clinging(motions);
+        let moved = clinging.iter().zip(&self.positions).map(|(c, x)| norm(sub(*c, *x)));
+        moved.fold(0.0, f64::max)
     }
 
     pub(crate) fn moved_surfaces(&self, motions: &[&Motion]) -> Result<Vec<MovedSurface>> {

@@ -18,8 +18,8 @@ use crate::restraint::Held;
 use crate::row_sums::in_pool;
 use crate::solution::Clock;
 
-/// Most sliding nodes whose whole flexibility is kept (three unknowns each, 8 bytes a pair, twice): with
-/// it a set of normals costs a few dense products, by sweeps a few passes over the factor.
+/// Most sliding nodes whose whole flexibility is kept (three unknowns each, 12 bytes a pair: doubles and
+/// floats): with it a set of normals costs a few dense products, by sweeps a few passes over the factor.
 const MAX_DENSE_SLIDING: usize = 2500;
 /// Most sliding nodes of which the flexibility along the normals at rest is kept: 8 bytes a pair.
 const MAX_KEPT_SLIDING: usize = 6000;
@@ -194,7 +194,7 @@ impl System {
         let share = Some(share);
         let mut contact = options.contact;
         if let Kept::Iterative(_) = self.kept {
-            let far = scale.max(sliding.farthest(motions)?);
+            let far = scale.max(sliding.farthest(motions));
             contact.allowed = contact.allowed.max(CONTACT_SHARE * options.tolerance * far);
         }
         let state = sliding.settle(motions, first, &contact, interrupted, |c| {

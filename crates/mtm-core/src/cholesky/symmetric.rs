@@ -23,9 +23,7 @@ const COLUMNS_AT_ONCE: usize = 4;
 const SUMS: usize = 8;
 
 /// Numbers of a product: doubles, or floats where reading half as much counts for more.
-pub trait Number:
-    Copy + Default + Send + Sync + AddAssign + Mul<Output = Self> + Sum + 'static
-{
+pub trait Number: Copy + Default + Send + Sync + AddAssign + Mul<Output = Self> + Sum {
     /// Runs [`DotsAndAdd`] in as many lanes as a register has.
     fn dots_and_add(pass: DotsAndAdd<'_, Self>) -> [Self; COLUMNS_AT_ONCE];
 }

@@ -46,7 +46,7 @@ impl Equilibrium {
             change[j as usize] = [0.0; 3];
         }
         // Walls move the body also where no node is joined to one.
-        let far = slide.sliding.farthest(slide.motions)?.max(reach(&rest, target));
+        let far = slide.sliding.farthest(slide.motions).max(reach(&rest, target));
         let first = far * STEP_SHARE.max(STEP_TOLERANCE * self.options.tolerance);
         let ((rows, mut contact), _) = by_tangent(Exact, |kind| {
             let change = Some(&change[..]);
