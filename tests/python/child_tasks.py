@@ -1,0 +1,46 @@
+"""What the child process is asked to do in `test_child.py`."""
+
+import builtins
+import os
+import sys
+import time
+
+import numpy as np
+
+from cmfsim import errors
+from cmfsim.io.child import Answer
+
+
+def arrays(count):
+    rows = np.arange(float(count))[:, None] * np.ones(3)
+    found = {"floats": rows, "empty": np.zeros((0, 3)), "bytes": np.zeros(3, np.uint8)}
+    return Answer({"name": "five", "none": None}, found)
+
+
+def fail(kind):
+    raise (getattr(errors, kind, None) or getattr(builtins, kind))("slice 7 is not there")
+
+
+def crash(number):
+    os.kill(os.getpid(), number)
+    time.sleep(5.0)
+
+
+def spin():
+    while True:
+        pass
+
+
+def sleep():
+    time.sleep(600.0)
+
+
+def allocate(size):
+    return Answer({}, {"all": np.ones(size, np.uint8)})
+
+
+def chatter():
+    os.write(1, b"warning: 12\n")
+    print("warning: 13")
+    sys.stdout.flush()
+    return Answer({"read": True}, {})

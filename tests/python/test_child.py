@@ -1,0 +1,80 @@
+"""The process in which third-party readers run: crashes, hangs and limits end in named errors."""
+
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cmfsim
+from cmfsim.io import child
+from cmfsim.io.child import Answer, ReaderError, ReadLimits, read_in_child
+
+HERE = "child_tasks"
+
+
+def test_values_and_arrays_come_back_as_they_were_made():
+    answer = read_in_child(f"{HERE}:arrays", count=5)
+    assert answer.values == {"name": "five", "none": None}
+    assert np.array_equal(answer.arrays["floats"], np.arange(5.0)[:, None] * np.ones(3))
+    assert answer.arrays["empty"].shape == (0, 3)
+    assert answer.arrays["bytes"].dtype == np.uint8
+
+
+@pytest.mark.parametrize("kind", ["ImageError", "ImageInputError", "FileNotFoundError"])
+def test_an_error_keeps_its_class_and_text(kind):
+    expected = {"FileNotFoundError": FileNotFoundError, "ImageError": cmfsim.ImageError}
+    with pytest.raises(expected.get(kind, cmfsim.ImageError), match="slice 7"):
+        read_in_child(f"{HERE}:fail", kind=kind)
+
+
+def test_other_errors_name_themselves():
+    with pytest.raises(ReaderError, match=r"its reader failed \(slice 7"):
+        read_in_child(f"{HERE}:fail", kind="ZeroDivisionError")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX")
+@pytest.mark.parametrize("name", ["SIGSEGV", "SIGABRT"])
+def test_a_crash_is_an_error_and_the_next_file_is_read(name):
+    with pytest.raises(ReaderError, match=name):
+        read_in_child(f"{HERE}:crash", number=int(getattr(signal, name)))
+    assert read_in_child(f"{HERE}:arrays", count=1).values["name"] == "five"
+
+
+def test_a_reader_that_never_ends_is_stopped():
+    begun = time.monotonic()
+    with pytest.raises(ReaderError, match="did not come to an end"):
+        read_in_child(f"{HERE}:spin", ReadLimits(seconds=1.0))
+    with pytest.raises(ReaderError, match="did not come to an end"):
+        read_in_child(f"{HERE}:sleep", ReadLimits(seconds=0.2))
+    assert time.monotonic() - begun < 30.0
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="limits memory on Linux")
+def test_a_reader_that_asks_for_all_memory_is_stopped():
+    with pytest.raises(ReaderError, match="memory"):
+        read_in_child(f"{HERE}:allocate", ReadLimits(memory=2**28), size=2**40)
+
+
+def test_what_a_library_prints_does_not_get_into_answers():
+    assert read_in_child(f"{HERE}:chatter").values == {"read": True}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX")
+def test_ctrl_c_ends_a_reader_that_hangs():
+    threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        read_in_child(f"{HERE}:sleep", ReadLimits(seconds=60.0))
+    assert time.monotonic() - begun < 20.0
+    assert read_in_child(f"{HERE}:arrays", count=1).values["name"] == "five"
+
+
+def test_one_process_serves_many_files():
+    read_in_child(f"{HERE}:arrays", count=1)
+    process = child._children[0].process.pid
+    assert isinstance(read_in_child(f"{HERE}:arrays", count=1), Answer)
+    assert child._children[0].process.pid == process
