@@ -167,7 +167,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
     for name, allowed in {
         "errors": "_core",
         "checks": "errors",
-        "scene": "checks errors",
+        "scene": "checks errors planning",
         "case": "checks errors scene",
         "patient": "checks errors",
         "model": "case checks musculature osteotomy scene",
@@ -187,7 +187,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "surface_checks surface_repair template_data _core"
         ),
         "phantom": "case checks errors scene",
-        "planning": "errors",
+        "planning": "errors _core",
         "achieved": "case checks errors planning registration scene _core",
         "bone_motion": "checks errors scene surface_checks topology _core",
         "osteotomy": "case checks errors planning scene _core",

@@ -181,6 +181,7 @@ __getattr__, __dir__, __all__ = deferred(
         "planning": (
             "RigidMotion",
             "decompose_motion",
+            "rigid_matrix",
             "rigid_motion",
         ),
         "prediction": (

@@ -137,7 +137,7 @@ from cmfsim.osteotomy import (
 from cmfsim.patient import CaseMuscles
 from cmfsim.patient_prediction import model_scene, predict_patient
 from cmfsim.phantom import HeadParameters, Muscle, PhantomHead, make_head
-from cmfsim.planning import RigidMotion, decompose_motion, rigid_motion
+from cmfsim.planning import RigidMotion, decompose_motion, rigid_matrix, rigid_motion
 from cmfsim.prediction import MODELS, Prediction
 from cmfsim.registration import (
     FoldReport,
@@ -325,6 +325,7 @@ __all__ = [
     "register_volumes",
     "repair_surface",
     "rigid_fit",
+    "rigid_matrix",
     "rigid_motion",
     "run_study",
     "scene_plan",

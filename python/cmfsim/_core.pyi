@@ -41,6 +41,7 @@ __all__ = [
     "icp",
     "part_mesh",
     "rigid_fit",
+    "rigid_matrix",
     "sample_muscles",
     "signed_distance_image",
     "stuff_image",
@@ -383,6 +384,7 @@ class IcpFit:
     @property
     def rms_history(self) -> _Floats: ...
 
+def rigid_matrix(matrix: ArrayLike, name: str = "matrix") -> _Floats: ...
 def rigid_fit(
     moving: ArrayLike,
     fixed: ArrayLike,

@@ -28,7 +28,7 @@ from cmfsim.checks import (
     frozen,
 )
 from cmfsim.errors import RegistrationError, RegistrationInputError
-from cmfsim.planning import RigidMotion, decompose_motion
+from cmfsim.planning import RigidMotion, decompose_motion, rigid_matrix
 from cmfsim.registration import icp
 from cmfsim.scene import MovedSurface, SurfaceData
 
@@ -339,9 +339,7 @@ def achieved_plan(
     """
     options = MatchOptions() if options is None else options
     parts = _surfaces(segments)
-    into = np.eye(4) if alignment is None else as_floats("alignment", alignment)
-    # Shape and rigidity; a planner's matrix may be off by rounding.
-    decompose_motion(into)
+    into = np.eye(4) if alignment is None else rigid_matrix(alignment, "alignment")
     if reference is not None:
         check_one_of("reference", reference, tuple(parts))
     for name in centres or {}:

@@ -6,13 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cmfsim._core import rigid_matrix
 from cmfsim.errors import BoundaryInputError
 
-__all__ = ["RigidMotion", "decompose_motion", "rigid_motion"]
-
-# Largest deviation of RᵀR from I that still counts as a rotation; a matrix typed with six decimals
-# passes, a scaled or sheared one does not. Dimensionless.
-ROTATION_TOLERANCE = 1e-5
+__all__ = ["RigidMotion", "decompose_motion", "rigid_matrix", "rigid_motion"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +87,12 @@ def rigid_motion(
     rotation = np.eye(3) + sine * cross + (1.0 - cosine) * (cross @ cross)
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
-    matrix[:3, 3] = c + t - rotation @ c
+    with np.errstate(over="ignore", invalid="ignore"):
+        matrix[:3, 3] = c + t - rotation @ c
+    if not np.isfinite(matrix).all():
+        raise BoundaryInputError(
+            f"translation {t.tolist()} about centre {c.tolist()} overflows: give both in mm"
+        )
     return matrix
 
 
@@ -100,7 +102,8 @@ def decompose_motion(matrix: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> 
     Parameters
     ----------
     matrix : (4, 4) float64, mm
-        A rotation with a translation; no scale, shear or mirror.
+        A rotation with a translation; no scale, shear or mirror. What `rigid_matrix` makes of it is
+        decomposed.
     centre : (3,) float64, mm
         The point about which the turn is meant. It decides the translation, not the angle.
 
@@ -111,8 +114,8 @@ def decompose_motion(matrix: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> 
     Raises
     ------
     BoundaryError
-        (also `ValueError`) Not a (4, 4) matrix, not finite, last row other than (0, 0, 0, 1), or
-        not a rotation.
+        (also `ValueError`) What `rigid_matrix` refuses: not a (4, 4) matrix, not finite, last row
+        other than (0, 0, 0, 1), or not a rotation. A centre that is not three finite numbers.
 
     Notes
     -----
@@ -127,24 +130,9 @@ def decompose_motion(matrix: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> 
     >>> round(motion.angle, 9), motion.translation.tolist()
     (10.0, [1.0, 2.0, 3.0])
     """
-    m = np.asarray(matrix, dtype=np.float64)
+    m = rigid_matrix(matrix)
     c = _three("centre", centre)
-    if m.shape != (4, 4):
-        raise BoundaryInputError(f"matrix has shape {m.shape}: a (4, 4) matrix is needed")
-    if not np.isfinite(m).all():
-        row, column = np.argwhere(~np.isfinite(m))[0]
-        raise BoundaryInputError(f"matrix[{row}, {column}] is {m[row, column]}: must be finite")
-    if not np.array_equal(m[3], [0.0, 0.0, 0.0, 1.0]):
-        raise BoundaryInputError(f"matrix[3] is {m[3].tolist()}: a motion ends with [0, 0, 0, 1]")
     rotation = m[:3, :3]
-    deviation = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if deviation > ROTATION_TOLERANCE:
-        raise BoundaryInputError(
-            f"matrix is not rigid: RᵀR differs from I by {deviation:.3g} "
-            f"(allowed {ROTATION_TOLERANCE:g}); it scales or shears"
-        )
-    if np.linalg.det(rotation) < 0.0:
-        raise BoundaryInputError("matrix mirrors (determinant −1): bones cannot be mirrored")
     # Vector (R − Rᵀ)∨ = 2 sin θ k and trace = 1 + 2 cos θ.
     twice_sine_axis = np.array(
         [
@@ -180,6 +168,8 @@ def _three(name: str, value: ArrayLike) -> NDArray[np.float64]:
         vector = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise BoundaryInputError(f"{name} is not three numbers: {value!r}") from error
+    except OverflowError as error:
+        raise BoundaryInputError(f"{name} holds a number of more than 308 digits") from error
     if vector.shape != (3,):
         raise BoundaryInputError(f"{name} has shape {vector.shape}: three numbers are needed")
     for index, entry in enumerate(vector):
@@ -193,6 +183,8 @@ def _finite(name: str, value: float) -> float:
         number = float(value)
     except (TypeError, ValueError) as error:
         raise BoundaryInputError(f"{name} is not a number: {value!r}") from error
+    except OverflowError as error:
+        raise BoundaryInputError(f"{name} is a number of more than 308 digits") from error
     if not math.isfinite(number):
         raise BoundaryInputError(f"{name} is {number}: must be finite")
     return number

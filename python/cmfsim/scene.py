@@ -30,6 +30,7 @@ from cmfsim.checks import (
     frozen,
 )
 from cmfsim.errors import CaseInputError
+from cmfsim.planning import rigid_matrix
 
 __all__ = [
     "MovedSurface",
@@ -336,8 +337,8 @@ class Scene:
     segments : mapping of str to SegmentData
         Order is kept.
     plan : mapping of str to (4, 4) float64, (j, 3) float64 or MovedSurface
-        One entry for every segment: a rigid motion (mm), the displacements of its joined nodes
-        (mm), or a surface before and after.
+        One entry for every segment: a rigid motion (mm; kept as `rigid_matrix` makes it exactly
+        rigid), the displacements of its joined nodes (mm), or a surface before and after.
     fixed : (f,) uint32
         Nodes that do not move.
     loads : (n, 3) float64, N, or None
@@ -351,6 +352,8 @@ class Scene:
     CaseError
         (also `ValueError`) Misshapen or non-finite arrays, indices out of range, a plan that lacks
         a segment or names another one.
+    BoundaryError
+        (also `ValueError`) A (4, 4) plan that is not rigid.
 
     Examples
     --------
@@ -428,6 +431,8 @@ class Scene:
                     f"plan of segment {name!r} has shape {array.shape}: a (4, 4) matrix or "
                     f"({joined}, 3) displacements of its joined nodes are needed"
                 )
+            if array.shape == (4, 4):
+                array = rigid_matrix(array, f"plan of segment {name!r}")
             checked[name] = frozen(array)
         return checked
 

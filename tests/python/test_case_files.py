@@ -178,6 +178,16 @@ def test_a_faulty_case_file_is_refused_with_line_and_key(name, tmp_path):
     assert str(caught.value).startswith(f"case.toml:{line}: ")
 
 
+def test_a_typed_matrix_is_made_exactly_rigid(tmp_path):
+    """Four decimals pass the case file, and the solver gets what `rigid_matrix` makes of them."""
+    typed = cmfsim.rigid_motion((2, 0, 0), 8, (1, 2, 0), (0, 0, 900)).round(4).tolist()
+    old = "[[1, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+    case = load(tmp_path, FULL.replace(old, str(typed), 1))
+    kept = [motion.matrix for motion in case.plan.values() if motion.matrix is not None]
+    assert any(np.array_equal(m, cmfsim.rigid_matrix(typed)) for m in kept)
+    assert np.abs(np.asarray(typed) - cmfsim.rigid_matrix(typed)).max() > 0
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

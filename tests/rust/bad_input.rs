@@ -588,8 +588,47 @@ fn matrices_that_are_not_rigid_are_refused_with_the_reason() {
         let outcome = RigidMotion::new("jaw", &matrix);
         assert_refused!(outcome, MtmError::Plan { .. }, Boundary, "\"jaw\"", parts[0], parts[1]);
     }
-    // Seven written digits are enough.
-    assert!(RigidMotion::new("jaw", &changed(&|m| m[0][0] += 1e-7)).is_ok());
+    // The figure tells a millimetre from an inch.
+    let error = RigidMotion::new(
+        "jaw",
+        &changed(&|m| {
+            m[..3].iter_mut().for_each(|row| row[..3].iter_mut().for_each(|entry| *entry *= 25.4));
+        }),
+    );
+    assert!(error.unwrap_err().to_string().contains("+2440.000 %"));
+}
+
+/// Every rotation written with four decimals or more is read, and what the solver gets is exactly rigid.
+#[test]
+fn written_rotations_are_made_orthogonal_and_exact_ones_are_kept_bit_for_bit() {
+    let mut worst: f64 = 0.0;
+    for i in 0..2000 {
+        let x = f64::from(i);
+        let axis = [(1.7 * x).sin(), (2.3 * x).cos(), (0.9 * x).sin() + 0.1];
+        let exact = rigid(axis, 0.7 * x, [3.0, -2.0, 900.0], [1.0, 2.0, 3.0]);
+        assert_eq!(RigidMotion::new("jaw", exact.matrix()).unwrap(), exact);
+        for decimals in [4, 5, 6, 7] {
+            let power = 10_f64.powi(decimals);
+            let typed = exact.matrix().map(|row| row.map(|v| (v * power).round() / power));
+            let read = RigidMotion::new("jaw", &typed).unwrap();
+            let off = |i: usize, j: usize| {
+                let m = read.matrix();
+                (0..3).map(|k| m[k][i] * m[k][j]).sum::<f64>() - f64::from(u8::from(i == j))
+            };
+            for (i, j) in [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)] {
+                worst = worst.max(off(i, j).abs());
+            }
+            for (row, (given, kept)) in typed.iter().zip(read.matrix()).enumerate() {
+                assert_eq!(given[3], kept[3]);
+                // The nearest rotation is no farther from the typed matrix than the true one.
+                for (a, b) in given[..3].iter().zip(&kept[..3]) {
+                    assert!((a - b).abs() <= 3.0 * 0.5 / power, "row {row}: {a} {b}");
+                }
+            }
+            assert_eq!(RigidMotion::new("jaw", read.matrix()).unwrap(), read);
+        }
+    }
+    assert!(worst < 2e-15, "{worst:e}");
 }
 
 #[test]

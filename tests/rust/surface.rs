@@ -560,14 +560,14 @@ fn rigid_motion_refuses_what_is_not_one() {
     let mut bad = good;
     bad[0][..3].iter_mut().for_each(|entry| *entry *= -1.0);
     assert!(problem(bad).contains("reflection"));
-    for scale in [1.0 + 1e-5, 0.0, 1e200] {
+    for scale in [1.0 + 1.1e-4, 0.0, 1e200] {
         let mut bad = good;
         bad[..3].iter_mut().for_each(|row| row[..3].iter_mut().for_each(|entry| *entry *= scale));
         assert!(problem(bad).contains("not rigid"), "{scale}");
     }
     let mut rounded = good;
     rounded[..3].iter_mut().for_each(|row| row[0] = (row[0] * 1e7).round() / 1e7);
-    assert_eq!(RigidMotion::new("chin", &rounded).unwrap().matrix(), &rounded);
+    assert_ne!(RigidMotion::new("chin", &rounded).unwrap().matrix(), &rounded);
     assert_eq!(RigidMotion::identity().displacement([5.0, -6.0, 7.0]), [0.0; 3]);
 }
 

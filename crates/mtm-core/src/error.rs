@@ -337,13 +337,15 @@ pub enum MtmError {
         /// Why, and what to do.
         reason: String,
     },
-    /// A matrix that a registration begins with is no rigid motion.
+    /// A matrix is no rigid motion.
     #[error("{what}: {problem}")]
     NotRigid {
         /// The matrix.
-        what: &'static str,
-        /// What is wrong with it, and the mend.
+        what: String,
+        /// What is wrong with it, and the fix.
         problem: String,
+        /// Whose input it is.
+        kind: ErrorKind,
     },
     /// Iterative closest points were still moving at the last step.
     #[error(
@@ -405,6 +407,7 @@ impl MtmError {
             | Self::NotFinite { kind, .. }
             | Self::OutOfRange { kind, .. }
             | Self::IndexOutOfRange { kind, .. }
+            | Self::NotRigid { kind, .. }
             | Self::UnknownName { kind, .. } => *kind,
             Self::DuplicateNode { .. }
             | Self::InvertedTet { .. }
@@ -427,7 +430,6 @@ impl MtmError {
             | Self::CoincidentPoints { .. }
             | Self::FlatPoints { .. }
             | Self::NotDetermined { .. }
-            | Self::NotRigid { .. }
             | Self::IcpNotConverged { .. } => ErrorKind::Registration,
             Self::Interrupted => ErrorKind::Interrupted,
         }

@@ -111,7 +111,7 @@ pub use kinematics::Kinematics;
 pub use material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
 pub use mesh::{MeshQuality, TetMesh};
 pub use method::{Interrupt, Method, StaticOptions};
-pub use motion::{RigidMotion, SurfaceMotion};
+pub use motion::{RigidMotion, SurfaceMotion, rigid_matrix};
 pub use registration::icp::{IcpFit, IcpOptions};
 pub use registration::rigid::{RigidFit, RigidFitOptions};
 pub use registration::thin_plate::ThinPlateSpline;

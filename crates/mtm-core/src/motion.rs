@@ -4,15 +4,25 @@
 use nalgebra::{Matrix3, Rotation2};
 use rayon::prelude::*;
 
-use crate::error::{MtmError, Result};
+use crate::error::{ErrorKind, MtmError, Result};
 use crate::surface::{Closest, Surface};
 use crate::triangle::Vec3;
 
-/// Largest entry by which RᵀR may differ from I, and the bottom row from 0 0 0 1.
+/// Largest entry by which RᵀR of a matrix that is read as a rigid motion may differ from I.
 ///
-/// Matrices written with seven digits or more pass. They are used as given, not made orthogonal:
-/// within this tolerance a point 200 mm from the origin moves by at most about 2e-4 mm too much.
-pub const RIGID_TOLERANCE: f64 = 1e-6;
+/// Entries written with four decimals are off by 5e-5 at most, which changes RᵀR by 2 · √3 · 5e-5 =
+/// 1.8e-4: every rotation written with four decimals or more passes, and lengths that change by
+/// more than 0.01 % do not. What passes is made orthogonal, see [`rigid_matrix`].
+pub const RIGID_TOLERANCE: f64 = 2e-4;
+
+/// Largest entry by which the bottom row of such a matrix may differ from 0 0 0 1.
+pub const BOTTOM_ROW_TOLERANCE: f64 = 1e-6;
+
+/// Deviation of RᵀR from I that is rounding: such matrices are rigid as they are.
+///
+/// Far above what products and inverses of rotations accumulate, and so small that a point 1 m from
+/// the origin is 1e-11 mm off.
+const ROUNDING: f64 = 1e-14;
 
 /// Points a thread takes at once.
 const POINTS_PER_TASK: usize = 64;
@@ -24,15 +34,15 @@ pub struct RigidMotion {
 }
 
 impl RigidMotion {
-    /// Motion of the named segment by a 4×4 matrix, row by row, t in mm.
+    /// Motion of the named segment by a 4×4 matrix, row by row, t in mm, as [`rigid_matrix`] makes it
+    /// exactly rigid.
     ///
     /// # Errors
-    /// [`MtmError::Plan`] with the segment's name if an entry is not finite, the bottom row is not
-    /// 0 0 0 1, R mirrors, or RᵀR differs from I by more than [`RIGID_TOLERANCE`].
+    /// [`MtmError::Plan`] with the segment's name where [`rigid_matrix`] refuses the matrix.
     pub fn new(segment: &str, matrix: &[[f64; 4]; 4]) -> Result<Self> {
-        match rigid_problem(matrix) {
-            None => Ok(Self { matrix: *matrix }),
-            Some(problem) => Err(MtmError::Plan { segment: segment.to_owned(), problem }),
+        match nearest_rigid(matrix) {
+            Ok(matrix) => Ok(Self { matrix }),
+            Err(problem) => Err(MtmError::Plan { segment: segment.to_owned(), problem }),
         }
     }
 
@@ -45,7 +55,7 @@ impl RigidMotion {
         Self { matrix }
     }
 
-    /// The 4×4 matrix, row by row, as it was given.
+    /// The 4×4 matrix, row by row: exactly rigid to rounding.
     pub fn matrix(&self) -> &[[f64; 4]; 4] {
         &self.matrix
     }
@@ -66,7 +76,7 @@ impl RigidMotion {
         })
     }
 
-    /// Position that the motion takes to `point`: R⁻¹ (x − t), mm, with the true inverse of R as given.
+    /// Position that the motion takes to `point`: R⁻¹ (x − t), mm.
     pub fn apply_inverse(&self, point: [f64; 3]) -> [f64; 3] {
         let m = &self.matrix;
         let r = Matrix3::from_fn(|i, j| m[i][j]);
@@ -84,41 +94,92 @@ impl RigidMotion {
     }
 }
 
-/// What keeps a matrix from being a rigid motion, with the mend.
-pub(crate) fn rigid_problem(matrix: &[[f64; 4]; 4]) -> Option<String> {
+/// The rigid matrix nearest to `matrix` (4×4, row by row): the one check of what may be called rigid.
+///
+/// R is replaced by the rotation nearest to it (its polar factor), the bottom row by 0 0 0 1; t stays
+/// as given. A matrix that is rigid to rounding already comes back bit for bit, so the function may
+/// be applied again.
+///
+/// # Errors
+/// [`MtmError::NotRigid`] of the family `kind`, which calls the matrix `what`: an entry that is not
+/// finite, a bottom row that differs from 0 0 0 1 by more than [`BOTTOM_ROW_TOLERANCE`], a mirror, or
+/// RᵀR that differs from I by more than [`RIGID_TOLERANCE`] (scale or shear), with the figure.
+pub fn rigid_matrix(what: &str, matrix: &[[f64; 4]; 4], kind: ErrorKind) -> Result<[[f64; 4]; 4]> {
+    nearest_rigid(matrix).map_err(|problem| MtmError::NotRigid {
+        what: what.to_owned(),
+        problem,
+        kind,
+    })
+}
+
+/// The nearest rigid matrix, or what is wrong with the given one and how to fix it.
+fn nearest_rigid(matrix: &[[f64; 4]; 4]) -> std::result::Result<[[f64; 4]; 4], String> {
     for (i, row) in matrix.iter().enumerate() {
         if let Some(j) = row.iter().position(|value| !value.is_finite()) {
             let value = row[j];
-            return Some(format!(
-                "entry [{i}][{j}] of its 4x4 motion is {value}: every entry must be finite"
+            return Err(format!(
+                "entry [{i}][{j}] of the 4x4 matrix is {value}: every entry must be finite"
             ));
         }
     }
     let bottom = matrix[3];
-    let off = |value: f64, ideal: f64| (value - ideal).abs() > RIGID_TOLERANCE;
+    let off = |value: f64, ideal: f64| (value - ideal).abs() > BOTTOM_ROW_TOLERANCE;
     if off(bottom[0], 0.0) || off(bottom[1], 0.0) || off(bottom[2], 0.0) || off(bottom[3], 1.0) {
-        return Some(format!(
-            "the bottom row of its 4x4 motion is {bottom:?}: it must be 0 0 0 1 within \
-             {RIGID_TOLERANCE:.0e}; if the translation stands there, transpose the matrix"
+        return Err(format!(
+            "the bottom row of the 4x4 matrix is {bottom:?}: it must be 0 0 0 1 within \
+             {BOTTOM_ROW_TOLERANCE:.0e}; if the translation stands there, transpose the matrix"
         ));
     }
     let r = Matrix3::from_fn(|i, j| matrix[i][j]);
-    let deviation = (r.transpose() * r - Matrix3::identity()).amax();
+    let product = r.transpose() * r;
+    let deviation = (product - Matrix3::identity()).amax();
     let determinant = r.determinant();
     if determinant < 0.0 {
-        return Some(format!(
-            "its 4x4 motion is a reflection (determinant {determinant:.6}): bone cannot be mirrored; \
-             check the signs of the axes (RAS and LPS differ by a rotation, never by a mirror)"
+        return Err(format!(
+            "the 4x4 matrix mirrors (a reflection, determinant {determinant:.6}): bone cannot be \
+             mirrored; check the signs of the axes (RAS and LPS differ by a rotation, never by a mirror)"
         ));
     }
     // Entries so large that the product overflows give NaN.
     if deviation.is_nan() || deviation > RIGID_TOLERANCE {
-        return Some(format!(
-            "its 4x4 motion is not rigid: R^T R differs from the identity by {deviation:.3e}, allowed is \
-             {RIGID_TOLERANCE:.0e}; remove scaling and shear, and write at least seven digits"
+        return Err(format!(
+            "the 4x4 matrix is not rigid: R^T R differs from the identity by {deviation:.3e}, allowed is \
+             {RIGID_TOLERANCE:.0e}{}; remove scale and shear, and write at least four decimals",
+            length_changes(&product)
         ));
     }
-    None
+    let mut rigid = *matrix;
+    rigid[3] = [0.0, 0.0, 0.0, 1.0];
+    if deviation > ROUNDING {
+        let r = nearest_rotation(r);
+        for (i, row) in rigid.iter_mut().take(3).enumerate() {
+            (row[0], row[1], row[2]) = (r[(i, 0)], r[(i, 1)], r[(i, 2)]);
+        }
+    }
+    Ok(rigid)
+}
+
+/// The polar factor of a matrix that is orthogonal within [`RIGID_TOLERANCE`].
+///
+/// Newton–Schulz: R ← R (3 I − RᵀR) / 2 squares the deviation in each step (Higham 2008, Functions of
+/// Matrices, section 8.3): 2e-4, 3e-8, 7e-16.
+fn nearest_rotation(mut r: Matrix3<f64>) -> Matrix3<f64> {
+    for _ in 0..4 {
+        r = r * (Matrix3::identity() * 3.0 - r.transpose() * r) * 0.5;
+    }
+    r
+}
+
+/// By how much a matrix shortens and lengthens, from RᵀR, in words; nothing where that overflows.
+fn length_changes(product: &Matrix3<f64>) -> String {
+    // Beyond this, eigenvalues say nothing that the deviation does not.
+    const LARGEST: f64 = 1e12;
+    if !product.iter().all(|entry| entry.abs() < LARGEST) {
+        return String::new();
+    }
+    let change =
+        product.symmetric_eigenvalues().map(|square| 100.0 * (square.max(0.0).sqrt() - 1.0));
+    format!(" (lengths change by {:+.3} % to {:+.3} %)", change.min(), change.max())
 }
 
 /// The motion of a surface whose vertices moved one by one, carried on to points near it.

@@ -208,6 +208,18 @@ pub fn matrix4(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Option<[[f
     Ok(Some(out))
 }
 
+/// A 4×4 matrix.
+pub fn square4(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<[[f64; 4]; 4]> {
+    matrix4(value, name)?.ok_or_else(|| {
+        let shape: Vec<usize> = value
+            .py()
+            .import("numpy")
+            .and_then(|numpy| numpy.call_method1("shape", (value,))?.extract())
+            .unwrap_or_default();
+        name.fail(format!("has shape {} where (4, 4) is needed", shape_text(&shape)))
+    })
+}
+
 /// Stiffness matrices, (6, 6) or (m, 6, 6).
 pub fn stiffness(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<[[f64; 6]; 6]>> {
     let (shape, values) = floats(value, name)?;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use mtm_core::error::ErrorKind;
 use mtm_core::mesh::{MeshQuality, TetMesh};
-use mtm_core::motion::{RigidMotion, SurfaceMotion};
+use mtm_core::motion::{SurfaceMotion, rigid_matrix as core_rigid_matrix};
 use mtm_core::surface::Surface;
 use mtm_core::winding::WindingTree;
 use numpy::{IntoPyArray, PyArray1, PyArray2};
@@ -313,9 +313,8 @@ impl PySurface {
     /// The surface after the rigid motion `matrix` ((4, 4)).
     fn transformed(&self, py: Python<'_>, matrix: &Bound<'_, PyAny>) -> PyResult<Self> {
         let name = Named("matrix", ErrorKind::Boundary);
-        let matrix = arrays::matrix4(matrix, name)?
-            .ok_or_else(|| errors::input(name.1, "matrix must have shape (4, 4)".into()))?;
-        RigidMotion::new("surface", &matrix).map_err(Failure)?;
+        let matrix = arrays::square4(matrix, name)?;
+        let matrix = core_rigid_matrix(name.0, &matrix, name.1).map_err(Failure)?;
         let core = self.core.clone();
         Ok(Self::wrap(py.detach(move || core.transformed(&matrix)).map_err(Failure)?))
     }
@@ -335,6 +334,45 @@ impl PySurface {
     pub fn wrap(core: Surface) -> Self {
         Self { core: Arc::new(core), winding: PyOnceLock::new() }
     }
+}
+
+/// The rigid matrix nearest to `matrix`, (4, 4) float64, mm: the one check of what counts as rigid.
+///
+/// Every plan, transform and alignment passes it, so that what the solver uses is exactly rigid. The
+/// turn becomes the rotation nearest to it (its polar factor); the translation stays as given. A
+/// matrix that is rigid to rounding, such as one of `rigid_motion`, comes back bit for bit.
+///
+/// Parameters
+/// ----------
+/// matrix : (4, 4) float64, mm
+///     x ↦ R x + t. Every rotation written with four decimals or more passes.
+/// name : str
+///     What errors call the matrix.
+///
+/// Raises
+/// ------
+/// BoundaryError
+///     (also `ValueError`) Another shape, NaN or infinity, a bottom row other than 0 0 0 1, a mirror,
+///     RᵀR that differs from I by more than 2e-4 (scale or shear), with the figure.
+///
+/// Examples
+/// --------
+/// >>> import cmfsim
+/// >>> typed = cmfsim.rigid_motion(angle=30, axis=(0, 0, 1)).round(4)
+/// >>> exact = cmfsim.rigid_matrix(typed)
+/// >>> bool(abs(exact[:3, :3] @ exact[:3, :3].T - [[1, 0, 0], [0, 1, 0], [0, 0, 1]]).max() < 1e-14)
+/// True
+#[pyfunction]
+#[pyo3(signature = (matrix, name = "matrix"))]
+pub fn rigid_matrix<'py>(
+    py: Python<'py>,
+    matrix: &Bound<'py, PyAny>,
+    name: &str,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let name = Named(name, ErrorKind::Boundary);
+    let matrix = arrays::square4(matrix, name)?;
+    let rigid = core_rigid_matrix(name.0, &matrix, name.1).map_err(Failure)?;
+    Ok(arrays::table(py, rigid.to_vec()))
 }
 
 /// Motion of a bone surface vertex by vertex: joined nodes and contact surfaces follow it.

@@ -24,7 +24,7 @@ mod _core {
     #[pymodule_export]
     use crate::fibres::PyMuscleFibres;
     #[pymodule_export]
-    use crate::geometry::{PyMeshQuality, PySurface, PySurfaceMotion, PyTetMesh};
+    use crate::geometry::{PyMeshQuality, PySurface, PySurfaceMotion, PyTetMesh, rigid_matrix};
     #[pymodule_export]
     use crate::materials::{PyMassTensors, PyTissue};
     #[pymodule_export]

@@ -12,7 +12,7 @@ use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
 
 use crate::arrays::{self, Named};
-use crate::errors::{self, Failure};
+use crate::errors::Failure;
 use crate::geometry::PySurface;
 use crate::running::interruptible;
 
@@ -325,8 +325,7 @@ pub fn icp(
     };
     let defaults = IcpOptions::default();
     let initial = match initial {
-        Some(matrix) => arrays::matrix4(matrix, Named("initial", REGISTRATION))?
-            .ok_or_else(|| errors::input(REGISTRATION, "initial must have shape (4, 4)".into()))?,
+        Some(matrix) => arrays::square4(matrix, Named("initial", REGISTRATION))?,
         None => defaults.initial,
     };
     let method = method.map(IcpMethod::from_name).transpose().map_err(Failure)?;

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cmfsim._core import rigid_matrix
 from cmfsim.case import ImageData
-from cmfsim.checks import Floats, as_floats, check_instance
-from cmfsim.errors import RegistrationError, RegistrationInputError
+from cmfsim.checks import Floats, check_instance
+from cmfsim.errors import BoundaryError, RegistrationError, RegistrationInputError
 from cmfsim.imaging.alignment_options import AlignmentOptions
 from cmfsim.imaging.descent import Clipped, Places, align, inverse, matrix_of
 from cmfsim.imaging.morphology import Mask
@@ -200,17 +201,7 @@ def _range(name: str, values: NDArray[Any]) -> tuple[float, float]:
 
 
 def _rigid(matrix: ArrayLike) -> Floats:
-    given = as_floats("initial", matrix)
-    if given.shape != (4, 4) or not np.array_equal(given[3], [0.0, 0.0, 0.0, 1.0]):
-        raise RegistrationInputError(
-            f"initial has shape {given.shape}: a rigid (4, 4) matrix with last row 0, 0, 0, 1 "
-            "is needed"
-        )
-    turn = given[:3, :3]
-    if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-5 or np.linalg.det(turn) < 0.0:
-        raise RegistrationInputError("initial is not rigid: it scales, shears or mirrors")
-    # The nearest rotation to the last digit, as ITK wants it.
-    u, _, v = np.linalg.svd(turn)
-    matrix = given.copy()
-    matrix[:3, :3] = u @ v
-    return matrix
+    try:
+        return rigid_matrix(matrix, "initial")
+    except BoundaryError as error:
+        raise RegistrationInputError(str(error)) from error

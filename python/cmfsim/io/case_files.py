@@ -29,7 +29,7 @@ from cmfsim.patient import (
     Plane,
     Region,
 )
-from cmfsim.planning import decompose_motion, rigid_motion
+from cmfsim.planning import rigid_matrix, rigid_motion
 from cmfsim.scene import (
     CONTACTS,
     ELEMENTS,
@@ -393,7 +393,7 @@ def _motion(table: Table, folder: Path) -> CaseMotion:
     if "matrix" in table:
         matrix = table.only("matrix").matrix("matrix")
         with table.at("matrix"):
-            decompose_motion(matrix)
+            matrix = rigid_matrix(matrix)
         return CaseMotion(matrix=matrix)
     if "transform" in table:
         return CaseMotion(transform=_file(table.only("transform"), "transform", folder))

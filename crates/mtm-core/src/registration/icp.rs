@@ -9,7 +9,7 @@ use nalgebra::{Matrix4, Matrix6, UnitQuaternion, Vector6};
 use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
-use crate::motion::{RigidMotion, rigid_problem};
+use crate::motion::{RigidMotion, rigid_matrix};
 use crate::registration::nearest::PointTree;
 use crate::registration::rigid::{LEAST_PAIRS, Pose, fit_pairs};
 use crate::registration::spread::{check_coordinates, check_not_in_line};
@@ -162,11 +162,12 @@ pub fn icp(
     interrupt: &(dyn Fn() -> bool + Sync),
 ) -> Result<IcpFit> {
     check(moving, normals, fixed, options)?;
+    let initial = rigid_matrix("initial", &options.initial, ErrorKind::Registration)?;
     let method = options.method.unwrap_or(match fixed {
         Fixed::Surface(_) => IcpMethod::Plane,
         Fixed::Points(_) => IcpMethod::Point,
     });
-    let mut pose = initial_pose(moving, &options.initial);
+    let mut pose = initial_pose(moving, &initial);
     let reach = |x: &[f64; 3]| (Vec3::from(*x) - pose.centre).norm();
     let radius = moving.iter().map(reach).fold(0.0, f64::max);
     let find = |pose: &Pose| Pairs::find(moving, normals, fixed, options, pose);
@@ -341,7 +342,6 @@ fn initial_pose(moving: &[[f64; 3]], initial: &[[f64; 4]; 4]) -> Pose {
     let matrix = Matrix4::from_fn(|i, k| initial[i][k]);
     let linear = matrix.fixed_view::<3, 3>(0, 0).into_owned();
     let image = linear * centre + matrix.fixed_view::<3, 1>(0, 3);
-    // The nearest rotation: the matrix is one to RIGID_TOLERANCE only.
     Pose { rotation: UnitQuaternion::from_matrix(&linear), scale: 1.0, centre, image }
 }
 
@@ -378,9 +378,6 @@ fn check(
                 kind,
             });
         }
-    }
-    if let Some(problem) = rigid_problem(&options.initial) {
-        return Err(MtmError::NotRigid { what: "initial", problem });
     }
     let refuse = |what: &str, value: f64, allowed: &'static str| {
         Err(MtmError::OutOfRange { what: what.to_owned(), index: 0, value, allowed, kind })
