@@ -17,6 +17,7 @@ from cmfsim.checks import Floats, as_rows, as_text, check_one_of
 from cmfsim.errors import CaseInputError
 
 __all__ = [
+    "DIRECTIONS",
     "FRAMES",
     "PROCEDURES",
     "UNITS",
@@ -37,6 +38,9 @@ UNITS: Mapping[str, float] = MappingProxyType(
     {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "inch": 25.4}
 )
 FRAMES = ("LPS", "RAS")
+# What the numbers of a transform file do, in 3D Slicer's words: carry a bone from where it is to
+# where it goes, or the moved bone back.
+DIRECTIONS = ("to-parent", "from-parent")
 # Standard procedures, and the segments that each makes (paper 2.1, 3.1).
 PROCEDURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -285,12 +289,19 @@ class CaseMotion:
     Attributes
     ----------
     matrix : (4, 4) float64, mm, or None
+        In LPS, whatever the frame of the case file's own numbers.
     transform : Path or None
-        ITK `.tfm`, or a text of 4 × 4 numbers.
+        ITK `.tfm` or `.h5`, or a text of 4 × 4 numbers.
     surface, moved_surface : Path or None
         Files with the same triangles.
-    centre : (3,) float64, mm, or None
+    centre : (3,) float64, mm, LPS, or None
         The centre of the turn, where the case states one.
+    direction : str or None
+        What the numbers of the transform file do: one of `DIRECTIONS`; stated for ITK's files.
+    frame : str or None
+        The frame in which the case file, or the transform file, has its numbers, where stated.
+    typed : bool
+        Whether the motion is given by translation, angle, axis and centre.
     """
 
     matrix: Floats | None = None
@@ -298,6 +309,9 @@ class CaseMotion:
     surface: Path | None = None
     moved_surface: Path | None = None
     centre: Floats | None = None
+    direction: str | None = None
+    frame: str | None = None
+    typed: bool = False
 
 
 @dataclass(frozen=True)

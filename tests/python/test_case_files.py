@@ -59,7 +59,7 @@ centre = [1, 0, 0]
 matrix = [[1, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
 [plan.mandible]
-transform = "jaw.tfm"
+transform = {file = "jaw.tfm", direction = "from-parent", frame = "LPS"}
 
 [node_kinds]
 joined_distance = 1.5
@@ -103,7 +103,9 @@ def test_everything_in_a_case_file_arrives(tmp_path):
     moved = case.plan["maxilla"].matrix @ [2, 0, 0, 1]
     assert moved.tolist() == [1.0, -4.0, 1.0, 1.0]
     assert case.plan["half"].matrix[0, 3] == 2.0
-    assert case.plan["mandible"].transform == tmp_path / "jaw.tfm"
+    jaw = case.plan["mandible"]
+    assert jaw.transform == tmp_path / "jaw.tfm"
+    assert (jaw.direction, jaw.frame) == ("from-parent", "LPS")
     assert case.node_kinds["joined_distance"] == 1.5
     assert case.tissue.kind == "isotropic"
     assert case.solver.method == "cholesky"
@@ -277,3 +279,41 @@ def test_a_note_is_kept_and_must_be_text(tmp_path):
     path.write_text("note = 3\n" + text, encoding="utf-8")
     with pytest.raises(cmfsim.CaseError, match=r"case\.toml:1: note is 3"):
         cmfsim.Case.load(path)
+
+
+@pytest.mark.parametrize(
+    ("motion", "complaint"),
+    [
+        ('transform = "a.tfm"', 'case.toml:8: plan.x.transform is an ITK file.*file = "a.tfm"'),
+        ('transform = "a.H5"', "does not record its direction.*from-parent.*to-parent"),
+        ('transform = {file = "a.h5"}', "case.toml:8: plan.x.transform lacks direction"),
+        ('transform = {file = "a.tfm", direction = "both"}', "use one of: to-parent, from-parent"),
+        (
+            'transform = {file = "a.tfm", direction = "to-parent", frame = "RAS"}',
+            'plan.x.transform.frame is "RAS", but ITK files',
+        ),
+        ('transform = {file = "a.txt", frame = "LAS"}', "use one of: LPS, RAS"),
+        ('transform = {direction = "to-parent"}', "lacks 'file'"),
+        ("transform = 3", "a text is needed"),
+        ('translation = [1, 2, 3]\nframe = "LAS"', "use one of: LPS, RAS"),
+    ],
+)
+def test_which_way_a_transform_carries_points_is_stated(motion, complaint, tmp_path):
+    """3D Slicer and ITK write the same format in opposite directions: nothing is assumed."""
+    with pytest.raises(cmfsim.CaseError, match=complaint):
+        load(tmp_path, f"{HEAD}{SURFACES}[plan.x]\n{motion}\n")
+
+
+def test_a_plan_typed_in_ras_is_the_same_motion_in_lps(tmp_path):
+    """5 mm forwards is +A in RAS and −P in LPS; x and y of the centre change sign as well."""
+    rows = "[[1, 0, 0, 1], [0, 1, 0, 5], [0, 0, 1, 2], [0, 0, 0, 1]]"
+    turn = "angle = 90\naxis = [0, 0, 1]\ncentre = [10, 20, 30]"
+    plans = [
+        f'[plan.a]\nmatrix = {rows}\nframe = "RAS"\n',
+        f'[plan.b]\ntranslation = [1, 5, 2]\n{turn}\nframe = "RAS"\n',
+        f"[plan.c]\ntranslation = [-1, -5, 2]\n{turn.replace('[10, 20', '[-10, -20')}\n",
+    ]
+    plan = load(tmp_path, HEAD + SURFACES + "".join(plans)).plan
+    assert plan["a"].matrix[:3, 3].tolist() == [-1.0, -5.0, 2.0]
+    np.testing.assert_allclose(plan["b"].matrix, plan["c"].matrix, rtol=0, atol=1e-12)
+    assert plan["b"].centre.tolist() == plan["c"].centre.tolist()

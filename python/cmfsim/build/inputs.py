@@ -115,7 +115,7 @@ def read_motion(case: Case, motion: CaseMotion) -> Floats | MovedSurface:
     if motion.matrix is not None:
         return motion.matrix
     if motion.transform is not None:
-        return read_transform(motion.transform)
+        return read_transform(motion.transform, direction=motion.direction, frame=motion.frame)
     if motion.surface is None or motion.moved_surface is None:
         return np.eye(4)
     units, frame = ("mm", "LPS")

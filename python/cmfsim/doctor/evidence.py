@@ -238,7 +238,7 @@ def _matrix(case: Case, name: str, motion: CaseMotion, findings: list[Finding]) 
     if motion.transform is None or not motion.transform.is_file():
         return motion.matrix
     try:
-        return read_transform(motion.transform)
+        return read_transform(motion.transform, direction=motion.direction, frame=motion.frame)
     except CmfsimError as error:
         findings.append(
             Finding(
@@ -247,7 +247,7 @@ def _matrix(case: Case, name: str, motion: CaseMotion, findings: list[Finding]) 
                 str(error),
                 case.where(f"plan.{name}.transform"),
                 f"nobody knows how {name} moves",
-                "save it again as a rigid ITK transform (.tfm), or write a matrix",
+                "save it again as one rigid ITK transform (.tfm or .h5), or write a matrix",
             )
         )
         return None

@@ -14,7 +14,9 @@ from cmfsim.checks import as_text
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import FORMAT_VERSION
 from cmfsim.io.tables import Table, read_tables
+from cmfsim.io.transforms import DIRECTION_CHOICE, is_itk_file, motion_in_lps
 from cmfsim.patient import (
+    DIRECTIONS,
     FRAMES,
     PROCEDURES,
     UNITS,
@@ -390,18 +392,20 @@ def _moved(document: Table, motion: Table, name: str, folder: Path) -> CaseMotio
 
 
 def _motion(table: Table, folder: Path) -> CaseMotion:
-    if "matrix" in table:
-        matrix = table.only("matrix").matrix("matrix")
-        with table.at("matrix"):
-            matrix = rigid_matrix(matrix)
-        return CaseMotion(matrix=matrix)
     if "transform" in table:
-        return CaseMotion(transform=_file(table.only("transform"), "transform", folder))
+        return _transform(table.only("transform"), folder)
     if "moved_surface" in table or "surface" in table:
         table.only("surface", "moved_surface")
         surface = _file(table, "surface", folder)
         return CaseMotion(surface=surface, moved_surface=_file(table, "moved_surface", folder))
-    table.only("translation", "angle", "axis", "centre", "matrix", "transform", "moved", "surface")
+    frame = table.text("frame", choices=FRAMES) if "frame" in table else None
+    if "matrix" in table:
+        matrix = table.only("matrix", "frame").matrix("matrix")
+        with table.at("matrix"):
+            matrix = rigid_matrix(matrix)
+        return CaseMotion(matrix=motion_in_lps(matrix, frame or "LPS"), frame=frame)
+    numbers = ("translation", "angle", "axis", "centre", "frame")
+    table.only(*numbers, "matrix", "transform", "moved", "surface")
     given: dict[str, Any] = {
         key: vector
         for key in ("translation", "axis", "centre")
@@ -410,7 +414,41 @@ def _motion(table: Table, folder: Path) -> CaseMotion:
     angle = table.number("angle", "degrees", low=-360.0, high=360.0)
     with table.at("axis" if "axis" in given else None):
         matrix = rigid_motion(angle=0.0 if angle is None else angle, **given)
-    return CaseMotion(matrix=matrix, centre=given.get("centre"))
+    centre = given.get("centre")
+    if centre is not None and frame == "RAS":
+        centre = centre * [-1.0, -1.0, 1.0]
+    matrix = motion_in_lps(matrix, frame or "LPS")
+    return CaseMotion(matrix=matrix, centre=centre, frame=frame, typed=True)
+
+
+def _transform(motion: Table, folder: Path) -> CaseMotion:
+    """The motion in a transform file; which way the file carries points is stated for ITK's."""
+    key = "transform"
+    if not isinstance(motion.need(key), dict):
+        file = _file(motion, key, folder)
+        if is_itk_file(file):
+            name = motion.text(key)
+            motion.fail(
+                key,
+                f"is an ITK file, which does not record its direction: write {key} = {{ file = "
+                f'"{name}", direction = "..." }} with {DIRECTION_CHOICE}',
+            )
+        return CaseMotion(transform=file)
+    table = motion.table(key).only("file", "direction", "frame")
+    file = _file(table, "file", folder)
+    direction = table.text("direction", choices=DIRECTIONS) if "direction" in table else None
+    frame = table.text("frame", choices=FRAMES) if "frame" in table else None
+    if is_itk_file(file) and direction is None:
+        table.fail(
+            None, f"lacks direction, which the ITK file does not record: write {DIRECTION_CHOICE}"
+        )
+    if is_itk_file(file) and frame == "RAS":
+        table.fail(
+            "frame",
+            'is "RAS", but ITK files (.tfm, .h5) are in LPS always, those that 3D Slicer saves as '
+            "well: remove frame",
+        )
+    return CaseMotion(transform=file, direction=direction, frame=frame)
 
 
 def _plain(table: Table) -> dict[str, Any]:

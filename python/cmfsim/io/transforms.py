@@ -1,7 +1,13 @@
-"""Relocations in files: ITK's text transforms (`.tfm`) and 4 × 4 matrices, read and written."""
+"""Relocations in files: ITK's transforms (`.tfm`, `.h5`) and 4 × 4 matrices, read and written.
+
+A transform file does not record whether it carries the bone to where it goes or back from there, so
+the direction is stated by whoever names the file (docs/formats.md).
+"""
 
 import os
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -11,34 +17,97 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.checks import Floats, as_floats, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import MAX_TEXT, named, replacing
-from cmfsim.planning import decompose_motion
+from cmfsim.io.itk_hdf5 import read_itk_hdf5
+from cmfsim.patient import DIRECTIONS, FRAMES
+from cmfsim.planning import rigid_matrix
 
-__all__ = ["read_transform", "write_transform"]
+__all__ = [
+    "DIRECTION_CHOICE",
+    "TransformFile",
+    "is_itk_file",
+    "motion_in_lps",
+    "read_transform",
+    "read_transform_file",
+    "write_transform",
+]
 
 MATRIX_SUFFIXES = (".txt", ".mat")
-# ITK's HDF5 and MATLAB 4 files.
-BINARY_SUFFIXES = (".h5", ".hdf5", ".hdf")
+HDF5_SUFFIXES = (".h5", ".hdf5", ".hdf")
 ITK_HEADER = "#Insight Transform File"
-FRAMES = ("LPS", "RAS")
+COMPOSITE = "CompositeTransform"
+# What a matrix means if neither the caller nor the file states it: a motion that somebody typed.
+DEFAULT_DIRECTION, DEFAULT_FRAME = "to-parent", "LPS"
 # Turns RAS coordinates into LPS and back.
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
+# What to state, as part of an error.
+DIRECTION_CHOICE = (
+    'direction = "from-parent" if the file carries the moved bone back to where it was, as 3D '
+    "Slicer saves a transform that was applied to the bone; "
+    'direction = "to-parent" if it carries the bone to where it goes, as ITK registers the bone '
+    "after (moving image) to the bone before (fixed image)"
+)
+ITK_IS_LPS = "is an ITK transform, which is LPS always: remove frame"
+# A comment by which `write_transform` states frame and direction.
+STATED = re.compile(r"^#.*\bmm, (LPS|RAS)(?:, (to-parent|from-parent))?\s*$")
+
+
+@dataclass(frozen=True, eq=False)
+class TransformFile:
+    """The motion in a transform file, and how the file was understood.
+
+    Attributes
+    ----------
+    matrix : (4, 4) float64, mm
+        The motion of the bone: x ↦ R x + t on LPS points.
+    direction : str
+        "to-parent" or "from-parent", as the numbers of the file were taken.
+    frame : str
+        "LPS" or "RAS".
+    assumed : tuple of str
+        Which of "direction" and "frame" were stated by neither the caller nor the file.
+    """
+
+    matrix: Floats
+    direction: str
+    frame: str
+    assumed: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """How the file was understood, in words."""
+        assumed = f" ({' and '.join(self.assumed)} assumed)" if self.assumed else ""
+        return f"{self.direction}, {self.frame}{assumed}"
+
+
+def is_itk_file(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is an ITK transform by its ending; `.txt` and `.mat` may be as well."""
+    return Path(path).suffix.lower() in (".tfm", *HDF5_SUFFIXES)
+
+
+def motion_in_lps(matrix: Floats, frame: str) -> Floats:
+    """A motion of points in a frame, "LPS" or "RAS", as the same motion of LPS points, (4, 4)."""
+    return FLIP @ matrix @ FLIP if frame == "RAS" else matrix
 
 
 def read_transform(
-    path: str | os.PathLike[str], *, frame: str = "LPS", inverse: bool = False
+    path: str | os.PathLike[str], *, direction: str | None = None, frame: str | None = None
 ) -> Floats:
-    """The rigid motion in a transform file, as a matrix in LPS.
+    """The motion of the bone in a transform file, as a matrix in LPS.
 
     Parameters
     ----------
     path : path
-        `.tfm` (ITK text: Euler3DTransform, VersorRigid3DTransform, VersorTransform,
-        TranslationTransform, AffineTransform, MatrixOffsetTransformBase or Rigid3DTransform, with
-        their centre), or `.txt` or `.mat` with a 4 × 4 matrix in text.
+        `.tfm` (ITK text) or `.h5` (ITK HDF5, read by SimpleITK): Euler3DTransform,
+        VersorRigid3DTransform, VersorTransform, TranslationTransform, AffineTransform,
+        MatrixOffsetTransformBase or Rigid3DTransform with their centre, or a CompositeTransform of
+        one of them; or `.txt` or `.mat` with a 4 × 4 matrix in text.
+    direction : str
+        "to-parent": the file carries the bone from where it is to where it goes, and is the motion
+        itself. "from-parent": it carries the moved bone back, and is inverted. Needed for ITK
+        files; a 4 × 4 matrix is "to-parent" if nothing is stated.
     frame : str
-        "LPS" or "RAS": the coordinates that a 4 × 4 matrix is meant in. ITK files are LPS.
-    inverse : bool
-        Return the inverse of what the file holds.
+        "LPS" or "RAS": the coordinates of a 4 × 4 matrix, LPS if nothing is stated. ITK files are
+        LPS always.
 
     Returns
     -------
@@ -50,53 +119,101 @@ def read_transform(
     FileNotFoundError
         The file does not exist.
     CaseError
-        (also `ValueError`) Not a transform, another kind of it, a wrong count of numbers (with the
-        line), scale or shear.
+        (also `ValueError`) No direction for an ITK file; a direction or frame other than the file's
+        own comment states; not a transform, several transforms, another kind, a wrong count of
+        numbers (with the line), scale or shear.
 
     Notes
     -----
     ITK's transforms carry points of the *fixed* (output) image to the *moving* (input) one, which
     is what resampling needs. Register post-operative bone (moving) to pre-operative bone (fixed)
-    and the file is the relocation itself. 3D Slicer writes the transform that moves an object as
-    its inverse, "from parent": read such a file with `inverse=True`.
+    and the file is the motion: "to-parent". 3D Slicer saves the transform that moves an object in
+    the same convention, hence as its inverse: "from-parent"
+    (https://slicer.readthedocs.io/en/latest/developer_guide/modules/transforms.html).
 
     Examples
     --------
     >>> import cmfsim
-    >>> motion = cmfsim.read_transform("maxilla.tfm", inverse=True)  # doctest: +SKIP
+    >>> motion = cmfsim.read_transform(
+    ...     "maxilla.tfm", direction="from-parent"
+    ... )  # doctest: +SKIP
     """
+    return read_transform_file(path, direction=direction, frame=frame).matrix
+
+
+def read_transform_file(
+    path: str | os.PathLike[str], *, direction: str | None = None, frame: str | None = None
+) -> TransformFile:
+    """The motion in a transform file with how it was understood: as `read_transform`."""
     path = Path(path)
-    check_one_of("frame", frame, FRAMES)
-    if path.suffix.lower() in BINARY_SUFFIXES:
+    if direction is not None:
+        check_one_of("direction", direction, DIRECTIONS)
+    if frame is not None:
+        check_one_of("frame", frame, FRAMES)
+    suffix = path.suffix.lower()
+    if suffix not in (".tfm", *MATRIX_SUFFIXES, *HDF5_SUFFIXES):
         raise CaseInputError(
-            f"{path.name}: HDF5 transforms are not read: save the transform as .tfm (ITK text)"
-        )
-    if path.suffix.lower() not in (".tfm", *MATRIX_SUFFIXES):
-        raise CaseInputError(
-            f"{path.name}: a transform is read from .tfm, .txt or .mat, not {path.suffix!r}"
+            f"{path.name}: a transform is read from .tfm, .h5, .txt or .mat, not {path.suffix!r}"
         )
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     with named(path):
-        text = _text(path)
-        if text.startswith(ITK_HEADER):
-            if frame != "LPS":
-                raise CaseInputError("is an ITK transform, which is LPS always: drop frame")
-            matrix = _itk(text)
-        elif path.suffix.lower() == ".tfm":
-            raise CaseInputError(f"line 1: an ITK transform begins with {ITK_HEADER!r}")
+        stated: tuple[str | None, str | None] = (None, None)
+        if suffix in HDF5_SUFFIXES:
+            is_itk, matrix = True, _matrix_of(read_itk_hdf5(path))
         else:
-            matrix = _four_by_four(text)
-            if frame == "RAS":
-                matrix = FLIP @ matrix @ FLIP
-        decompose_motion(matrix)
-        return _inverse(matrix) if inverse else matrix
+            text = _text(path)
+            is_itk, stated = text.startswith(ITK_HEADER), _stated(text)
+            if is_itk:
+                matrix = _itk(text)
+            elif suffix == ".tfm":
+                raise CaseInputError(f"line 1: an ITK transform begins with {ITK_HEADER!r}")
+            else:
+                matrix = _four_by_four(text)
+        return _understood(matrix, (direction, frame), stated, is_itk=is_itk)
+
+
+def _understood(
+    matrix: Floats,
+    given: tuple[str | None, str | None],
+    stated: tuple[str | None, str | None],
+    *,
+    is_itk: bool,
+) -> TransformFile:
+    """The matrix as a motion in LPS, as the caller and the file's own comment state it."""
+    for name, mine, its in zip(("direction", "frame"), given, stated, strict=True):
+        if mine is not None and its is not None and mine != its:
+            raise CaseInputError(f"states {name} {its} in its comment, not {mine}")
+    direction, frame = given[0] or stated[0], given[1] or stated[1]
+    if is_itk:
+        if frame == "RAS":
+            raise CaseInputError(ITK_IS_LPS)
+        if direction is None:
+            raise CaseInputError(
+                f"is an ITK transform, and does not record its direction: state {DIRECTION_CHOICE}"
+            )
+        frame = "LPS"
+    matrix = rigid_matrix(matrix)
+    assumed = [
+        name for name, value in (("direction", direction), ("frame", frame)) if value is None
+    ]
+    direction, frame = direction or DEFAULT_DIRECTION, frame or DEFAULT_FRAME
+    matrix = motion_in_lps(matrix, frame)
+    if direction == "from-parent":
+        matrix = _inverse(matrix)
+    return TransformFile(matrix, direction, frame, tuple(assumed))
 
 
 def write_transform(
-    path: str | os.PathLike[str], matrix: ArrayLike, *, frame: str = "LPS", inverse: bool = False
+    path: str | os.PathLike[str],
+    matrix: ArrayLike,
+    *,
+    direction: str | None = None,
+    frame: str = "LPS",
 ) -> None:
     """Writes a rigid motion as ITK text (`.tfm`) or as a 4 × 4 matrix (`.txt`).
+
+    A comment in the file states direction and frame; other programs skip it.
 
     Parameters
     ----------
@@ -104,15 +221,16 @@ def write_transform(
         Replaced when all is written.
     matrix : (4, 4) float64, mm
         A rigid motion of LPS points.
+    direction : str
+        "to-parent" writes the motion itself, "from-parent" its inverse, which 3D Slicer shows as
+        the motion. Needed for `.tfm`; a `.txt` is "to-parent" if left out.
     frame : str
         "LPS" or "RAS": the coordinates in which a `.txt` is written.
-    inverse : bool
-        Write the inverse, as 3D Slicer does for the motion of an object.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) Another ending, RAS in a `.tfm`.
+        (also `ValueError`) Another ending, RAS or no direction in a `.tfm`.
     BoundaryError
         (also `ValueError`) Not a rigid motion.
 
@@ -120,34 +238,50 @@ def write_transform(
     --------
     >>> import cmfsim
     >>> motion = cmfsim.rigid_motion((0, -5, 0))
-    >>> cmfsim.write_transform("maxilla.tfm", motion)  # doctest: +SKIP
+    >>> cmfsim.write_transform("a.tfm", motion, direction="from-parent")  # doctest: +SKIP
     """
     path = Path(path)
     check_one_of("frame", frame, FRAMES)
-    m = as_floats("matrix", matrix)
-    decompose_motion(m)
-    if inverse:
+    if direction is not None:
+        check_one_of("direction", direction, DIRECTIONS)
+    m = rigid_matrix(as_floats("matrix", matrix))
+    if direction == "from-parent":
         m = _inverse(m)
     if path.suffix.lower() == ".tfm":
         if frame != "LPS":
-            raise CaseInputError(f"{path.name}: ITK transforms are LPS always: drop frame")
+            raise CaseInputError(f"{path.name}: {ITK_IS_LPS}")
+        if direction is None:
+            raise CaseInputError(
+                f'{path.name}: state direction = "from-parent" for 3D Slicer, which shows the '
+                'inverse of the file as the motion, or "to-parent" to write the motion itself'
+            )
         lines: tuple[str, ...] = (
             f"{ITK_HEADER} V1.0",
+            f"# mm, LPS, {direction}",
             "#Transform 0",
             "Transform: AffineTransform_double_3_3",
             f"Parameters: {_numbers(np.concatenate([m[:3, :3].ravel(), m[:3, 3]]))}",
             "FixedParameters: 0 0 0",
         )
     elif path.suffix.lower() == ".txt":
-        if frame == "RAS":
-            m = FLIP @ m @ FLIP
-        lines = (f"# 4 x 4, mm, {frame}", *(_numbers(row) for row in m))
+        m = motion_in_lps(m, frame)
+        header = f"# 4 x 4, mm, {frame}, {direction or DEFAULT_DIRECTION}"
+        lines = (header, *(_numbers(row) for row in m))
     else:
         raise CaseInputError(
             f"{path.name}: a transform is written as .tfm or .txt, not {path.suffix!r}"
         )
     with replacing(path) as file:
         file.write(("\n".join(lines) + "\n").encode())
+
+
+def _stated(text: str) -> tuple[str | None, str | None]:
+    """Direction and frame that a comment of `write_transform` states."""
+    for line in text.splitlines():
+        found = STATED.match(line)
+        if found:
+            return found[2], found[1]
+    return None, None
 
 
 def _text(path: Path) -> str:
@@ -157,17 +291,27 @@ def _text(path: Path) -> str:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise CaseInputError(
-            "is not text (a MATLAB or HDF5 file?): save the transform as .tfm (ITK text)"
+            "is not text (a MATLAB file?): save the transform as .tfm (ITK text)"
         ) from error
     if "\0" in text:
         raise CaseInputError("is not text: save the transform as .tfm (ITK text)")
     return text
 
 
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """One transform of a file: its ITK class without precision and dimension, and its numbers."""
+
+    kind: str
+    parameters: Floats
+    fixed: Floats
+    # What stands before an error about each: the line of a text.
+    where: Mapping[str, str]
+
+
 def _itk(text: str) -> Floats:
     """The matrix of the only transform in an ITK text file."""
-    kind, kind_line = "", 0
-    found: dict[str, tuple[int, Floats]] = {}
+    blocks: list[dict[str, tuple[int, str]]] = []
     for number, line in enumerate(text.splitlines(), start=1):
         name, colon, value = line.partition(":")
         if not line.strip() or line.startswith("#"):
@@ -176,50 +320,80 @@ def _itk(text: str) -> Floats:
             raise CaseInputError(f"line {number}: {line.strip()[:60]!r} is not 'name: value'")
         name = name.strip()
         if name == "Transform":
-            if kind:
-                raise CaseInputError(
-                    f"line {number}: holds a second transform: save one transform per segment"
-                )
-            kind, kind_line = value.strip(), number
-        elif name in {"Parameters", "FixedParameters"}:
-            if name in found:
-                raise CaseInputError(f"line {number}: {name} again")
-            found[name] = number, _floats(value, number)
-        else:
+            blocks.append({name: (number, value.strip())})
+        elif name not in {"Parameters", "FixedParameters"}:
             raise CaseInputError(f"line {number}: unknown entry {name[:60]!r}")
-    if not kind:
+        elif not blocks:
+            raise CaseInputError(f"line {number}: {name} stands before 'Transform: ...'")
+        elif name in blocks[-1]:
+            raise CaseInputError(f"line {number}: {name} again")
+        else:
+            blocks[-1][name] = number, value
+    if not blocks:
         raise CaseInputError("holds no line 'Transform: ...'")
+    return _matrix_of([_found(block) for block in blocks])
+
+
+def _found(block: Mapping[str, tuple[int, str]]) -> _Found:
+    line, kind = block["Transform"]
     base = kind.removesuffix("_3_3").removesuffix("_double").removesuffix("_float")
-    if base == kind or base not in ITK_KINDS:
-        known = ", ".join(ITK_KINDS)
+    where = {name: f"line {number}: " for name, (number, _) in block.items()}
+    where = {"Parameters": where["Transform"], "FixedParameters": where["Transform"], **where}
+    if base == kind or (base not in ITK_KINDS and base != COMPOSITE):
+        raise _unknown_kind(where["Transform"], kind)
+    if base != COMPOSITE and "Parameters" not in block:
+        raise CaseInputError(f"line {line}: {base} lacks its line 'Parameters: ...'")
+    numbers = {name: _floats(*block[name][::-1]) for name in block if name != "Transform"}
+    return _Found(
+        base,
+        numbers.get("Parameters", np.zeros(0)),
+        # Older files have no centre.
+        numbers.get("FixedParameters", np.zeros(0)),
+        where,
+    )
+
+
+def _unknown_kind(where: str, kind: str) -> CaseInputError:
+    known = ", ".join(ITK_KINDS)
+    return CaseInputError(
+        f"{where}{kind[:60]!r} is not a rigid 3-D transform that cmfsim reads: use one of {known}"
+    )
+
+
+def _matrix_of(found: Sequence[tuple[str, Floats, Floats] | _Found]) -> Floats:
+    """The matrix of the only rigid transform, which may be the only one of a composite."""
+    all_of = [f if isinstance(f, _Found) else _Found(*f, MappingProxyType({})) for f in found]
+    inner = [f for f in all_of if f.kind != COMPOSITE]
+    if len(inner) != 1 or len(all_of) - len(inner) > 1:
+        kinds = ", ".join(f.kind for f in all_of)
+        where = all_of[1].where.get("Transform", "") if len(all_of) > 1 else ""
         raise CaseInputError(
-            f"line {kind_line}: {kind[:60]!r} is no rigid transform of 3-D space that is read: "
-            f"use one of {known}, with _double_3_3"
+            f"{where}the file holds {len(inner)} transforms ({kinds}), not one rigid transform per "
+            "segment: combine them into one (3D Slicer: harden the transform)"
         )
-    counts, rotation = ITK_KINDS[base]
-    if "Parameters" not in found:
-        raise CaseInputError("holds no line 'Parameters: ...'")
-    parameters_line, parameters = found["Parameters"]
-    if len(parameters) != counts:
+    one = inner[0]
+    if one.kind not in ITK_KINDS:
+        raise _unknown_kind("", one.kind)
+    counts, rotation = ITK_KINDS[one.kind]
+    if len(one.parameters) != counts:
         raise CaseInputError(
-            f"line {parameters_line}: Parameters holds {len(parameters)} numbers: "
-            f"{base} needs {counts}"
+            f"{one.where.get('Parameters', '')}Parameters holds {len(one.parameters)} numbers: "
+            f"{one.kind} needs {counts}"
         )
-    fixed_line, fixed = found.get("FixedParameters", (parameters_line, np.zeros(0)))
-    # Older files have no centre; Euler3DTransform has a fourth number, the order of its turns.
-    allowed = (0, 3, 4) if base == "Euler3DTransform" else (0, 3)
-    if len(fixed) not in allowed:
+    # Euler3DTransform has a fourth number, the order of its turns.
+    allowed = (0, 3, 4) if one.kind == "Euler3DTransform" else (0, 3)
+    if len(one.fixed) not in allowed:
         raise CaseInputError(
-            f"line {fixed_line}: FixedParameters holds {len(fixed)} numbers: the centre, "
-            f"{' or '.join(str(n) for n in allowed)}, is needed"
+            f"{one.where.get('FixedParameters', '')}FixedParameters holds {len(one.fixed)} "
+            f"numbers: the centre, {' or '.join(str(n) for n in allowed)}, is needed"
         )
-    centre = fixed[:3] if len(fixed) else np.zeros(3)
+    centre = one.fixed[:3] if len(one.fixed) else np.zeros(3)
     try:
-        turn = rotation(parameters, fixed)
+        turn = rotation(one.parameters, one.fixed)
     except CaseInputError as error:
-        raise CaseInputError(f"line {parameters_line}: {error}") from error
+        raise CaseInputError(f"{one.where.get('Parameters', '')}{error}") from error
     # x ↦ R (x − c) + c + t; a VersorTransform has no t.
-    shift = parameters[-3:] if base != "VersorTransform" else np.zeros(3)
+    shift = np.zeros(3) if one.kind in WITHOUT_SHIFT else one.parameters[-3:]
     matrix = np.eye(4)
     matrix[:3, :3] = turn
     matrix[:3, 3] = shift + centre - turn @ centre
@@ -308,8 +482,10 @@ ITK_KINDS: Mapping[str, tuple[int, Callable[[Floats, Floats], Floats]]] = Mappin
         "VersorRigid3DTransform": (6, _versor),
         "VersorTransform": (3, _versor),
         "TranslationTransform": (3, _no_turn),
+        "IdentityTransform": (0, _no_turn),
         "AffineTransform": (12, _matrix),
         "MatrixOffsetTransformBase": (12, _matrix),
         "Rigid3DTransform": (12, _matrix),
     }
 )
+WITHOUT_SHIFT = ("VersorTransform", "IdentityTransform")
