@@ -188,13 +188,16 @@ PYTHON: Mapping[str, frozenset[str]] = {
         ),
         "phantom": "case checks errors scene",
         "planning": "errors _core",
+        "clinical_plan": "checks errors planning scene _core",
         "achieved": "case checks errors planning registration scene _core",
         "bone_motion": "checks errors scene surface_checks topology _core",
         "osteotomy": "case checks errors planning scene _core",
         "node_kinds": "case checks errors scene _core",
         "inversion": "case checks _core",
         "simulation": "errors inversion scene _core",
-        "patient_prediction": "checks errors model planning prediction scene simulation _core",
+        "patient_prediction": (
+            "checks clinical_plan errors model planning prediction scene simulation _core"
+        ),
         "deferred": "",
         "evaluation": "case checks errors registration scene topology _core",
         "build": (
@@ -209,8 +212,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "build case checks deferred errors evaluation io model musculature patient "
             "patient_prediction prediction scene template _core"
         ),
-        "pictures": "case checks errors musculature prediction scene _core",
-        "report": "case errors io scene",
+        "pictures": "case checks clinical_plan errors musculature prediction scene _core",
+        "report": "case clinical_plan errors io scene",
         "insilico": "build case checks errors io phantom planning scene topology _core",
         "bench": (
             "build checks errors evaluation io model patient patient_prediction pictures "
@@ -222,19 +225,20 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "surface_checks": "checks crossings scene topology",
         "surface_repair": "capping case checks errors scene surface_checks topology _core",
         "doctor": (
-            "case checks errors io osteotomy patient planning registration scene "
+            "case checks clinical_plan errors io osteotomy patient planning registration scene "
             "surface_checks surface_repair template topology _core"
         ),
         "cli": (
-            "bench build case checks cmfsim demo doctor errors evaluation insilico io meshing "
-            "musculature phantom pictures prediction report scene simulation study template"
+            "bench build case checks clinical_plan cmfsim demo doctor errors evaluation insilico "
+            "io meshing musculature phantom pictures prediction report scene simulation study "
+            "template"
         ),
         "__main__": "cli",
         "__init__": (
-            "achieved bench build case deferred doctor equivalent errors evaluation imaging "
-            "insilico io landmark_sites meshing model musculature node_kinds osteotomy patient "
-            "patient_prediction phantom planning prediction registration scene simulation study "
-            "surface_checks surface_repair template _core"
+            "achieved bench build case clinical_plan deferred doctor equivalent errors evaluation "
+            "imaging insilico io landmark_sites meshing model musculature node_kinds osteotomy "
+            "patient patient_prediction phantom planning prediction registration scene simulation "
+            "study surface_checks surface_repair template _core"
         ),
     }.items()
 }

@@ -62,7 +62,15 @@ __getattr__, __dir__, __all__ = deferred(
             "ImageData",
             "NodeKinds",
         ),
-        "doctor": ("diagnose",),
+        "clinical_plan": (
+            "ClinicalMotion",
+            "clinical_motion",
+        ),
+        "doctor": (
+            "Examination",
+            "diagnose",
+            "examine",
+        ),
         "equivalent": (
             "Mixture",
             "MuscleVolume",

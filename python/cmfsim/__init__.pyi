@@ -39,7 +39,8 @@ from cmfsim.bench import (
 )
 from cmfsim.build import build_case, build_model, with_muscles, write_phantom_case
 from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
-from cmfsim.doctor import diagnose
+from cmfsim.clinical_plan import ClinicalMotion, clinical_motion
+from cmfsim.doctor import Examination, diagnose, examine
 from cmfsim.equivalent import Mixture, MuscleVolume, equivalent_material
 from cmfsim.errors import (
     BoundaryError,
@@ -200,6 +201,7 @@ __all__ = [
     "CaseMuscles",
     "Choice",
     "ClassifiedNodes",
+    "ClinicalMotion",
     "CmfsimError",
     "Cohort",
     "ContactError",
@@ -207,6 +209,7 @@ __all__ = [
     "CuttingPlane",
     "DistanceStatistics",
     "ErrorTable",
+    "Examination",
     "Finding",
     "FoldReport",
     "Folds",
@@ -282,6 +285,7 @@ __all__ = [
     "check_surface",
     "check_template",
     "classify_nodes",
+    "clinical_motion",
     "compare_models",
     "compare_skins",
     "contact_surface",
@@ -292,6 +296,7 @@ __all__ = [
     "equivalent_material",
     "error_table",
     "evaluate",
+    "examine",
     "fold_report",
     "free_cut",
     "frontier",

@@ -313,6 +313,26 @@ class CaseMotion:
     frame: str | None = None
     typed: bool = False
 
+    def source(self, understood: str = "") -> str:
+        """Where the motion comes from and what was assumed, in words; empty for a typed one.
+
+        Parameters
+        ----------
+        understood : str
+            How the transform file was understood, where it is known.
+        """
+        if self.transform is not None:
+            return f"{self.transform.name}{f': {understood}' if understood else ''}"
+        if self.moved_surface is not None:
+            return self.moved_surface.name
+        if not self.typed:
+            return f"matrix: {self.frame}" if self.frame else "matrix: LPS (frame assumed)"
+        words = ["typed in RAS"] if self.frame == "RAS" else []
+        turns = self.matrix is not None and not np.array_equal(self.matrix[:3, :3], np.eye(3))
+        if turns and self.centre is None:
+            words.append("turned about the origin of the coordinates: no centre is given")
+        return "; ".join(words)
+
 
 @dataclass(frozen=True)
 class CaseMuscles:

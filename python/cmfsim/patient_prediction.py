@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import rigid_fit
 from cmfsim.checks import check_one_of
+from cmfsim.clinical_plan import clinical_motion
 from cmfsim.errors import CaseInputError
 from cmfsim.model import PatientModel
 from cmfsim.planning import decompose_motion
@@ -110,7 +111,22 @@ def predict_patient(patient: PatientModel, model: str = "M+S") -> Prediction:
 
 
 def _motion(patient: PatientModel, name: str, motion: Any) -> dict[str, Any]:
-    """A segment's motion in a planner's numbers, about its own centre (paper, Table 2)."""
+    """A segment's motion in a planner's numbers, and in a surgeon's.
+
+    A planner's are those about the segment's own centre (paper, Table 2).
+    """
+    surfaces = {segment.name: segment.surface for segment in patient.segments}
+    if isinstance(motion, MovedSurface) or np.shape(motion) == (4, 4):
+        vertices = np.asarray(surfaces[name].vertices)
+    else:
+        vertices = np.asarray(patient.scene.nodes)[np.asarray(patient.scene.segments[name].joined)]
+    clinical = clinical_motion(
+        name,
+        motion,
+        landmarks=patient.landmarks.get("skull"),
+        vertices=vertices,
+        source=patient.summary.get("plan_sources", {}).get(name, ""),
+    ).as_dict()
     if isinstance(motion, MovedSurface):
         here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
         size = np.linalg.norm(there - here, axis=1)
@@ -121,14 +137,13 @@ def _motion(patient: PatientModel, name: str, motion: Any) -> dict[str, Any]:
             # The nearest rigid motion, and what it leaves of the vertices' own.
             **_rigid_numbers(np.asarray(fit.matrix), here.mean(axis=0)),
             "bending": float(fit.rms),
+            "clinical": clinical,
         }
     matrix = np.asarray(motion, dtype=np.float64)
     if matrix.shape != (4, 4):
         size = np.linalg.norm(matrix, axis=1)
-        return {"mean": float(size.mean()), "largest": float(size.max())}
-    surfaces = {segment.name: segment.surface for segment in patient.segments}
-    centre = np.asarray(surfaces[name].vertices).mean(axis=0)
-    return _rigid_numbers(matrix, centre)
+        return {"mean": float(size.mean()), "largest": float(size.max()), "clinical": clinical}
+    return {**_rigid_numbers(matrix, vertices.mean(axis=0)), "clinical": clinical}
 
 
 def _rigid_numbers(matrix: NDArray[np.float64], centre: NDArray[np.float64]) -> dict[str, Any]:

@@ -20,13 +20,13 @@ from cmfsim.build.inputs import (
     read_anatomy,
     read_case_landmarks,
 )
-from cmfsim.build.motions import planned_bones
+from cmfsim.build.motions import PlannedBones, planned_bones
 from cmfsim.build.postoperative import Postoperative
 from cmfsim.build.skin_part import on_skin
 from cmfsim.build.tissue_mesh import end_planes, region_of, tissue_mesh
 from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, NodeKinds
 from cmfsim.checks import Floats
-from cmfsim.doctor import diagnose
+from cmfsim.doctor import SizedMotion, check_motion_size, diagnose
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Case, write_model
 from cmfsim.meshing import (
@@ -158,6 +158,7 @@ def build_model(
         stages.begin("reading the achieved plan")
     bones = planned_bones(case, cut.segments, after)
     findings += bones.findings
+    findings += _plan_sizes(case, bones, findings)
     moved = [*dict.fromkeys([*_cut_segments(case), *bones.motions])]
 
     stages.begin("finding the soft tissue")
@@ -212,6 +213,7 @@ def build_model(
         summary={
             **_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
             **({} if bones.achieved is None else {"achieved": bones.achieved.as_dict()}),
+            "plan_sources": dict(bones.sources),
         },
     )
     if case.muscles is None:
@@ -282,6 +284,39 @@ def _procedures(case: Case, landmarks: Mapping[str, Floats]) -> list[Procedure]:
 
 def _cut_segments(case: Case) -> list[str]:
     return [name for osteotomy in case.osteotomies for name in osteotomy.segments]
+
+
+def _plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> list[Finding]:
+    """What is to be found about the sizes of the motions now that every segment has its surface.
+
+    The doctor has no surface of bone that is still to be segmented. Raises what it would have
+    raised: a bone that is torn away.
+    """
+    seen = {(finding.code, finding.where) for finding in known}
+    surfaces = {segment.name: segment.surface for segment in bones.segments}
+    found: list[Finding] = []
+    for name, motion in bones.motions.items():
+        if isinstance(motion, MovedSurface):
+            continue
+        given = case.plan.get(name)
+        sized = SizedMotion(
+            name,
+            motion,
+            case.where("plan" if case.achieved else f"plan.{name}"),
+            points=np.asarray(surfaces[name].vertices),
+            typed=given is not None and given.typed,
+            has_centre=given is not None and given.centre is not None,
+        )
+        # A measured motion may be as small as it likes.
+        found += [
+            finding
+            for finding in check_motion_size(sized)
+            if (finding.code, finding.where) not in seen
+            and not (case.achieved and finding.code.startswith("plan-tiny"))
+        ]
+    if case.surfaces is None and (errors := [f for f in found if f.severity == "error"]):
+        raise CaseInputError(f"{errors[0].where}: {errors[0].what}; {errors[0].mend}")
+    return found
 
 
 def _untouched(case: Case, kinds: NodeKinds, motions: Iterable[str]) -> list[Finding]:

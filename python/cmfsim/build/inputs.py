@@ -22,6 +22,7 @@ from cmfsim.io import (
 )
 from cmfsim.io.images import read_image_file
 from cmfsim.io.models import is_model_file
+from cmfsim.io.transforms import read_transform_file
 from cmfsim.meshing import anatomy_from_surfaces
 from cmfsim.patient import CaseMotion
 from cmfsim.scene import MovedSurface
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = [
     "check_output",
     "input_hashes",
+    "motion_source",
     "read_anatomy",
     "read_case_landmarks",
     "read_motion",
@@ -122,6 +124,14 @@ def read_motion(case: Case, motion: CaseMotion) -> Floats | MovedSurface:
     if case.surfaces is not None:
         units, frame = case.surfaces.units, case.surfaces.frame
     return read_moved_surface(motion.surface, motion.moved_surface, units=units, frame=frame)
+
+
+def motion_source(motion: CaseMotion) -> str:
+    """Where a motion comes from and how its transform file was understood, in words."""
+    if motion.transform is None:
+        return motion.source()
+    read = read_transform_file(motion.transform, direction=motion.direction, frame=motion.frame)
+    return motion.source(read.text)
 
 
 def input_hashes(case: Case) -> dict[str, str]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cmfsim.bone_motion import smooth_motion, sound_motion, torn_pieces
-from cmfsim.build.inputs import read_motion
+from cmfsim.build.inputs import motion_source, read_motion
 from cmfsim.build.postoperative import REFERENCES, Postoperative, read_postoperative
 from cmfsim.case import BoneSegment, Finding
 from cmfsim.checks import Floats
@@ -39,12 +39,15 @@ class PlannedBones:
     findings : tuple of Finding
     achieved : AchievedPlan or None
         How they were found, where the plan is the achieved one and was searched for.
+    sources : mapping of str to str
+        Where each motion comes from and how it was understood, in words.
     """
 
     segments: tuple[BoneSegment, ...]
     motions: Motions
     findings: tuple[Finding, ...] = ()
     achieved: AchievedPlan | None = None
+    sources: Mapping[str, str] = field(default_factory=dict)
 
 
 def planned_bones(
@@ -75,7 +78,10 @@ def planned_bones(
     if case.achieved:
         return _achieved_bones(case, segments, after or read_postoperative(case))
     motions = {name: read_motion(case, motion) for name, motion in case.plan.items()}
-    return _with_motions(case, segments, motions)
+    planned = _with_motions(case, segments, motions)
+    return replace(
+        planned, sources={name: motion_source(motion) for name, motion in case.plan.items()}
+    )
 
 
 def _with_motions(

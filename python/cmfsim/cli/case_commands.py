@@ -7,14 +7,15 @@ import sys
 import time
 from collections.abc import Sequence
 from importlib import import_module
-from typing import TextIO
+from typing import Any, TextIO
 
 from cmfsim.case import SEVERITIES, Finding
 from cmfsim.checks import as_positive
 from cmfsim.cli.build_report import WIDTH, build_text
 from cmfsim.cli.exit_codes import BAD_INPUT, DONE
 from cmfsim.cli.terminal import StageProgress, columns, escaped, in_colour
-from cmfsim.doctor import diagnose, findings_text
+from cmfsim.clinical_plan import plan_lines
+from cmfsim.doctor import Examination, examine, findings_text
 from cmfsim.io import Case
 
 __all__ = ["build", "case_of", "checked", "doctor"]
@@ -25,13 +26,22 @@ def doctor(options: argparse.Namespace) -> int:
     case = Case.load(options.case)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         progress.stage(f"checking {case.name}")
-        findings = diagnose(case)
+        found = examine(case)
+    findings, plan = found.findings, _plan_values(found)
     if options.json:
         counts = {f"{s}s": sum(f.severity == s for f in findings) for s in SEVERITIES}
         entries = [dataclasses.asdict(finding) for finding in findings]
-        report = {"case": case.name, "file": str(case.file), **counts, "findings": entries}
+        report = {
+            "case": case.name,
+            "file": str(case.file),
+            **counts,
+            "plan": plan,
+            "findings": entries,
+        }
         print(json.dumps(report, allow_nan=False))
     else:
+        for line in plan_lines(plan):
+            print(f"plan: {escaped(line)}")
         _print_findings(findings, sys.stdout)
     return BAD_INPUT if _has_errors(findings) else DONE
 
@@ -75,11 +85,19 @@ def checked(case: Case, *, quiet: bool) -> tuple[Finding, ...] | None:
     """What the doctor finds; none, with the findings printed, if one of them is an error."""
     with StageProgress(sys.stderr, quiet=quiet) as progress:
         progress.stage("checking the case")
-        findings = diagnose(case)
-    if _has_errors(findings):
-        _print_findings(findings, sys.stderr)
+        found = examine(case)
+    if not quiet:
+        # Before the work: a reversed plan is seen here, not in the face.
+        for line in plan_lines(_plan_values(found)):
+            print(f"cmfsim: plan: {escaped(line)}", file=sys.stderr, flush=True)
+    if _has_errors(found.findings):
+        _print_findings(found.findings, sys.stderr)
         return None
-    return findings
+    return found.findings
+
+
+def _plan_values(found: Examination) -> dict[str, Any]:
+    return {name: motion.as_dict() for name, motion in found.plan.items()}
 
 
 def _has_errors(findings: Sequence[Finding]) -> bool:

@@ -19,6 +19,7 @@ from cmfsim.cli.results import (
     write_study_report,
 )
 from cmfsim.cli.terminal import StageProgress, escaped
+from cmfsim.clinical_plan import plan_lines
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Cohort, read_landmarks, replacing
 from cmfsim.io.predictions import is_prediction_file
@@ -66,6 +67,7 @@ def predict(options: argparse.Namespace) -> int:
         return FAILED if failed else DONE
     if prediction.patient.summary.get("achieved") is not None:
         print(achieved_text(prediction.patient.summary["achieved"]))
+    print(_plan_text(prediction))
     for entry in written:
         print(_prediction_text(entry))
     _print_report(case.output, made)
@@ -99,6 +101,7 @@ def evaluate(options: argparse.Namespace) -> int:
     achieved = found.predictions[0].patient.summary.get("achieved")
     if achieved is not None:
         print(achieved_text(achieved))
+    print(_plan_text(found.predictions[0]))
     print(f"{escaped(case.name)}: distance from the face after the operation, mm")
     print("  model        mean     SD   95 %    max   < 2 mm")
     for name, entry in [*values["models"].items(), ("no change", values["no_change"])]:
@@ -215,9 +218,16 @@ def _figures(prediction: Prediction) -> dict[str, Any]:
         "residual": solution["residual"],
         "contact_iterations": solution["contact_iterations"],
         "contact_gap": solution["contact_gap"],
+        "plan": {name: m["clinical"] for name, m in prediction.summary["plan"].items()},
         "skin": dict(prediction.summary["skin"]),
         "timings": dict(prediction.summary["timings"]),
     }
+
+
+def _plan_text(prediction: Prediction) -> str:
+    """The plan as it was applied, a line for each segment."""
+    plan = {name: entry["clinical"] for name, entry in prediction.summary["plan"].items()}
+    return "\n".join(f"plan: {escaped(line)}" for line in plan_lines(plan))
 
 
 def _prediction_text(entry: dict[str, Any]) -> str:

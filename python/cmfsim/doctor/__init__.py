@@ -2,22 +2,54 @@
 
 `diagnose` reads the files of a case and looks; it changes and writes nothing. `evidence` is what
 was read, `placement` asks whether it lies where it should, `surfaces` whether it is sound,
-`operation` whether cuts and plan can be meant, `moved` whether a bone before and after is one bone,
+`operation` whether cuts and plan can be meant, `plan_size` whether motions have a bone's size,
+`plan` the plan in words, `moved` whether a bone before and after is one bone,
 `after` whether what is given after the operation belongs together, `muscles` whether these can be
 placed.
 """
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
 from cmfsim.case import SEVERITIES, Finding
+from cmfsim.clinical_plan import ClinicalMotion
 from cmfsim.doctor.after import check_after
 from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.moved import check_moved
-from cmfsim.doctor.operation import check_cuts, check_plan
+from cmfsim.doctor.operation import check_cuts, check_plan, pieces_of
 from cmfsim.doctor.placement import check_placement
+from cmfsim.doctor.plan import state_plan
+from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
 from cmfsim.doctor.report import findings_text
 from cmfsim.doctor.surfaces import check_image, check_mesh_size, check_surfaces
 from cmfsim.io import Case
 
-__all__ = ["diagnose", "findings_text"]
+__all__ = [
+    "Examination",
+    "SizedMotion",
+    "check_motion_size",
+    "diagnose",
+    "examine",
+    "findings_text",
+]
+
+
+@dataclass(frozen=True)
+class Examination:
+    """What is known of a case before any work.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        Errors first, then warnings and notes.
+    plan : mapping of str to ClinicalMotion
+        How each segment moves that the plan names, as far as it can be read. Empty for a plan that
+        is read off the bones after the operation.
+    """
+
+    findings: tuple[Finding, ...]
+    plan: Mapping[str, ClinicalMotion]
 
 
 def diagnose(case: Case) -> tuple[Finding, ...]:
@@ -43,19 +75,43 @@ def diagnose(case: Case) -> tuple[Finding, ...]:
     >>> for finding in cmfsim.diagnose(cmfsim.Case.load("case.toml")):  # doctest: +SKIP
     ...     print(finding.severity, finding.what, finding.mend)
     """
+    return examine(case).findings
+
+
+def examine(case: Case) -> Examination:
+    """What `diagnose` finds, with the plan in a surgeon's words.
+
+    Parameters
+    ----------
+    case : Case
+
+    Returns
+    -------
+    Examination
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> found = cmfsim.examine(cmfsim.Case.load("case.toml"))  # doctest: +SKIP
+    >>> found.plan["maxilla"].text  # doctest: +SKIP
+    '5.0 mm forwards, 0.5 mm up at the upper incisors (supradentale); pitch +2.0° (front up)'
+    """
     evidence = gather(case)
     findings = [*evidence.findings, *check_cuts(evidence)]
     placement = check_placement(evidence)
     findings += placement
     findings += [*check_image(evidence), *check_surfaces(evidence)]
+    pieces = pieces_of(evidence)
+    plan = state_plan(evidence, pieces)
     # Distances between things in different frames say nothing.
     if not any(finding.severity == "error" for finding in placement):
         findings += check_mesh_size(evidence)
-        findings += check_plan(evidence)
+        findings += check_plan(evidence, plan, pieces)
         findings += check_moved(evidence)
         findings += check_after(evidence)
         if case.muscles is not None:
             from cmfsim.doctor.muscles import check_muscles  # noqa: PLC0415
 
             findings += check_muscles(evidence)
-    return tuple(sorted(findings, key=lambda f: SEVERITIES.index(f.severity)))
+    in_order = sorted(findings, key=lambda f: SEVERITIES.index(f.severity))
+    return Examination(tuple(in_order), MappingProxyType(plan))

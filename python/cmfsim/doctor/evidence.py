@@ -13,10 +13,11 @@ from cmfsim._core import PRESETS, Surface
 from cmfsim.case import Finding, ImageData
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseError, CmfsimError
-from cmfsim.io import Case, read_landmark_file, read_surface, read_transform
+from cmfsim.io import Case, read_landmark_file, read_moved_surface, read_surface
 from cmfsim.io.images import read_image_file
+from cmfsim.io.transforms import TransformFile, read_transform_file
 from cmfsim.patient import CaseMotion, CaseSurfaces
-from cmfsim.scene import SurfaceData
+from cmfsim.scene import MovedSurface, SurfaceData
 from cmfsim.surface_checks import SurfaceReport, check_surface
 from cmfsim.surface_repair import RepairOptions, repair_surface
 
@@ -80,6 +81,8 @@ class Evidence:
     motions : mapping of str to (4, 4) float64, mm
         Of the segments whose plan is a matrix.
     findings : tuple of Finding
+    transforms : mapping of str to TransformFile
+        How the transform files of the plan were understood, by segment.
     """
 
     case: Case
@@ -90,6 +93,24 @@ class Evidence:
     skin_landmarks: Mapping[str, Floats] = field(default_factory=dict)
     motions: Mapping[str, Floats] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
+    transforms: Mapping[str, TransformFile] = field(default_factory=dict)
+
+    @cached_property
+    def moved(self) -> Mapping[str, MovedSurface | CmfsimError]:
+        """The motions that are given by surfaces before and after, or why they are not read."""
+        found: dict[str, MovedSurface | CmfsimError] = {}
+        given = self.case.surfaces
+        units, frame = ("mm", "LPS") if given is None else (given.units, given.frame)
+        for name, motion in self.case.plan.items():
+            before, after = motion.surface, motion.moved_surface
+            # A file that is missing is reported where files are looked for.
+            if before is None or after is None or not (before.is_file() and after.is_file()):
+                continue
+            try:
+                found[name] = read_moved_surface(before, after, units=units, frame=frame)
+            except CmfsimError as error:
+                found[name] = error
+        return found
 
     def in_region(self, points: Floats) -> NDArray[np.bool_]:
         """Which of (n, 3) points lie in the part of the head that is meshed.
@@ -150,9 +171,13 @@ def gather(case: Case) -> Evidence:
                 folder = key == "image"
                 _check_file(case, f"postoperative.{key}", path, findings, folder=folder)
     motions: dict[str, Floats] = {}
+    transforms: dict[str, TransformFile] = {}
     for name, motion in case.plan.items():
         _check_motion_files(case, name, motion, findings)
-        matrix = _matrix(case, name, motion, findings)
+        transform = _transform(case, name, motion, findings)
+        if transform is not None:
+            transforms[name] = transform
+        matrix = motion.matrix if transform is None else transform.matrix
         if matrix is not None:
             motions[name] = matrix
     try:
@@ -180,7 +205,9 @@ def gather(case: Case) -> Evidence:
             )
         )
     _check_output(case, findings)
-    return Evidence(case, image, skin, bones, skull, skin_points, motions, tuple(findings))
+    return Evidence(
+        case, image, skin, bones, skull, skin_points, motions, tuple(findings), transforms
+    )
 
 
 def _body(
@@ -233,12 +260,14 @@ def _image(case: Case, findings: list[Finding]) -> ImageData | None:
     return found.image
 
 
-def _matrix(case: Case, name: str, motion: CaseMotion, findings: list[Finding]) -> Floats | None:
-    """The motion of a segment where it is a matrix, in the case or in a readable file."""
+def _transform(
+    case: Case, name: str, motion: CaseMotion, findings: list[Finding]
+) -> TransformFile | None:
+    """The transform file of a segment, where there is one that can be read."""
     if motion.transform is None or not motion.transform.is_file():
-        return motion.matrix
+        return None
     try:
-        return read_transform(motion.transform, direction=motion.direction, frame=motion.frame)
+        return read_transform_file(motion.transform, direction=motion.direction, frame=motion.frame)
     except CmfsimError as error:
         findings.append(
             Finding(

@@ -7,19 +7,21 @@ import numpy as np
 from cmfsim._core import rigid_fit
 from cmfsim.case import Finding
 from cmfsim.checks import Floats
+from cmfsim.clinical_plan import clinical_motion
 from cmfsim.doctor.evidence import Evidence
-from cmfsim.doctor.operation import FAR, TOO_FAR, check_against_skin
+from cmfsim.doctor.operation import check_against_skin
 from cmfsim.doctor.places import place_text
+from cmfsim.doctor.plan_size import FAR, TOO_FAR, check_tiny, check_turn
 from cmfsim.errors import CmfsimError, RegistrationError
-from cmfsim.io import Case, read_moved_surface
-from cmfsim.patient import CaseMotion
 from cmfsim.scene import MovedSurface
 from cmfsim.topology import edges_of
 
 __all__ = ["check_moved"]
 
-# A bone whose vertices all move less than this was not moved, mm: a tenth of a voxel of a CT.
-STILL = 0.05
+# A bone whose vertices all move less than this was not moved, mm: rounding in a surface file.
+STILL = 1e-4
+# A motion that leaves less than this of its vertices' own, mm RMS, was computed, not measured.
+COMPUTED = 1e-3
 # A bone that is scaled by more than this was not measured in the same unit.
 SCALED = 0.03
 # Cosine between an edge before and after the bone's own turn, on average: 1 of a rigid bone, above
@@ -39,20 +41,13 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
     """Findings about motions given by surfaces, vertex by vertex."""
     case = evidence.case
     least: dict[str, float] = {}
-    for name, motion in case.plan.items():
-        if motion.surface is None or motion.moved_surface is None:
-            continue
-        if not (motion.surface.is_file() and motion.moved_surface.is_file()):
-            # Said where files are looked for.
-            continue
+    for name, moved in evidence.moved.items():
         where = case.where(f"plan.{name}")
-        try:
-            moved = _read(case, motion)
-        except CmfsimError as error:
+        if isinstance(moved, CmfsimError):
             yield Finding(
                 "error",
                 "moved-not-paired",
-                str(error),
+                str(moved),
                 where,
                 f"nobody knows where each vertex of {name} went",
                 "export the bone before, and the same mesh after the motion",
@@ -60,7 +55,7 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
             continue
         here, there = np.asarray(moved.surface.vertices), np.asarray(moved.moved_vertices)
         wrong = list(_check_pairs(name, where, moved))
-        wrong = wrong or list(_check_distance(name, where, here, there))
+        wrong = wrong or list(_check_distance(name, where, moved))
         yield from wrong
         if not any(finding.severity == "error" for finding in wrong):
             least[name] = float(np.quantile(np.linalg.norm(there - here, axis=1), FEW))
@@ -76,15 +71,6 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
             "frames, the whole face is moved by the difference",
             "lay the scan after on the one before by the skull (register_volumes, icp)",
         )
-
-
-def _read(case: Case, motion: CaseMotion) -> MovedSurface:
-    units, frame = ("mm", "LPS")
-    if case.surfaces is not None:
-        units, frame = case.surfaces.units, case.surfaces.frame
-    return read_moved_surface(
-        str(motion.surface), str(motion.moved_surface), units=units, frame=frame
-    )
 
 
 def _check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]:
@@ -152,7 +138,10 @@ def _is_mirrored(here: Floats, there: Floats) -> bool:
     return kept > STAYS and mirrored < MIRRORED * kept
 
 
-def _check_distance(name: str, where: str, here: Floats, there: Floats) -> Iterator[Finding]:
+def _check_distance(name: str, where: str, motion: MovedSurface) -> Iterator[Finding]:
+    """Whether the bone moves as far, and turns as far, as bone is moved."""
+    surface, there = motion.surface, np.asarray(motion.moved_vertices)
+    here = np.asarray(surface.vertices)
     moved = np.linalg.norm(there - here, axis=1)
     worst = int(np.argmax(moved))
     if moved[worst] < STILL:
@@ -164,7 +153,8 @@ def _check_distance(name: str, where: str, here: Floats, there: Floats) -> Itera
             "the plan moves nothing there",
             "check that the file is the bone after the operation; else leave it out",
         )
-    elif moved[worst] > FAR:
+        return
+    if moved[worst] > FAR:
         turned = np.linalg.norm(here * [-1.0, -1.0, 1.0] - there, axis=1).max() < moved[worst]
         yield Finding(
             "error" if moved[worst] > TOO_FAR else "warning",
@@ -177,3 +167,11 @@ def _check_distance(name: str, where: str, here: Floats, there: Floats) -> Itera
             else "lay the scan after on the one before by the skull, and check that both files "
             "number their vertices alike",
         )
+        # What flies off may turn as well: one reason is enough.
+        return
+    fit = clinical_motion(name, MovedSurface(surface, there))
+    angle = float(np.linalg.norm([fit.pitch, fit.yaw, fit.roll]))
+    yield from check_turn(name, where, angle)
+    # A measured turn may be as small as it likes.
+    computed = fit.residual is not None and fit.residual < COMPUTED
+    yield from check_tiny(name, where, float(moved[worst]), angle if computed else 0.0)

@@ -1,24 +1,22 @@
 """Whether cuts and plan can be meant: names, landmarks, sizes of motions, bone through skin."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from cmfsim.case import Finding
 from cmfsim.checks import Floats
+from cmfsim.clinical_plan import ClinicalMotion
 from cmfsim.doctor.evidence import Body, Evidence
 from cmfsim.doctor.places import place_text
+from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
 from cmfsim.errors import CaseError, LandmarkError
+from cmfsim.io.transforms import motion_in_lps
 from cmfsim.osteotomy import Procedure, place_procedure
 from cmfsim.patient import CaseOsteotomy
-from cmfsim.planning import decompose_motion
 
-__all__ = ["FAR", "TOO_FAR", "check_against_skin", "check_cuts", "check_plan"]
+__all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of"]
 
-# Motions of bone above which a plan is unusual, and above which it cannot be meant; mm and degrees.
-# The largest relocation in Table 2 of the paper is 12.6 mm; distraction reaches 30 mm.
-FAR, TOO_FAR = 20.0, 60.0
-TURNED, TOO_TURNED = 20.0, 60.0
 # Depth by which a moved bone may pass the skin at rest before it is said, mm: skin goes with the
 # bone, and an ordinary advancement exceeds the thickness of tissue over the piriform rim.
 THROUGH_SKIN = 2.0
@@ -124,12 +122,41 @@ def _with_normals(body: Body) -> Floats:
     return np.concatenate([body.samples, body.index.closest(body.samples)[1]], axis=1)
 
 
-def check_plan(evidence: Evidence) -> Iterator[Finding]:
-    """Findings about what the plan does to each bone."""
+def pieces_of(evidence: Evidence) -> dict[str, Floats | None]:
+    """What `_piece` gives for each segment whose motion is a matrix, by name."""
+    return {name: _piece(evidence, name) for name in evidence.motions}
+
+
+def check_plan(
+    evidence: Evidence, plan: Mapping[str, ClinicalMotion], pieces: Mapping[str, Floats | None]
+) -> Iterator[Finding]:
+    """Findings about what the plan does to each bone.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    plan : mapping of str to ClinicalMotion
+        As `state_plan` gives it.
+    pieces : mapping of str to (k, 6) float64 or None
+        As `pieces_of` gives it.
+    """
+    case = evidence.case
     for name, matrix in evidence.motions.items():
-        piece = _piece(evidence, name)
-        points = None if piece is None else piece[:, :3]
-        wrong = list(_check_size(evidence, name, matrix, points))
+        piece, given = pieces[name], case.plan[name]
+        yield from _check_frame(evidence, name, matrix)
+        wrong = list(
+            check_motion_size(
+                SizedMotion(
+                    name,
+                    matrix,
+                    case.where(f"plan.{name}"),
+                    None if piece is None else piece[:, :3],
+                    plan[name].point,
+                    typed=given.typed,
+                    has_centre=given.centre is not None,
+                )
+            )
+        )
         yield from wrong
         # A bone that flies off passes the skin as well: one reason is enough.
         if piece is not None and not any(f.severity == "error" for f in wrong):
@@ -138,38 +165,25 @@ def check_plan(evidence: Evidence) -> Iterator[Finding]:
             )
 
 
-def _check_size(
-    evidence: Evidence, name: str, matrix: Floats, points: Floats | None
-) -> Iterator[Finding]:
-    case = evidence.case
-    centre = case.plan[name].centre
-    if centre is None:
-        centre = np.zeros(3) if points is None else points.mean(axis=0)
-    motion = decompose_motion(matrix, centre)
-    moved = motion.translation[None] if points is None else _moved(matrix, points) - points
-    far = float(np.linalg.norm(moved, axis=1).max())
-    where = case.where(f"plan.{name}")
-    if far > FAR:
-        about_origin = motion.angle > 0.0 and case.plan[name].centre is None
-        yield Finding(
-            "error" if far > TOO_FAR else "warning",
-            "plan-far",
-            f"{name} moves by up to {far:.1f} mm",
-            where,
-            f"bone moves by {FAR:g} mm at most in ordinary surgery; tissue would be torn",
-            "give the centre of the turn: without it, it is about the origin of the coordinates"
-            if about_origin
-            else "check translation (mm), sign and frame (LPS: forwards is −P)",
-        )
-    if motion.angle > TURNED:
-        yield Finding(
-            "error" if motion.angle > TOO_TURNED else "warning",
-            "plan-turned",
-            f"{name} turns by {motion.angle:.1f}°",
-            where,
-            f"bone turns by {TURNED:g}° at most in ordinary surgery; linear strain invents volume",
-            "check angle (degrees, not radians) and axis",
-        )
+def _check_frame(evidence: Evidence, name: str, matrix: Floats) -> Iterator[Finding]:
+    """Numbers without a frame beside surfaces that are not in LPS, which would be assumed."""
+    case, read = evidence.case, evidence.transforms.get(name)
+    stated = case.plan[name].frame is not None
+    if read is not None:
+        stated = "frame" not in read.assumed
+    if stated or case.surfaces is None or case.surfaces.frame == "LPS":
+        return
+    if np.allclose(motion_in_lps(matrix, case.surfaces.frame), matrix, rtol=0.0, atol=1e-9):
+        return
+    yield Finding(
+        "warning",
+        "plan-frame",
+        f"the motion of {name} states no frame and is taken as LPS; the surfaces are in "
+        f"{case.surfaces.frame}",
+        case.where(f"plan.{name}"),
+        "in the other frame forwards is backwards, and left is right",
+        f'write frame = "LPS" or frame = "{case.surfaces.frame}" beside the numbers of the motion',
+    )
 
 
 def check_against_skin(

@@ -9,6 +9,7 @@ import os
 import struct
 import subprocess
 import sys
+import textwrap
 import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -54,6 +55,8 @@ DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
 MARGIN = 1.04
 TEXT_SIZE = 9
 LEGEND_ROW = 26  # pixels
+# Mean width of a letter of this size, pixels, as VTK draws them: the widest of many lines.
+LETTER = 9.5
 # What draws nothing into a small window. Where OpenGL is missing VTK ends the process instead of
 # raising, so this is tried in a process of its own, once.
 PROBE = """
@@ -89,14 +92,21 @@ def draw(
     paint: Callable[[Any, View], None],
     legend: Sequence[tuple[str, str]],
     columns: int | None = None,
+    words: Sequence[str] = (),
 ) -> None:
-    """Writes the views side by side, in rows of `columns`, under a temporary name first."""
+    """Writes the views side by side, in rows of `columns`, under a temporary name first.
+
+    Below them stand the words, a paragraph each; the views shrink for them, by half at most.
+    """
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise CaseInputError(f"{path.name}: a picture is written as .png, not {path.suffix!r}")
     width, height = (int(as_positive("picture size", n)) for n in size)
     pv = pyvista_module()
     check_can_draw(path.name)
+    lines = _wrapped(words, width)
+    band = len(lines) * LEGEND_ROW + 16 if lines else 0
+    height = max(height - band, height // 2)
     # One scale for all views.
     columns = columns or len(views)
     rows = -(-len(views) // columns)
@@ -128,6 +138,8 @@ def draw(
                 image = np.array(plotter.screenshot(return_img=True))[:, :, :3]
             finally:
                 plotter.close()
+            if band:
+                written = _band_of_text(lines, width, band)
     except (RuntimeError, OSError, AttributeError) as error:
         raise CaseInputError(
             f"{path.name}: the picture cannot be drawn ({error}); {NO_OPENGL}"
@@ -135,7 +147,38 @@ def draw(
     for top, colour in swatches:
         image[top - 1 : top + 19, 11:31] = 90
         image[top : top + 18, 12:30] = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+    if band:
+        image = np.concatenate([image, written])
     write_picture(path, image)
+
+
+def _wrapped(words: Sequence[str], width: int) -> list[str]:
+    """The lines of text that fit a picture of a width in pixels."""
+    return [
+        line
+        for text in words
+        for line in textwrap.wrap(
+            text, max(int((width - 24) / LETTER), 20), subsequent_indent="    "
+        )
+    ]
+
+
+def _band_of_text(lines: Sequence[str], width: int, height: int) -> NDArray[np.uint8]:
+    """Lines of text on white, (height, width, 3)."""
+    plotter = pyvista_module().Plotter(off_screen=True, window_size=[width, height])
+    try:
+        plotter.set_background("white")
+        for row, line in enumerate(lines):
+            # The fonts that come with VTK have no minus sign; it sets formulas between dollars.
+            plotter.add_text(
+                "".join(c if c.isprintable() and c != "$" else "?" for c in line.replace("−", "-")),
+                position=(12, height - 8 - (row + 1) * LEGEND_ROW),
+                font_size=TEXT_SIZE,
+                color="black",
+            )
+        return np.array(plotter.screenshot(return_img=True))[:, :, :3]
+    finally:
+        plotter.close()
 
 
 def add_scale_bar(plotter: Any, place: tuple[float, float], labels: int, form: str) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from cmfsim.clinical_plan import plan_lines
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
 from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.skin_ends import skin_ends, trimmed
@@ -94,6 +95,8 @@ def picture_plan(
 ) -> None:
     """Writes a picture of a plan: bone segments where they go, and behind them where they were.
 
+    The motion of each segment stands below, in words.
+
     Parameters
     ----------
     path : path
@@ -133,4 +136,6 @@ def picture_plan(
                 plotter.add_mesh(shape, color=GHOST_COLOUR, opacity=0.3, smooth_shading=True)
 
     views = tuple(View(name, name) for name in ("right", "front", "left"))
-    draw(path, views, corners, size, paint, [*colours.items(), ("before", GHOST_COLOUR)])
+    legend = [*colours.items(), ("before", GHOST_COLOUR)]
+    plan = {name: m["clinical"] for name, m in prediction.summary.get("plan", {}).items()}
+    draw(path, views, corners, size, paint, legend, words=plan_lines(plan))

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from cmfsim.clinical_plan import plan_lines
 from cmfsim.report.document import NOTHING, Document, Figure, Note, Section, Table, number
 from cmfsim.report.labels import MESH, MUSCLES, labelled
 
@@ -144,8 +145,22 @@ def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
                 f"leaves: {', '.join(bent)}."
             )
         )
+    words = [
+        Note(line)
+        for line in plan_lines(
+            # Results of cmfsim 0.1 have no words.
+            {n: m["clinical"] for n, m in prediction["plan"].items() if "clinical" in m}
+        )
+    ]
     return Section(
-        "Plan", (*_picture("plan", pictures), table, *notes, *_achieved(prediction.get("achieved")))
+        "Plan",
+        (
+            *words,
+            *_picture("plan", pictures),
+            table,
+            *notes,
+            *_achieved(prediction.get("achieved")),
+        ),
     )
 
 

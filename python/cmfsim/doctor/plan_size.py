@@ -1,0 +1,128 @@
+"""Whether a motion has the size of a bone's: neither torn away, nor in metres or radians."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from cmfsim.case import Finding
+from cmfsim.checks import Floats
+from cmfsim.planning import decompose_motion
+
+__all__ = ["FAR", "TOO_FAR", "SizedMotion", "check_motion_size", "check_tiny", "check_turn"]
+
+# Motions of bone above which a plan is unusual, and above which it cannot be meant; mm and degrees.
+# The largest relocation in Table 2 of the paper is 12.6 mm; distraction reaches 30 mm.
+FAR, TOO_FAR = 20.0, 60.0
+TURNED, TOO_TURNED = 20.0, 60.0
+# A motion that no face shows, mm: a tenth of a voxel of a CT. 20 mm written in metres is 0.02.
+TINY = 0.05
+# Turns that nobody plans, degrees: 0.2 rad are 11°. Below the first, rounding of a typed matrix.
+TINY_TURN = (1e-3, 0.2)
+# Less than this is rounding of no motion, mm and degrees.
+NOTHING = 1e-6
+# Where no surface of the segment is known, how far it reaches from the point that is, mm.
+REACH = 60.0
+
+
+@dataclass(frozen=True, eq=False)
+class SizedMotion:
+    """A rigid motion of a segment with what its size is judged by.
+
+    Attributes
+    ----------
+    name : str
+        Of the segment.
+    matrix : (4, 4) float64, mm
+    where : str
+        Its place in the case file.
+    points : (k, 3) float64, mm, or None
+        On the segment's surface, where one is known.
+    point : (3,) float64, mm, or None
+        One point of the segment, where no surface is known.
+    typed : bool
+        Whether it was given by translation, angle, axis and centre.
+    has_centre : bool
+    """
+
+    name: str
+    matrix: Floats
+    where: str
+    points: Floats | None = None
+    point: Floats | None = None
+    typed: bool = False
+    has_centre: bool = False
+
+
+def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
+    """Findings about a motion that is too large, too small, or turns too far or too little."""
+    points = motion.points
+    if points is None:
+        points = (np.zeros(3) if motion.point is None else motion.point)[None]
+    rotation, shift = motion.matrix[:3, :3], motion.matrix[:3, 3]
+    far = float(np.linalg.norm(points @ rotation.T + shift - points, axis=1).max())
+    angle = decompose_motion(motion.matrix).angle
+    if far > FAR:
+        about_origin = angle > 0.0 and motion.typed and not motion.has_centre
+        remedy = "check translation (mm), sign and frame (LPS: forwards is −P)"
+        if about_origin:
+            remedy = (
+                "give the centre of the turn: without it, it is about the origin of the coordinates"
+            )
+        elif not motion.typed:
+            remedy = "check the unit (mm), frame (LPS or RAS) and direction of the transform"
+        yield _too_far(motion, far, remedy)
+    yield from check_turn(motion.name, motion.where, angle)
+    reach = 0.0 if motion.points is not None else REACH * math.radians(angle)
+    yield from check_tiny(motion.name, motion.where, far + reach, angle)
+
+
+def _too_far(motion: SizedMotion, far: float, remedy: str) -> Finding:
+    return Finding(
+        "error" if far > TOO_FAR else "warning",
+        "plan-far",
+        f"{motion.name} moves by up to {far:.1f} mm",
+        motion.where,
+        f"bone moves by {FAR:g} mm at most in ordinary surgery; tissue would be torn",
+        remedy,
+    )
+
+
+def check_turn(name: str, where: str, angle: float) -> Iterator[Finding]:
+    """A finding about a turn, in degrees, of more than bone is turned."""
+    if angle > TURNED:
+        yield Finding(
+            "error" if angle > TOO_TURNED else "warning",
+            "plan-turned",
+            f"{name} turns by {angle:.1f}°",
+            where,
+            f"bone turns by {TURNED:g}° at most in ordinary surgery; linear strain invents volume",
+            "check angle (degrees, not radians) and axis",
+        )
+
+
+def check_tiny(name: str, where: str, far: float, angle: float) -> Iterator[Finding]:
+    """Findings about a motion of `far` mm at most and a turn, in degrees, that nobody plans."""
+    if NOTHING < far < TINY:
+        yield Finding(
+            "warning",
+            "plan-tiny",
+            f"{name} moves by {far:.2g} mm at most",
+            where,
+            "no face shows that: the prediction is the face before the operation",
+            f"check the unit: translations and matrices are in mm ({far:.2g} m would be "
+            f"{1000.0 * far:.2g} mm); if the segment stays, leave it out of the plan",
+        )
+    least, most = TINY_TURN
+    if least <= angle < most:
+        yield Finding(
+            "warning",
+            "plan-tiny-angle",
+            f"{name} turns by {angle:.2g}°",
+            where,
+            f"no operation is planned to that; {angle:.2g} radians would be "
+            f"{math.degrees(angle):.1f}°",
+            "check the unit: angles are in degrees; nothing to do if the turn is meant, or was "
+            "measured",
+        )
