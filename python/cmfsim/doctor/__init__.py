@@ -8,7 +8,7 @@ was read, `placement` asks whether it lies where it should, `surfaces` whether i
 placed.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -52,12 +52,15 @@ class Examination:
     plan: Mapping[str, ClinicalMotion]
 
 
-def diagnose(case: Case) -> tuple[Finding, ...]:
+def diagnose(case: Case, models: Sequence[str] | None = None) -> tuple[Finding, ...]:
     """What a person should know before a case is built: errors first, then warnings and notes.
 
     Parameters
     ----------
     case : Case
+    models : sequence of str, optional
+        The models that are asked for, of "H", "M", "H+S" and "M+S": muscles are checked only if
+        one of them has muscles. Default: all that the case can be solved with.
 
     Returns
     -------
@@ -75,15 +78,17 @@ def diagnose(case: Case) -> tuple[Finding, ...]:
     >>> for finding in cmfsim.diagnose(cmfsim.Case.load("case.toml")):  # doctest: +SKIP
     ...     print(finding.severity, finding.what, finding.mend)
     """
-    return examine(case).findings
+    return examine(case, models).findings
 
 
-def examine(case: Case) -> Examination:
+def examine(case: Case, models: Sequence[str] | None = None) -> Examination:
     """What `diagnose` finds, with the plan in a surgeon's words.
 
     Parameters
     ----------
     case : Case
+    models : sequence of str, optional
+        As for `diagnose`.
 
     Returns
     -------
@@ -109,7 +114,7 @@ def examine(case: Case) -> Examination:
         findings += check_plan(evidence, plan, pieces)
         findings += check_moved(evidence)
         findings += check_after(evidence)
-        if case.muscles is not None:
+        if case.muscles is not None and (models is None or any("M" in name for name in models)):
             from cmfsim.doctor.muscles import check_muscles  # noqa: PLC0415
 
             findings += check_muscles(evidence)
