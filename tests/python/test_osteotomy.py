@@ -156,8 +156,9 @@ def test_a_contact_surface_bridges_the_gaps_between_teeth(box):
 
 def test_ready_surfaces_are_segments_as_they_are(box):
     ready = surface_of_level("maxilla", box)
+    other = box_level((5.5, 5.5, 22.5), (30.5, 25.5, 35.5))
     segments = cmfsim.segments_from_surfaces(
-        {"maxilla": box, "cranium": box}, {"maxilla": ready, "skin": ready}
+        {"maxilla": box, "cranium": other}, {"maxilla": ready, "skin": ready}
     )
     assert [s.name for s in segments] == ["maxilla", "cranium"]
     assert segments[0].surface is ready

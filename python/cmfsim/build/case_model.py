@@ -39,6 +39,7 @@ from cmfsim.node_kinds import KindOptions, classify_nodes, segment_data
 from cmfsim.osteotomy import (
     CuttingPlane,
     Procedure,
+    check_segments,
     contact_surface,
     cut_bones,
     free_cut,
@@ -159,6 +160,8 @@ def build_model(
     bones = planned_bones(case, cut.segments, after)
     findings += bones.findings
     findings += _plan_sizes(case, bones, findings)
+    # Again for all of them together: pieces of two bones never met before.
+    check_segments(bones.segments)
     moved = [*dict.fromkeys([*_cut_segments(case), *bones.motions])]
 
     stages.begin("finding the soft tissue")
@@ -191,7 +194,7 @@ def build_model(
     findings += noticed
     if mesh.n_tets < whole:
         report = report_of_part(mesh, report)
-    findings += _untouched(case, kinds, bones.motions)
+    findings += _untouched(case, mesh, kinds, bones)
     findings = [*dict.fromkeys(findings)]
 
     stages.begin("assembling the scene")
@@ -319,19 +322,47 @@ def _plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> li
     return found
 
 
-def _untouched(case: Case, kinds: NodeKinds, motions: Iterable[str]) -> list[Finding]:
-    return [
-        Finding(
-            "warning",
-            "segment-touches-no-tissue",
-            f"segment {name!r} moves, but no node of the tissue is joined to it",
-            case.where(f"plan.{name}"),
-            "its motion does not reach the face",
-            "check the cut that makes it, bone_distance in [node_kinds], and the posterior plane",
+def _untouched(
+    case: Case, mesh: TetMesh, kinds: NodeKinds, bones: PlannedBones
+) -> tuple[Finding, ...]:
+    """A finding for each moved segment that lies beyond the mesh and holds none of its nodes.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A moved segment that holds no node and is named in the case, or lies at
+        the mesh: the face would not follow it.
+    """
+    findings = []
+    segments = {segment.name: segment for segment in bones.segments}
+    nodes = np.asarray(mesh.nodes)
+    low, high = nodes.min(axis=0), nodes.max(axis=0)
+    for name, motion in bones.motions.items():
+        if len(kinds.nodes("joined", name)) or len(kinds.nodes("sliding", name)):
+            continue
+        if not isinstance(motion, MovedSurface) and np.array_equal(motion, np.eye(4)):
+            continue
+        vertices = np.asarray(segments[name].surface.vertices)
+        beside = ((vertices > low) & (vertices < high)).all(axis=1).any()
+        what = (
+            f"segment {name!r} moves, but no node of the tissue is joined to it or slides on it "
+            "(segment-touches-no-tissue)"
         )
-        for name in motions
-        if not len(kinds.nodes("joined", name)) and not len(kinds.nodes("sliding", name))
-    ]
+        where = case.where(f"plan.{name}")
+        mend = "check the cut that makes it, bone_distance in [node_kinds], and the posterior plane"
+        if name in case.plan or name in _cut_segments(case) or beside:
+            raise CaseInputError(f"{where}: {what}: the face would not follow it; {mend}")
+        findings.append(
+            Finding(
+                "warning",
+                "segment-touches-no-tissue",
+                f"{what}; it lies beyond the meshed tissue, and the case does not name it",
+                where,
+                "its motion does not reach the face",
+                "if it belongs to the face, widen [region]",
+            )
+        )
+    return tuple(findings)
 
 
 def _scene(

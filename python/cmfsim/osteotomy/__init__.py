@@ -4,6 +4,7 @@ from cmfsim.osteotomy.cutting import CutBones, CutOptions, cut_bones, segments_f
 from cmfsim.osteotomy.parting import part_segment
 from cmfsim.osteotomy.planes import Cut, CuttingPlane, Procedure, free_cut
 from cmfsim.osteotomy.procedures import PROCEDURES, place_procedure, procedure_options
+from cmfsim.osteotomy.segment_checks import check_segments
 from cmfsim.osteotomy.surfaces import SurfaceOptions, contact_surface, surface_of_level
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "CuttingPlane",
     "Procedure",
     "SurfaceOptions",
+    "check_segments",
     "contact_surface",
     "cut_bones",
     "free_cut",

@@ -14,6 +14,7 @@ from cmfsim.checks import as_number, check_instance
 from cmfsim.errors import CaseInputError
 from cmfsim.osteotomy.planes import Cut, Procedure
 from cmfsim.osteotomy.procedures import PROCEDURES, place_procedure
+from cmfsim.osteotomy.segment_checks import check_segments
 from cmfsim.osteotomy.surfaces import SurfaceOptions, block_of, surface_of_level
 from cmfsim.scene import SurfaceData
 
@@ -105,8 +106,9 @@ def cut_bones(
     Raises
     ------
     CaseError
-        (also `ValueError`) No bone to cut, a cut that misses its bone or leaves nothing of it, two
-        pieces of one name.
+        Two segments with the same surface, or one whose surface is not that of its level; also
+        `ValueError`: no bone to cut, a cut that misses its bone or leaves nothing of it, two pieces
+        of one name.
     LandmarkError
         (also `ValueError`) A landmark missing; names it and the procedure.
 
@@ -149,7 +151,8 @@ def cut_bones(
         for cut in procedure.cuts:
             _make_cut(procedure, cut, grid, pieces, findings, options)
     levels = {name: grid.with_values(values) for name, values in pieces.items()}
-    # Decimation uses one thread and leaves Python's lock alone, so that two pieces go side by side.
+    # Marching cubes and smoothing of one piece go on while another is decimated; decimation itself
+    # takes one piece at a time.
     with ThreadPoolExecutor(SURFACES_AT_ONCE) as pool:
         surfaces = pool.map(
             lambda name: surface_of_level(name, levels[name], options.surface), levels
@@ -158,6 +161,7 @@ def cut_bones(
             BoneSegment(name, levels[name], surface)
             for name, surface in zip(levels, surfaces, strict=True)
         )
+    check_segments(segments)
     return CutBones(segments, placed, tuple(findings))
 
 
@@ -181,7 +185,8 @@ def segments_from_surfaces(
     Raises
     ------
     CaseError
-        (also `ValueError`) A surface without a level.
+        Two segments with the same surface, or one whose surface is not that of its level; also
+        `ValueError`: a surface without a level.
 
     Examples
     --------
@@ -192,12 +197,14 @@ def segments_from_surfaces(
         if name != "skin" and name not in levels:
             known = ", ".join(repr(n) for n in levels) or "none"
             raise CaseInputError(f"surface {name!r} has no level; levels are: {known}")
-    return tuple(
+    segments = tuple(
         BoneSegment(
             name, level, surfaces[name] if name in surfaces else surface_of_level(name, level)
         )
         for name, level in levels.items()
     )
+    check_segments(segments)
+    return segments
 
 
 def _placed(

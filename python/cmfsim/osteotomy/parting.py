@@ -10,6 +10,7 @@ from cmfsim._core import Surface
 from cmfsim.case import BoneSegment, ImageData
 from cmfsim.errors import CaseInputError
 from cmfsim.osteotomy.cutting import SURFACES_AT_ONCE
+from cmfsim.osteotomy.segment_checks import check_segments
 from cmfsim.osteotomy.surfaces import surface_of_level
 from cmfsim.scene import SurfaceData
 
@@ -76,10 +77,12 @@ def part_segment(
         )
     with ThreadPoolExecutor(SURFACES_AT_ONCE) as pool:
         made = pool.map(lambda name: surface_of_level(name, parted[name]), parted)
-        return tuple(
+        segments = tuple(
             BoneSegment(name, parted[name], surface)
             for name, surface in zip(parted, made, strict=True)
         )
+    check_segments(segments)
+    return segments
 
 
 def _distance(surface: Surface, points: NDArray[np.float64]) -> NDArray[np.float64]:

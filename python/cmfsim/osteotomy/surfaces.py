@@ -1,5 +1,7 @@
 """Closed, lightly smoothed surfaces of levels, of a size that contact can be searched on."""
 
+import os
+import threading
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, cast
@@ -22,6 +24,24 @@ SHRINK, GROW = 0.5, -0.53
 CONTACT_RELIEF = 3.0
 # Where the blur is cut off, in standard deviations.
 BLUR_REACH = 3.0
+
+
+class _OneAtATime:
+    """A lock for one call at a time in a process, free again in the child of a fork."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        if hasattr(os, "register_at_fork"):
+            # A thread that holds the lock while another forks does not exist in the child.
+            os.register_at_fork(after_in_child=self._renew)
+
+    def _renew(self) -> None:
+        self.lock = threading.Lock()
+
+
+# fast-simplification keeps its mesh in global variables and releases Python's lock while it works:
+# two threads inside it exchange their meshes without an error.
+_DECIMATING = _OneAtATime()
 
 
 @dataclass(frozen=True)
@@ -221,7 +241,8 @@ def _decimated(
         "with fast-simplification (or raise max_triangles)",
     )
     # Quadric decimation stays within a tenth of a voxel, but here and there it folds a sheet.
-    fewer, corners = quadrics.simplify(points, triangles.astype(np.int32), target_count=wanted)
+    with _DECIMATING.lock:
+        fewer, corners = quadrics.simplify(points, triangles.astype(np.int32), target_count=wanted)
     return _closed(np.asarray(fewer, dtype=np.float64), np.asarray(corners, dtype=np.int64))
 
 
