@@ -10,6 +10,7 @@ import sys
 import numpy as np
 
 import cmfsim
+from angles import angle_of_lines
 
 # Points asked per muscle, and points drawn per point that is expected inside.
 POINTS, SURPLUS = 2000, 1.3
@@ -53,8 +54,7 @@ def points_inside(surface: cmfsim.Surface) -> np.ndarray:
 
 def angles(found: np.ndarray, truth: np.ndarray) -> str:
     """Median and 95th percentile of the angle between unit vectors of any sign, in words."""
-    cosine = np.minimum(np.abs((found * truth).sum(axis=1)), 1.0)
-    median, p95 = np.percentile(np.degrees(np.arccos(cosine)), [50, 95])
+    median, p95 = np.percentile(angle_of_lines(found, truth), [50, 95])
     return f"{median:.1f}°, {p95:.1f}°"
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import cmfsim
+from angles import angle_of_lines
 
 # Median angle between boxes and true fibres over the volume of a muscle, degrees, and its P95, as
 # measured on the phantom and rounded up. Bent ends, converging lines and thin rings are worse.
@@ -20,11 +21,6 @@ STRAPS = {
 @cache
 def head():
     return cmfsim.make_head()
-
-
-def angle(a, b):
-    cosine = np.abs((np.asarray(a) * np.asarray(b)).sum(axis=-1))
-    return np.degrees(np.arccos(np.minimum(cosine, 1.0)))
 
 
 def core_surface(data):
@@ -56,7 +52,7 @@ def test_true_fibres_are_the_tangents_of_the_lines_for_every_muscle():
                 gap = np.linalg.norm(line[:, None] - other[None], axis=2).min(axis=1)
                 alone &= gap > 4.0
             if alone.any():
-                assert angle(found, tangent)[alone].max() < (1.0 if others else 1e-5), name
+                assert angle_of_lines(found, tangent)[alone].max() < (1.0 if others else 1e-5), name
 
 
 def test_streamlines_of_the_true_fibres_run_from_origin_to_insertion():
@@ -93,7 +89,7 @@ def test_boxes_of_a_strap_lie_along_its_known_course(name):
     assert surface.volume > 0.0
     fibres = cmfsim.MuscleFibres(surface, muscle.kind)
     points = inside(surface)
-    off = angle(fibres.directions(points), muscle.fibre(points))
+    off = angle_of_lines(fibres.directions(points), muscle.fibre(points))
     median, p95 = STRAPS[name]
     assert np.median(off) < median
     assert np.percentile(off, 95) < p95

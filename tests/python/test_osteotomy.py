@@ -8,6 +8,7 @@ import pytest
 
 import cmfsim
 import real_heads
+from angles import angle_between
 from cmfsim.osteotomy import (
     PROCEDURES,
     CutOptions,
@@ -307,7 +308,7 @@ def test_options_move_the_planes_by_what_they_say():
         return placed.cuts[cut].groups[group][number]
 
     def angle(p, q):
-        return np.degrees(np.arccos(np.clip(np.asarray(p.normal) @ np.asarray(q.normal), -1, 1)))
+        return angle_between(p.normal, q.normal)
 
     base, higher = plane("le_fort_1"), plane("le_fort_1", height=9.0)
     assert angle(base, higher) < 1e-6

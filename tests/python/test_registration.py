@@ -12,6 +12,7 @@ import pytest
 
 import cmfsim
 import real_heads
+from angles import angle_of_rotation
 
 # Where a head lies in a scanner, mm.
 OFFSET = np.array([0.0, -150.0, 1500.0])
@@ -216,7 +217,7 @@ def test_rigid_fit_agrees_with_scipy_and_meets_the_noise_bound():
         middle = moved(fit.matrix, moving.mean(0)[None]) - exact.mean(0)
         assert np.abs(middle).max() < 5 * sigma / math.sqrt(n)
         turned = fit.matrix[:3, :3] @ motion[:3, :3].T
-        angle = math.acos(min(1.0, (np.trace(turned) - 1) / 2))
+        angle = math.radians(angle_of_rotation(turned))
         assert angle < 6 * sigma / math.sqrt(n) / 60 * math.sqrt(3)
     assert np.mean(squares) == pytest.approx(sigma**2 * (3 - 6 / n), rel=0.05)
 
