@@ -41,6 +41,6 @@ def allocate(size):
 
 def chatter():
     os.write(1, b"warning: 12\n")
-    print("warning: 13")
+    sys.stdout.write("warning: 13\n")
     sys.stdout.flush()
     return Answer({"read": True}, {})
