@@ -41,6 +41,6 @@ def allocate(size):
 
 def chatter():
     os.write(1, b"warning: 12\n")
-    sys.stdout.write("warning: 13\n")
+    print("warning: 13")  # noqa: T201 (what libraries do)
     sys.stdout.flush()
     return Answer({"read": True}, {})

@@ -11,7 +11,6 @@ import pytest
 import cmfsim
 from cmfsim.capping import cap_loop
 from cmfsim.crossings import crossing_pairs
-from cmfsim.io.ply import read_plain_ply
 from cmfsim.topology import connected_labels
 from head_case import icosphere
 
@@ -96,7 +95,8 @@ def ply(tmp_path, order="<", real="float", whole="int", name="vertex_indices", r
     kinds = {"float": "f4", "double": "f8", "int": "i4", "uint": "u4"}
     format_ = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
     head = HEADER.format(format=format_, real=real, whole=whole, name=name, more=more)
-    data = places.astype(order + kinds[real]).tobytes()
+    extra = b"\7" if "red" in more else b""
+    data = b"".join(row.tobytes() + extra for row in places.astype(order + kinds[real]))
     for row in rows or [[0, 1, 2], [2, 1, 3]]:
         data += bytes([len(row)]) + np.array(row, order + kinds[whole]).tobytes()
     path = tmp_path / "file.ply"
@@ -106,45 +106,26 @@ def ply(tmp_path, order="<", real="float", whole="int", name="vertex_indices", r
 
 @pytest.mark.parametrize("order", "<>")
 @pytest.mark.parametrize(("real", "whole"), [("float", "int"), ("double", "uint")])
-def test_plain_ply_is_read_as_meshio_reads_it(order, real, whole, tmp_path):
-    path = ply(tmp_path, order, real, whole)
-    points, triangles = read_plain_ply(path)
+@pytest.mark.parametrize("more", ["", "\nproperty uchar red"])
+def test_ply_is_read_as_meshio_reads_it(order, real, whole, more, tmp_path):
+    path = ply(tmp_path, order, real, whole, more=more)
     known = meshio.read(path)
-    assert points.dtype.itemsize == known.points.dtype.itemsize
-    np.testing.assert_array_equal(points, known.points)
-    np.testing.assert_array_equal(triangles, known.cells_dict["triangle"])
     surface = cmfsim.read_surface(path)
+    np.testing.assert_array_equal(surface.vertices, known.points)
     np.testing.assert_array_equal(surface.triangles, known.cells_dict["triangle"])
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"rows": [[0, 1, 2], [0, 1, 2, 3]]},
-        {"rows": [[0, 1, 2], [2, 1, 4]]},
-        {"rows": [[0, 1, 2], [2, 1, -1]]},
-        {"name": "corners"},
-        {"more": "\nproperty uchar red"},
-    ],
-)
-def test_other_ply_is_left_to_a_reader_of_all_of_it(change, tmp_path):
-    assert read_plain_ply(ply(tmp_path, **change)) is None
 
 
 @pytest.mark.parametrize("ending", [".ply", ".stl", ".obj", ".vtp"])
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.6, 0.97])
 def test_a_file_cut_short_is_refused_in_time(ending, share, tmp_path):
-    """Never a hang, a crash, or another error than CaseError; a cut OBJ may still be a surface."""
+    """Never a hang, a crash, a shorter surface, or another error than CaseError."""
     path = tmp_path / f"cut{ending}"
     cmfsim.write_surface(path, cmfsim.SurfaceData(*sphere(2)))
     whole = path.read_bytes()
     path.write_bytes(whole[: int(share * len(whole))])
     started = time.perf_counter()
-    if ending == ".obj" and share > 0.9:
-        assert len(cmfsim.read_surface(path).triangles) < 320
-    else:
-        with pytest.raises(cmfsim.CaseError, match="cut"):
-            cmfsim.read_surface(path)
+    with pytest.raises(cmfsim.CaseError, match="cut"):
+        cmfsim.read_surface(path)
     assert time.perf_counter() - started < 10.0
 
 

@@ -113,7 +113,7 @@ class _Child:
             message = "cannot be read here: this Python cannot start another (sys.executable)"
             raise ReaderError(message)
         self.parent = os.getpid()
-        self.process = subprocess.Popen(  # noqa: S603 (this interpreter, and a text of this file)
+        self.process = subprocess.Popen(  # noqa: S603 (this very Python, and no shell)
             [sys.executable, "-I", "-c", PROGRAM],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

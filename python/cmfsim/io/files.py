@@ -9,6 +9,7 @@ import contextlib
 import glob
 import json
 import os
+import stat
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path, PurePosixPath
@@ -20,6 +21,7 @@ from cmfsim.io.leftovers import abandoned, temporary_file
 __all__ = [
     "FORMAT_VERSION",
     "beside",
+    "check_readable",
     "check_version",
     "known_keys",
     "named",
@@ -33,6 +35,8 @@ __all__ = [
 # Text files (plans, scene descriptions) above this size are not what they say they are, bytes.
 MAX_TEXT = 16 * 2**20
 FORMAT_VERSION = 1
+# Characters of a file's name that an error repeats; names that no system takes are longer.
+MAX_SHOWN_NAME = 255
 
 
 @contextlib.contextmanager
@@ -63,6 +67,35 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         raise
 
 
+def check_readable(path: Path, error: type[ValueError] = CaseInputError) -> None:
+    """Refuses what is no plain file: opening a pipe waits for ever, a device may never end.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is nothing of this name.
+    CaseError, or the error that is given
+        (also `ValueError`) A folder, a pipe or device, a name that no file can have, no permission.
+    """
+    name = path.name if len(path.name) <= MAX_SHOWN_NAME else f"{path.name[:MAX_SHOWN_NAME]}…"
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISREG(mode) and not os.access(path, os.R_OK):
+            raise error(f"{name}: may not be read: its owner has to permit it")
+    except (FileNotFoundError, NotADirectoryError) as missing:
+        raise FileNotFoundError(f"{path}: no such file") from missing
+    except OSError as other:
+        raise error(f"{name}: cannot be opened ({other.strerror})") from other
+    except ValueError as other:
+        if isinstance(other, error):
+            raise
+        raise error(f"{name!r}: no file is called so ({other})") from other
+    if stat.S_ISDIR(mode):
+        raise error(f"{name}: is a folder, not a file")
+    if not stat.S_ISREG(mode):
+        raise error(f"{name}: is a pipe or a device, not a file: copy its content to a file")
+
+
 @contextlib.contextmanager
 def named(path: Path) -> Iterator[None]:
     """Puts the file's name before the text of an error about its content."""
@@ -74,6 +107,8 @@ def named(path: Path) -> Iterator[None]:
         raise FileNotFoundError(f"{error.filename}: no such file") from error
     except IsADirectoryError as error:
         raise CaseInputError(f"{path.name}: is a folder, not a file") from error
+    except PermissionError as error:
+        raise CaseInputError(f"{path.name}: may not be read: its owner has to permit it") from error
     except ValueError as error:
         raise CaseInputError(f"{path.name}: {error}") from error
 

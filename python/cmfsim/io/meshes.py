@@ -1,86 +1,179 @@
-"""Meshes in the formats that meshio reads; XML with a document type is refused."""
+"""Meshes of any format: by our own readers, and by meshio in a process of its own."""
 
 import contextlib
 import io as stdio
 import os
+from collections.abc import Callable, Mapping
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files import named
-from cmfsim.io.ply import read_plain_ply
+from cmfsim.io.child import Answer, ReaderError, ReadLimits, read_in_child
+from cmfsim.io.files import check_readable, named
+from cmfsim.io.msh import read_msh
+from cmfsim.io.obj import read_obj
+from cmfsim.io.plain_mesh import Cells, PlainMesh
+from cmfsim.io.ply import read_ply
+from cmfsim.io.stl import read_stl
+from cmfsim.io.vtk_legacy import read_vtk_legacy
+from cmfsim.io.vtk_xml import read_vtk_xml
 
-__all__ = [
-    "read_mesh",
-    "read_tet_mesh",
-    "read_tets",
-]
+__all__ = ["read_mesh", "read_tet_mesh", "read_tets"]
 
-# Length of a PLY header with any number of properties and comments, bytes.
-MAX_PLY_HEADER = 2**16
-
-
-def _meshio() -> Any:
-    try:
-        return import_module("meshio")
-    except ModuleNotFoundError as error:
-        raise CaseInputError(
-            "meshes and surfaces are read with meshio: pip install 'cmfsim[mesh]'"
-        ) from error
+# Formats of meshio whose files name other files, which may lie anywhere, or hold no mesh.
+NAME_OTHERS = frozenset({".xdmf", ".xmf", ".hmf", ".node", ".ele", ".svg"})
+# Cells that lie on or in the tets of a file without being part of the tissue.
+PASSED_OVER = frozenset({"vertex", "line", "triangle", "quad", "tetra"})
 
 
-def read_mesh(path: Path) -> Any:
-    """What meshio reads from a file."""
-    _meshio()
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    _refuse_entities(path)
-    _refuse_headless(path)
-    with named(path):
-        try:
-            # meshio prints what it finds and, in some readers, exits: neither is the caller's.
-            with (
-                contextlib.redirect_stdout(stdio.StringIO()),
-                contextlib.redirect_stderr(stdio.StringIO()),
-            ):
-                return _read(path)
-        except (Exception, SystemExit) as error:
-            raise CaseInputError(f"cannot be read as a mesh ({error})") from error
+def _of_triangles(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> PlainMesh:
+    return PlainMesh(points, (Cells("triangle", triangles),) if len(triangles) else ())
 
 
-def _read(path: Path) -> Any:
-    if path.suffix == ".vtp":
-        return _read_vtp(path)
-    # meshio takes PLY's triangles one by one.
-    plain = read_plain_ply(path) if path.suffix.lower() == ".ply" else None
-    if plain is not None:
-        points, triangles = plain
-        return _meshio().Mesh(points, [("triangle", triangles)])
-    return _meshio().read(path)
+def _stl(data: bytes) -> PlainMesh:
+    corners = read_stl(data)
+    return _of_triangles(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
 
-def _refuse_entities(path: Path) -> None:
-    """Refuses XML with a document type, in which entities could grow without bound."""
-    data = path.read_bytes()
-    if data[:1] == b"<" and (b"<!DOCTYPE" in data or b"<!ENTITY" in data):
-        raise CaseInputError(f"{path.name}: XML with a document type is not read")
-    if data[:2] in {b"\xff\xfe", b"\xfe\xff"}:
-        raise CaseInputError(f"{path.name}: XML in UTF-16 is not read")
+READERS: Mapping[str, Callable[[bytes], PlainMesh]] = MappingProxyType(
+    {
+        ".stl": _stl,
+        ".ply": lambda data: _of_triangles(*read_ply(data)),
+        ".obj": lambda data: _of_triangles(*read_obj(data)),
+        ".vtp": lambda data: read_vtk_xml(data, "PolyData"),
+        ".vtu": lambda data: read_vtk_xml(data, "UnstructuredGrid"),
+        ".vtk": read_vtk_legacy,
+        ".msh": read_msh,
+    }
+)
 
 
-def read_tet_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
-    """The nodes (n, 3), mm, and tets (m, 4) of a file that meshio reads, all positively oriented.
+def read_mesh(path: Path) -> PlainMesh:
+    """The mesh in a file, its indices checked.
+
+    Parameters
+    ----------
+    path : path
+        STL, PLY, OBJ, VTP, VTU, legacy VTK, Gmsh; or another format of one file that meshio reads,
+        in the child process.
 
     Raises
     ------
     FileNotFoundError
         The file does not exist.
     CaseError
-        (also `ValueError`) No linear tets.
+        (also `ValueError`) Not such a file, cut short, damaged, an index that is not there, a
+        coordinate that is not finite, more memory or time than a file of this size needs.
+    """
+    check_readable(path)
+    suffix = path.suffix.lower()
+    with named(path):
+        if suffix not in READERS:
+            return _by_meshio(path)
+        try:
+            data = path.read_bytes()
+            # Fluent's files have the same ending as Gmsh's, and begin with "(".
+            if suffix == ".msh" and data[:1] == b"(":
+                return _by_meshio(path)
+            return READERS[suffix](data)
+        except MemoryError as error:
+            raise CaseInputError("does not fit into memory") from error
+
+
+def _by_meshio(path: Path) -> PlainMesh:
+    suffix = path.suffix.lower()
+    if suffix in NAME_OTHERS or not suffix:
+        raise CaseInputError(
+            f"files of {suffix or 'no ending'} are not read: save it as .vtu (meshio convert)"
+        )
+    if find_spec("meshio") is None:
+        raise CaseInputError(
+            f"files of {suffix} are read with meshio: pip install 'cmfsim[mesh]'; "
+            f"{', '.join(READERS)} need nothing more"
+        )
+    limits = ReadLimits.of_bytes(path.stat().st_size)
+    try:
+        answer = read_in_child("cmfsim.io.meshes:meshio_answer", limits, path=os.path.abspath(path))  # noqa: PTH100
+    except ReaderError as error:
+        raise CaseInputError(f"cannot be read as a mesh: {error}") from error
+    arrays, values = answer.arrays, answer.values
+    n_points, n_blocks = len(values["point_data"]), len(values["types"])
+    blocks = tuple(
+        Cells(name, _as_indices(arrays[f"cells.{i}"])) for i, name in enumerate(values["types"])
+    )
+    points = np.asarray(arrays["points"], dtype=np.float64)
+    if points.ndim == 2 and points.shape[1] == 2:
+        points = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
+    return PlainMesh(
+        points,
+        blocks,
+        {values["point_data"][i]: arrays[f"point_data.{i}"] for i in range(n_points)},
+        {
+            name: tuple(arrays[f"cell_data.{i}.{k}"] for k in range(n_blocks))
+            for i, name in enumerate(values["cell_data"])
+        },
+    )
+
+
+def meshio_answer(path: str) -> Answer:
+    """What meshio reads from a file; called in the child process."""
+    meshio: Any = import_module("meshio")
+    try:
+        # meshio prints what it finds and, in some readers, exits: neither is the caller's.
+        with (
+            contextlib.redirect_stdout(stdio.StringIO()),
+            contextlib.redirect_stderr(stdio.StringIO()),
+        ):
+            mesh = meshio.read(path)
+        arrays = {"points": np.asarray(mesh.points, dtype=np.float64)}
+        for i, block in enumerate(mesh.cells):
+            arrays[f"cells.{i}"] = np.asarray(block.data)
+        for i, values in enumerate(mesh.point_data.values()):
+            arrays[f"point_data.{i}"] = np.asarray(values)
+        for i, parts in enumerate(mesh.cell_data.values()):
+            for k, values in enumerate(parts):
+                arrays[f"cell_data.{i}.{k}"] = np.asarray(values)
+    except MemoryError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise CaseInputError(f"cannot be read as a mesh ({error})") from error
+    if any(array.dtype.kind not in "fiub" for array in arrays.values()):
+        raise CaseInputError("holds cells or values that are no arrays of numbers")
+    texts = {
+        "types": [str(block.type) for block in mesh.cells],
+        "point_data": [str(name) for name in mesh.point_data],
+        "cell_data": [str(name) for name in mesh.cell_data],
+    }
+    return Answer(texts, arrays)
+
+
+def _as_indices(array: NDArray[Any]) -> NDArray[np.int64]:
+    if array.dtype.kind not in "iu":
+        raise CaseInputError(f"has cells of {array.dtype}: whole numbers are needed")
+    return array.astype(np.int64)
+
+
+def read_tet_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
+    """The nodes (n, 3), mm, and tets (m, 4) of a file, all positively oriented.
+
+    Parameters
+    ----------
+    path : path
+        VTU, legacy VTK, Gmsh, or another format of one file that meshio reads.
+
+    Raises
+    ------
+    FileNotFoundError
+        The file does not exist.
+    CaseError
+        (also `ValueError`) No linear tets, other volume elements beside them, an index that is not
+        there, a node that is not finite.
 
     Examples
     --------
@@ -89,10 +182,8 @@ def read_tet_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], ND
     """
     path = Path(path)
     mesh = read_mesh(path)
-    nodes = np.asarray(mesh.points, dtype=np.float64)
-    tets = np.asarray(read_tets(mesh, path)[0], dtype=np.int64)
-    if tets.size and (tets.min() < 0 or tets.max() >= len(nodes)):
-        raise CaseInputError(f"{path.name}: a tet names a node that is not among {len(nodes)}")
+    nodes = mesh.points
+    tets = read_tets(mesh, path)[0].copy()
     # Programs differ in the order of nodes: which one a file has, its volumes say.
     corners = nodes[tets]
     negative = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0.0
@@ -100,41 +191,18 @@ def read_tet_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], ND
     return nodes, tets.astype(np.uint32)
 
 
-def _read_vtp(path: Path) -> Any:
-    """The triangles of VTK's surface format, which meshio does not know, as a mesh of meshio."""
-    try:
-        pyvista = import_module("pyvista")
-    except ModuleNotFoundError as error:
-        raise CaseInputError("VTP is read with pyvista: pip install 'cmfsim[mesh]'") from error
-    # VTK prints what it finds wrong and goes on with nothing.
-    shown = pyvista.vtk_verbosity()
-    pyvista.vtk_verbosity("off")
-    try:
-        surface = pyvista.read(path).triangulate()
-    finally:
-        pyvista.vtk_verbosity(shown)
-    triangles = surface.faces.reshape(-1, 4)[:, 1:]
-    values = {name: np.asarray(surface.point_data[name]) for name in surface.point_data}
-    cells = [("triangle", triangles)] if len(triangles) else []
-    return _meshio().Mesh(surface.points, cells, point_data=values)
+def read_tets(mesh: PlainMesh, path: Path) -> tuple[NDArray[np.int64], dict[str, NDArray[Any]]]:
+    """The linear tets of a mesh and their cell data.
 
-
-def _refuse_headless(path: Path) -> None:
-    """Refuses a PLY whose header does not end, for which meshio 5.3 waits for ever."""
-    if path.suffix.lower() != ".ply":
-        return
-    with path.open("rb") as file:
-        head = file.read(MAX_PLY_HEADER)
-    if b"end_header" not in head:
-        raise CaseInputError(f"{path.name}: is no PLY file, or is cut short in its header")
-
-
-def read_tets(mesh: Any, path: Path) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:
-    """The linear tets of a mesh and their cell data."""
-    blocks = [i for i, b in enumerate(mesh.cells) if b.type == "tetra"]
-    if not blocks:
-        found = ", ".join(sorted({b.type for b in mesh.cells})) or "nothing"
-        raise CaseInputError(f"{path.name}: linear tets are needed, found {found}")
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) No tets, or other volume elements: leaving them out would leave holes.
+    """
+    blocks = [i for i, b in enumerate(mesh.cells) if b.type == "tetra" and len(b.data)]
+    others = {b.type for b in mesh.cells if len(b.data)} - PASSED_OVER
+    if not blocks or others:
+        raise CaseInputError(f"{path.name}: linear tets are needed, found {mesh.found}")
     tets = np.concatenate([mesh.cells[i].data for i in blocks])
     data = {
         name: np.concatenate([np.asarray(values[i]) for i in blocks])

@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 
 from cmfsim.checks import check_one_of
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files import replacing
+from cmfsim.io.files import named, replacing
 from cmfsim.io.meshes import read_mesh
+from cmfsim.io.obj import write_obj
+from cmfsim.io.plain_mesh import Cells, PlainMesh
+from cmfsim.io.ply import write_ply
+from cmfsim.io.polygons import triangles_of
+from cmfsim.io.stl import write_stl
 from cmfsim.io.vtk import data_array, write_vtk
 from cmfsim.patient import FRAMES, UNITS
 from cmfsim.scene import MovedSurface, SurfaceData
@@ -38,7 +43,8 @@ def read_surface(
     Parameters
     ----------
     path : path
-        STL, PLY, OBJ, VTP, or another file of triangles that meshio reads.
+        STL, PLY, OBJ, VTP, VTU, legacy VTK, Gmsh, or another file of triangles that meshio reads.
+        Polygons become triangles where a fan of these fills them.
     crease_angle : float, degrees
     units : str
         Of the numbers in the file: "mm", "cm", "m", "um", "inch".
@@ -54,7 +60,8 @@ def read_surface(
     FileNotFoundError
         The file does not exist.
     CaseError
-        (also `ValueError`) Not a surface, no triangles, a coordinate that is not finite.
+        (also `ValueError`) Not a surface, no triangles, cut short, an index that is not there, a
+        coordinate that is not finite.
 
     Examples
     --------
@@ -159,23 +166,36 @@ def _numbered(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     return points, triangles
 
 
-def _triangles(mesh: Any, path: Path) -> NDArray[np.int64]:
-    """The triangles of a mesh that has nothing else."""
-    triangles = [b.data for b in mesh.cells if b.type == "triangle"]
-    if not triangles or any(b.type not in {"triangle", "vertex", "line"} for b in mesh.cells):
-        found = ", ".join(sorted({b.type for b in mesh.cells})) or "nothing"
-        raise CaseInputError(f"{path.name}: a surface of triangles is needed, found {found}")
-    return np.concatenate(triangles).astype(np.int64)
+def _triangles(mesh: PlainMesh, path: Path) -> NDArray[np.int64]:
+    """The triangles of a mesh that has nothing else but polygons."""
+    faces = [b for b in mesh.cells if b.type in {"triangle", "quad"} and len(b.data)]
+    others = {b.type for b in mesh.cells if len(b.data)} - {"triangle", "quad", "vertex", "line"}
+    if not faces or others:
+        raise CaseInputError(f"{path.name}: a surface of triangles is needed, found {mesh.found}")
+    with named(path):
+        return np.concatenate([_cut(mesh, block) for block in faces])
+
+
+def _cut(mesh: PlainMesh, block: Cells) -> NDArray[np.int64]:
+    """Triangles that fill the triangles or quads of a block."""
+    rows, width = block.data.shape
+    return triangles_of(mesh.points, np.full(rows, width), block.data.reshape(-1))
 
 
 def _welded(rows: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
     """The rows that are kept when equal ones become one, and the number each row then has."""
-    _, first, back = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    order = np.lexsort(rows.T)
+    in_order = rows[order]
+    begins = np.concatenate([[True], (in_order[1:] != in_order[:-1]).any(axis=1)])[: len(rows)]
+    # Equal rows keep the order of the file: the first of each group is the first in it.
+    first = order[begins]
+    back = np.empty(len(rows), dtype=np.int64)
+    back[order] = np.cumsum(begins) - 1
     # In the order of the file, so that a surface without repetitions keeps its numbers.
-    order = np.argsort(first)
+    rise = np.argsort(first)
     number = np.empty(len(first), dtype=np.int64)
-    number[order] = np.arange(len(first))
-    return first[order], number[back.reshape(-1)]
+    number[rise] = np.arange(len(first))
+    return first[rise], number[back]
 
 
 def write_surface(path: str | os.PathLike[str], surface: SurfaceData) -> None:
@@ -207,7 +227,8 @@ def write_surface(path: str | os.PathLike[str], surface: SurfaceData) -> None:
         known = ", ".join(WRITERS)
         raise CaseInputError(f"{path.name}: a surface is written as {known}, not {path.suffix!r}")
     with replacing(path) as file:
-        WRITERS[path.suffix](file, surface)
+        vertices = np.asarray(surface.vertices, dtype=np.float64)
+        WRITERS[path.suffix](file, vertices, np.asarray(surface.triangles))
 
 
 def surface_suffixes() -> tuple[str, ...]:
@@ -215,48 +236,9 @@ def surface_suffixes() -> tuple[str, ...]:
     return tuple(WRITERS)
 
 
-def _write_ply(file: BinaryIO, surface: SurfaceData) -> None:
-    vertices = np.asarray(surface.vertices, dtype="<f8")
-    triangles = np.asarray(surface.triangles)
-    rows = np.zeros(len(triangles), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-    rows["count"] = 3
-    rows["corners"] = triangles
-    file.write(
-        (
-            "ply\nformat binary_little_endian 1.0\ncomment LPS mm\n"
-            f"element vertex {len(vertices)}\n"
-            "property double x\nproperty double y\nproperty double z\n"
-            f"element face {len(triangles)}\n"
-            "property list uchar int vertex_indices\nend_header\n"
-        ).encode()
-    )
-    file.write(vertices.tobytes())
-    file.write(rows.tobytes())
-
-
-def _write_stl(file: BinaryIO, surface: SurfaceData) -> None:
-    corners = np.asarray(surface.vertices)[np.asarray(surface.triangles)]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    # A triangle without area has no normal: zeros, as the format allows.
-    normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
-    rows = np.zeros(len(corners), dtype=[("n", "<f4", 3), ("v", "<f4", (3, 3)), ("a", "<u2")])
-    rows["n"], rows["v"] = normals, corners
-    file.write(b"cmfsim LPS mm".ljust(80, b" "))
-    file.write(np.uint32(len(corners)).astype("<u4").tobytes())
-    file.write(rows.tobytes())
-
-
-def _write_obj(file: BinaryIO, surface: SurfaceData) -> None:
-    file.write(b"# LPS mm\n")
-    lines = [f"v {x!r} {y!r} {z!r}\n" for x, y, z in np.asarray(surface.vertices).tolist()]
-    lines += [f"f {a} {b} {c}\n" for a, b, c in (np.asarray(surface.triangles) + 1).tolist()]
-    file.write("".join(lines).encode())
-
-
-def _write_vtp(file: BinaryIO, surface: SurfaceData) -> None:
-    vertices = np.asarray(surface.vertices, dtype=np.float64)
-    triangles = np.asarray(surface.triangles)
+def _write_vtp(
+    file: BinaryIO, vertices: NDArray[np.float64], triangles: NDArray[np.integer]
+) -> None:
     n = len(triangles)
     polys = data_array("connectivity", triangles.reshape(-1).astype(np.int64)) + data_array(
         "offsets", 3 * np.arange(1, n + 1, dtype=np.int64)
@@ -270,6 +252,6 @@ def _write_vtp(file: BinaryIO, surface: SurfaceData) -> None:
     )
 
 
-WRITERS: Mapping[str, Callable[[BinaryIO, SurfaceData], None]] = MappingProxyType(
-    {".ply": _write_ply, ".stl": _write_stl, ".obj": _write_obj, ".vtp": _write_vtp}
+WRITERS: Mapping[str, Callable[[BinaryIO, NDArray[np.float64], NDArray[np.integer]], None]] = (
+    MappingProxyType({".ply": write_ply, ".stl": write_stl, ".obj": write_obj, ".vtp": _write_vtp})
 )

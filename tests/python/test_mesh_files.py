@@ -1,0 +1,481 @@
+"""Files of surfaces and meshes: each form is read, and each fault has an error that names it."""
+
+import base64
+import os
+import struct
+import zlib
+
+import numpy as np
+import pytest
+
+import cmfsim
+import meshes
+from cmfsim.io.meshes import read_mesh
+from head_case import icosphere
+
+meshio = pytest.importorskip("meshio")
+CUBE = np.array([[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)])
+QUADS = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
+
+
+def saved(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def refused(path, match):
+    with pytest.raises(cmfsim.CaseError, match=match) as caught:
+        cmfsim.read_surface(path)
+    assert isinstance(caught.value, ValueError)
+    assert path.name in str(caught.value)
+
+
+# OBJ.
+
+CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+OBJ = {
+    "plain": CORNERS + "f 1 3 2\nf 1 2 4\n",
+    "from the end": CORNERS + "f -4 -2 -3\nf 1 2 -1\n",
+    "defined so far": "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -1 -2\nv 0 0 1\nf 1 2 -1\n",
+    "textures": "vt 0 0\n" + CORNERS + "f 1/1 3/1 2/1\nf 1/1/1 2/1/1 4/1/1\n",
+    "normals": "vn 0 0 1\n" + CORNERS + "f 1//1 3//1 2//1\nf -4//-1 2//1 4//1\n",
+    "other lines": "# by hand\nmtllib a.mtl\no it\n"
+    + CORNERS
+    + "usemtl x\ns 1\nf 1 3 2\nf 1 2 4\n",
+    "colours": CORNERS.replace("\n", " 0.5 0.5 0.5\n") + "f 1 3 2\nf 1 2 4",
+    "tabs and returns": (CORNERS + "f 1 3 2\nf\t1 2 4\n")
+    .replace("\n", "\r\n")
+    .replace("v ", "v\t"),
+    "continued": CORNERS + "f 1 \\\n3 2\nf 1 2 4\n",
+}
+
+
+@pytest.mark.parametrize("form", OBJ)
+def test_obj_is_read_in_every_form(form, tmp_path):
+    surface = cmfsim.read_surface(saved(tmp_path, "it.obj", OBJ[form]))
+    assert surface.triangles.tolist() == [[0, 2, 1], [0, 1, 3]]
+    assert surface.vertices[3].tolist() == [0, 0, 1]
+
+
+BAD_OBJ = {
+    "f 1 2 0": "line 5: names vertex 0; OBJ numbers vertices from 1 on",
+    "f 1 2 5": "line 5: names vertex 5, but there are 4 vertices",
+    "f 1 2 -5": "line 5: names vertex -5, but there are 4 vertices",
+    "f 1 2": "line 5: a face has 2 corners",
+    "f 1 2 3.0": "line 5: '3.0' is not a whole number",
+    "f 1 2 99999999999999999999": "line 5: '99999999999999999999' is not a whole number",
+    f"f 1 2 {'9' * 5000}": "line 5: '9*'… is not a whole number",
+    "f 1 2 1_0": "line 5: '1_0' is not a whole number",
+    "f 1/a 2 3": "line 5: '/a' is no texture",
+    "f 1/1/1/1 2 3": "line 5: '/1/1/1' is no texture",
+    "v 0 0\nf 1 2 3": "line 5: a vertex has 2 numbers",
+    "v 0 0 nan\nf 1 2 3": "line 5: 'nan' is not finite",
+    "v 0 0 1e999\nf 1 2 3": "line 5: '1e999' is not finite",
+    "v 0 0 1 2\nf 1 2 3": "line 5: a vertex has 4 numbers",
+    "fo 1 2 3": "line 5: 'fo' is not known in OBJ",
+    "f 1 2 3\n# 5 vertices": "a comment states 5 vertices, the file holds 4",
+    "f 1 2 3\n# Faces: 2": "a comment states 2 faces, the file holds 1",
+    "f 1 2 3\n\0": "zero bytes",
+    "": "found nothing",
+}
+
+
+@pytest.mark.parametrize("line", BAD_OBJ)
+def test_a_fault_in_obj_is_named_with_its_line(line, tmp_path):
+    refused(saved(tmp_path, "it.obj", CORNERS + line + "\n"), BAD_OBJ[line])
+
+
+# PLY.
+
+
+def ply(order="ascii", face="property list uchar int vertex_indices", faces=(), vertices=CUBE):
+    """A PLY file; faces come before vertices and rows have colours, as the format allows."""
+    head = (
+        f"ply\nformat {order} 1.0\nobj_info x\nelement face {len(faces)}\nproperty uchar flags\n"
+        f"{face}\nelement vertex {len(vertices)}\nproperty uchar red\nproperty double x\n"
+        "property double y\nproperty double z\nproperty list uchar short more\nend_header\n"
+    )
+    kinds = {"uchar": "B", "char": "b", "short": "h", "ushort": "H", "int": "i", "uint": "I"}
+    kinds |= {"float": "f", "double": "d"}
+    _, _, count, whole, _ = face.split() if " list " in face else (None, None, "uchar", "int", None)
+    if order == "ascii":
+        rows = [f"7 {len(f)} {' '.join(map(str, f))}\n" for f in faces]
+        rows += [f"9 {x!r} {y!r} {z!r} 2 5 6\n" for x, y, z in np.asarray(vertices).tolist()]
+        return (head + "".join(rows)).encode()
+    e = ">" if "big" in order else "<"
+    rows = [struct.pack(f"{e}B{kinds[count]}{len(f)}{kinds[whole]}", 7, len(f), *f) for f in faces]
+    rows += [struct.pack(f"{e}BdddBhh", 9, *v, 2, 5, 6) for v in vertices]
+    return head.encode() + b"".join(rows)
+
+
+TRIANGLES = [t for a, b, c, d in QUADS for t in ([a, b, c], [a, c, d])]
+ORDERS = ["ascii", "binary_little_endian", "binary_big_endian"]
+LISTS = ["uchar int", "int uint", "uchar ushort", "ushort short", "uchar char"]
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("kinds", LISTS)
+def test_ply_is_read_with_any_order_of_elements_and_types(order, kinds, tmp_path):
+    face = f"property list {kinds} vertex_index"
+    path = saved(tmp_path, "it.ply", ply(order, face, TRIANGLES))
+    surface = cmfsim.read_surface(path)
+    assert surface.triangles.tolist() == TRIANGLES
+    assert np.array_equal(surface.vertices, CUBE)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_polygons_become_the_triangles_that_fill_them(order, tmp_path):
+    """A cube of quads and one of mixed faces: volume 1, closed, outward."""
+    for faces in (QUADS, [*TRIANGLES[:4], *QUADS[2:]]):
+        surface = cmfsim.read_surface(saved(tmp_path, "it.ply", ply(order, faces=faces)))
+        report = cmfsim.check_surface(surface)
+        assert report.is_closed
+        assert report.volume == pytest.approx(1.0, abs=1e-15)
+        assert len(surface.triangles) == 12
+
+
+def test_a_polygon_with_a_dent_is_cut_where_a_fan_fills_it_and_else_refused(tmp_path):
+    dart = [[0, 0, 0], [2, 0, 0], [0.5, 0.5, 0], [0, 2, 0]]
+    for start in range(4):
+        text = "".join(f"v {x} {y} {z}\n" for x, y, z in np.roll(dart, start, axis=0))
+        surface = cmfsim.read_surface(saved(tmp_path, "dart.obj", text + "f 1 2 3 4\n"))
+        assert cmfsim.check_surface(surface).area == pytest.approx(1.0)
+    bow = "v 0 0 0\nv 1 1 0\nv 1 0 0\nv 0 1.5 0\nf 1 2 3 4\n"
+    refused(saved(tmp_path, "bow.obj", bow), "face 0 has 4 corners that no fan of triangles fills")
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"faces": [[0, 1, 8]]}, "face 0 names vertex 8, but there are 8 vertices.*from 1"),
+        ({"faces": [[0, 2, 1], [0, 1, -1]]}, "face 1 names vertex -1, but there are 8"),
+        ({"faces": [[0, 1, 2, -1]]}, "face 0 names vertex -1"),
+        ({"faces": [[0, 1, 2], [0, 1]]}, "face 1 has 2 corners"),
+        ({"faces": [[0, 1, 2]], "vertices": CUBE + np.inf}, "not finite"),
+        (
+            {"faces": [[0, 1, 2]], "face": "property list uchar float vertex_indices"},
+            "not a list of whole",
+        ),
+        ({"faces": [[0, 1, 2]], "face": "property list uchar int corners"}, "0 properties"),
+        ({"faces": [[0, 1, 2]], "face": "property list float int vertex_index"}, "types are"),
+    ],
+)
+def test_a_fault_in_ply_is_named(order, change, match, tmp_path):
+    content = ply(order, **{"face": "property list uchar int vertex_indices", **change})
+    refused(saved(tmp_path, "it.ply", content), match)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("change", [-9, -1, 3, 40])
+def test_ply_with_another_length_than_its_header_states_is_refused(order, change, tmp_path):
+    content = ply(order, faces=TRIANGLES)
+    content = content[:change] if change < 0 else content + b"1 " * change
+    if order == "ascii" and change == -1:
+        content = content[:-4]
+    refused(saved(tmp_path, "it.ply", content), "cut short|more than its header|numbers are left")
+
+
+# STL.
+
+
+def stl_text(corners, name="it"):
+    lines = [f"solid {name}"]
+    for triangle in corners:
+        lines += ["facet normal 0 0 0", " outer loop"]
+        lines += ["  vertex {!r} {!r} {!r}".format(*map(float, corner)) for corner in triangle]
+        lines += [" endloop", "endfacet"]
+    return "\n".join([*lines, f"endsolid {name}", ""]).encode()
+
+
+@pytest.fixture
+def ball(tmp_path):
+    vertices, triangles = icosphere(1)
+    surface = cmfsim.SurfaceData(vertices.astype(np.float32).astype(float), triangles)
+    path = tmp_path / "ball.stl"
+    cmfsim.write_surface(path, surface)
+    return path.read_bytes(), np.asarray(surface.vertices)[np.asarray(surface.triangles)]
+
+
+def test_stl_is_told_apart_by_its_content(ball, tmp_path):
+    """Bytes that begin with "solid" are bytes; text in capitals, or of two solids, is text."""
+    binary, corners = ball
+    half = len(corners) // 2
+    for content in (
+        b"solid " + binary[6:],
+        stl_text(corners),
+        stl_text(corners).upper(),
+        stl_text(corners[:half], "one facet") + stl_text(corners[half:], "two"),
+    ):
+        surface = cmfsim.read_surface(saved(tmp_path, "it.stl", content))
+        assert np.array_equal(surface.vertices[surface.triangles], corners)
+
+
+def test_stl_of_another_length_than_its_count_is_refused(ball, tmp_path):
+    binary, corners = ball
+    count = struct.unpack("<I", binary[80:84])[0]
+    for content, match in (
+        (binary[:-50], f"states {count} triangles, which take {len(binary)} bytes"),
+        (binary + bytes(50), f"states {count} triangles"),
+        (b"solid " + binary[6:-50], f"states {count} triangles"),
+        (binary[:80] + struct.pack("<I", count - 1) + binary[84:], "states 79 triangles"),
+        (binary[:80] + struct.pack("<I", 2**32 - 1) + binary[84:], "states 4294967295"),
+        (binary[:83], "83 bytes, a header has 84"),
+        (stl_text(corners).replace(b"endsolid it\n", b""), "1 solids begin and 0 end"),
+        (stl_text(corners).replace(b"endfacet", b"", 1), "words are not 21 for each facet"),
+        (stl_text(corners).replace(b"vertex", b"vortex", 1), "facet 0 has 'vortex'"),
+        (stl_text(corners).replace(b"loop\n  vertex", b"loop\n  vertex 1e999", 1), "words"),
+        (stl_text([*corners, [[0, 0, np.nan]] * 3]), "facet 80: 'nan' is not finite"),
+        (binary[:96] + struct.pack("<f", np.inf) + binary[100:], "triangle 0 .* not finite"),
+    ):
+        refused(saved(tmp_path, "it.stl", content), match)
+
+
+# VTK's XML files.
+
+
+def vtp(**change):
+    """A tetrahedron; a change gives an array other bytes, or the root other attributes."""
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    corners = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], dtype=np.int64)
+    given = {"points": points, "corners": corners, "ends": 3 * np.arange(1, 5), "n": 4}
+    given |= {"type": "Float64", "root": 'header_type="UInt64"', "head": "", **change}
+
+    def array(name, kind, values, width=1):
+        raw = np.ascontiguousarray(values).tobytes()
+        text = base64.b64encode(struct.pack("<Q", len(raw)) + raw).decode()
+        return (
+            f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{width}" '
+            f'format="binary">{text}</DataArray>'
+        )
+
+    return (
+        f'{given["head"]}<VTKFile type="PolyData" byte_order="LittleEndian" {given["root"]}>'
+        f'<PolyData><Piece NumberOfPoints="{len(points)}" NumberOfPolys="{given["n"]}"><Points>'
+        f"{array('points', given['type'], given['points'], 3)}</Points><Polys>"
+        f"{array('connectivity', 'Int64', given['corners'])}"
+        f"{array('offsets', 'Int64', given['ends'])}</Polys></Piece></PolyData></VTKFile>"
+    )
+
+
+TETRA = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], dtype=np.int64)
+ENTITIES = '<!DOCTYPE v [<!ENTITY a "1">]>'
+BAD_VTP = {
+    "negative": ({"corners": np.where(TETRA == 3, -1, TETRA)}, "face 1 names vertex -1"),
+    "too large": ({"corners": np.where(TETRA == 3, 4, TETRA)}, "face 1 names vertex 4.*from 1"),
+    "huge": ({"corners": np.where(TETRA == 3, 2**62, TETRA)}, "names vertex 4611686018427387904"),
+    "type": ({"type": "Float32"}, "'points': states 96 bytes, 48 are needed"),
+    "count": ({"n": 3}, "states 32 bytes, 24 are needed"),
+    "offsets": ({"ends": np.array([3, 9, 6, 12])}, r"offsets\[2\] is 6: below the one before"),
+    "ends": ({"ends": np.array([3, 6, 9, 11])}, "states 96 bytes, 88 are needed"),
+    "header": ({"root": 'header_type=""'}, "header_type ''"),
+    "packer": ({"root": 'compressor="vtkNoDataCompressor"'}, "is packed by 'vtkNoDataCompressor'"),
+    "entities": ({"head": ENTITIES}, "document type"),
+    "after a line": ({"head": "\n\n" + ENTITIES}, "document type"),
+    "after a mark": ({"head": "\ufeff" + ENTITIES}, "document type"),
+    "after both": ({"head": "\ufeff\n " + ENTITIES}, "document type"),
+    "later": ({"head": '<?xml version="1.0"?>' + "<!-- x -->" * 9 + ENTITIES}, "document type"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD_VTP)
+def test_a_fault_in_vtp_is_named(fault, tmp_path):
+    change, match = BAD_VTP[fault]
+    path = saved(tmp_path, "it.vtp", vtp())
+    assert cmfsim.read_surface(path).triangles.tolist() == TETRA.tolist()
+    refused(saved(tmp_path, "it.vtp", vtp(**change)), match)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32", "cp037"])
+def test_xml_in_another_encoding_hides_nothing(encoding, tmp_path):
+    content = vtp(head=f'<?xml version="1.0" encoding="{encoding}"?>{ENTITIES}').encode(encoding)
+    refused(saved(tmp_path, "it.vtp", content), "not XML in UTF-8")
+    refused(saved(tmp_path, "it.vtp", content.replace(ENTITIES.encode(encoding), b"")), "UTF-8")
+
+
+def test_deep_xml_is_refused(tmp_path):
+    for content in ("<a>" * 100_000, "<VTKFile>" + "<a/>" * 200_000 + "</VTKFile>"):
+        refused(saved(tmp_path, "it.vtp", content), "too deeply, or has too many")
+
+
+@pytest.mark.parametrize("mode", ["ascii", "binary", "appended", "raw"])
+@pytest.mark.parametrize("packer", ["None", "ZLib", "LZ4", "LZMA"])
+def test_vtp_of_vtk_is_read_in_every_form(mode, packer, tmp_path):
+    """What VTK writes, in four modes and four packings, as VTK reads it."""
+    pyvista = pytest.importorskip("pyvista")
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter  # noqa: PLC0415 (needs the extra)
+
+    ball = pyvista.Sphere(theta_resolution=30, phi_resolution=30)
+    writer = vtkXMLPolyDataWriter()
+    writer.SetInputData(ball)
+    writer.SetFileName(str(tmp_path / "it.vtp"))
+    {
+        "ascii": writer.SetDataModeToAscii,
+        "binary": writer.SetDataModeToBinary,
+        "appended": writer.SetDataModeToAppended,
+        "raw": writer.SetDataModeToAppended,
+    }[mode]()
+    writer.SetEncodeAppendedData(mode == "appended")
+    getattr(writer, f"SetCompressorTypeTo{packer}")()
+    writer.SetBlockSize(4096)
+    writer.SetByteOrder(packer == "LZ4")
+    writer.Write()
+    mesh = read_mesh(tmp_path / "it.vtp")
+    known = pyvista.read(tmp_path / "it.vtp")
+    assert np.array_equal(mesh.points, known.points)
+    assert np.array_equal(mesh.cells_dict["triangle"], known.faces.reshape(-1, 4)[:, 1:])
+    assert np.array_equal(mesh.point_data["Normals"], known["Normals"])
+    whole = (tmp_path / "it.vtp").read_bytes()
+    for share in (0.3, 0.6, 0.9, 0.99):
+        refused(saved(tmp_path, "cut.vtp", whole[: int(share * len(whole))]), "cut short")
+
+
+def test_a_packed_block_is_not_unpacked_beyond_its_stated_size(tmp_path):
+    """A bomb of 256 MB that states 96 bytes ends at the ninety-seventh."""
+    packed = zlib.compress(bytes(2**28), 9)
+    head = struct.pack("<4Q", 1, 96, 96, len(packed))
+    text = (base64.b64encode(head) + base64.b64encode(packed)).decode()
+    whole = vtp(root='header_type="UInt64" compressor="vtkZLibDataCompressor"')
+    first = whole.index('format="binary">') + len('format="binary">')
+    content = whole[:first] + text + whole[whole.index("</DataArray>") :]
+    refused(saved(tmp_path, "it.vtp", content), "'points': a packed block is .*larger than stated")
+
+
+# Volumes.
+
+NODES, TETS = meshes.box((2, 2, 2), (4.0, 4.0, 4.0))
+
+
+def volume(tmp_path, name, **how):
+    """Tets, and triangles where the format takes them beside each other, with values on both."""
+    path = tmp_path / name
+    cells = {"tetra": TETS.astype(np.int64), "triangle": TETS[:4, :3].astype(np.int64)}
+    gmsh = path.suffix == ".msh"
+    if gmsh:
+        del cells["triangle"]
+    mesh = meshio.Mesh(
+        NODES,
+        cells,
+        point_data={"kind": np.arange(len(NODES)) % 4.0},
+        cell_data={"young": [np.arange(float(len(TETS))), np.zeros(4)][: len(cells)]},
+    )
+    if gmsh:
+        mesh.point_data["gmsh:dim_tags"] = np.full((len(NODES), 2), 3)
+        mesh.cell_data |= {
+            f"gmsh:{key}": [np.full(len(TETS), 3)] for key in ("geometrical", "physical")
+        }
+        # meshio 5.3 writes numbers as np.float64(0.0) with numpy 2.
+        with np.printoptions(legacy="1.25"):
+            mesh.write(path, **how)
+    else:
+        mesh.write(path, **how)
+    return path
+
+
+FORMS = [
+    ("it.vtu", {"binary": True}),
+    ("it.vtu", {"binary": False}),
+    ("it.vtu", {"compression": None}),
+    ("it.vtk", {"file_format": "vtk42", "binary": True}),
+    ("it.vtk", {"file_format": "vtk42", "binary": False}),
+    ("it.vtk", {"file_format": "vtk51", "binary": True}),
+    ("it.vtk", {"file_format": "vtk51", "binary": False}),
+    ("it.msh", {"file_format": "gmsh22", "binary": False}),
+    ("it.msh", {"file_format": "gmsh22", "binary": True}),
+    ("it.msh", {"file_format": "gmsh", "binary": False}),
+    ("it.msh", {"file_format": "gmsh", "binary": True}),
+    ("it.mesh", {}),
+    ("it.inp", {}),
+]
+
+
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize(("name", "how"), FORMS)
+def test_a_volume_is_read_as_meshio_wrote_it(name, how, tmp_path):
+    path = volume(tmp_path, name, **how)
+    nodes, tets = cmfsim.read_tet_mesh(path)
+    assert np.array_equal(nodes, NODES)
+    assert np.array_equal(np.sort(tets, axis=1), np.sort(TETS, axis=1))
+    mesh = read_mesh(path)
+    if path.suffix in {".vtu", ".vtk", ".msh"}:
+        assert np.array_equal(np.ravel(mesh.point_data["kind"]), np.arange(len(NODES)) % 4)
+        assert np.array_equal(np.ravel(mesh.cell_data["young"][0]), np.arange(len(TETS)))
+        whole = path.read_bytes()
+        for share in (0.2, 0.5, 0.8, 0.97):
+            path.write_bytes(whole[: int(share * len(whole))])
+            with pytest.raises(cmfsim.CaseError, match=path.name):
+                cmfsim.read_tet_mesh(path)
+
+
+def test_gmsh_numbers_of_nodes_are_looked_up(tmp_path):
+    """In any order and with gaps; 0 and one that is not there are no node (meshio wraps round)."""
+    text = (
+        "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\n1 4 3 40\n3 1 0 4\n40\n3\n7\n8\n"
+        "0 0 0\n1 0 0\n0 1 0\n0 0 1\n$EndNodes\n"
+        "$Elements\n1 1 1 1\n3 1 4 1\n1 40 3 7 {}\n$EndElements\n"
+    )
+    nodes, tets = cmfsim.read_tet_mesh(saved(tmp_path, "it.msh", text.format(8)))
+    assert tets.tolist() == [[0, 1, 2, 3]]
+    assert nodes[3].tolist() == [0, 0, 1]
+    for node in (0, 9, 41, 2**62):
+        with pytest.raises(cmfsim.CaseError, match=f"names node {node}, which is not there"):
+            cmfsim.read_tet_mesh(saved(tmp_path, "it.msh", text.format(node)))
+    for old, new, match in (
+        ("1 4 3 40", "1 5 3 40", "states 5 nodes, its blocks hold 4"),
+        ("1 1 1 1\n", "1 2 1 1\n", "states 2 elements, its blocks hold 1"),
+        ("40\n3\n", "3\n3\n", "node 3 stands there twice"),
+        ("0 0 1\n", "0 0 inf\n", "not finite"),
+    ):
+        with pytest.raises(cmfsim.CaseError, match=match):
+            cmfsim.read_tet_mesh(saved(tmp_path, "it.msh", text.format(8).replace(old, new, 1)))
+
+
+def test_other_volume_elements_are_refused_not_left_out(tmp_path):
+    """A mesh of tets and a brick was read without the brick: a hole in the tissue."""
+    brick = [0, 1, 4, 3, 9, 10, 13, 12]
+    for name in ("it.vtu", "it.vtk", "it.msh"):
+        path = tmp_path / name
+        how = {"file_format": "gmsh22"} if path.suffix == ".msh" else {}
+        cells = [("tetra", TETS[8:].astype(np.int64)), ("hexahedron", np.array([brick]))]
+        meshio.Mesh(NODES, cells).write(path, **how)
+        with pytest.raises(
+            cmfsim.CaseError, match="linear tets are needed, found hexahedron, tetra"
+        ):
+            cmfsim.read_tet_mesh(path)
+
+
+def test_vtk_models_of_slicer_are_read(tmp_path):
+    """Legacy POLYDATA, in bytes and words, old and new, which meshio does not read."""
+    pyvista = pytest.importorskip("pyvista")
+    ball = pyvista.Sphere(theta_resolution=8, phi_resolution=8)
+    for binary in (True, False):
+        ball.save(tmp_path / "it.vtk", binary=binary)
+        surface = cmfsim.read_surface(tmp_path / "it.vtk")
+        assert np.allclose(surface.vertices, ball.points, atol=1e-6)
+        assert np.array_equal(surface.triangles, ball.faces.reshape(-1, 4)[:, 1:])
+
+
+def test_files_that_name_other_files_are_refused(tmp_path):
+    for name in ("it.xdmf", "it.ele", "it"):
+        refused(saved(tmp_path, name, "<Xdmf/>"), "are not read: save it as .vtu")
+
+
+# What is no file.
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with a name are POSIX")
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "it.ply")
+    refused(tmp_path / "it.ply", "is a pipe or a device")
+
+
+def test_names_that_no_file_can_have_are_refused(tmp_path):
+    with pytest.raises(cmfsim.CaseError, match="no file is called so"):
+        cmfsim.read_surface("a\0b.ply")
+    with pytest.raises(cmfsim.CaseError, match="cannot be opened"):
+        cmfsim.read_surface("a" * 5000 + ".ply")
+    (tmp_path / "it.ply").mkdir()
+    refused(tmp_path / "it.ply", "is a folder, not a file")
+    with pytest.raises(FileNotFoundError):
+        cmfsim.read_surface(tmp_path / "absent.ply")
