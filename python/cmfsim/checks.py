@@ -40,7 +40,7 @@ def as_floats(name: str, value: ArrayLike) -> Floats:
         if array.dtype.kind not in "fiu":
             raise CaseInputError(f"{name} has dtype {array.dtype}: real numbers are needed")
         array = array.astype(np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         if isinstance(error, CaseInputError):
             raise
         raise CaseInputError(f"{name} is not an array of numbers: {error}") from error
@@ -102,7 +102,10 @@ def as_number(name: str, value: object) -> float:
     """A finite float."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise CaseInputError(f"{name} is {value!r}: a number is needed")
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        raise CaseInputError(f"{name} is a whole number of more than 308 digits") from None
     if not np.isfinite(number):
         raise CaseInputError(f"{name} is {number}: must be finite")
     return number

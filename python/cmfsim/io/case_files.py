@@ -221,10 +221,7 @@ def _read(path: Path) -> Case:
 
 def _file(table: Table, key: str, folder: Path) -> Path:
     """A path to read; the case is its owner's, so that it may lead to images kept elsewhere."""
-    name = table.text(key)
-    if "\0" in name:
-        table.fail(key, "holds a zero character: no file is called so")
-    return folder / Path(name).expanduser()
+    return table.path(key, folder)
 
 
 def _file_or_none(table: Table, key: str, folder: Path) -> Path | None:

@@ -92,7 +92,7 @@ class Cohort:
         cases: dict[str, Path] = {}
         for table in document.tables("cases"):
             table.only("name", "file")
-            file = folder / Path(table.text("file")).expanduser()
+            file = table.path("file", folder)
             name = table.text("name", file.parent.name or file.stem)
             if name in cases:
                 table.fail("name" if "name" in table else "file", f"is a second case {name!r}")

@@ -8,11 +8,14 @@ whole.
 import contextlib
 import glob
 import json
+import math
 import os
+import re
 import stat
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path, PurePosixPath
+from types import MappingProxyType
 from typing import Any, BinaryIO
 
 from cmfsim.errors import CaseInputError
@@ -21,7 +24,10 @@ from cmfsim.io.leftovers import abandoned, temporary_file
 __all__ = [
     "FORMAT_VERSION",
     "beside",
+    "check_numbers",
+    "check_plain_toml",
     "check_readable",
+    "check_units",
     "check_version",
     "known_keys",
     "named",
@@ -35,6 +41,21 @@ __all__ = [
 # Text files (plans, scene descriptions) above this size are not what they say they are, bytes.
 MAX_TEXT = 16 * 2**20
 FORMAT_VERSION = 1
+# Digits of the largest whole number that is a float as well, and that number.
+MAX_DIGITS = 308
+MAX_WHOLE = 10**MAX_DIGITS
+# Parts of a dotted TOML key: ours have four.
+MAX_KEY_PARTS = 8
+KEY_PART = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')"""
+DEEP_KEY = rf"(?<![A-Za-z0-9_-]){KEY_PART}(?:[ \t]*\.[ \t]*{KEY_PART}){{{MAX_KEY_PARTS}}}"
+# Comments and texts are taken as a whole, so that a key is found outside of them alone.
+OUTSIDE_TEXTS = re.compile(
+    r"#[^\n]*|\"\"\"(?:[^\"\\]|\\.|\"(?!\"\"))*(?:\"\"\"|\Z)|'''.*?(?:'''|\Z)"
+    rf"|(?P<deep>{DEEP_KEY})|{KEY_PART}",
+    re.DOTALL,
+)
+# The units that every file of ours has; others are refused, never taken for these.
+UNITS: Mapping[str, str] = MappingProxyType({"length": "mm", "stress": "MPa", "force": "N"})
 # Characters of a file's name that an error repeats; names that no system takes are longer.
 MAX_SHOWN_NAME = 255
 
@@ -110,7 +131,9 @@ def named(path: Path) -> Iterator[None]:
     except PermissionError as error:
         raise CaseInputError(f"{path.name}: may not be read: its owner has to permit it") from error
     except ValueError as error:
-        raise CaseInputError(f"{path.name}: {error}") from error
+        text = str(error)
+        own = text.startswith(f"{path.name}: ")
+        raise CaseInputError(text if own else f"{path.name}: {text}") from error
 
 
 def beside(folder: Path, where: str, name: object) -> Path:
@@ -118,15 +141,27 @@ def beside(folder: Path, where: str, name: object) -> Path:
     if not isinstance(name, str) or not name:
         raise CaseInputError(f"{where} names no file")
     relative = PurePosixPath(name)
-    if relative.is_absolute() or ".." in relative.parts or "\\" in name or ":" in name:
+    path = folder / relative
+    leads_out = relative.is_absolute() or ".." in relative.parts or any(c in name for c in "\\:\0")
+    # A link may not lead out of the folder either.
+    if leads_out or not _is_below(path, folder):
         raise CaseInputError(f"{where} is {name!r}: a file in the folder of the scene is needed")
-    return folder / relative
+    return path
+
+
+def _is_below(path: Path, folder: Path) -> bool:
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):
+        # Links that lead round in a circle, a name that no system takes.
+        return False
 
 
 def read_document(path: Path) -> dict[str, Any]:
     """The tables of a `.toml` or `.json` file."""
     if path.suffix not in {".toml", ".json"}:
         raise CaseInputError(f"ends in {path.suffix!r}: .toml or .json is needed")
+    check_readable(path)
     if path.stat().st_size > MAX_TEXT:
         raise CaseInputError(f"is larger than {MAX_TEXT} bytes")
     try:
@@ -134,12 +169,53 @@ def read_document(path: Path) -> dict[str, Any]:
         if path.suffix == ".json":
             document = json.loads(text, parse_constant=refuse_constant)
         else:
-            document = toml_module().loads(text)
+            check_plain_toml(text)
+            document = toml_module().loads(text.replace("\r\n", "\n"))
     except (ValueError, RecursionError) as error:
         raise CaseInputError(f"cannot be read: {error}") from error
     if not isinstance(document, dict):
         raise CaseInputError("is not a table of names and values")
+    check_numbers(document)
     return document
+
+
+def check_plain_toml(text: str) -> None:
+    """Refuses keys of more than 8 parts: their tables in tables take a thousand times the text.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) With the line.
+    """
+    # Usually there is no such key, in texts and comments neither.
+    found = re.search(DEEP_KEY, text) and next(
+        (match for match in OUTSIDE_TEXTS.finditer(text) if match["deep"]), None
+    )
+    if found:
+        line = text.count("\n", 0, found.start()) + 1
+        raise CaseInputError(f"line {line}: a key has more than {MAX_KEY_PARTS} parts")
+
+
+def check_numbers(value: object) -> None:
+    """Refuses whole numbers beyond a float's range anywhere in plain values of a text.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) With the number of its digits.
+    """
+    left = [value]
+    while left:
+        entry = left.pop()
+        if isinstance(entry, dict):
+            left.extend(entry.values())
+        elif isinstance(entry, list):
+            left.extend(entry)
+        elif isinstance(entry, int) and not -MAX_WHOLE <= entry <= MAX_WHOLE:
+            digits = round(entry.bit_length() * math.log10(2.0))
+            raise CaseInputError(
+                f"holds a whole number of about {digits} digits: at most {MAX_DIGITS} are read"
+            )
 
 
 def toml_module() -> Any:
@@ -172,6 +248,22 @@ def table_of(header: Mapping[str, Any], name: str, *, optional: bool = False) ->
     if not isinstance(table, dict):
         raise CaseInputError(f"lacks the table {name!r}" if table is None else f"{name!r} no table")
     return table
+
+
+def check_units(units: object) -> None:
+    """Refuses a table of units that states others than mm, MPa and N; none at all means these."""
+    if units is None:
+        return
+    if not isinstance(units, dict):
+        raise CaseInputError(f"units is {units!r}: a table of names and units is needed")
+    for name, unit in units.items():
+        if name not in UNITS:
+            raise CaseInputError(f"units has the unknown key {name!r}: use {', '.join(UNITS)}")
+        if unit != UNITS[name]:
+            raise CaseInputError(
+                f"units.{name} is {unit!r}: only {UNITS[name]!r} is read. Convert every {name} "
+                f"of the file to {UNITS[name]} and write {UNITS[name]!r}"
+            )
 
 
 def check_version(version: object) -> None:

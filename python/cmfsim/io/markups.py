@@ -12,7 +12,7 @@ import numpy as np
 
 from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
-from cmfsim.io.files import refuse_constant, replacing
+from cmfsim.io.files import MAX_WHOLE, check_readable, refuse_constant, replacing
 
 __all__ = [
     "Markup",
@@ -68,10 +68,7 @@ def markup_text(path: Path) -> str:
     LandmarkError
         (also `ValueError`) A folder, too large, not UTF-8.
     """
-    if path.is_dir():
-        raise LandmarkInputError(f"{path.name}: is a folder, not a file of landmarks")
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+    check_readable(path, LandmarkInputError)
     size = path.stat().st_size
     if size > MAX_LANDMARK_TEXT:
         raise LandmarkInputError(
@@ -145,6 +142,8 @@ def as_position(number: int, position: object) -> Floats:
         is_number = isinstance(value, int | float | np.integer | np.floating)
         if isinstance(value, bool) or not is_number:
             raise LandmarkInputError(f"point {number} has the coordinate {value!r}: no number")
+        if isinstance(value, int) and abs(value) > MAX_WHOLE:
+            raise LandmarkInputError(f"point {number} has a coordinate of more than 308 digits")
         if not math.isfinite(value):
             raise LandmarkInputError(f"point {number} has the coordinate {value}: must be finite")
     return np.array(position, dtype=np.float64)

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from cmfsim.case import NODE_KINDS
 from cmfsim.errors import CaseInputError
 from cmfsim.io.archives import member_of, read_archive, write_archive
-from cmfsim.io.files import beside, check_version, known_keys, named, read_document, table_of
+from cmfsim.io.files import (
+    beside,
+    check_units,
+    check_version,
+    known_keys,
+    named,
+    read_document,
+    table_of,
+)
 from cmfsim.io.meshes import read_mesh, read_tets
 from cmfsim.io.surfaces import read_moved_surface, read_surface
 from cmfsim.planning import rigid_motion
@@ -28,6 +36,11 @@ from cmfsim.scene import (
 __all__ = ["read_plan", "read_scene", "write_scene"]
 
 SCENE_FORMAT = "cmfsim-scene"
+SCENE_KEYS = (
+    *("format", "version", "units", "mesh", "conflicts"),
+    *("tissue", "segments", "plan", "solver"),
+)
+PLAN_KEYS = ("format", "version", "name", "note", "units", "plan")
 # Texts of a tissue, beside its arrays.
 TISSUE_TEXTS = ("kind", "law", "preset", "mixing")
 
@@ -49,7 +62,8 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     FileNotFoundError
         The file, or one that it names, does not exist.
     CaseError
-        (also `ValueError`) Not a scene, another version, an entry missing, misshapen or not finite.
+        (also `ValueError`) Not a scene, another version, units other than mm, MPa and N, an entry
+        missing, misshapen or not finite.
 
     Examples
     --------
@@ -112,7 +126,8 @@ def read_plan(path: str | os.PathLike[str], scene: Scene) -> dict[str, NDArray[A
     FileNotFoundError
         The file does not exist.
     CaseError
-        (also `ValueError`) Not a plan, an unknown segment or key, a segment missing.
+        (also `ValueError`) Not a plan, an unknown segment or key, a segment missing, units other
+        than mm.
 
     Examples
     --------
@@ -121,7 +136,8 @@ def read_plan(path: str | os.PathLike[str], scene: Scene) -> dict[str, NDArray[A
     """
     path = Path(path)
     with named(path):
-        document = read_document(path)
+        document = known_keys("plan file", read_document(path), PLAN_KEYS)
+        check_units(document.get("units"))
         table = table_of(document, "plan")
         for name in table:
             if name not in scene.segments:
@@ -135,7 +151,7 @@ def read_plan(path: str | os.PathLike[str], scene: Scene) -> dict[str, NDArray[A
         return {name: _motion(name, table, path.parent) for name in scene.segments}
 
 
-def _scene_from_members(header: Mapping[str, Any], members: dict[str, NDArray[Any]]) -> Scene:
+def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray[Any]]) -> Scene:
     tissue = table_of(header, "tissue")
     kind = _tissue_kind(tissue)
     arrays = {n: members[f"tissue.{n}"] for n in TISSUE_ARRAYS[kind] if f"tissue.{n}" in members}
@@ -202,8 +218,8 @@ def _read_toml_scene(path: Path) -> Scene:
         if document.get("format") != SCENE_FORMAT:
             raise CaseInputError(f"format is {document.get('format')!r}: {SCENE_FORMAT!r} needed")
         check_version(document.get("version"))
-        keys = ("format", "version", "mesh", "conflicts", "tissue", "segments", "plan", "solver")
-        known_keys("scene", document, keys)
+        known_keys("scene", document, SCENE_KEYS)
+        check_units(document.get("units"))
         mesh_path = beside(path.parent, "mesh", document.get("mesh"))
         mesh = read_mesh(mesh_path)
         tets, tet_data = read_tets(mesh, mesh_path)

@@ -12,7 +12,7 @@ import numpy as np
 
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io.files import toml_module
+from cmfsim.io.files import check_numbers, check_plain_toml, check_readable, named, toml_module
 from cmfsim.io.toml_lines import KeyPath, line_of, toml_lines
 
 __all__ = ["Table", "nearest", "read_tables"]
@@ -30,12 +30,9 @@ def read_tables(path: Path) -> "Table":
     FileNotFoundError
         The file does not exist.
     CaseError
-        (also `ValueError`) Not TOML, not UTF-8, larger than 1 MiB.
+        (also `ValueError`) Not TOML, not UTF-8, larger than 1 MiB, a pipe, keys of many parts.
     """
-    if path.is_dir():
-        raise CaseInputError(f"{path.name}: is a folder, not a case file")
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+    check_readable(path)
     if path.suffix != ".toml":
         raise CaseInputError(f"{path.name}: a case file ends in .toml, not {path.suffix!r}")
     if path.stat().st_size > MAX_CASE_TEXT:
@@ -44,7 +41,11 @@ def read_tables(path: Path) -> "Table":
         )
     try:
         text = path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
+        with named(path):
+            check_plain_toml(text)
         values = toml_module().loads(text)
+        with named(path):
+            check_numbers(values)
     except UnicodeDecodeError as error:
         raise CaseInputError(f"{path.name}: is not UTF-8 text ({error})") from error
     except RecursionError as error:
@@ -206,6 +207,16 @@ class Table:
                 continue
             self._checked_number(key, entry)
         return value
+
+    def path(self, key: str, folder: Path) -> Path:
+        """A path to read, against a folder unless it is absolute; `~` is the home folder."""
+        name = self.text(key)
+        if "\0" in name:
+            self.fail(key, "holds a zero character: no file is called so")
+        try:
+            return folder / Path(name).expanduser()
+        except RuntimeError:
+            self.fail(key, f"is {name!r}: there is no home folder of this name; write the path")
 
     def table(self, key: str) -> "Table":
         """A table below this one; empty where it is absent."""

@@ -106,7 +106,7 @@ def read_template_archive(path: Path) -> TemplateData:
     header, members = read_archive(path, TEMPLATE_FORMAT, "template")
     vertices, course = (_rows(members, name) for name in ("vertices", "course"))
     steps = member_of(members, "triangle_steps")
-    if steps.ndim != 1 or steps.dtype.kind not in "iu" or len(steps) % 3:
+    if steps.ndim != 1 or steps.dtype.kind != "i" or len(steps) % 3:
         raise CaseInputError(f"triangle_steps has {steps.dtype} of shape {steps.shape}: (3 t,)")
     triangles = np.cumsum(steps, dtype=np.int64).reshape(-1, 3)
     entries = header.get("muscles")
@@ -138,8 +138,11 @@ def read_template_archive(path: Path) -> TemplateData:
         name = entry.get("name")
         if not isinstance(name, str):
             raise CaseInputError(f"muscle {number} has the name {name!r}: a text is needed")
-        if "concepts" in entry:
-            concepts[name] = tuple(map(str, entry["concepts"]))
+        given = entry.get("concepts", [])
+        if not isinstance(given, list):
+            raise CaseInputError(f"concepts of {name} are {given!r}: a list of texts is needed")
+        if given:
+            concepts[name] = tuple(map(str, given))
         side, kind, boxes = (entry.get(key) for key in ("side", "kind", "boxes"))
         if "mirror_of" in entry:
             other = muscles.get(str(entry["mirror_of"]))
