@@ -213,7 +213,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "patient_prediction prediction scene template _core"
         ),
         "pictures": "case checks clinical_plan errors musculature prediction scene _core",
-        "report": "case clinical_plan errors io scene",
+        "report": "case clinical_plan errors finding_groups io scene",
+        "finding_groups": "case",
         "insilico": "build case checks errors io phantom planning scene topology _core",
         "bench": (
             "build checks errors evaluation io model patient patient_prediction pictures "
@@ -229,9 +230,9 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "surface_checks surface_repair template topology _core"
         ),
         "cli": (
-            "bench build case checks clinical_plan cmfsim demo doctor errors evaluation insilico "
-            "io meshing musculature phantom pictures prediction report scene simulation study "
-            "template"
+            "bench build case checks clinical_plan cmfsim demo doctor errors evaluation "
+            "finding_groups insilico io meshing musculature phantom pictures prediction report "
+            "scene simulation study template"
         ),
         "__main__": "cli",
         "__init__": (

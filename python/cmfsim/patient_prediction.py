@@ -1,6 +1,8 @@
 """The face that a model predicts for a patient: a scene of the paper's four models, solved."""
 
+import hashlib
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -96,6 +98,7 @@ def predict_patient(patient: PatientModel, model: str = "M+S") -> Prediction:
     summary = {
         **patient.summary,
         "model": model,
+        "case_key": _case_key(patient, scene),
         "plan": {name: _motion(patient, name, m) for name, m in scene.plan.items()},
         "skin": {
             "mean": float(moved.mean()),
@@ -108,6 +111,32 @@ def predict_patient(patient: PatientModel, model: str = "M+S") -> Prediction:
         "left_out": _left_out(patient, scene, model),
     }
     return Prediction(model, patient, scene, result, summary)
+
+
+def _case_key(patient: PatientModel, scene: Scene) -> str:
+    """The key of what a prediction belongs to, the same for all models of a patient and plan.
+
+    Beyond the key of the case's files it is that of mesh and motions, since a patient may be given
+    another plan in memory.
+    """
+    digest = hashlib.sha256(str(patient.summary.get("inputs_key", "")).encode())
+    for name, array in _arrays(scene):
+        values = np.ascontiguousarray(array)
+        digest.update(f"{name} {values.dtype.str} {values.shape}\n".encode())
+        digest.update(values.tobytes())
+    return digest.hexdigest()
+
+
+def _arrays(scene: Scene) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Mesh and motions of a scene, each with its name."""
+    yield "nodes", np.asarray(scene.nodes)
+    yield "tets", np.asarray(scene.tets)
+    for name, motion in scene.plan.items():
+        if isinstance(motion, MovedSurface):
+            yield f"surface of {name}", np.asarray(motion.surface.vertices)
+            yield f"moved {name}", np.asarray(motion.moved_vertices)
+        else:
+            yield f"motion of {name}", np.asarray(motion)
 
 
 def _motion(patient: PatientModel, name: str, motion: Any) -> dict[str, Any]:

@@ -10,6 +10,7 @@ __getattr__, __dir__, __all__ = deferred(
             "build_model",
         ),
         "inputs": (
+            "case_key",
             "check_output",
             "input_hashes",
         ),

@@ -1,5 +1,5 @@
 from cmfsim.build.case_model import build_case, build_model
-from cmfsim.build.inputs import check_output, input_hashes
+from cmfsim.build.inputs import case_key, check_output, input_hashes
 from cmfsim.build.muscles import with_muscles
 from cmfsim.build.phantom_case import write_phantom_case
 from cmfsim.build.postoperative import Postoperative, read_postoperative
@@ -8,6 +8,7 @@ __all__ = [
     "Postoperative",
     "build_case",
     "build_model",
+    "case_key",
     "check_output",
     "input_hashes",
     "read_postoperative",

@@ -15,6 +15,7 @@ from cmfsim._core import TetMesh, __version__
 from cmfsim.build.clefts import without_clefts
 from cmfsim.build.held import held_part
 from cmfsim.build.inputs import (
+    case_key,
     check_output,
     input_hashes,
     read_anatomy,
@@ -28,7 +29,7 @@ from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, NodeKinds
 from cmfsim.checks import Floats
 from cmfsim.doctor import SizedMotion, check_motion_size, diagnose
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io import Case, write_model
+from cmfsim.io import Case, CaseOrPath, as_case, write_model
 from cmfsim.meshing import (
     MeshReport,
     report_of_part,
@@ -53,26 +54,30 @@ __all__ = ["build_case", "build_model"]
 _log = logging.getLogger(__name__)
 
 Progress = Callable[[str], None]
+OnFindings = Callable[[Iterable[Finding]], None]
 
 
 def build_case(
-    case: Case,
+    case: CaseOrPath,
     *,
     progress: Progress | None = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
+    on_findings: OnFindings | None = None,
 ) -> PatientModel:
     """The model of a case, written to its output folder.
 
     Parameters
     ----------
-    case : Case
+    case : Case, or path of its file or folder
     progress : callable, optional
         Called with the name of each stage as it begins.
     check : bool
         Whether the doctor looks at the case first; an error that it finds ends the work.
     findings : iterable of Finding
         What is known of the case already; the model keeps it.
+    on_findings : callable, optional
+        Called with new findings at the end of each stage.
 
     Returns
     -------
@@ -92,8 +97,11 @@ def build_case(
     >>> model = cmfsim.build_case(cmfsim.Case.load("case.toml"))  # doctest: +SKIP
     >>> result = cmfsim.solve_scene(model.scene)  # doctest: +SKIP
     """
+    case = as_case(case)
     check_output(case)
-    model = build_model(case, progress=progress, check=check, findings=findings)
+    model = build_model(
+        case, progress=progress, check=check, findings=findings, on_findings=on_findings
+    )
     stage = progress or _quiet
     stage("writing the model")
     begun = time.perf_counter()
@@ -104,19 +112,20 @@ def build_case(
 
 
 def build_model(
-    case: Case,
+    case: CaseOrPath,
     *,
     progress: Progress | None = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
     anatomy: Anatomy | None = None,
     after: Postoperative | None = None,
+    on_findings: OnFindings | None = None,
 ) -> PatientModel:
     """The model of a case: read, segmented, cut, meshed and classified; nothing is written.
 
     Parameters
     ----------
-    case : Case
+    case : Case, or path of its file or folder
     progress : callable, optional
     check : bool
     findings : iterable of Finding
@@ -125,6 +134,8 @@ def build_model(
         The head, where it is known; the image or surfaces of the case are then not read.
     after : Postoperative, optional
         What `read_postoperative` gives, where it is known already; an achieved plan is read off it.
+    on_findings : callable, optional
+        Called with new findings at the end of each stage.
 
     Returns
     -------
@@ -140,8 +151,9 @@ def build_model(
     >>> import cmfsim
     >>> model = cmfsim.build_model(cmfsim.Case.load("case.toml"))  # doctest: +SKIP
     """
-    stages = _Stages(progress or _quiet)
+    case = as_case(case)
     findings = [*findings]
+    stages = _Stages(progress or _quiet, findings, on_findings)
     if check:
         stages.begin("checking the case")
         findings += _checked(case)
@@ -195,7 +207,7 @@ def build_model(
     if mesh.n_tets < whole:
         report = report_of_part(mesh, report)
     findings += _untouched(case, mesh, kinds, bones)
-    findings = [*dict.fromkeys(findings)]
+    findings[:] = [*dict.fromkeys(findings)]
 
     stages.begin("assembling the scene")
     scene = _scene(case, mesh, kinds, bones.segments, bones.motions)
@@ -242,8 +254,12 @@ def _draw(model: PatientModel, folder: Path) -> list[str]:
 class _Stages:
     """The stages as they pass, with the seconds that each took."""
 
-    def __init__(self, progress: Progress) -> None:
+    def __init__(
+        self, progress: Progress, findings: list[Finding], on_findings: OnFindings | None
+    ) -> None:
         self._progress = progress
+        # The list that the stages add to, and what of it is known.
+        self._findings, self._known, self._on_findings = findings, set(findings), on_findings
         self._name: str | None = None
         self._begun = 0.0
         self.seconds: dict[str, float] = {}
@@ -258,6 +274,10 @@ class _Stages:
             took = time.perf_counter() - self._begun
             self.seconds[self._name] = self.seconds.get(self._name, 0.0) + took
             self._name = None
+        new = [finding for finding in self._findings if finding not in self._known]
+        self._known.update(new)
+        if new and self._on_findings is not None:
+            self._on_findings(new)
 
 
 def _quiet(stage: str) -> None:
@@ -399,7 +419,7 @@ def _summary(
     seconds: Mapping[str, float],
     procedures: tuple[Procedure, ...],
 ) -> dict[str, Any]:
-    grid = anatomy.skin
+    grid, inputs = anatomy.skin, input_hashes(case)
     return {
         "case": case.name,
         "note": case.note,
@@ -420,7 +440,8 @@ def _summary(
         ],
         "findings": [asdict(finding) for finding in findings],
         "timings": dict(seconds),
-        "inputs": input_hashes(case),
+        "inputs": inputs,
+        "inputs_key": case_key(case, inputs),
         "versions": {
             "cmfsim": __version__,
             "numpy": np.__version__,

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import os
+import json
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cmfsim._core import __version__
 from cmfsim.case import Anatomy, Finding
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
@@ -20,6 +22,7 @@ from cmfsim.io import (
     read_surface,
     read_transform,
 )
+from cmfsim.io.folders import check_below, check_writable
 from cmfsim.io.images import read_image_file
 from cmfsim.io.models import is_model_file
 from cmfsim.io.transforms import read_transform_file
@@ -32,6 +35,7 @@ if TYPE_CHECKING:
     from cmfsim.imaging import SegmentOptions
 
 __all__ = [
+    "case_key",
     "check_output",
     "input_hashes",
     "motion_source",
@@ -143,6 +147,54 @@ def input_hashes(case: Case) -> dict[str, str]:
     return {_path_from(path, folder): _sha256(path) for path in sorted(set(_files(case)))}
 
 
+def case_key(case: Case, hashes: Mapping[str, str] | None = None) -> str:
+    """The SHA-256 of everything that results of a case depend on: files, plan, options, version.
+
+    Results of one key may be shown together. Folders may be moved: paths count from the case's own,
+    and where the results go does not count.
+
+    Parameters
+    ----------
+    case : Case
+        Changes that were made to it in memory count as those in its file.
+    hashes : mapping of str to str, optional
+        Its `input_hashes`, where they are known already.
+
+    Raises
+    ------
+    OSError
+        A file that the case names cannot be read.
+    """
+    folder = case.file.parent
+    content = {
+        "inputs": dict(input_hashes(case) if hashes is None else hashes),
+        "case": {
+            field.name: _plain(getattr(case, field.name), folder)
+            for field in fields(case)
+            if field.name not in {"file", "output", "lines"}
+        },
+        "version": __version__,
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _plain(value: Any, folder: Path) -> Any:
+    """A value of a case as JSON holds it, so that equal values have equal texts."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name), folder) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(name): _plain(entry, folder) for name, entry in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist(), folder)
+    if isinstance(value, list | tuple | set | frozenset):
+        return [_plain(entry, folder) for entry in value]
+    if isinstance(value, Path):
+        return _path_from(value, folder)
+    if value is None or isinstance(value, str | int | float):
+        return value
+    raise TypeError(f"{type(value).__name__} in a case")  # no repr: it may hold an address
+
+
 def _path_from(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
 
@@ -159,17 +211,14 @@ def check_output(case: Case, is_written: Callable[[str], bool] = is_model_file) 
     Raises
     ------
     CaseError
-        (also `ValueError`) The output folder is a file, or holds an input of a name that is written
-        there.
+        (also `ValueError`) The output folder is a file, a link that leads out of the case's folder,
+        or holds an input of a name that is written there.
     OSError
         It cannot be written to.
     """
     folder = case.output
-    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if not there.is_dir():
-        raise CaseInputError(f"{there}: is a file; the output folder cannot be made there")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise PermissionError(f"{there}: the output cannot be written there")
+    check_below(folder, case.file.parent)
+    check_writable(folder)
     for path in _files(case):
         written = folder / path.name
         if not is_written(path.name) or not path.exists() or not written.exists():

@@ -1,20 +1,28 @@
-"""The command line: `cmfsim doctor`, `build`, `solve`, `info`, and made heads to try them on.
+"""The command line: `cmfsim doctor`, `build`, `solve`, `info`, and synthetic heads to try them on.
 
-Results and `--json` go to standard output, progress and errors to standard error.
-Exit codes: 0 done, 1 failed, 2 bad input.
+Results and `--json` go to standard output, progress, warnings and errors to standard error.
+Exit codes: 0 done, 1 failed, 2 bad input, 141 where standard output was closed.
 """
 
 import argparse
+import contextlib
+import io
+import json
 import logging
+import os
+import select
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from cmfsim.cli.exit_codes import BAD_INPUT, DONE, FAILED
+from cmfsim.cli.case_commands import print_findings
+from cmfsim.cli.exit_codes import BAD_INPUT, CLOSED, DONE, FAILED
+from cmfsim.cli.notices import FindingsError
 from cmfsim.cli.parsing import make_parser
-from cmfsim.cli.terminal import ProgressHandler, say_error
+from cmfsim.cli.terminal import ProgressHandler, error_text, print_error
 from cmfsim.errors import CmfsimError
 
-__all__ = ["BAD_INPUT", "DONE", "FAILED", "main"]
+__all__ = ["BAD_INPUT", "CLOSED", "DONE", "FAILED", "main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,11 +43,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     >>> main(["solve", "no-such-scene.npz", "-o", "out.npz"])
     2
     """
-    parser = make_parser()
-    options = parser.parse_args(arguments)
-    if options.command is None:
-        parser.print_help(sys.stderr)
-        return BAD_INPUT
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    _open_closed_streams()
+    try:
+        code = _command(words)
+        # Here, not at the end of the interpreter, where nobody would catch it.
+        sys.stdout.flush()
+    except OSError as error:
+        if isinstance(error, BrokenPipeError) and _output_is_closed():
+            _drop_output()
+            return CLOSED
+        # What was printed did not reach its file, as on a full disk.
+        _drop_output()
+        print_error(error)
+        return FAILED
+    return code
+
+
+def _command(words: Sequence[str]) -> int:
+    options = _parsed(words)
+    if isinstance(options, int):
+        return options
     handler = ProgressHandler()
     logger = logging.getLogger("cmfsim")
     previous = logger.level
@@ -52,15 +76,84 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logger.setLevel(previous)
 
 
+def _parsed(words: Sequence[str]) -> argparse.Namespace | int:
+    """The options of a command line, or the exit code where it has none."""
+    parser = make_parser()
+    if "--json" not in words:
+        options = parser.parse_args(words)
+    else:
+        # Words that are wrong are an error like others to who reads JSON.
+        said = io.StringIO()
+        try:
+            with contextlib.redirect_stderr(said):
+                options = parser.parse_args(words)
+        except SystemExit as error:
+            print(said.getvalue(), end="", file=sys.stderr)
+            if error.code == BAD_INPUT:
+                lines = said.getvalue().strip().splitlines() or ["bad words"]
+                _print_json("UsageError", lines[-1], BAD_INPUT)
+            raise
+    if options.command is None:
+        parser.print_help(sys.stderr)
+        return BAD_INPUT
+    return options
+
+
 def _run(options: argparse.Namespace) -> int:
     try:
         return int(options.run(options))
-    except (FileNotFoundError, ValueError) as error:
-        say_error(error)
+    except BrokenPipeError:
+        raise
+    except FindingsError as error:
+        print_findings(error.findings, sys.stderr)
+        if getattr(options, "json", False):
+            more = {"findings": [vars(finding) for finding in error.findings]}
+            _print_json("FindingsError", str(error), BAD_INPUT, more)
         return BAD_INPUT
+    except (FileNotFoundError, ValueError) as error:
+        return _ended(options, error, BAD_INPUT)
     except (CmfsimError, OSError, MemoryError) as error:
-        say_error(error)
-        return FAILED
+        return _ended(options, error, FAILED)
     except KeyboardInterrupt:
-        print("cmfsim: stopped; existing files are as they were", file=sys.stderr)
+        text = "stopped; existing files are as they were"
+        print(f"cmfsim: {text}", file=sys.stderr)
+        if getattr(options, "json", False):
+            _print_json("KeyboardInterrupt", text, FAILED)
         return FAILED
+
+
+def _ended(options: argparse.Namespace, error: BaseException, code: int) -> int:
+    print_error(error)
+    if getattr(options, "json", False):
+        _print_json(type(error).__name__, error_text(error), code)
+    return code
+
+
+def _print_json(kind: str, text: str, code: int, more: Mapping[str, Any] | None = None) -> None:
+    print(json.dumps({"error": {"kind": kind, "text": text, "exit": code}, **(more or {})}))
+
+
+def _open_closed_streams() -> None:
+    """Gives a process that was started without standard output or error somewhere to write to."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            stream = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115 (kept open)
+            setattr(sys, name, stream)
+
+
+def _output_is_closed() -> bool:
+    """Whether nobody reads standard output any more; true where the system does not tell."""
+    try:
+        poll = select.poll()
+        poll.register(sys.stdout.fileno(), select.POLLOUT)
+        return any(events & (select.POLLERR | select.POLLHUP) for _, events in poll.poll(0))
+    except (AttributeError, OSError, ValueError):
+        return True
+
+
+def _drop_output() -> None:
+    """Lets nothing more be written to a standard output that takes nothing."""
+    with contextlib.suppress(OSError, ValueError):
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, sys.stdout.fileno())
+        os.close(nothing)

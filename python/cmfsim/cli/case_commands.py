@@ -13,12 +13,15 @@ from cmfsim.case import SEVERITIES, Finding
 from cmfsim.checks import as_positive
 from cmfsim.cli.build_report import WIDTH, build_text
 from cmfsim.cli.exit_codes import BAD_INPUT, DONE
+from cmfsim.cli.notices import FindingsError, Notices
+from cmfsim.cli.preparation import prepare
 from cmfsim.cli.terminal import StageProgress, columns, escaped, in_colour
 from cmfsim.clinical_plan import plan_lines
 from cmfsim.doctor import Examination, examine, findings_text
 from cmfsim.io import Case
+from cmfsim.io.models import is_model_file
 
-__all__ = ["build", "case_of", "checked", "doctor"]
+__all__ = ["build", "case_of", "checked", "doctor", "print_findings"]
 
 
 def doctor(options: argparse.Namespace) -> int:
@@ -42,21 +45,23 @@ def doctor(options: argparse.Namespace) -> int:
     else:
         for line in plan_lines(plan):
             print(f"plan: {escaped(line)}")
-        _print_findings(findings, sys.stdout)
+        print_findings(findings, sys.stdout)
     return BAD_INPUT if _has_errors(findings) else DONE
 
 
 def build(options: argparse.Namespace) -> int:
     """Builds a case, unless the doctor finds an error in it."""
     case = case_of(options)
+    prepare(case, is_model_file)
+    notices = Notices(quiet=options.quiet)
     begun = time.perf_counter()
-    findings = () if options.no_doctor else checked(case, quiet=options.quiet)
-    if findings is None:
-        return BAD_INPUT
+    findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
     seconds = time.perf_counter() - begun
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         build_case = import_module("cmfsim.build").build_case
-        built = build_case(case, progress=progress.stage, check=False, findings=findings)
+        built = build_case(
+            case, progress=progress.stage, check=False, findings=findings, on_findings=notices.add
+        )
     summary = dict(built.summary)
     if not options.no_doctor:
         summary["timings"] = {"checking the case": seconds, **summary["timings"]}
@@ -77,22 +82,29 @@ def case_of(options: argparse.Namespace) -> Case:
             case, mesh=dataclasses.replace(case.mesh, edge_length=edge_length)
         )
     if options.output is not None:
-        case = dataclasses.replace(case, output=options.output)
+        # A link that the user names is followed, and the folder it leads to is printed.
+        output = options.output.resolve() if options.output.is_symlink() else options.output
+        case = dataclasses.replace(case, output=output)
     return case
 
 
-def checked(case: Case, *, quiet: bool) -> tuple[Finding, ...] | None:
-    """What the doctor finds; none, with the findings printed, if one of them is an error."""
+def checked(case: Case, notices: Notices, *, quiet: bool) -> tuple[Finding, ...]:
+    """What the doctor finds, with its warnings printed.
+
+    Raises
+    ------
+    FindingsError
+        An error is among the findings.
+    """
     with StageProgress(sys.stderr, quiet=quiet) as progress:
         progress.stage("checking the case")
         found = examine(case)
-    if not quiet:
-        # Before the work: a reversed plan is seen here, not in the face.
-        for line in plan_lines(_plan_values(found)):
-            print(f"cmfsim: plan: {escaped(line)}", file=sys.stderr, flush=True)
+    # Before the work, quiet or not: a reversed plan is seen here, not in the face.
+    for line in plan_lines(_plan_values(found)):
+        print(f"cmfsim: plan: {escaped(line)}", file=sys.stderr, flush=True)
     if _has_errors(found.findings):
-        _print_findings(found.findings, sys.stderr)
-        return None
+        raise FindingsError(found.findings)
+    notices.add(found.findings)
     return found.findings
 
 
@@ -104,7 +116,7 @@ def _has_errors(findings: Sequence[Finding]) -> bool:
     return any(finding.severity == "error" for finding in findings)
 
 
-def _print_findings(findings: Sequence[Finding], stream: TextIO) -> None:
+def print_findings(findings: Sequence[Finding], stream: TextIO) -> None:
     """On a terminal wrapped and coloured, in a pipe one line for each part."""
     width = columns() if stream.isatty() else 0
     text = findings_text(findings, colour=in_colour(stream), width=width, escape=escaped)

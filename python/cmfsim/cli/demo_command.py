@@ -10,12 +10,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from cmfsim.cli.exit_codes import DONE, FAILED
-from cmfsim.cli.results import (
-    folder_of,
-    write_case_report,
-    write_evaluation,
-    write_prediction_files,
-)
+from cmfsim.cli.notices import Notices
+from cmfsim.cli.preparation import prepare
+from cmfsim.cli.results import WrittenResults, write_results
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.demo import DemoCase, write_demo_case
 from cmfsim.pictures import has_screen
@@ -33,49 +30,68 @@ def demo(options: argparse.Namespace) -> int:
     """Predicts the face of the embedded case, writes its report and opens it."""
     models: tuple[str, ...] = options.models
     begun = time.perf_counter()
+    notices = Notices(quiet=options.quiet)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         progress.stage("making a head")
         made = write_demo_case(options.folder, edge_length=options.edge_length)
-        _work(made, models, progress)
-        progress.stage("writing the report")
-        places = [folder_of(made.case.output, model, len(models)) for model in models]
-        name = write_case_report(made.case.output, places)
+        prepare(made.case, report=True, evaluation=made.truth is not None)
+        name = _work(made, models, progress, notices).report
     if name is None:
         return FAILED
     page = made.case.output / name
     seconds = time.perf_counter() - begun
     if options.json:
-        answer = {"case": str(made.case.file), "report": str(page), "seconds": seconds}
+        answer = {
+            "case": str(made.case.file),
+            "report": str(page),
+            "seconds": seconds,
+            "findings": notices.as_dicts(),
+        }
         print(json.dumps(answer, allow_nan=False))
         return DONE
     print(f"case    {escaped(str(made.case.file))}")
     print(f"report  {escaped(str(page))}")
     print(f"time    {seconds:.0f} s")
+    notices.summarise(str(page))
     if not options.no_open and _someone_looks():
         webbrowser.open(page.resolve().as_uri())
     return DONE
 
 
-def _work(made: DemoCase, models: tuple[str, ...], progress: StageProgress) -> None:
+def _work(
+    made: DemoCase, models: tuple[str, ...], progress: StageProgress, notices: Notices
+) -> WrittenResults:
     """Predicts by each model, compares where the truth is known, and writes everything."""
     case, found = made.case, None
     predictions: Iterable[Prediction]
     if made.truth is None:
         predictions = predict_models(
-            case, models, progress=progress.stage, check=False, anatomy=made.anatomy
+            case,
+            models,
+            progress=progress.stage,
+            check=False,
+            anatomy=made.anatomy,
+            on_findings=notices.add,
         )
     else:
-        found = evaluate(case, models, progress=progress.stage, check=False, anatomy=made.anatomy)
+        found = evaluate(
+            case,
+            models,
+            progress=progress.stage,
+            check=False,
+            anatomy=made.anatomy,
+            on_findings=notices.add,
+        )
         predictions = found.predictions
-    for prediction in predictions:
-        progress.stage(f"writing {prediction.model}")
+    return write_results(
+        case.output,
+        predictions,
+        len(models),
+        stage=progress.stage,
+        evaluation=None if found is None else lambda: found,
         # The report shows the pictures of the last model alone.
-        pictures = prediction.model == models[-1]
-        folder = folder_of(case.output, prediction.model, len(models))
-        write_prediction_files(folder, prediction, pictures=pictures)
-    if found is not None:
-        progress.stage("writing the comparison")
-        write_evaluation(case.output, found)
+        pictures=lambda model: model == models[-1],
+    )
 
 
 def _someone_looks() -> bool:

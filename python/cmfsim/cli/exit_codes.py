@@ -1,5 +1,6 @@
 """What the program's exit codes mean."""
 
-__all__ = ["BAD_INPUT", "DONE", "FAILED"]
+__all__ = ["BAD_INPUT", "CLOSED", "DONE", "FAILED"]
 
-DONE, FAILED, BAD_INPUT = 0, 1, 2
+# The last is what shells report of a program that a closed pipe ended: 128 and the signal's number.
+DONE, FAILED, BAD_INPUT, CLOSED = 0, 1, 2, 141

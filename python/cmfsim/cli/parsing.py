@@ -36,8 +36,12 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"cmfsim {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--json", action="store_true", help="print a JSON object")
-    common.add_argument("-q", "--quiet", action="store_true", help="no progress lines")
+    common.add_argument(
+        "--json", action="store_true", help="print a JSON object, of errors as well"
+    )
+    common.add_argument(
+        "-q", "--quiet", action="store_true", help="no progress lines; warnings and errors stay"
+    )
     _add_case_commands(commands, common)
     _add_scene_commands(commands, common)
     _add_template_commands(commands, common)
@@ -47,7 +51,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     named = argparse.ArgumentParser(add_help=False, parents=[common])
-    named.add_argument("case", metavar="CASE", type=Path, help="case.toml")
+    named.add_argument("case", metavar="CASE", type=Path, help="case.toml, or its folder")
 
     demo = commands.add_parser(
         "demo", parents=[common], help="predict the face of an embedded case, and open its report"
@@ -88,7 +92,7 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     doctor = commands.add_parser(
         "doctor",
         parents=[named],
-        help="say what will go wrong with a case, and how to mend it",
+        help="report what will go wrong with a case, and how to fix it",
         epilog="Exit codes: 0 no errors found, 2 errors found or the case file cannot be read.",
     )
     doctor.set_defaults(run=case_commands.doctor)
@@ -163,6 +167,10 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         "evaluate", parents=[changed], help="predict, and compare with the face after it"
     )
     evaluate.add_argument("--model", **models, help="as in predict (default all)")
+    # For a study's own processes: they end when what started them does.
+    evaluate.add_argument("--end-with-input", action="store_true", help=argparse.SUPPRESS)
+    for command in (predict, evaluate):
+        command.add_argument("--no-report", action="store_true", help="make no report.html")
     evaluate.set_defaults(run=study_commands.evaluate)
 
     sensitivity = commands.add_parser(
@@ -186,7 +194,7 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     study = commands.add_parser(
         "study", parents=[common], help="every case of a cohort by every model"
     )
-    study.add_argument("cohort", metavar="COHORT", type=Path, help="cohort.toml")
+    study.add_argument("cohort", metavar="COHORT", type=Path, help="cohort.toml, or its folder")
     study.add_argument("--workers", metavar="N", type=int, help="cases at a time")
     study.add_argument(
         "--scheduler", metavar="ADDRESS", help="of a Dask cluster that sees the same files"
@@ -195,7 +203,7 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     study.set_defaults(run=study_commands.study)
 
     report = commands.add_parser(
-        "report", parents=[common], help="make the report of a folder of results anew"
+        "report", parents=[common], help="make the report of a folder of results again"
     )
     report.add_argument("folder", metavar="FOLDER", type=Path, help="what predict wrote")
     report.set_defaults(run=study_commands.report)

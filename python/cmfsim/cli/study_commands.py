@@ -3,26 +3,25 @@
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cmfsim.build import check_output
 from cmfsim.cli.case_commands import case_of, checked
-from cmfsim.cli.exit_codes import BAD_INPUT, DONE, FAILED
+from cmfsim.cli.exit_codes import DONE, FAILED
+from cmfsim.cli.notices import Notices
+from cmfsim.cli.preparation import prepare
 from cmfsim.cli.results import (
-    REPORT_FILE,
-    folder_of,
+    WrittenPrediction,
+    WrittenResults,
     write_case_report,
-    write_evaluation,
-    write_prediction_files,
+    write_results,
     write_study_report,
 )
-from cmfsim.cli.terminal import StageProgress, escaped
+from cmfsim.cli.terminal import StageProgress, end_with_input, escaped
 from cmfsim.clinical_plan import plan_lines
-from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.errors import CmfsimError
 from cmfsim.io import Cohort, read_landmarks, replacing
-from cmfsim.io.predictions import is_prediction_file
 from cmfsim.prediction import MODELS, Prediction
 from cmfsim.study import CaseOutcome, StudyReport, predict_models, run_study
 from cmfsim.study import evaluate as evaluate_case
@@ -41,67 +40,95 @@ def predict(options: argparse.Namespace) -> int:
     """Predicts the face of a case by one model or by several."""
     case = case_of(options)
     models = models_of(options.model, ("M+S",))
-    findings = () if options.no_doctor else checked(case, quiet=options.quiet)
-    if findings is None:
-        return BAD_INPUT
-    check_output(case, is_prediction_file)
-    written: list[dict[str, Any]] = []
+    prepare(case, report=not options.no_report)
+    notices = Notices(quiet=options.quiet)
+    findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
     failed: dict[str, CmfsimError] = {}
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         predictions = predict_models(
-            case, models, progress=progress.stage, check=False, findings=findings, failed=failed
+            case,
+            models,
+            progress=progress.stage,
+            check=False,
+            findings=findings,
+            failed=failed,
+            on_findings=notices.add,
         )
-        for prediction in predictions:
-            progress.stage(f"writing {prediction.model}")
-            folder = folder_of(case.output, prediction.model, len(models))
-            names = write_prediction_files(folder, prediction)
-            written.append({**_figures(prediction), "output": str(folder), "files": names})
-        if not written:
-            raise next(iter(failed.values()))
-        progress.stage("writing the report")
-        made = write_case_report(case.output, [Path(entry["output"]) for entry in written])
+        written = write_results(
+            case.output,
+            _at_least_one(predictions, failed),
+            len(models),
+            stage=progress.stage,
+            with_report=not options.no_report,
+        )
     if options.json:
+        entries = [_figures(entry, case.output) for entry in written.predictions]
         reasons = {model: str(error) for model, error in failed.items()}
-        answer = {"case": case.name, "predictions": written, "failed": reasons, "report": made}
-        print(json.dumps(answer, allow_nan=False))
+        answer = {"case": case.name, "predictions": entries, "failed": reasons}
+        more = {"findings": notices.as_dicts(), "left_out": written.left_out}
+        print(json.dumps({**answer, **more, "report": written.report}, allow_nan=False))
         return FAILED if failed else DONE
-    if prediction.patient.summary.get("achieved") is not None:
-        print(achieved_text(prediction.patient.summary["achieved"]))
-    print(_plan_text(prediction))
-    for entry in written:
-        print(_prediction_text(entry))
-    _print_report(case.output, made)
-    _say_failed({model: str(error) for model, error in failed.items()})
+    summary = written.predictions[0].summary
+    if summary.get("achieved") is not None:
+        print(achieved_text(summary["achieved"]))
+    print(_plan_text(summary))
+    for entry in written.predictions:
+        print(_prediction_text(_figures(entry, case.output)))
+    _print_report(case.output, written.report)
+    _end(notices, case.output, written)
+    _print_failed({model: str(error) for model, error in failed.items()})
     return FAILED if failed else DONE
+
+
+def _at_least_one(
+    predictions: Iterable[Prediction], failed: Mapping[str, CmfsimError]
+) -> Iterator[Prediction]:
+    """The predictions, or the first error where there is none."""
+    found = False
+    for prediction in predictions:
+        found = True
+        yield prediction
+    if not found:
+        raise next(iter(failed.values()))
 
 
 def evaluate(options: argparse.Namespace) -> int:
     """Predicts a case and compares it with the face after the operation."""
+    if options.end_with_input:
+        end_with_input()
     case = case_of(options)
     models = models_of(options.model, MODELS)
-    findings = () if options.no_doctor else checked(case, quiet=options.quiet)
-    if findings is None:
-        return BAD_INPUT
-    check_output(case, is_prediction_file)
+    prepare(case, report=not options.no_report, evaluation=True)
+    notices = Notices(quiet=options.quiet)
+    findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
-        found = evaluate_case(case, models, progress=progress.stage, check=False, findings=findings)
-        for prediction in found.predictions:
-            progress.stage(f"writing {prediction.model}")
-            folder = folder_of(case.output, prediction.model, len(models))
-            write_prediction_files(folder, prediction)
-        progress.stage("writing the comparison and the report")
-        names = write_evaluation(case.output, found)
-        made = REPORT_FILE if REPORT_FILE in names else None
+        found = evaluate_case(
+            case,
+            models,
+            progress=progress.stage,
+            check=False,
+            findings=findings,
+            on_findings=notices.add,
+        )
+        written = write_results(
+            case.output,
+            found.predictions,
+            len(models),
+            stage=progress.stage,
+            evaluation=lambda: found,
+            with_report=not options.no_report,
+        )
     values = found.as_dict()
     code = FAILED if found.failed else DONE
     if options.json:
-        answer = {**values, "output": str(case.output), "files": names, "report": made}
-        print(json.dumps(answer, allow_nan=False))
+        answer = {**values, "output": str(case.output), "files": written.files}
+        more = {"findings": notices.as_dicts(), "left_out": written.left_out}
+        print(json.dumps({**answer, **more, "report": written.report}, allow_nan=False))
         return code
     achieved = found.predictions[0].patient.summary.get("achieved")
     if achieved is not None:
         print(achieved_text(achieved))
-    print(_plan_text(found.predictions[0]))
+    print(_plan_text(found.predictions[0].summary))
     print(f"{escaped(case.name)}: distance from the face after the operation, mm")
     print("  model        mean     SD   95 %    max   < 2 mm")
     for name, entry in [*values["models"].items(), ("no change", values["no_change"])]:
@@ -111,17 +138,25 @@ def evaluate(options: argparse.Namespace) -> int:
             f"{figures['p95_mm']:6.2f} {figures['max_mm']:6.2f} "
             f"{100 * figures['within']['2 mm']:6.0f} %"
         )
-    _print_report(case.output, made)
-    _say_failed(found.failed)
+    _print_report(case.output, written.report)
+    _end(notices, case.output, written)
+    _print_failed(found.failed)
     return code
 
 
+def _end(notices: Notices, output: Path, written: WrittenResults) -> None:
+    """Prints what is doubtful once more, below the figures."""
+    place = written.predictions[0].place
+    where = written.report or f"{place}/prediction.json".lstrip("/")
+    notices.summarise(str(output / where))
+
+
 def sensitivity(options: argparse.Namespace) -> int:
-    """Says what the error of skull landmarks does to muscles and face."""
+    """Reports what the error of skull landmarks does to muscles and face."""
     case = case_of(options)
-    findings = () if options.no_doctor else checked(case, quiet=options.quiet)
-    if findings is None:
-        return BAD_INPUT
+    prepare(case)
+    notices = Notices(quiet=options.quiet)
+    findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         found = landmark_sensitivity(
             case,
@@ -131,8 +166,10 @@ def sensitivity(options: argparse.Namespace) -> int:
             model=options.model,
             progress=progress.stage,
             check=False,
+            findings=findings,
+            on_findings=notices.add,
         )
-    values = found.as_dict()
+    values = {**found.as_dict(), "findings": notices.as_dicts()}
     text = json.dumps(values, indent=1, allow_nan=False)
     case.output.mkdir(parents=True, exist_ok=True)
     with replacing(case.output / "sensitivity.json") as file:
@@ -152,6 +189,7 @@ def sensitivity(options: argparse.Namespace) -> int:
         )
     moved = found.skin_deviation(moved=True)
     print(f"  skin that the operation moves: {moved:.3f} mm on average")
+    notices.summarise(str(case.output / "sensitivity.json"))
     return DONE
 
 
@@ -191,16 +229,11 @@ def study(options: argparse.Namespace) -> int:
 
 
 def report(options: argparse.Namespace) -> int:
-    """Makes the report of a folder of results anew."""
+    """Makes the report of a folder of results again."""
     folder: Path = options.folder
-    places = [folder / m for m in MODELS if (folder / m / "prediction.json").exists()] or [folder]
-    if not (places[0] / "prediction.json").exists():
-        raise CaseInputError(
-            f"{folder}: holds no prediction.json: run cmfsim predict or evaluate first"
-        )
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         progress.stage("writing the report")
-        name = write_case_report(folder, places)
+        name = write_case_report(folder)
     if name is None:
         return FAILED
     if options.json:
@@ -210,37 +243,38 @@ def report(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _figures(prediction: Prediction) -> dict[str, Any]:
-    solution = prediction.summary["solution"]
+def _figures(entry: WrittenPrediction, output: Path) -> dict[str, Any]:
+    solution = entry.summary["solution"]
     return {
-        "model": prediction.model,
+        "model": entry.summary["model"],
         "n_tets": solution["n_tets"],
         "residual": solution["residual"],
         "contact_iterations": solution["contact_iterations"],
         "contact_gap": solution["contact_gap"],
-        "plan": {name: m["clinical"] for name, m in prediction.summary["plan"].items()},
-        "skin": dict(prediction.summary["skin"]),
-        "timings": dict(prediction.summary["timings"]),
+        "plan": {name: m["clinical"] for name, m in entry.summary["plan"].items()},
+        "skin": dict(entry.summary["skin"]),
+        "timings": dict(entry.summary["timings"]),
+        "output": str(output / entry.place),
+        "files": entry.files,
     }
 
 
-def _plan_text(prediction: Prediction) -> str:
+def _plan_text(summary: Mapping[str, Any]) -> str:
     """The plan as it was applied, a line for each segment."""
-    plan = {name: entry["clinical"] for name, entry in prediction.summary["plan"].items()}
+    plan = {name: entry["clinical"] for name, entry in summary["plan"].items()}
     return "\n".join(f"plan: {escaped(line)}" for line in plan_lines(plan))
 
 
 def _prediction_text(entry: dict[str, Any]) -> str:
     skin = entry["skin"]
+    residual = "unknown" if entry["residual"] is None else f"{entry['residual']:.1e}"
     lines = [
         f"model {entry['model']}",
-        f"  solved      {entry['n_tets']} tets, residual {entry['residual']:.1e}",
+        f"  solved      {entry['n_tets']} tets, residual {residual}",
     ]
     if entry["contact_iterations"]:
-        lines.append(
-            f"  contact     {entry['contact_iterations']} iterations, largest gap "
-            f"{entry['contact_gap']:.1e} mm"
-        )
+        gap = "unknown" if entry["contact_gap"] is None else f"{entry['contact_gap']:.1e} mm"
+        lines.append(f"  contact     {entry['contact_iterations']} iterations, largest gap {gap}")
     lines += [
         f"  skin moves  {skin['mean']:.2f} mm on average, {skin['largest']:.2f} mm at most",
         f"  time        {sum(entry['timings'].values()):.1f} s from the files to the face",
@@ -269,8 +303,8 @@ def _study_text(found: StudyReport) -> str:
     return "\n".join(lines)
 
 
-def _say_failed(failed: Mapping[str, str]) -> None:
-    """Says which of several models have no result; the others were written."""
+def _print_failed(failed: Mapping[str, str]) -> None:
+    """Prints which of several models have no result; the others were written."""
     for model, reason in failed.items():
         print(f"cmfsim: error: model {model}: {escaped(reason)}", file=sys.stderr)
 

@@ -1,6 +1,7 @@
 """`cmfsim view`: predictions, models, scenes, results and surfaces in a window."""
 
 import argparse
+import contextlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -11,8 +12,8 @@ from cmfsim import TetMesh
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_parts, read_result, read_scene, read_surface
+from cmfsim.io.predictions import predictions_of
 from cmfsim.pictures import KIND_COLOURS, SKIN_COLOUR, ViewPart, segment_colours, view_parts
-from cmfsim.prediction import MODELS
 from cmfsim.scene import SurfaceData
 from cmfsim.template import joined_surface
 
@@ -72,13 +73,13 @@ def parts_of(path: Path, model: str | None = None) -> list[ViewPart]:
 
 def _of_folder(folder: Path, model: str | None) -> list[ViewPart]:
     """A prediction; else those of a folder by model; else a model of a patient; else a case."""
-    if (folder / "prediction.json").exists():
-        return _of_prediction(folder)
-    there = [name for name in MODELS if (folder / name / "prediction.json").exists()]
-    if there:
-        if model is not None and model not in there:
-            raise CaseInputError(f"{folder}: holds models {', '.join(there)}, not {model}")
-        return _of_prediction(folder / (model or there[-1]))
+    with contextlib.suppress(FileNotFoundError):
+        found = {entry["model"]: place for place, entry in predictions_of(folder).items()}
+        if model is not None and model not in found:
+            raise CaseInputError(f"{folder}: holds models {', '.join(found)}, not {model}")
+        # The case's own prediction before those in folders by model.
+        own = next((name for name, place in found.items() if place == folder), None)
+        return _of_prediction(found[model or own or [*found][-1]])
     if (folder / "build.json").exists():
         return _of_model(folder)
     if (folder / "case.toml").exists():

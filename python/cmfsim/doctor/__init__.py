@@ -23,7 +23,7 @@ from cmfsim.doctor.plan import state_plan
 from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
 from cmfsim.doctor.report import findings_text
 from cmfsim.doctor.surfaces import check_image, check_mesh_size, check_surfaces
-from cmfsim.io import Case
+from cmfsim.io import CaseOrPath, as_case
 
 __all__ = [
     "Examination",
@@ -52,12 +52,12 @@ class Examination:
     plan: Mapping[str, ClinicalMotion]
 
 
-def diagnose(case: Case, models: Sequence[str] | None = None) -> tuple[Finding, ...]:
+def diagnose(case: CaseOrPath, models: Sequence[str] | None = None) -> tuple[Finding, ...]:
     """What a person should know before a case is built: errors first, then warnings and notes.
 
     Parameters
     ----------
-    case : Case
+    case : Case, or path of its file or folder
     models : sequence of str, optional
         The models that are asked for, of "H", "M", "H+S" and "M+S": muscles are checked only if
         one of them has muscles. Default: all that the case can be solved with.
@@ -81,12 +81,12 @@ def diagnose(case: Case, models: Sequence[str] | None = None) -> tuple[Finding, 
     return examine(case, models).findings
 
 
-def examine(case: Case, models: Sequence[str] | None = None) -> Examination:
+def examine(case: CaseOrPath, models: Sequence[str] | None = None) -> Examination:
     """What `diagnose` finds, with the plan in a surgeon's words.
 
     Parameters
     ----------
-    case : Case
+    case : Case, or path of its file or folder
     models : sequence of str, optional
         As for `diagnose`.
 
@@ -101,6 +101,7 @@ def examine(case: Case, models: Sequence[str] | None = None) -> Examination:
     >>> found.plan["maxilla"].text  # doctest: +SKIP
     '5.0 mm forwards, 0.5 mm up at the upper incisors (supradentale); pitch +2.0° (front up)'
     """
+    case = as_case(case)
     evidence = gather(case)
     findings = [*evidence.findings, *check_cuts(evidence)]
     placement = check_placement(evidence)

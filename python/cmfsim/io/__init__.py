@@ -1,6 +1,6 @@
 """Files and values: each format's reader beside its writer, one file per subject."""
 
-from cmfsim.io.case_files import Case
+from cmfsim.io.case_files import Case, CaseOrPath, as_case
 from cmfsim.io.cohorts import Cohort
 from cmfsim.io.files import replacing
 from cmfsim.io.folders import finish_writing, replacing_files
@@ -17,8 +17,10 @@ from cmfsim.io.transforms import read_transform, write_transform
 
 __all__ = [
     "Case",
+    "CaseOrPath",
     "Cohort",
     "LandmarkFile",
+    "as_case",
     "finish_writing",
     "read_image",
     "read_landmark_file",

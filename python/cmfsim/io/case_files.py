@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeAlias
 
 from cmfsim.checks import as_text
 from cmfsim.errors import CaseInputError
@@ -43,9 +43,11 @@ from cmfsim.scene import (
     TissueData,
 )
 
-__all__ = ["CASE_FORMAT", "Case"]
+__all__ = ["CASE_FORMAT", "Case", "CaseOrPath", "as_case"]
 
 CASE_FORMAT = "cmfsim-case"
+# What a case's file is called where its folder alone is given.
+CASE_FILE = "case.toml"
 # What stands for the plan where it is read off the bones after the operation.
 ACHIEVED = "achieved"
 TABLES = (
@@ -153,6 +155,7 @@ class Case:
         Parameters
         ----------
         path : path
+            Of the file, or of a folder that holds a `case.toml`.
 
         Returns
         -------
@@ -166,7 +169,7 @@ class Case:
             (also `ValueError`) Not TOML, an unknown key, a value of another type or out of range:
             with file, line and key.
         """
-        return _read(Path(path))
+        return _read(_case_file(Path(path)))
 
     def where(self, key: str) -> str:
         """File, line and key, as findings name a place in the case file."""
@@ -176,6 +179,45 @@ class Case:
             if line is not None:
                 return f"{self.file.name}:{line} {key}"
         return f"{self.file.name} {key}"
+
+
+# What functions on cases take.
+CaseOrPath: TypeAlias = Case | str | os.PathLike[str]
+
+
+def as_case(case: CaseOrPath) -> Case:
+    """The case itself, or the one that the file or folder at a path describes.
+
+    Parameters
+    ----------
+    case : Case or path
+
+    Raises
+    ------
+    FileNotFoundError, CaseError
+        As `Case.load`; `CaseError` (also `ValueError`) also for anything else.
+    """
+    if isinstance(case, Case):
+        return case
+    if isinstance(case, str | os.PathLike):
+        return Case.load(case)
+    raise CaseInputError(
+        f"the case is of type {type(case).__name__}: give a Case, or the path of a case.toml or of "
+        "the folder that holds it"
+    )
+
+
+def _case_file(path: Path) -> Path:
+    """The case file that a path leads to: itself, or the one in a folder."""
+    if not path.is_dir():
+        return path
+    file = path / CASE_FILE
+    if not file.exists():
+        raise CaseInputError(
+            f"{path.resolve()}: is a folder without a {CASE_FILE}: name the case file, or the "
+            "folder that holds it"
+        )
+    return file
 
 
 def _read(path: Path) -> Case:

@@ -7,12 +7,14 @@ from pathlib import Path
 from cmfsim.checks import as_text, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import FORMAT_VERSION
-from cmfsim.io.tables import read_tables
+from cmfsim.io.tables import Table, read_tables
 from cmfsim.prediction import MODELS
 
 __all__ = ["COHORT_FORMAT", "Cohort"]
 
 COHORT_FORMAT = "cmfsim-cohort"
+# What a cohort's file is called where its folder alone is given.
+COHORT_FILE = "cohort.toml"
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,7 @@ class Cohort:
         Parameters
         ----------
         path : path
+            Of the file, or of a folder that holds a `cohort.toml`.
 
         Returns
         -------
@@ -73,6 +76,10 @@ class Cohort:
             line and key.
         """
         path = Path(path)
+        if path.is_dir():
+            if not (path / COHORT_FILE).exists():
+                raise CaseInputError(f"{path.resolve()}: is a folder without a {COHORT_FILE}")
+            path = path / COHORT_FILE
         document = read_tables(path).only(
             "format", "version", "name", "note", "models", "cases", "output"
         )

@@ -7,6 +7,7 @@ left, and the next run that writes there takes it away. Where the system has no 
 
 import contextlib
 import os
+import stat
 import tempfile
 import time
 from collections.abc import Iterator
@@ -64,9 +65,14 @@ def holding(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def abandoned(folder: Path, pattern: str) -> Iterator[Path]:
-    """What killed runs left in a folder, each locked while the caller has it."""
+def abandoned(folder: Path, pattern: str, *, folders: bool = False) -> Iterator[Path]:
+    """Files, or folders, that killed runs left in a folder, each locked while the caller has it.
+
+    What has such a name and is something else (a link, a pipe, a folder for a file) is no run's.
+    """
     for path in sorted(folder.glob(pattern)):
+        if not _is_kind(path, folders=folders):
+            continue
         handle = _opened(path)
         if handle is None:
             with contextlib.suppress(OSError):
@@ -78,6 +84,15 @@ def abandoned(folder: Path, pattern: str) -> Iterator[Path]:
                 yield path
         finally:
             os.close(handle)
+
+
+def _is_kind(path: Path, *, folders: bool) -> bool:
+    """Whether it is a plain file, or a plain folder; links are neither, and pipes would block."""
+    try:
+        mode = path.lstat().st_mode
+    except OSError:
+        return False
+    return stat.S_ISDIR(mode) if folders else stat.S_ISREG(mode)
 
 
 def _locks() -> Any:
@@ -93,7 +108,7 @@ def _opened(path: Path) -> int | None:
     if _locks() is None or path.is_symlink():
         return None
     try:
-        return os.open(path, os.O_RDONLY)
+        return os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
     except OSError:
         return None
 

@@ -2,14 +2,137 @@
 
 import json
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import replacing
+from cmfsim.io.summaries import (
+    checked_file,
+    finding,
+    listing,
+    mapping,
+    number,
+    one_of,
+    optional,
+    plain,
+    read_summary,
+    table,
+    text,
+    whole,
+)
+from cmfsim.prediction import MODELS
 
-__all__ = ["write_metrics"]
+__all__ = [
+    "EVALUATION_FILE",
+    "REPORT_FILE",
+    "is_evaluation_file",
+    "read_evaluation",
+    "read_evaluation_picture",
+    "read_picture",
+    "write_metrics",
+]
+
+# Written last, so that a case that has it is finished.
+EVALUATION_FILE = "metrics.json"
+REPORT_FILE = "report.html"
+EVALUATION_FILES = re.compile(
+    r"metrics\.(json|csv)|errors\.png|error-(H|M|H\+S|M\+S)\.png|report\.html"
+)
+AGAIN = "run cmfsim evaluate again"
+# A picture of a report above this size is none of ours, bytes.
+MOST_PICTURE = 64 * 2**20
+PNG = b"\x89PNG\r\n\x1a\n"
+
+_DISTANCE, _SHARE = number(-1e6, 1e6), number(0.0, 1.0)
+_STATISTICS = table(
+    {
+        **dict.fromkeys(
+            ("mean_mm", "std_mm", "median_mm", "rms_mm", "p90_mm", "p95_mm", "max_mm"),
+            number(0.0, 1e6),
+        ),
+        "signed_mean_mm": _DISTANCE,
+        "within": table({"2 mm": _SHARE}, dict.fromkeys(("1 mm", "1.5 mm", "3 mm"), _SHARE)),
+    },
+    {"count": whole()},
+)
+_ERRORS = table({"regions": table({"whole": _STATISTICS})}, {"comparison": plain})
+
+
+def _regions(where: str, value: object) -> None:
+    _ERRORS(where, value)
+    if isinstance(value, dict):
+        mapping(_STATISTICS, most=100)(f"{where}.regions", value["regions"])
+
+
+def _file_name(where: str, value: object) -> None:
+    if not isinstance(value, str) or not is_evaluation_file(value):
+        raise CaseInputError(f"{where} is {value!r:.60}: no file of an evaluation is called so")
+
+
+_EVALUATION = table(
+    {
+        "case": text,
+        "key": text,
+        "case_key": text,
+        "models": mapping(_regions, keys=one_of(*MODELS)),
+        "failed": mapping(text, keys=one_of(*MODELS)),
+        "files": listing(_file_name),
+    },
+    {
+        "no_change": _regions,
+        "wilcoxon": mapping(table({"p": optional(_SHARE)})),
+        "notes": listing(text),
+        "seconds": mapping(number(0.0, 1e9)),
+        "findings": listing(finding),
+    },
+)
+
+
+def is_evaluation_file(name: str) -> bool:
+    """Whether an evaluation is written as files of this name, among others."""
+    return EVALUATION_FILES.fullmatch(name) is not None
+
+
+def read_evaluation(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """What `metrics.json` in a folder holds, which `cmfsim evaluate` wrote there.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is none.
+    CaseError
+        (also `ValueError`) It was changed, or holds what an evaluation does not.
+    """
+    return read_summary(Path(folder) / EVALUATION_FILE, _EVALUATION, AGAIN)
+
+
+def read_evaluation_picture(
+    folder: str | os.PathLike[str], evaluation: Mapping[str, Any], name: str
+) -> bytes:
+    """A picture that an evaluation lists, as it was written.
+
+    Raises
+    ------
+    FileNotFoundError
+        It is missing.
+    CaseError
+        (also `ValueError`) It is none of that evaluation, or no PNG.
+    """
+    _file_name("files", name)
+    return read_picture(checked_file(Path(folder), evaluation, name, AGAIN))
+
+
+def read_picture(path: Path) -> bytes:
+    """The bytes of a PNG."""
+    if path.stat().st_size > MOST_PICTURE:
+        raise CaseInputError(f"{path}: is larger than {MOST_PICTURE} bytes")
+    data = path.read_bytes()
+    if not data.startswith(PNG):
+        raise CaseInputError(f"{path}: is no PNG picture")
+    return data
 
 
 def write_metrics(path: str | os.PathLike[str], metrics: Any) -> None:

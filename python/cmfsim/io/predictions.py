@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,25 +12,254 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import replacing
-from cmfsim.io.folders import replacing_files
+from cmfsim.io.folders import finish_writing, replacing_files
 from cmfsim.io.meshes import read_mesh
+from cmfsim.io.metrics import (
+    EVALUATION_FILE,
+    REPORT_FILE,
+    is_evaluation_file,
+    read_evaluation,
+    read_picture,
+)
 from cmfsim.io.results import write_result
+from cmfsim.io.summaries import (
+    checked_file,
+    finding,
+    flag,
+    listing,
+    mapping,
+    number,
+    one_of,
+    optional,
+    plain,
+    read_summary,
+    table,
+    text,
+    whole,
+    write_summary,
+)
 from cmfsim.io.surfaces import write_surface
 from cmfsim.io.vtk import write_tets, write_triangles
-from cmfsim.prediction import Prediction
+from cmfsim.prediction import MODELS, Prediction
 from cmfsim.scene import SurfaceData
 
-__all__ = ["is_prediction_file", "read_parts", "write_prediction"]
+__all__ = [
+    "fill_prediction",
+    "is_prediction_file",
+    "is_result_file",
+    "predictions_of",
+    "read_parts",
+    "read_prediction",
+    "read_prediction_picture",
+    "stale_results",
+    "write_prediction",
+]
 
+PREDICTION_FILE = "prediction.json"
+AGAIN = "run cmfsim predict again"
 PREDICTION_FILES = re.compile(
     r"prediction\.(vtp|stl|vtu|npz|png|json)|face\.(vtp|stl)|(bones|muscles)\.vtp"
     r"|(plan|muscles)\.png|timings\.json"
 )
 
 
+_LENGTH, _COUNT, _SECONDS = number(-1e6, 1e6), whole(0, 10**12), number(0.0, 1e9)
+_VECTOR = listing(_LENGTH, length=3)
+_RIGID = table({"translation": _VECTOR, "angle": number(0.0, 360.0), "axis": _VECTOR})
+_MOVED = table({"mean": number(0.0, 1e6), "largest": number(0.0, 1e6)})
+
+
+def _motion(where: str, value: object) -> None:
+    table({}, {"mean": number(0.0, 1e6), "bending": number(0.0, 1e6)})(where, value)
+    rigid = isinstance(value, dict) and "translation" in value
+    (_RIGID if rigid else _MOVED)(where, value)
+
+
+def _file_name(where: str, value: object) -> None:
+    if not isinstance(value, str) or not is_prediction_file(value):
+        raise CaseInputError(f"{where} is {value!r:.60}: no file of a prediction is called so")
+
+
+_SOLUTION = table(
+    {
+        "method": text,
+        "n_tets": _COUNT,
+        "n_unknowns": _COUNT,
+        "residual": optional(number(0.0, 1e12)),
+        "contact_iterations": _COUNT,
+        "contact_gap": optional(_LENGTH),
+    },
+    dict.fromkeys(("error_bound", "error_estimate"), optional(number(0.0, 1e12))),
+)
+_FIT = table({"rms_mm": number(0.0, 1e6), "worst_mm": number(0.0, 1e6), "share": number(0.0, 1.0)})
+_PREDICTION = table(
+    {
+        "case": text,
+        "model": one_of(*MODELS),
+        "case_key": text,
+        "versions": mapping(text, most=100),
+        "inputs": mapping(text),
+        "timings": mapping(_SECONDS, most=1000),
+        "skin": table(dict.fromkeys(("mean", "p95", "largest"), number(0.0, 1e6))),
+        "plan": mapping(_motion, most=1000),
+        "segments": mapping(table({"joined": _COUNT, "sliding": _COUNT}), most=1000),
+        "mesh": mapping(plain),
+        "solution": _SOLUTION,
+        "findings": listing(finding),
+        "parts": mapping(listing(text), most=10, keys=one_of("bones", "muscles")),
+        "files": listing(_file_name),
+    },
+    {
+        "note": text,
+        "left_out": listing(text),
+        "achieved": table({"segments": mapping(_FIT, most=1000)}),
+        "muscles": table({}, {"volumes": mapping(number(0.0, 1e12)), "template": text}),
+        "refined": flag,
+    },
+)
+
+
 def is_prediction_file(name: str) -> bool:
     """Whether a prediction is written as files of this name, among others."""
     return PREDICTION_FILES.fullmatch(name) is not None
+
+
+def is_result_file(name: str) -> bool:
+    """Whether predictions and evaluations of a case are written as files of this name.
+
+    Parameters
+    ----------
+    name : str
+        From the case's output folder; those of several models lie in a folder for each.
+    """
+    model, _, plain_name = name.rpartition("/")
+    if model:
+        return model in MODELS and is_prediction_file(plain_name)
+    return is_prediction_file(name) or is_evaluation_file(name)
+
+
+def read_prediction(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """What `prediction.json` in a folder holds, which `write_prediction` wrote there.
+
+    Parameters
+    ----------
+    folder : path
+
+    Returns
+    -------
+    dict of str to plain values
+
+    Raises
+    ------
+    FileNotFoundError
+        There is none: another program's folder, or a run that was stopped.
+    CaseError
+        (also `ValueError`) It was changed, or holds what a prediction does not.
+    """
+    return read_summary(Path(folder) / PREDICTION_FILE, _PREDICTION, AGAIN)
+
+
+def read_prediction_picture(
+    folder: str | os.PathLike[str], summary: Mapping[str, Any], name: str
+) -> bytes | None:
+    """A picture of a prediction as it was written; None where it was not drawn.
+
+    Raises
+    ------
+    FileNotFoundError
+        It is missing.
+    CaseError
+        (also `ValueError`) It is another file than was written, or no PNG.
+    """
+    if name not in summary["files"]:
+        return None
+    return read_picture(checked_file(Path(folder), summary, name, AGAIN))
+
+
+def predictions_of(folder: str | os.PathLike[str]) -> dict[Path, dict[str, Any]]:
+    """The predictions in a case's output folder, all of one plan, by the folder of each.
+
+    What a stopped run had still to put in place is put there first.
+
+    Parameters
+    ----------
+    folder : path
+        That of the case, or of one model.
+
+    Returns
+    -------
+    dict of Path to mapping
+        What `read_prediction` gives, in the order of the models; each model once.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is no prediction.
+    CaseError
+        (also `ValueError`) Predictions of different plans, inputs or versions lie there together,
+        or one that was changed: names them.
+    """
+    folder = Path(folder)
+    places = [folder, *(folder / model for model in MODELS)]
+    for place in places:
+        if place.is_dir() and not place.is_symlink():
+            finish_writing(place)
+    there = [
+        place
+        for place in places
+        if not (place.is_symlink() and place != folder) and (place / PREDICTION_FILE).exists()
+    ]
+    if not there:
+        raise FileNotFoundError(
+            f"{folder}: holds no prediction.json, or a run was stopped while it wrote: run cmfsim "
+            "predict or evaluate first"
+        )
+    found = {place: read_prediction(place) for place in there}
+    if len({summary["case_key"] for summary in found.values()}) > 1:
+        names = ", ".join(str(place / PREDICTION_FILE) for place in found)
+        raise CaseInputError(
+            f"{names}: belong to different plans, inputs or versions; {AGAIN}, or name the folder "
+            "of one of them"
+        )
+    by_model = {summary["model"]: place for place, summary in reversed(found.items())}
+    ordered = [by_model[model] for model in MODELS if model in by_model]
+    return {place: found[place] for place in ordered}
+
+
+def stale_results(folder: Path, key: str) -> list[str]:
+    """The names of results in a case's output folder that belong to another plan than a key.
+
+    Parameters
+    ----------
+    folder : Path
+    key : str
+        The "case_key" of the results that are about to be put there.
+
+    Returns
+    -------
+    list of str
+        Files of predictions, of their comparison and their report, with the folder of the model.
+    """
+    stale: list[str] = []
+    for place in ("", *MODELS):
+        base = folder / place
+        if (place and base.is_symlink()) or not os.path.lexists(base / PREDICTION_FILE):
+            continue
+        if _key_of(read_prediction, base) != key:
+            names = sorted(path.name for path in base.iterdir() if is_prediction_file(path.name))
+            stale += [f"{place}/{name}".lstrip("/") for name in names]
+    if os.path.lexists(folder / EVALUATION_FILE) and _key_of(read_evaluation, folder) != key:
+        stale += sorted(path.name for path in folder.iterdir() if is_evaluation_file(path.name))
+    if stale and os.path.lexists(folder / REPORT_FILE):
+        stale.append(REPORT_FILE)
+    return [*dict.fromkeys(stale)]
+
+
+def _key_of(read: Callable[[Path], Mapping[str, Any]], folder: Path) -> str | None:
+    try:
+        return str(read(folder)["case_key"])
+    except (OSError, ValueError):
+        return None
 
 
 def write_prediction(
@@ -46,7 +275,8 @@ def write_prediction(
     `prediction.npz` (everything, for `read_result`), `bones.vtp` (segments before the operation,
     with their `displacement`) and `muscles.vtp`, each vertex with the number of its `part` (the
     summary lists their names), `timings.json`, and `prediction.json` (counts, parameters, findings,
-    versions, hashes). All take their places together, or none does.
+    versions, hashes). All take their places together, or none does. Predictions, a comparison and a
+    report in the folder that belong to another plan are removed.
 
     Parameters
     ----------
@@ -69,39 +299,50 @@ def write_prediction(
     >>> import cmfsim
     >>> names = cmfsim.write_prediction("out", prediction)  # doctest: +SKIP
     """
+    folder = Path(folder)
+    key = str(prediction.summary.get("case_key", ""))
+    return replacing_files(
+        folder,
+        PREDICTION_FILE,
+        is_result_file,
+        lambda fresh: fill_prediction(fresh, prediction, draw),
+        lambda: stale_results(folder, key),
+    )
 
-    def fill(fresh: Path) -> list[str]:
-        names = [f"prediction.{ending}" for ending in ("vtp", "stl", "vtu", "npz")]
-        names += ["face.vtp", "face.stl"]
-        result, skin = prediction.result, prediction.skin_before
-        with replacing(fresh / names[0]) as file:
-            moved = {
-                "displacement": prediction.skin_displacements,
-                "node": prediction.skin_nodes.astype(np.int64),
-            }
-            write_triangles(file, skin.vertices, skin.triangles, moved)
-        write_surface(fresh / names[1], prediction.skin)
-        face, before = prediction.face, prediction.face_before
-        with replacing(fresh / names[4]) as file:
-            carried = np.asarray(face.vertices) - np.asarray(before.vertices)
-            write_triangles(file, before.vertices, before.triangles, {"displacement": carried})
-        write_surface(fresh / names[5], face)
-        with replacing(fresh / names[2]) as file:
-            points = {"displacement": result.displacements, "force": result.forces}
-            write_tets(file, result.nodes, result.tets, points, _muscle_data(prediction))
-        write_result(fresh / names[3], result)
-        parts = _write_parts(fresh, prediction)
-        names.extend(f"{name}.vtp" for name in parts)
-        if draw is not None:
-            names.extend(draw(fresh))
-        names += ["timings.json", "prediction.json"]
-        _write_json(fresh / "timings.json", prediction.summary["timings"])
-        _write_json(
-            fresh / "prediction.json", {**prediction.summary, "parts": parts, "files": names}
-        )
-        return names
 
-    return replacing_files(Path(folder), "prediction.json", is_prediction_file, fill)
+def fill_prediction(
+    fresh: Path, prediction: Prediction, draw: Callable[[Path], Iterable[str]] | None = None
+) -> list[str]:
+    """The names of the files of a prediction, written into a folder that has none of them."""
+    names = [f"prediction.{ending}" for ending in ("vtp", "stl", "vtu", "npz")]
+    names += ["face.vtp", "face.stl"]
+    result, skin = prediction.result, prediction.skin_before
+    with replacing(fresh / names[0]) as file:
+        moved = {
+            "displacement": prediction.skin_displacements,
+            "node": prediction.skin_nodes.astype(np.int64),
+        }
+        write_triangles(file, skin.vertices, skin.triangles, moved)
+    write_surface(fresh / names[1], prediction.skin)
+    face, before = prediction.face, prediction.face_before
+    with replacing(fresh / names[4]) as file:
+        carried = np.asarray(face.vertices) - np.asarray(before.vertices)
+        write_triangles(file, before.vertices, before.triangles, {"displacement": carried})
+    write_surface(fresh / names[5], face)
+    with replacing(fresh / names[2]) as file:
+        points = {"displacement": result.displacements, "force": result.forces}
+        write_tets(file, result.nodes, result.tets, points, _muscle_data(prediction))
+    write_result(fresh / names[3], result)
+    parts = _write_parts(fresh, prediction)
+    names.extend(f"{name}.vtp" for name in parts)
+    if draw is not None:
+        names.extend(draw(fresh))
+    _write_json(fresh / "timings.json", prediction.summary["timings"])
+    names.append("timings.json")
+    summary = {"case_key": "", **prediction.summary, "parts": parts}
+    summary["files"] = [*names, PREDICTION_FILE]
+    write_summary(fresh / PREDICTION_FILE, summary, sealed=names)
+    return [*names, PREDICTION_FILE]
 
 
 def _write_parts(folder: Path, prediction: Prediction) -> dict[str, list[str]]:
@@ -151,18 +392,15 @@ def read_parts(
     FileNotFoundError
         A file is missing: another program's folder, or an older version's.
     CaseError
-        (also `ValueError`) A file that cannot be read; PyVista is missing.
+        (also `ValueError`) A file that cannot be read, or is not the one that was written with the
+        others; PyVista is missing.
     """
     folder = Path(folder)
-    text = (folder / "prediction.json").read_text(encoding="utf-8")
-    try:
-        listed = {kind: [*names] for kind, names in json.loads(text).get("parts", {}).items()}
-    except (ValueError, AttributeError, TypeError) as error:
-        raise CaseInputError(f"{folder}: prediction.json cannot be read ({error})") from error
-    found = {"skin": _read_part_file(folder / "face.vtp", ["skin"])}
-    for kind in ("bones", "muscles"):
-        if kind in listed:
-            found[kind] = _read_part_file(folder / f"{kind}.vtp", listed[kind])
+    summary = read_prediction(folder)
+    found = {"skin": _read_part_file(checked_file(folder, summary, "face.vtp", AGAIN), ["skin"])}
+    for kind, names in summary["parts"].items():
+        path = checked_file(folder, summary, f"{kind}.vtp", AGAIN)
+        found[kind] = _read_part_file(path, names)
     return found
 
 

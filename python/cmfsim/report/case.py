@@ -3,8 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from cmfsim.case import Finding
 from cmfsim.clinical_plan import plan_lines
-from cmfsim.report.document import NOTHING, Document, Figure, Note, Section, Table, number
+from cmfsim.errors import CaseInputError
+from cmfsim.finding_groups import counted, grouped
+from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
 from cmfsim.report.labels import MESH, MUSCLES, labelled
 
 __all__ = ["case_document", "statistics_table"]
@@ -36,64 +39,140 @@ NO_PICTURES = (
 def case_document(
     predictions: Sequence[Values],
     *,
+    shown: str | None = None,
     evaluation: Values | None = None,
     pictures: Mapping[str, bytes] | None = None,
     figures: Sequence[Figure] = (),
+    left_out: str = "",
 ) -> Document:
     """The report of a case.
 
     Parameters
     ----------
     predictions : sequence of mapping
-        What `prediction.json` holds, one per model; the first one's counts are shown.
+        What `prediction.json` holds, one per model, all of one plan.
+    shown : str, optional
+        The model whose pictures are given, and whose figures stand at the top; the last if left
+        out.
     evaluation : mapping, optional
-        What `evaluation.json` holds.
+        What `metrics.json` holds.
     pictures : mapping of str to bytes, optional
-        PNG files by name, those of `PICTURES` first.
+        PNG files of the model that is shown, by name, those of `PICTURES` first.
     figures : sequence of Figure
         Plots of the evaluation.
+    left_out : str
+        What does not belong to these predictions and is missing for that.
 
     Returns
     -------
     Document
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Predictions, or predictions and evaluation, that do not belong together.
     """
-    first = predictions[0]
+    entry = _shown(predictions, shown)
+    _check_together(predictions, evaluation)
     pictures = pictures or {}
     models = ", ".join(entry["model"] for entry in predictions)
     sections = [
-        *_note_section(first),
-        _prediction_section(predictions, pictures),
-        _plan_section(first, pictures),
+        *_note_section(entry),
+        _prediction_section(predictions, entry, pictures),
+        _plan_section(entry, pictures),
         *_evaluation_sections(evaluation, figures),
-        *_muscle_section(predictions, pictures),
-        _model_section(predictions, pictures),
+        *_muscle_section(entry, predictions, pictures),
+        _model_section(predictions, entry, pictures),
         _time_section(predictions),
-        _finding_section(predictions),
-        _input_section(first),
+        _finding_section(_findings(predictions, evaluation)),
+        _input_section(entry),
     ]
-    versions = ", ".join(f"{name} {version}" for name, version in first["versions"].items())
+    versions = ", ".join(f"{name} {version}" for name, version in entry["versions"].items())
+    several = "Models" if len(predictions) > 1 else "Model"
     return Document(
-        title=f"{first['case']}: predicted face",
-        subtitle=f"Model {models}. Lengths in mm; L is the patient's left, P posterior, S up.",
-        facts=_facts(first, evaluation),
+        title=f"{entry['case']}: predicted face",
+        subtitle=f"{several} {models}. Lengths in mm; L is the patient's left, P posterior, S up.",
+        facts=_facts(entry, evaluation),
         sections=sections,
         footer=f"Made by {versions}. Mass-tensor model after Kim, Jürgens, Weber, Nolte and Reyes "
         "(2010).",
+        alerts=_alerts(_findings(predictions, evaluation), left_out),
+        facts_title=f"Model {_named(entry['model'])}",
     )
 
 
+def _shown(predictions: Sequence[Values], shown: str | None) -> Values:
+    """The prediction whose pictures and figures are shown."""
+    if not predictions:
+        raise CaseInputError("there is no prediction to report")
+    by_model = {entry["model"]: entry for entry in predictions}
+    if shown is None:
+        return predictions[-1]
+    if shown not in by_model:
+        raise CaseInputError(f"model {shown!r} is not among those predicted: {', '.join(by_model)}")
+    return by_model[shown]
+
+
+def _check_together(predictions: Sequence[Values], evaluation: Values | None) -> None:
+    """Refuses results of different plans, inputs or versions in one report."""
+    keys = {entry.get("case_key") for entry in predictions}
+    if len(keys) > 1:
+        models = ", ".join(entry["model"] for entry in predictions)
+        raise CaseInputError(
+            f"the predictions of {models} belong to different plans, inputs or versions: "
+            "predict all of them again"
+        )
+    if evaluation is not None and evaluation.get("case_key") not in keys:
+        raise CaseInputError(
+            "the comparison belongs to another plan, other inputs or another version than the "
+            "prediction: run cmfsim evaluate again"
+        )
+
+
+def _named(model: str) -> str:
+    return f"{model} ({MODEL_NAMES[model]})"
+
+
 def _facts(prediction: Values, evaluation: Values | None) -> dict[str, str]:
-    skin = prediction["skin"]
+    """The figures of the model that is shown; errors only where this model was evaluated."""
+    skin, model = prediction["skin"], prediction["model"]
     facts = {
-        "skin moves at most": f"{skin['largest']:.1f} mm",
-        "tets": number(prediction["solution"]["n_tets"]),
-        "from files to face": f"{sum(prediction['timings'].values()):.0f} s",
+        f"{model}: skin moves at most": f"{skin['largest']:.1f} mm",
+        f"{model}: tets": number(prediction["solution"]["n_tets"]),
+        f"{model}: from files to face": f"{sum(prediction['timings'].values()):.0f} s",
     }
-    if evaluation is not None:
-        face = evaluation["models"][prediction["model"]]["regions"]["whole"]
-        facts["mean error of the face"] = f"{face['mean_mm']:.2f} mm"
-        facts["within 2 mm"] = f"{100 * face['within']['2 mm']:.0f} %"
+    if evaluation is not None and model in evaluation["models"]:
+        face = evaluation["models"][model]["regions"]["whole"]
+        facts[f"{model}: mean error of the face"] = f"{face['mean_mm']:.2f} mm"
+        facts[f"{model}: within 2 mm"] = f"{100 * face['within']['2 mm']:.0f} %"
     return facts
+
+
+def _findings(predictions: Sequence[Values], evaluation: Values | None) -> list[Finding]:
+    """What the stages noticed, the solution of any model and the comparison; each once."""
+    entries = [finding for prediction in predictions for finding in prediction["findings"]]
+    entries += [] if evaluation is None else evaluation.get("findings", [])
+    known = ("severity", "code", "what", "where", "why", "mend")
+    return [
+        *dict.fromkeys(
+            Finding(**{name: entry.get(name, "") for name in known}) for entry in entries
+        )
+    ]
+
+
+def _alerts(findings: Sequence[Finding], left_out: str) -> list[Alert]:
+    """Errors and warnings by kind, and how many notes there are."""
+    alerts = [Alert("warning", left_out)] if left_out else []
+    for group in grouped(findings):
+        if group.severity == "note":
+            continue
+        several = len(group.findings) > 1
+        details = [_sentence(f, with_what=several) for f in group.findings]
+        alerts.append(Alert(group.severity, group.line, tuple(d for d in details if d)))
+    notes = [finding for finding in findings if finding.severity == "note"]
+    if notes:
+        alerts.append(Alert("note", f"{counted(notes)}, listed below under Findings"))
+    return alerts
 
 
 def _note_section(prediction: Values) -> list[Section]:
@@ -102,10 +181,12 @@ def _note_section(prediction: Values) -> list[Section]:
     return [Section("About this case", (Note(note, "warning"),))] if note else []
 
 
-def _prediction_section(predictions: Sequence[Values], pictures: Mapping[str, bytes]) -> Section:
+def _prediction_section(
+    predictions: Sequence[Values], shown: Values, pictures: Mapping[str, bytes]
+) -> Section:
     rows = tuple(
         (
-            f"{entry['model']} ({MODEL_NAMES[entry['model']]})",
+            _named(entry["model"]),
             number(entry["skin"]["mean"]),
             number(entry["skin"]["p95"]),
             number(entry["skin"]["largest"]),
@@ -114,7 +195,7 @@ def _prediction_section(predictions: Sequence[Values], pictures: Mapping[str, by
     )
     table = Table(("model", "mean", "95 %", "largest"), rows, "How far the skin moves, mm.")
     drawn: Sequence[Figure | Note] = [
-        Figure(figure.image, f"{figure.caption} Model {predictions[-1]['model']}.")
+        Figure(figure.image, f"{figure.caption} Model {shown['model']}.")
         for figure in _picture("prediction", pictures)
     ]
     return Section("Prediction", (*(drawn or (Note(NO_PICTURES, "warning"),)), table))
@@ -244,10 +325,14 @@ def statistics_table(regions: Mapping[str, Values], caption: str) -> Table:
     return Table(columns, rows, caption)
 
 
-def _muscle_section(predictions: Sequence[Values], pictures: Mapping[str, bytes]) -> list[Section]:
-    used = next((e["muscles"] for e in predictions if e["model"].startswith("M")), None)
-    if used is None:
+def _muscle_section(
+    shown: Values, predictions: Sequence[Values], pictures: Mapping[str, bytes]
+) -> list[Section]:
+    # Muscles are placed once for all models that have them.
+    entry = next((e for e in (shown, *predictions) if e["model"].startswith("M")), None)
+    if entry is None or "muscles" not in entry:
         return []
+    used = entry["muscles"]
     figures = Table.of_pairs(labelled(used, MUSCLES), "How the muscles were placed and sampled.")
     blocks: list[Note | Table | Figure] = [*_picture("muscles", pictures), figures]
     volumes = used.get("volumes")
@@ -257,7 +342,9 @@ def _muscle_section(predictions: Sequence[Values], pictures: Mapping[str, bytes]
     return [Section("Muscles", tuple(blocks))]
 
 
-def _model_section(predictions: Sequence[Values], pictures: Mapping[str, bytes]) -> Section:
+def _model_section(
+    predictions: Sequence[Values], shown: Values, pictures: Mapping[str, bytes]
+) -> Section:
     rows = []
     for entry in predictions:
         solved = entry["solution"]
@@ -267,22 +354,22 @@ def _model_section(predictions: Sequence[Values], pictures: Mapping[str, bytes])
                 solved["method"],
                 number(solved["n_unknowns"]),
                 number(solved["residual"]),
-                number(solved["error_bound"]),
+                number(solved.get("error_estimate", solved.get("error_bound"))),
                 number(solved["contact_iterations"]),
                 number(solved["contact_gap"]),
             )
         )
     columns = ("model", "method", "unknowns", "residual", "error ≤ mm", "contact its.", "gap, mm")
     solved_table = Table(columns, tuple(rows), "How the equations were solved.")
-    first = predictions[0]
     segments = tuple(
         (name, number(held["joined"]), number(held["sliding"]))
-        for name, held in first["segments"].items()
+        for name, held in shown["segments"].items()
     )
-    kinds = Table(("segment", "joined", "sliding"), segments, "Nodes held by each segment.")
-    mesh = Table.of_pairs(labelled(first["mesh"], MESH), "The mesh.")
+    caption = "Nodes on each segment; models without sliding join those that could slide."
+    kinds = Table(("segment", "joined", "sliding"), segments, caption)
+    mesh = Table.of_pairs(labelled(shown["mesh"], MESH), "The mesh, the same for all models.")
     left_out = [
-        Note(f"Left out, because the scene did not need it ({entry['model']}): " + "; ".join(left))
+        Note(f"Model {entry['model']} did not need: " + "; ".join(left))
         for entry in predictions
         if (left := entry.get("left_out"))
     ]
@@ -302,26 +389,23 @@ def _time_section(predictions: Sequence[Values]) -> Section:
     return Section("Time", (table, *([note] if len(predictions) > 1 else [])))
 
 
-def _finding_section(predictions: Sequence[Values]) -> Section:
-    """What the stages noticed, and the solution of any model; what all share once."""
-    found: list[Values] = []
-    for prediction in predictions:
-        found += [finding for finding in prediction["findings"] if finding not in found]
+def _finding_section(findings: Sequence[Finding]) -> Section:
+    """Every finding in full, errors first."""
     kinds = {"error": "error", "warning": "warning"}
+    ordered = [finding for group in grouped(findings) for finding in group.findings]
     blocks = [
-        Note(
-            f"{f['severity']}: {f['what']} ({f['where']}). {_reason(f)}".rstrip(),
-            kinds.get(f["severity"], "plain"),
-        )
-        for f in found
+        Note(f"{f.severity}: {_sentence(f)}", kinds.get(f.severity, "plain")) for f in ordered
     ]
     return Section("Findings", tuple(blocks or [Note("Nothing was noticed.")]))
 
 
-def _reason(finding: Values) -> str:
-    """Why a finding matters and what mends it, as far as it says so."""
-    said = "; ".join(text for text in (finding["why"], finding["mend"]) if text)
-    return f"{said}." if said else ""
+def _sentence(finding: Finding, *, with_what: bool = True) -> str:
+    """What a finding states, where, why it matters and what to do, as far as it does."""
+    place = f" ({finding.where})" if finding.where else ""
+    what = f"{finding.what}{place}" if with_what else ""
+    fix = f"Fix: {finding.mend}" if finding.mend else ""
+    parts = [text.rstrip(". ") for text in (what, finding.why, fix) if text]
+    return "".join(f"{text}. " for text in parts).strip()
 
 
 def _input_section(prediction: Values) -> Section:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from cmfsim.errors import CaseInputError
 
-__all__ = ["Document", "Figure", "Note", "Section", "Table", "number"]
+__all__ = ["Alert", "Document", "Figure", "Note", "Section", "Table", "number"]
 
 # Stands where there is no figure.
 NOTHING = "–"
@@ -72,6 +72,24 @@ class Figure:
 
 
 @dataclass(frozen=True)
+class Alert:
+    """What a reader should know first: one line, with what it sums up folded below it.
+
+    Attributes
+    ----------
+    kind : str
+        "error", "warning" or "note".
+    line : str
+    details : tuple of str
+        Shown when the line is opened, and on paper.
+    """
+
+    kind: str
+    line: str
+    details: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Section:
     """A part of a report under its heading."""
 
@@ -86,6 +104,10 @@ class Document:
     Attributes
     ----------
     title, subtitle : str
+    alerts : sequence of Alert
+        Above everything else.
+    facts_title : str
+        Whose figures the facts are.
     facts : mapping of str to str
         The few figures that a reader looks for first.
     sections : sequence of Section
@@ -97,3 +119,5 @@ class Document:
     facts: Mapping[str, str] = field(default_factory=dict)
     sections: Sequence[Section] = ()
     footer: str = ""
+    alerts: Sequence[Alert] = ()
+    facts_title: str = ""

@@ -1,20 +1,25 @@
 """Many cases by several models: each in a process of its own, kept when it was done before."""
 
-import json
+import contextlib
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, BinaryIO
 
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Case, Cohort, finish_writing
-from cmfsim.study.evaluation import EVALUATION_FILE, evaluation_key
+from cmfsim.io.folders import check_below, check_writable
+from cmfsim.io.metrics import EVALUATION_FILE, read_evaluation
+from cmfsim.study.evaluation import evaluation_key
 
 __all__ = ["CaseJob", "CaseOutcome", "StudyReport", "run_study"]
 
@@ -131,9 +136,10 @@ def run_study(
     Raises
     ------
     CaseError
-        (also `ValueError`) Less than one worker; no Dask installed, or no cluster at the address.
+        (also `ValueError`) Less than one worker; no Dask installed, or no cluster at the address;
+        an output folder that is a file, or a link that leads out of the cohort's folder.
     OSError
-        The output folder cannot be made.
+        The output folder cannot be made or written to.
 
     Examples
     --------
@@ -147,11 +153,14 @@ def run_study(
         raise CaseInputError(f"workers is {workers}: must be 1 or more")
     workers = max(1, cores // 2) if workers is None else workers
     begun = time.perf_counter()
+    check_below(cohort.output, cohort.file.parent)
+    check_writable(cohort.output)
     cohort.output.mkdir(parents=True, exist_ok=True)
     outcomes: dict[str, CaseOutcome] = {}
     jobs = []
     for name, file in cohort.cases.items():
         output = cohort.output / name
+        check_below(output, cohort.output)
         kept = None if fresh else _kept(name, file, output, cohort.models)
         if kept is None:
             threads = max(1, cores // workers)
@@ -173,13 +182,11 @@ def _kept(name: str, file: Path, output: Path, models: tuple[str, ...]) -> CaseO
     """The outcome of an earlier run, if nothing has changed since."""
     try:
         finish_writing(output)
-        written = json.loads((output / EVALUATION_FILE).read_text(encoding="utf-8"))
+        written = read_evaluation(output)
         key = evaluation_key(Case.load(file), models)
     except (OSError, ValueError, CmfsimError):
         return None
-    if not isinstance(written, dict) or written.get("key") != key:
-        return None
-    return _outcome(name, "kept", 0.0, written)
+    return _outcome(name, "kept", 0.0, written) if written["key"] == key else None
 
 
 def _outcome(name: str, status: str, seconds: float, written: Mapping[str, Any]) -> CaseOutcome:
@@ -189,17 +196,74 @@ def _outcome(name: str, status: str, seconds: float, written: Mapping[str, Any])
     return CaseOutcome(name, "failed" if failed else status, seconds, error, written)
 
 
+class _Workers:
+    """The processes that work on cases, so that they can be ended."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._ended = False
+
+    def run(self, words: list[str], environment: Mapping[str, str], log: BinaryIO) -> int:
+        """The exit code of a command, which ends when this process does."""
+        with self._lock:
+            if self._ended:
+                return -signal.SIGTERM
+            # Its input is a pipe that nothing is written to: the system closes it with us, however
+            # we end, and the child then ends itself.
+            process = subprocess.Popen(  # noqa: S603 (this interpreter and our own words)
+                words, env=environment, stdin=subprocess.PIPE, stdout=log, stderr=log
+            )
+            self._running.add(process)
+        try:
+            return process.wait()
+        finally:
+            with self._lock:
+                self._running.discard(process)
+            process.kill()
+            process.wait()
+            if process.stdin is not None:
+                process.stdin.close()
+
+    def end(self) -> None:
+        """Ends those that run, and starts no more."""
+        with self._lock:
+            self._ended = True
+            for process in self._running:
+                process.kill()
+
+
 def _on_this_machine(jobs: list[CaseJob], workers: int) -> Iterator[CaseOutcome]:
     # Threads that wait for processes: what a case does, happens in its own.
-    with ThreadPoolExecutor(workers) as pool:
-        running: list[Future[CaseOutcome]] = [pool.submit(run_job, job) for job in jobs]
+    processes = _Workers()
+    with ThreadPoolExecutor(workers) as pool, _ended_by_signal():
+        running: list[Future[CaseOutcome]] = [pool.submit(run_job, job, processes) for job in jobs]
         try:
             for future in as_completed(running):
                 yield future.result()
         except BaseException:
             for future in running:
                 future.cancel()
+            processes.end()
             raise
+
+
+@contextlib.contextmanager
+def _ended_by_signal() -> Iterator[None]:
+    """Has SIGTERM end this process as Ctrl-C does: with all that it started."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _on_dask(jobs: list[CaseJob], scheduler: str) -> Iterator[CaseOutcome]:
@@ -225,32 +289,28 @@ def _on_dask(jobs: list[CaseJob], scheduler: str) -> Iterator[CaseOutcome]:
                 yield CaseOutcome(job.name, "failed", error=f"the cluster lost the case: {error}")
 
 
-def run_job(job: CaseJob) -> CaseOutcome:
+def run_job(job: CaseJob, processes: _Workers | None = None) -> CaseOutcome:
     """The outcome of one case, worked on by another process."""
     output = Path(job.output)
     begun = time.perf_counter()
     command = [sys.executable, "-m", "cmfsim.cli", "evaluate", job.file, "-o", job.output, "-q"]
+    command.append("--end-with-input")
     for model in job.models:
         command += ["--model", model]
     environment = {**os.environ, "RAYON_NUM_THREADS": str(job.threads)}
     try:
         output.mkdir(parents=True, exist_ok=True)
         before = _stamp(output / EVALUATION_FILE)
-        with (output / LOG_FILE).open("wb") as log:
-            done = subprocess.run(  # noqa: S603 (this interpreter and our own words)
-                command,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                check=False,
-            )
+        # Made again, so that a link of that name leads nowhere.
+        (output / LOG_FILE).unlink(missing_ok=True)
+        with (output / LOG_FILE).open("xb") as log:
+            code = (processes or _Workers()).run(command, environment, log)
         seconds = time.perf_counter() - begun
         # A case of which a model failed, or none, has written its figures all the same.
         written = _stamp(output / EVALUATION_FILE) not in {before, None}
-        if done.returncode < 0 or not written:
-            return CaseOutcome(job.name, "failed", seconds, _reason(done.returncode, output))
-        evaluation = json.loads((output / EVALUATION_FILE).read_text(encoding="utf-8"))
+        if code < 0 or not written:
+            return CaseOutcome(job.name, "failed", seconds, _reason(code, output))
+        evaluation = read_evaluation(output)
     except (OSError, ValueError) as error:
         seconds = time.perf_counter() - begun
         return CaseOutcome(job.name, "failed", seconds, f"{type(error).__name__}: {error}")

@@ -3,27 +3,26 @@
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
-from cmfsim._core import __version__
-from cmfsim.build import Postoperative, input_hashes, read_postoperative
+from cmfsim.build import Postoperative, case_key, read_postoperative
 from cmfsim.case import Anatomy, Finding
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.evaluation import NO_CHANGE, WHOLE, ModelComparison, compare_models
-from cmfsim.io import Case
+from cmfsim.io import Case, CaseOrPath, as_case
+from cmfsim.io.metrics import EVALUATION_FILE
 from cmfsim.prediction import MODELS, Prediction
 from cmfsim.scene import SurfaceData
-from cmfsim.study.prediction import predict_models
+from cmfsim.study.prediction import named_models, predict_models
 
 __all__ = ["EVALUATION_FILE", "CaseEvaluation", "evaluate", "evaluation_key"]
 
 Progress = Callable[[str], None]
-# Written last, so that a case that has it is finished.
-EVALUATION_FILE = "metrics.json"
+OnFindings = Callable[[Iterable[Finding]], None]
 WILCOXON_NOTE = (
     "Wilcoxon's signed-rank test vertex by vertex, as the paper has it: neighbouring vertices are "
     "not independent, so that its p values are far too small; look at the size of the difference."
@@ -69,14 +68,22 @@ class CaseEvaluation:
         return {
             "case": first.name,
             "key": self.key,
+            # That of the predictions: what is shown together must have the same.
+            "case_key": first.summary["case_key"],
             "models": errors,
             "failed": dict(self.failed),
             "no_change": still,
             "wilcoxon": tests,
             "notes": [WILCOXON_NOTE] if tests else [],
             "seconds": timings,
-            "findings": [f.what for f in self.postoperative.findings],
+            "findings": [asdict(finding) for finding in self.findings],
         }
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What was noticed of the face after the operation, and of the comparison with it."""
+        compared = [f for c in self.comparison.comparisons.values() for f in c.findings]
+        return tuple(dict.fromkeys([*self.postoperative.findings, *compared]))
 
     def _of(self, name: str) -> dict[str, Any]:
         comparison = self.comparison
@@ -89,13 +96,14 @@ class CaseEvaluation:
 
 
 def evaluate(
-    case: Case,
-    models: Sequence[str] = MODELS,
+    case: CaseOrPath,
+    models: str | Sequence[str] = MODELS,
     *,
     progress: Progress | None = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
     anatomy: Anatomy | None = None,
+    on_findings: OnFindings | None = None,
 ) -> CaseEvaluation:
     """The predictions of several models for a case, compared with what came after.
 
@@ -104,13 +112,14 @@ def evaluate(
 
     Parameters
     ----------
-    case : Case
+    case : Case, or path of its file or folder
         With [postoperative].
-    models : sequence of str
+    models : str or sequence of str
     progress : callable, optional
     check : bool
     findings : iterable of Finding
     anatomy : Anatomy, optional
+    on_findings : callable, optional
         As for `predict_models`.
 
     Returns
@@ -130,8 +139,10 @@ def evaluate(
     >>> found.comparison.statistics["M+S"].mean  # doctest: +SKIP
     1.21
     """
+    case, models = as_case(case), named_models(models)
     if progress is not None:
         progress("reading the face after the operation")
+    key = evaluation_key(case, models)
     # First, for it fails at once where the case has none.
     postoperative = read_postoperative(case)
     if postoperative.skin is None:
@@ -149,6 +160,7 @@ def evaluate(
             after=postoperative,
             failed=failed,
             anatomy=anatomy,
+            on_findings=on_findings,
         )
     )
     if not predictions:
@@ -157,8 +169,10 @@ def evaluate(
         progress("comparing the faces")
     comparison = _compare(predictions, postoperative.skin, postoperative.landmarks)
     reasons = {model: str(error) for model, error in failed.items()}
-    key = evaluation_key(case, models)
-    return CaseEvaluation(predictions, postoperative, comparison, key, reasons)
+    found = CaseEvaluation(predictions, postoperative, comparison, key, reasons)
+    if on_findings is not None and found.findings:
+        on_findings(found.findings)
+    return found
 
 
 def _compare(
@@ -185,10 +199,5 @@ def evaluation_key(case: Case, models: Sequence[str]) -> str:
     OSError
         A file that the case names cannot be read.
     """
-    content: Mapping[str, Any] = {
-        "inputs": input_hashes(case),
-        "models": sorted(models),
-        "edge_length": case.mesh.edge_length,
-        "version": __version__,
-    }
+    content = {"case": case_key(case), "models": sorted(models)}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -4,11 +4,11 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from cmfsim.build import Postoperative, build_model
+from cmfsim.build import Postoperative, build_model, case_key, input_hashes
 from cmfsim.case import Anatomy, Finding
 from cmfsim.checks import check_one_of
-from cmfsim.errors import CmfsimError, ContactError, SolverError
-from cmfsim.io import Case
+from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
+from cmfsim.io import CaseOrPath, as_case
 from cmfsim.model import PatientModel
 from cmfsim.patient import CaseMuscles
 from cmfsim.patient_prediction import predict_patient
@@ -19,10 +19,11 @@ __all__ = ["build_patient", "predict", "predict_models"]
 _log = logging.getLogger(__name__)
 
 Progress = Callable[[str], None]
+OnFindings = Callable[[Iterable[Finding]], None]
 
 
 def predict(
-    case: Case, *, model: str = "M+S", progress: Progress | None = None, check: bool = True
+    case: CaseOrPath, *, model: str = "M+S", progress: Progress | None = None, check: bool = True
 ) -> Prediction:
     """The face that a model predicts for a case; nothing is written.
 
@@ -30,7 +31,7 @@ def predict(
 
     Parameters
     ----------
-    case : Case
+    case : Case, or path of its file or folder
     model : str
         "H", "M", "H+S" or "M+S" (Kim et al. 2010, section 3.2): homogeneous or with muscles,
         without or with sliding at teeth and mucosa.
@@ -55,13 +56,12 @@ def predict(
     >>> prediction.skin.vertices.shape  # doctest: +SKIP
     (19840, 3)
     """
-    check_one_of("model", model, MODELS)
-    return next(predict_models(case, (model,), progress=progress, check=check))
+    return next(predict_models(case, model, progress=progress, check=check))
 
 
 def predict_models(
-    case: Case,
-    models: Sequence[str] = MODELS,
+    case: CaseOrPath,
+    models: str | Sequence[str] = MODELS,
     *,
     progress: Progress | None = None,
     check: bool = True,
@@ -69,13 +69,14 @@ def predict_models(
     anatomy: Anatomy | None = None,
     after: Postoperative | None = None,
     failed: dict[str, CmfsimError] | None = None,
+    on_findings: OnFindings | None = None,
 ) -> Iterator[Prediction]:
     """The predictions of several models for one case, which is built once.
 
     Parameters
     ----------
-    case : Case
-    models : sequence of str
+    case : Case, or path of its file or folder
+    models : str or sequence of str
     progress : callable, optional
     check : bool
         As for `predict`.
@@ -88,6 +89,8 @@ def predict_models(
     failed : dict, optional
         Where given, a model whose solution does not come about (contact that does not settle, say)
         is put there with its error, and the others go on.
+    on_findings : callable, optional
+        Called with new findings as the stages of building and each solution notice them.
 
     Yields
     ------
@@ -105,8 +108,7 @@ def predict_models(
     >>> for prediction in cmfsim.predict_models(case, ["H", "M+S"]):  # doctest: +SKIP
     ...     print(prediction.model, prediction.result.summary["residual"])
     """
-    for model in models:
-        check_one_of("model", model, MODELS)
+    models = named_models(models)
     patient = build_patient(
         case,
         models,
@@ -115,7 +117,9 @@ def predict_models(
         findings=findings,
         anatomy=anatomy,
         after=after,
+        on_findings=on_findings,
     )
+    known = set(patient.findings)
     for model in models:
         if progress is not None:
             progress(f"solving {model}")
@@ -127,11 +131,34 @@ def predict_models(
             _log.warning("model %s: %s", model, error)
             failed[model] = error
         else:
+            new = [finding for finding in prediction.findings if finding not in known]
+            if new and on_findings is not None:
+                on_findings(new)
+            known.update(new)
             yield prediction
 
 
+def named_models(models: str | Sequence[str]) -> tuple[str, ...]:
+    """Models by name, each once, in the order given.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) None, or another name: with the one that was meant, it seems.
+    """
+    named = (models,) if isinstance(models, str) else tuple(dict.fromkeys(models))
+    if not named:
+        raise CaseInputError(f"no model is named: give one or more of {', '.join(MODELS)}")
+    for model in named:
+        meant = model.strip().upper() if isinstance(model, str) else None
+        if model not in MODELS and meant in MODELS:
+            raise CaseInputError(f"model is {model!r}: did you mean {meant!r}?")
+        check_one_of("model", model, MODELS)
+    return named
+
+
 def build_patient(
-    case: Case,
+    case: CaseOrPath,
     models: Sequence[str],
     *,
     progress: Progress | None = None,
@@ -139,13 +166,38 @@ def build_patient(
     findings: Iterable[Finding] = (),
     anatomy: Anatomy | None = None,
     after: Postoperative | None = None,
+    on_findings: OnFindings | None = None,
 ) -> PatientModel:
-    """The patient as models need it: muscles are placed if one of them has muscles."""
+    """The patient as models need it: muscles are placed if one of them has muscles.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A file of the case changed while the work went on.
+    """
+    case = as_case(case)
+    # Before the files are read: the key must be that of what is built.
+    hashes = input_hashes(case)
+    key = case_key(case, hashes)
     wanted = any(model.startswith("M") for model in models)
     if not wanted:
         case = replace(case, muscles=None)
     elif case.muscles is None:
         case = replace(case, muscles=CaseMuscles())
-    return build_model(
-        case, progress=progress, check=check, findings=findings, anatomy=anatomy, after=after
+    patient = build_model(
+        case,
+        progress=progress,
+        check=check,
+        findings=findings,
+        anatomy=anatomy,
+        after=after,
+        on_findings=on_findings,
     )
+    if on_findings is not None:
+        on_findings(patient.findings)
+    for name, found in patient.summary["inputs"].items():
+        if hashes.get(name, found) != found:
+            raise CaseInputError(
+                f"{name}: changed while the case was worked on; run it again once nothing writes it"
+            )
+    return replace(patient, summary={**patient.summary, "inputs_key": key})

@@ -1,6 +1,6 @@
 """How much a prediction depends on where the skull landmarks were placed (Kim et al. 2010, 3.3)."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.build import with_muscles
+from cmfsim.case import Finding
 from cmfsim.checks import Floats, as_positive, as_rows
 from cmfsim.errors import CaseInputError, LandmarkInputError
-from cmfsim.io import Case
+from cmfsim.io import CaseOrPath, as_case
 from cmfsim.model import PatientModel
 from cmfsim.musculature import Musculature
 from cmfsim.patient import CaseMuscles
@@ -22,6 +23,7 @@ from cmfsim.study.prediction import build_patient
 __all__ = ["LandmarkTrial", "SensitivityReport", "landmark_trials", "sensitivity"]
 
 Progress = Callable[[str], None]
+OnFindings = Callable[[Iterable[Finding]], None]
 # Standard deviation of a landmark's place along each axis that moves the masseter by the 2 mm of
 # the paper's three trials, mm.
 LANDMARK_SD = 2.0
@@ -96,6 +98,7 @@ class SensitivityReport:
         """Plain values, ready for JSON."""
         return {
             "case": self.prediction.name,
+            "case_key": self.prediction.summary["case_key"],
             "model": self.prediction.model,
             "muscle_deviation": self.muscle_deviation(),
             "skin_deviation": self.skin_deviation(),
@@ -138,7 +141,7 @@ def landmark_trials(
 
 
 def sensitivity(
-    case: Case,
+    case: CaseOrPath,
     *,
     trials: int | Sequence[Mapping[str, ArrayLike]] = 3,
     std: float = LANDMARK_SD,
@@ -146,6 +149,8 @@ def sensitivity(
     model: str = "M+S",
     progress: Progress | None = None,
     check: bool = True,
+    findings: Iterable[Finding] = (),
+    on_findings: OnFindings | None = None,
 ) -> SensitivityReport:
     """What the error of skull landmarks does to muscles and predicted face.
 
@@ -153,7 +158,7 @@ def sensitivity(
 
     Parameters
     ----------
-    case : Case
+    case : Case, or path of its file or folder
     trials : int, or sequence of mapping of str to (3,) float64, mm
         Number of trials that are drawn, or the landmarks of each, as an operator placed them again.
     std : float, mm
@@ -163,7 +168,9 @@ def sensitivity(
         "M" or "M+S".
     progress : callable, optional
     check : bool
-        As for `predict`.
+    findings : iterable of Finding
+    on_findings : callable, optional
+        As for `predict_models`.
 
     Returns
     -------
@@ -187,7 +194,10 @@ def sensitivity(
         raise CaseInputError(f"model {model!r} has no muscles for landmarks to move: use M or M+S")
     if (trials if isinstance(trials, int) else len(trials)) < 1:
         raise CaseInputError("no trial is asked for: at least one is needed")
-    patient = build_patient(case, (model,), progress=progress, check=check)
+    case = as_case(case)
+    patient = build_patient(
+        case, (model,), progress=progress, check=check, findings=findings, on_findings=on_findings
+    )
     skull = patient.landmarks.get("skull", {})
     if isinstance(trials, int):
         trials = list(landmark_trials(skull, count=trials, std=std, seed=seed))
