@@ -357,17 +357,6 @@ def test_the_report_states_the_plan(predicted):
     assert LINE in unescape((folder / "report.html").read_text(encoding="utf-8"))
 
 
-def test_a_report_of_results_without_words_is_still_made(predicted, tmp_path):
-    """Version 0.1 wrote none."""
-    pytest.importorskip("jinja2")
-    folder, _, _ = predicted
-    old = json.loads((folder / "prediction.json").read_text(encoding="utf-8"))
-    for motion in old["plan"].values():
-        del motion["clinical"]
-    (tmp_path / "prediction.json").write_text(json.dumps(old), encoding="utf-8")
-    assert main(["report", str(tmp_path)]) == 0
-
-
 def test_the_picture_of_the_plan_has_its_words_below(predicted):
     """Dark letters on white in the lowest lines, as far as the words go."""
     image_of = pytest.importorskip("matplotlib.image")

@@ -99,9 +99,10 @@ def checked(case: Case, notices: Notices, *, quiet: bool) -> tuple[Finding, ...]
     with StageProgress(sys.stderr, quiet=quiet) as progress:
         progress.stage("checking the case")
         found = examine(case)
-    # Before the work, quiet or not: a reversed plan is seen here, not in the face.
-    for line in plan_lines(_plan_values(found)):
-        print(f"cmfsim: plan: {escaped(line)}", file=sys.stderr, flush=True)
+    if not quiet:
+        # Before the work: a reversed plan is seen here, not in the face.
+        for line in plan_lines(_plan_values(found)):
+            print(f"cmfsim: plan: {escaped(line)}", file=sys.stderr, flush=True)
     if _has_errors(found.findings):
         raise FindingsError(found.findings)
     notices.add(found.findings)

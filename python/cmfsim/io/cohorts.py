@@ -7,7 +7,7 @@ from pathlib import Path
 from cmfsim.checks import as_text, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import FORMAT_VERSION
-from cmfsim.io.tables import Table, read_tables
+from cmfsim.io.tables import read_tables
 from cmfsim.prediction import MODELS
 
 __all__ = ["COHORT_FORMAT", "Cohort"]

@@ -227,11 +227,7 @@ def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
             )
         )
     words = [
-        Note(line)
-        for line in plan_lines(
-            # Results of cmfsim 0.1 have no words.
-            {n: m["clinical"] for n, m in prediction["plan"].items() if "clinical" in m}
-        )
+        Note(line) for line in plan_lines({n: m["clinical"] for n, m in prediction["plan"].items()})
     ]
     return Section(
         "Plan",
