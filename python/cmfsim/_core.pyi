@@ -9,6 +9,7 @@ __all__ = [
     "KINEMATICS",
     "LAWS",
     "METHODS",
+    "MOST_BOXES",
     "PRESETS",
     "Boundary",
     "BoundaryError",
@@ -58,6 +59,7 @@ ELEMENTS: tuple[str, ...]
 KINEMATICS: tuple[str, ...]
 PRESETS: tuple[str, ...]
 LAWS: tuple[str, ...]
+MOST_BOXES: int
 
 class CmfsimError(Exception): ...
 class MeshError(CmfsimError): ...

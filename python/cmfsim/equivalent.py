@@ -207,15 +207,12 @@ def equivalent_material(
     _check_name("preset", preset, PRESETS)
     _check_name("mixing", mixing, MIXINGS)
     _check_name("inside", inside, INSIDE_TESTS)
-    for name, value in (("samples", samples), ("seed", seed)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer):
-            raise MaterialInputError(f"{name} is {value!r}: a whole number is needed")
     start = time.perf_counter()
     named = _named(muscles)
     with ThreadPoolExecutor() as pool:  # most of the work is the core's, without the GIL
         ready = list(pool.map(_ready, named, named.values()))
     surfaces_done = time.perf_counter()
-    shares = _core.sample_muscles(mesh, ready, samples=int(samples), seed=int(seed), inside=inside)
+    shares = _core.sample_muscles(mesh, ready, samples=samples, seed=seed, inside=inside)
     tissue_start = time.perf_counter()
     tissue = shares.tissue(preset, mixing=mixing)
     end = time.perf_counter()

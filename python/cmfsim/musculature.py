@@ -7,12 +7,16 @@ A template's muscles, the same muscles in a patient, and surfaces that a user br
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
+from cmfsim._core import MOST_BOXES
 from cmfsim.case import Finding
 from cmfsim.checks import Floats, as_rows, as_text, check_instance, check_one_of
 from cmfsim.errors import CaseInputError
+from cmfsim.pickling import Frozen
 from cmfsim.scene import SurfaceData
 
-__all__ = ["MUSCLE_KINDS", "MUSCLE_SIDES", "MuscleSurface", "Musculature"]
+__all__ = ["MOST_BOXES", "MUSCLE_KINDS", "MUSCLE_SIDES", "MuscleSurface", "Musculature"]
 
 # How the fibres of a muscle run: along it; spread from a narrow insertion; round an opening; in a
 # layer whose surface does not tell their direction.
@@ -21,7 +25,7 @@ MUSCLE_SIDES = ("L", "R", "both")
 
 
 @dataclass(frozen=True, eq=False)
-class MuscleSurface:
+class MuscleSurface(Frozen):
     """One muscle: its closed surface and how its fibres run.
 
     Attributes
@@ -35,7 +39,8 @@ class MuscleSurface:
     kind : str
         "strap", "fan", "ring" or "sheet".
     boxes : int or None
-        Number of oriented boxes that its fibre directions are taken from; None lets the shape say.
+        Number of oriented boxes that its fibre directions are taken from, 1 to 64; None lets the
+        shape decide.
     course : tuple of (n, 3) float64, mm
         Fibre lines from origin to insertion, where the template's author knows them; they come
         before boxes.
@@ -43,7 +48,8 @@ class MuscleSurface:
     Raises
     ------
     CaseError
-        (also `ValueError`) An unknown side or kind, less than one box, a line of one point.
+        (also `ValueError`) An unknown side or kind, boxes that are not a whole number from 1 to 64,
+        a line of one point.
 
     Examples
     --------
@@ -65,8 +71,8 @@ class MuscleSurface:
         check_one_of(f"side of {self.name}", self.side, MUSCLE_SIDES)
         check_one_of(f"kind of {self.name}", self.kind, MUSCLE_KINDS)
         check_instance(f"surface of {self.name}", self.surface, SurfaceData)
-        if self.boxes is not None and self.boxes < 1:
-            raise CaseInputError(f"boxes of {self.name} is {self.boxes}: must be 1 or more")
+        if self.boxes is not None:
+            object.__setattr__(self, "boxes", _checked_boxes(self.name, self.boxes))
         lines = []
         for i, line in enumerate(self.course):
             points = as_rows(f"course {i} of {self.name}", line, 3)
@@ -74,6 +80,18 @@ class MuscleSurface:
                 raise CaseInputError(f"course {i} of {self.name} has one point: two are needed")
             lines.append(points)
         object.__setattr__(self, "course", tuple(lines))
+
+
+def _checked_boxes(name: str, boxes: object) -> int:
+    """A number of boxes that the core takes, whether from a template, an archive or code."""
+    if isinstance(boxes, bool) or not isinstance(boxes, int | np.integer):
+        raise CaseInputError(
+            f"boxes of {name} is {boxes!r:.40}: a whole number from 1 to {MOST_BOXES} is needed"
+        )
+    if not 1 <= boxes <= MOST_BOXES:
+        shown = str(boxes) if abs(boxes) < 10**18 else "a number of more than 18 digits"
+        raise CaseInputError(f"boxes of {name} is {shown}: allowed is 1 to {MOST_BOXES}")
+    return int(boxes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -127,9 +127,16 @@ def test_bad_input_is_named():
     plate = cmfsim.Surface([[0, 0, 0], [9, 0, 0], [0, 2, 0]], [[0, 1, 2]])
     for kind, boxes, course, text in (
         ("stripe", None, (), "stripe"),
-        ("strap", 0, (), "number of fibre boxes"),
+        ("strap", 0, (), "boxes is 0: allowed is 1 to 64"),
         ("strap", -2, (), "boxes is -2"),
-        ("ring", 2, (), "3 or more"),
+        ("strap", 65, (), "boxes is 65: allowed is 1 to 64"),
+        ("sheet", 100_000, (), "boxes is 100000: allowed is 1 to 64"),
+        ("fan", 10**30, (), "allowed is 1 to 64"),
+        ("fan", -(10**5000), (), "allowed is 1 to 64"),
+        ("strap", True, (), "boxes is True: a whole number is needed, 1 to 64"),
+        ("strap", 2.0, (), "boxes is 2.0: a whole number is needed"),
+        ("strap", "2", (), "boxes is '2': a whole number is needed"),
+        ("ring", 2, (), "3 to 64"),
         ("strap", None, ([[0.0, 0.0, 0.0]],), "fibre line 0"),
         ("strap", None, ([[0.0, 0.0, float("nan")], [1.0, 0.0, 0.0]],), "course 0"),
     ):
@@ -138,3 +145,35 @@ def test_bad_input_is_named():
         assert isinstance(caught.value, ValueError)
     with pytest.raises(cmfsim.MeshError, match="points"):
         cmfsim.MuscleFibres(plate).directions([[0.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("boxes", "text"),
+    [
+        (0, "boxes of masseter_L is 0: allowed is 1 to 64"),
+        (65, "boxes of masseter_L is 65: allowed is 1 to 64"),
+        (1_000_000, "boxes of masseter_L is 1000000: allowed is 1 to 64"),
+        (10**400, "more than 18 digits: allowed is 1 to 64"),
+        (True, "is True: a whole number from 1 to 64"),
+        (2.0, r"is 2\.0: a whole number from 1 to 64"),
+        ("2", "is '2': a whole number from 1 to 64"),
+    ],
+)
+def test_a_muscle_with_too_many_boxes_cannot_be_made(boxes, text):
+    """However it is made: from a template, an archive, an atlas or by hand, it is this value."""
+    plate = cmfsim.SurfaceData([[0, 0, 0], [9, 0, 0], [0, 2, 0]], [[0, 1, 2]])
+    with pytest.raises(cmfsim.CaseError, match=text) as caught:
+        cmfsim.MuscleSurface("masseter_L", "L", plate, boxes=boxes)
+    assert isinstance(caught.value, ValueError)
+    kept = cmfsim.MuscleSurface("masseter_L", "L", plate, boxes=np.int64(64)).boxes
+    assert kept == 64
+    assert type(kept) is int
+
+
+def test_the_most_boxes_are_taken_from_every_kind():
+    """What is allowed also works: 64 boxes of a small surface are made at once."""
+    plate = cmfsim.Surface([[0, 0, 0], [9, 0, 0], [9, 2, 0], [0, 2, 0]], [[0, 1, 2], [0, 2, 3]])
+    for kind in ("strap", "fan", "ring", "sheet"):
+        fibres = cmfsim.MuscleFibres(plate, kind, 64)
+        assert 1 <= len(fibres.boxes[0]) <= 64
+        assert np.isfinite(fibres.directions([[1.0, 1.0, 0.0]])).all()

@@ -230,6 +230,7 @@ def test_a_sound_folder_has_no_errors(folder):
         ('side = "L"', 'side = "left"', "template-muscle", "'left'"),
         ("boxes = 2", "boxes = 0", "template-muscle", "at least 1"),
         ("boxes = 2", "boxes = 1.5", "template-muscle", "whole number"),
+        ("boxes = 2", "boxes = 65", "template-muscle", "at most 64"),
         ("licence =", "license =", "template-text", "did you mean 'licence'"),
         ("version = 1", "version = 2", "template-format", "reads 1"),
         ('"cmfsim-template"', '"cmfsim-case"', "template-format", "'cmfsim-template'"),
@@ -319,6 +320,23 @@ def test_broken_archives_are_refused(small, tmp_path):
         np.savez(path, **{**members, name: value})
         with pytest.raises(cmfsim.CmfsimError):
             cmfsim.MuscleTemplate.load(path)
+
+
+@pytest.mark.parametrize("boxes", ["1000000", "1e6", "0", "true", '"2"', "9" * 400])
+def test_an_archive_that_asks_for_too_many_boxes_is_refused(small, tmp_path, boxes):
+    """A folder's template was limited, an archive's was not: 100 000 boxes ended the interpreter."""
+    path = tmp_path / "t.npz"
+    small.save(path)
+    with np.load(path) as archive:
+        members = dict(archive)
+    text = str(members["template"])
+    assert text.count('"boxes": 2') >= 1
+    members["template"] = np.array(text.replace('"boxes": 2', f'"boxes": {boxes}'))
+    np.savez(path, **members)
+    with pytest.raises(cmfsim.CaseError, match=r"t\.npz.*boxes of masseter_L.* 1 to 64"):
+        cmfsim.MuscleTemplate.load(path)
+    findings = cmfsim.check_template(path)
+    assert any(f.severity == "error" and "boxes of masseter_L" in f.what for f in findings)
 
 
 # Faults of contents.

@@ -249,7 +249,12 @@ fn many_points_in_parallel_are_the_single_ones() {
 fn bad_input_is_named() {
     let bar = plate(|s, v| [60.0 * s, 10.0 * v], [1, 1], 4.0);
     let number = |kind, boxes| MuscleFibres::from_surface(&bar, kind, Some(boxes)).unwrap_err();
-    for error in [number(MuscleKind::Strap, 0), number(MuscleKind::Ring, 2)] {
+    for error in [
+        number(MuscleKind::Strap, 0),
+        number(MuscleKind::Ring, 2),
+        number(MuscleKind::Sheet, 65),
+        number(MuscleKind::Fan, 100_000),
+    ] {
         assert!(matches!(error, MtmError::OutOfRange { .. }), "{error}");
     }
     let text = MuscleKind::parse("stripe").unwrap_err().to_string();

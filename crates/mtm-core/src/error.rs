@@ -287,6 +287,14 @@ pub enum MtmError {
         /// What to try.
         advice: &'static str,
     },
+    /// A forked process could start no threads.
+    #[error(
+        "no threads could be started ({reason}): allow this process more, or set RAYON_NUM_THREADS to fewer"
+    )]
+    NoThreads {
+        /// What the system answered.
+        reason: String,
+    },
     /// Fewer points than a registration needs.
     #[error("{what} needs {needed} {shape} at least, and there are {found}")]
     TooFewPoints {
@@ -425,6 +433,7 @@ impl MtmError {
             Self::ContactSurface { .. } | Self::ContactCycle { .. } => ErrorKind::Contact,
             Self::NotPositiveDefinite { .. }
             | Self::NotConverged { .. }
+            | Self::NoThreads { .. }
             | Self::OutOfMemory { .. } => ErrorKind::Solver,
             Self::TooFewPoints { .. }
             | Self::CoincidentPoints { .. }
@@ -444,6 +453,7 @@ impl MtmError {
                 | Self::NotConverged { .. }
                 | Self::IcpNotConverged { .. }
                 | Self::OutOfMemory { .. }
+                | Self::NoThreads { .. }
                 | Self::Interrupted
         )
     }

@@ -78,6 +78,7 @@ mod nodal_pressure;
 pub mod ordering;
 pub mod parting;
 mod polar;
+pub mod pool;
 mod projected_product;
 mod quadratic;
 mod reaction;

@@ -3,13 +3,16 @@
 //! Any real dtype, order and stride is accepted: what is not C-ordered float64 already is copied by
 //! numpy first, so that Fortran-ordered arrays and strided views arrive as the user sees them.
 
+use std::ops::RangeInclusive;
+
 use mtm_core::error::ErrorKind;
 use numpy::{
     IntoPyArray, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArrayDyn,
     PyUntypedArrayMethods,
 };
+use pyo3::exceptions::PyOverflowError;
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyBool, PyDict};
 
 use crate::errors;
 
@@ -261,6 +264,35 @@ fn indices(value: &Bound<'_, PyAny>, name: Named<'_>, width: usize) -> PyResult<
             })
         })
         .collect()
+}
+
+/// Characters of a refused value that an error repeats.
+const SHOWN: usize = 40;
+
+/// A whole number of the `allowed` range; bool and real numbers are none.
+pub fn whole<T: TryFrom<i64>>(
+    value: &Bound<'_, PyAny>,
+    name: Named<'_>,
+    allowed: RangeInclusive<i64>,
+) -> PyResult<T> {
+    let range = match allowed.clone().into_inner() {
+        (least, i64::MAX) => format!("{least} or more, below 2^63"),
+        (least, most) => format!("{least} to {most}"),
+    };
+    // A number of thousands of digits has no text.
+    let text = value.repr().map_or_else(|_| "very large".into(), |text| text.to_string());
+    let shown: String = text.chars().take(SHOWN).collect();
+    let dots = if text.chars().nth(SHOWN).is_some() { "..." } else { "" };
+    let out_of_range = || name.fail(format!("is {shown}{dots}: allowed is {range}"));
+    let is_bool = value.is_instance_of::<PyBool>();
+    match value.extract::<i64>() {
+        Ok(number) if !is_bool && allowed.contains(&number) => {
+            T::try_from(number).map_err(|_| out_of_range())
+        }
+        Ok(_) if !is_bool => Err(out_of_range()),
+        Err(error) if error.is_instance_of::<PyOverflowError>(value.py()) => Err(out_of_range()),
+        _ => Err(name.fail(format!("is {shown}{dots}: a whole number is needed, {range}"))),
+    }
 }
 
 /// Node indices.

@@ -11,12 +11,14 @@ use numpy::{IntoPyArray, PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::arrays;
-use crate::errors::{self, Failure};
+use crate::arrays::{self, Named};
+use crate::errors::Failure;
 use crate::fibres::PyMuscleFibres;
 use crate::geometry::{PySurface, PyTetMesh};
 use crate::materials::PyTissue;
-use crate::running::interruptible;
+use crate::running::{attempted, interruptible};
+
+const MATERIAL: ErrorKind = ErrorKind::Material;
 
 /// Muscle in a mesh, tet by tet; made by `sample_muscles`.
 #[pyclass(frozen, module = "cmfsim._core", name = "MuscleShares")]
@@ -46,8 +48,8 @@ pub fn sample(
     py: Python<'_>,
     mesh: &Bound<'_, PyTetMesh>,
     muscles: Vec<(Bound<'_, PySurface>, Bound<'_, PyMuscleFibres>)>,
-    samples: i64,
-    seed: i64,
+    samples: &Bound<'_, PyAny>,
+    seed: &Bound<'_, PyAny>,
     inside: &str,
 ) -> PyResult<PyMuscleShares> {
     let mesh = mesh.get().core.clone();
@@ -59,18 +61,12 @@ pub fn sample(
         })
         .collect();
     let options = SamplingOptions {
-        samples: whole("samples", samples, &format!("1 to {MOST_SAMPLES}"))?,
-        seed: whole("seed", seed, "0 or more")?,
+        samples: arrays::whole(samples, Named("samples", MATERIAL), 1..=MOST_SAMPLES as i64)?,
+        seed: arrays::whole(seed, Named("seed", MATERIAL), 0..=i64::MAX)?,
         inside: InsideTest::from_name(inside).map_err(Failure)?,
     };
     let core = interruptible(py, move |stop| sample_muscles(&mesh, &muscles, &options, stop))?;
     Ok(PyMuscleShares { core: Arc::new(core) })
-}
-
-fn whole<T: TryFrom<i64>>(name: &str, value: i64, allowed: &str) -> PyResult<T> {
-    T::try_from(value).map_err(|_| {
-        errors::input(ErrorKind::Material, format!("{name} is {value}: allowed is {allowed}"))
-    })
 }
 
 #[pymethods]
@@ -168,6 +164,6 @@ impl PyMuscleShares {
     fn tissue(&self, py: Python<'_>, preset: &str, mixing: &str) -> PyResult<PyTissue> {
         let preset = Preset::from_name(preset).map_err(Failure)?;
         let mixing = Mixing::from_name(mixing).map_err(Failure)?;
-        PyTissue::wrap(py.detach(|| self.core.tissue(preset, mixing)))
+        Ok(PyTissue::wrap(attempted(py, || self.core.tissue(preset, mixing))?))
     }
 }

@@ -3,13 +3,14 @@
 use std::sync::Arc;
 
 use mtm_core::error::ErrorKind;
-use mtm_core::fibre::{MuscleFibres, MuscleKind, OrientedBox};
+use mtm_core::fibre::{MOST_BOXES, MuscleFibres, MuscleKind, OrientedBox};
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
 
 use crate::arrays::{self, Named};
-use crate::errors::{self, Failure};
+use crate::errors::Failure;
 use crate::geometry::PySurface;
+use crate::running::{attempted, detached};
 
 const MESH: ErrorKind = ErrorKind::Mesh;
 /// Why kind and extents are known.
@@ -26,15 +27,15 @@ const FROM_SURFACE: &str = "made from a surface";
 ///     "strap": along the muscle, as many boxes in series as it bends; "fan": lanes that converge to
 ///     its narrow end; "ring": round the opening; "sheet": lanes along the longest axis.
 /// boxes : int or None
-///     How many boxes: in series, side by side in a fan, round a ring (3 or more). None: as the shape
-///     needs.
+///     How many boxes, 1 to 64: in series, side by side in a fan, round a ring (3 or more). None: as
+///     the shape needs.
 /// course : sequence of (n, 3) array_like, mm
 ///     Known fibre lines; where there are any they are followed, not the boxes.
 ///
 /// Raises
 /// ------
 /// MeshError
-///     An unknown kind, too few boxes, NaN or infinity, a line without two different points.
+///     An unknown kind, too few or too many boxes, NaN or infinity, a line without two different points.
 ///
 /// Examples
 /// --------
@@ -59,25 +60,23 @@ impl PyMuscleFibres {
         py: Python<'_>,
         surface: &Bound<'_, PySurface>,
         kind: &str,
-        boxes: Option<i64>,
+        boxes: Option<&Bound<'_, PyAny>>,
         course: Vec<Bound<'_, PyAny>>,
     ) -> PyResult<Self> {
         let kind = MuscleKind::parse(kind).map_err(Failure)?;
-        let boxes = boxes.map(|count| {
-            usize::try_from(count)
-                .map_err(|_| errors::input(MESH, format!("boxes is {count}: must be 1 or more")))
-        });
-        let boxes = boxes.transpose()?;
+        let most = MOST_BOXES as i64;
+        let boxes =
+            boxes.map(|count| arrays::whole(count, Named("boxes", MESH), 1..=most)).transpose()?;
         let line = |(i, line): (usize, &Bound<'_, PyAny>)| {
             arrays::points(line, Named(&format!("course {i}"), MESH))
         };
         let lines = course.iter().enumerate().map(line).collect::<PyResult<Vec<_>>>()?;
         let surface = surface.get().core.clone();
-        let core = py.detach(|| {
+        let core = attempted(py, || {
             let fibres = MuscleFibres::from_surface(&surface, kind, boxes)?;
             if lines.is_empty() { Ok(fibres) } else { fibres.with_courses(&lines) }
-        });
-        Ok(Self { core: Arc::new(core.map_err(Failure)?), lines })
+        })?;
+        Ok(Self { core: Arc::new(core), lines })
     }
 
     /// Unit directions at `points` ((k, 3), mm), (k, 3) float64; their sign means nothing.
@@ -88,7 +87,7 @@ impl PyMuscleFibres {
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let points = arrays::points(points, Named("points", MESH))?;
         let core = self.core.clone();
-        Ok(arrays::rows(py, py.detach(move || core.directions(&points))))
+        Ok(arrays::rows(py, detached(py, move || core.directions(&points))?))
     }
 
     /// The oriented boxes of the surface: centres (b, 3) mm, axes (b, 3, 3) as rows with the fibres along

@@ -14,6 +14,7 @@ use pyo3::types::PyDict;
 
 use crate::arrays::{self, Named};
 use crate::errors::{self, Failure};
+use crate::running::{attempted, detached};
 
 const MESH: ErrorKind = ErrorKind::Mesh;
 
@@ -52,7 +53,7 @@ impl PyTetMesh {
     fn new(py: Python<'_>, nodes: &Bound<'_, PyAny>, tets: &Bound<'_, PyAny>) -> PyResult<Self> {
         let nodes = arrays::points(nodes, Named("nodes", MESH))?;
         let tets = arrays::tets(tets, Named("tets", MESH))?;
-        let core = py.detach(|| TetMesh::new(nodes, tets)).map_err(Failure)?;
+        let core = attempted(py, || TetMesh::new(nodes, tets))?;
         Ok(Self::wrap(Arc::new(core)))
     }
 
@@ -94,33 +95,33 @@ impl PyTetMesh {
     }
 
     /// Triangles of the boundary, outward, (t, 3) uint32 in mesh node indices.
-    fn boundary_triangles<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<u32>> {
+    fn boundary_triangles<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<u32>>> {
         let core = self.core.clone();
-        arrays::table(py, py.detach(move || core.boundary_triangles()))
+        Ok(arrays::table(py, detached(py, move || core.boundary_triangles())?))
     }
 
     /// Nodes on the boundary, (k,) uint32, ascending: vertex i of `surface()` is node i of these.
-    fn boundary_nodes<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u32>> {
-        boundary_nodes(&self.core).into_pyarray(py)
+    fn boundary_nodes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<u32>>> {
+        Ok(detached(py, || boundary_nodes(&self.core))?.into_pyarray(py))
     }
 
     /// Boundary of the mesh as a `Surface` with outward normals; its vertices are `boundary_nodes()`.
     fn surface(&self, py: Python<'_>) -> PyResult<PySurface> {
         let core = self.core.clone();
-        let surface = py.detach(move || {
+        let surface = attempted(py, move || {
             let nodes = boundary_nodes(&core);
             let vertices = nodes.iter().map(|&j| core.nodes()[j as usize]).collect();
             let local = |j: u32| nodes.partition_point(|&k| k < j) as u32;
             let triangles = core.boundary_triangles().iter().map(|t| t.map(local)).collect();
             Surface::new(vertices, triangles)
-        });
-        Ok(PySurface::wrap(surface.map_err(Failure)?))
+        })?;
+        Ok(PySurface::wrap(surface))
     }
 
     /// Dihedral angles and edge ratio of every tet.
-    fn quality(&self, py: Python<'_>) -> PyMeshQuality {
+    fn quality(&self, py: Python<'_>) -> PyResult<PyMeshQuality> {
         let core = self.core.clone();
-        PyMeshQuality { core: py.detach(move || core.quality()) }
+        Ok(PyMeshQuality { core: detached(py, move || core.quality())? })
     }
 
     fn __repr__(&self) -> String {
@@ -218,9 +219,7 @@ impl PySurface {
         let vertices = arrays::points(vertices, Named("vertices", MESH))?;
         let triangles = arrays::triangles(triangles, Named("triangles", MESH))?;
         let crease = crease_angle.to_radians();
-        let core = py
-            .detach(|| Surface::with_crease_angle(vertices, triangles, crease))
-            .map_err(Failure)?;
+        let core = attempted(py, || Surface::with_crease_angle(vertices, triangles, crease))?;
         Ok(Self::wrap(core))
     }
 
@@ -283,7 +282,7 @@ impl PySurface {
     {
         let points = arrays::points(points, Named("points", MESH))?;
         let core = self.core.clone();
-        let found = py.detach(move || core.closest(&points));
+        let found = detached(py, move || core.closest(&points))?;
         Ok((
             arrays::rows(py, found.iter().map(|c| c.point).collect()),
             arrays::rows(py, found.iter().map(|c| c.normal).collect()),
@@ -299,15 +298,16 @@ impl PySurface {
         points: &Bound<'py, PyAny>,
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
         let points = arrays::points(points, Named("points", MESH))?;
-        let tree = self.winding.get_or_init(py, || WindingTree::new(&self.core));
-        Ok(py.detach(|| tree.winding_number(&points)).into_pyarray(py))
+        let build = || detached(py, || WindingTree::new(&self.core));
+        let tree = self.winding.get_or_try_init(py, build)?;
+        Ok(detached(py, || tree.winding_number(&points))?.into_pyarray(py))
     }
 
     /// The same triangles on new vertex positions ((v, 3), mm).
     fn moved(&self, py: Python<'_>, vertices: &Bound<'_, PyAny>) -> PyResult<Self> {
         let vertices = arrays::points(vertices, Named("vertices", MESH))?;
         let core = self.core.clone();
-        Ok(Self::wrap(py.detach(move || core.moved(vertices)).map_err(Failure)?))
+        Ok(Self::wrap(attempted(py, move || core.moved(vertices))?))
     }
 
     /// The surface after the rigid motion `matrix` ((4, 4)).
@@ -316,7 +316,7 @@ impl PySurface {
         let matrix = arrays::square4(matrix, name)?;
         let matrix = core_rigid_matrix(name.0, &matrix, name.1).map_err(Failure)?;
         let core = self.core.clone();
-        Ok(Self::wrap(py.detach(move || core.transformed(&matrix)).map_err(Failure)?))
+        Ok(Self::wrap(attempted(py, move || core.transformed(&matrix))?))
     }
 
     fn __repr__(&self) -> String {
@@ -415,7 +415,7 @@ impl PySurfaceMotion {
                 ),
             ));
         }
-        let core = py.detach(|| SurfaceMotion::new(rest, moved)).map_err(Failure)?;
+        let core = attempted(py, || SurfaceMotion::new(rest, moved))?;
         Ok(Self { core: Arc::new(core) })
     }
 
@@ -439,6 +439,6 @@ impl PySurfaceMotion {
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let points = arrays::points(points, Named("points", MESH))?;
         let core = self.core.clone();
-        Ok(arrays::rows(py, py.detach(move || core.displacement(&points))))
+        Ok(arrays::rows(py, detached(py, move || core.displacement(&points))?))
     }
 }

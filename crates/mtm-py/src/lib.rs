@@ -43,6 +43,7 @@ mod _core {
         module.add("ELEMENTS", ("p1", "anp", "p2"))?;
         module.add("KINEMATICS", ("linear", "corotational", "hyperelastic"))?;
         module.add("PRESETS", ("kim2010", "kim2010-swapped"))?;
-        module.add("LAWS", ("spencer", "picinbono"))
+        module.add("LAWS", ("spencer", "picinbono"))?;
+        module.add("MOST_BOXES", mtm_core::fibre::MOST_BOXES)
     }
 }

@@ -16,6 +16,7 @@ use pyo3::sync::PyOnceLock;
 use crate::arrays::{self, Named};
 use crate::errors::Failure;
 use crate::geometry::PyTetMesh;
+use crate::running::{attempted, detached};
 
 const MATERIAL: ErrorKind = ErrorKind::Material;
 
@@ -75,7 +76,7 @@ impl PyTissue {
         let m = common_rows(&[("young", young.len()), ("poisson", poisson.len())])?;
         let rows: Vec<Elastic> =
             (0..m).map(|t| Elastic { young: at(&young, t), poisson: at(&poisson, t) }).collect();
-        Self::wrap(py.detach(|| Tissue::isotropic(&rows)))
+        Ok(Self::wrap(attempted(py, || Tissue::isotropic(&rows))?))
     }
 
     /// Transversely isotropic tissue with its stiff or soft direction along a fibre.
@@ -123,7 +124,7 @@ impl PyTissue {
                 poisson: at(&poisson, t),
             })
             .collect();
-        Self::wrap(py.detach(|| Tissue::transversely_isotropic(&rows, &fibre, law)))
+        Ok(Self::wrap(attempted(py, || Tissue::transversely_isotropic(&rows, &fibre, law))?))
     }
 
     /// Tissue of any stiffness ((6, 6) or (m, 6, 6), MPa, Voigt xx yy zz yz xz xy, engineering shears).
@@ -135,7 +136,7 @@ impl PyTissue {
     #[staticmethod]
     fn from_stiffness(py: Python<'_>, stiffness: &Bound<'_, PyAny>) -> PyResult<Self> {
         let rows = arrays::stiffness(stiffness, Named("stiffness", MATERIAL))?;
-        Self::wrap(py.detach(|| Tissue::from_stiffness(rows)))
+        Ok(Self::wrap(attempted(py, || Tissue::from_stiffness(rows))?))
     }
 
     /// Fat with a muscle fraction in each tet.
@@ -165,19 +166,19 @@ impl PyTissue {
         let fraction = arrays::values(fraction, Named("fraction", MATERIAL))?;
         // Without directions a tet with muscle is refused for its zero fibre, by index.
         let fibre = fibre.map_or(Ok(vec![[0.0; 3]; fraction.len()]), fibres)?;
-        Self::wrap(py.detach(|| Tissue::mixture(&fraction, &fibre, preset, mixing)))
+        Ok(Self::wrap(attempted(py, || Tissue::mixture(&fraction, &fibre, preset, mixing))?))
     }
 
     /// Stiffness in global axes, (m, 6, 6) float64, MPa, Voigt; (1, 6, 6) if uniform.
-    fn stiffness<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray3<f64>> {
+    fn stiffness<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f64>>> {
         let core = self.core.clone();
-        arrays::voigt(py, py.detach(move || core.stiffness()))
+        Ok(arrays::voigt(py, detached(py, move || core.stiffness())?))
     }
 
     /// Smallest eigenvalue of each stiffness (Mandel form), (m,) float64, MPa; (1,) if uniform.
-    fn smallest_eigenvalues<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+    fn smallest_eigenvalues<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<f64>>> {
         let core = self.core.clone();
-        py.detach(move || core.smallest_eigenvalues()).into_pyarray(py)
+        Ok(detached(py, move || core.smallest_eigenvalues())?.into_pyarray(py))
     }
 
     /// Number of rows of constants: 1 for a uniform tissue.
@@ -196,8 +197,8 @@ impl PyTissue {
 
 impl PyTissue {
     /// The Python object of a core tissue, or its error.
-    pub fn wrap(core: mtm_core::error::Result<Tissue>) -> PyResult<Self> {
-        Ok(Self { core: Arc::new(core.map_err(Failure)?) })
+    pub fn wrap(core: Tissue) -> Self {
+        Self { core: Arc::new(core) }
     }
 }
 
@@ -261,8 +262,7 @@ impl PyMassTensors {
     ) -> PyResult<Self> {
         let (mesh, tissue) = (mesh.get().core.clone(), tissue.get().core.clone());
         let element = Element::from_name(element).map_err(Failure)?;
-        let core =
-            py.detach(|| MassTensors::with_element(mesh, tissue, element)).map_err(Failure)?;
+        let core = attempted(py, || MassTensors::with_element(mesh, tissue, element))?;
         Ok(Self::wrap(Arc::new(core)))
     }
 
@@ -335,11 +335,11 @@ impl PyMassTensors {
         let u = arrays::points(u, Named("u", ErrorKind::Mesh))?;
         let kinematics = Kinematics::from_name(kinematics).map_err(Failure)?;
         let core = self.core.clone();
-        let forces = py.detach(move || match kinematics {
+        let forces = attempted(py, move || match kinematics {
             Kinematics::Linear => core.internal_force(&u),
             large => Ok(StrainEnergy::new(core, large).state(&u)?.forces),
-        });
-        Ok(arrays::rows(py, forces.map_err(Failure)?))
+        })?;
+        Ok(arrays::rows(py, forces))
     }
 
     /// Elastic energy of displacements ((n, 3), mm), N mm: u.K u / 2 if linear.
@@ -348,11 +348,10 @@ impl PyMassTensors {
         let u = arrays::points(u, Named("u", ErrorKind::Mesh))?;
         let kinematics = Kinematics::from_name(kinematics).map_err(Failure)?;
         let core = self.core.clone();
-        let energy = py.detach(move || match kinematics {
+        attempted(py, move || match kinematics {
             Kinematics::Linear => core.energy(&u),
             large => Ok(StrainEnergy::new(core, large).state(&u)?.energy),
-        });
-        Ok(energy.map_err(Failure)?)
+        })
     }
 
     /// Tangent stiffness under displacements, a `scipy.sparse.bsr_matrix`, (3n, 3n), N/mm.
@@ -372,11 +371,11 @@ impl PyMassTensors {
         let u = arrays::points(u, Named("u", ErrorKind::Mesh))?;
         let kinematics = Kinematics::from_name(kinematics).map_err(Failure)?;
         let core = self.core.clone();
-        let matrix = py.detach(move || match kinematics {
+        let matrix = attempted(py, move || match kinematics {
             Kinematics::Linear => core.internal_force(&u).map(|_| core.matrix().clone()),
             large => StrainEnergy::new(core, large).stiffness(&u, TangentKind::Exact),
-        });
-        sparse(py, &matrix.map_err(Failure)?)
+        })?;
+        sparse(py, &matrix)
     }
 
     /// Linear strain of each tet, (m, 6) float64, Voigt with engineering shears.
@@ -386,7 +385,7 @@ impl PyMassTensors {
         u: &Bound<'py, PyAny>,
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let u = arrays::points(u, Named("u", ErrorKind::Mesh))?;
-        Ok(arrays::table(py, py.detach(|| self.core.strain(&u)).map_err(Failure)?))
+        Ok(arrays::table(py, attempted(py, || self.core.strain(&u))?))
     }
 
     /// Stress of each tet, (m, 6) float64, MPa, Voigt.
@@ -396,7 +395,7 @@ impl PyMassTensors {
         u: &Bound<'py, PyAny>,
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let u = arrays::points(u, Named("u", ErrorKind::Mesh))?;
-        Ok(arrays::table(py, py.detach(|| self.core.stress(&u)).map_err(Failure)?))
+        Ok(arrays::table(py, attempted(py, || self.core.stress(&u))?))
     }
 
     /// Relative volume change det(I + grad u) - 1 of each tet, (m,) float64; -1 or less is collapsed.
@@ -406,7 +405,7 @@ impl PyMassTensors {
         u: &Bound<'py, PyAny>,
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
         let u = arrays::points(u, Named("u", ErrorKind::Mesh))?;
-        Ok(py.detach(|| self.core.volume_change(&u)).map_err(Failure)?.into_pyarray(py))
+        Ok(attempted(py, || self.core.volume_change(&u))?.into_pyarray(py))
     }
 
     /// K in block rows: `indptr` (n+1,) int64, `columns` (b,) int32, `blocks` (b, 3, 3) float64, N/mm.

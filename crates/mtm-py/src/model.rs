@@ -19,7 +19,7 @@ use crate::arrays::{self, Named};
 use crate::errors::{self, Failure};
 use crate::geometry::{PySurface, PySurfaceMotion};
 use crate::materials::PyMassTensors;
-use crate::running::interruptible;
+use crate::running::{attempted, interruptible};
 
 const BOUNDARY: ErrorKind = ErrorKind::Boundary;
 /// Share of the free memory that a factor may take unless the caller says otherwise.
@@ -630,7 +630,7 @@ impl PyPlanOperator {
         plan: &Bound<'py, PyAny>,
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let plan = self::plan(plan)?;
-        Ok(arrays::rows(py, self.core.apply(&plan).map_err(Failure)?))
+        Ok(arrays::rows(py, attempted(py, || self.core.apply(&plan))?))
     }
 
     /// The nodes it answers for, (k,) uint32.

@@ -14,7 +14,7 @@ use pyo3::prelude::*;
 use crate::arrays::{self, Named};
 use crate::errors::Failure;
 use crate::geometry::PySurface;
-use crate::running::interruptible;
+use crate::running::{attempted, detached, interruptible};
 
 const REGISTRATION: ErrorKind = ErrorKind::Registration;
 
@@ -62,8 +62,7 @@ impl PyThinPlateSpline {
     ) -> PyResult<Self> {
         let source = arrays::points(source, Named("source", REGISTRATION))?;
         let target = arrays::points(target, Named("target", REGISTRATION))?;
-        let core =
-            py.detach(|| ThinPlateSpline::new(source, target, smoothing)).map_err(Failure)?;
+        let core = attempted(py, || ThinPlateSpline::new(source, target, smoothing))?;
         Ok(Self { core: Arc::new(core) })
     }
 
@@ -73,7 +72,7 @@ impl PyThinPlateSpline {
         points: &Bound<'py, PyAny>,
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let points = arrays::points(points, Named("points", REGISTRATION))?;
-        let images = py.detach(|| self.core.warp(&points)).map_err(Failure)?;
+        let images = attempted(py, || self.core.warp(&points))?;
         Ok(arrays::rows(py, images))
     }
 
@@ -87,7 +86,7 @@ impl PyThinPlateSpline {
         points: &Bound<'py, PyAny>,
     ) -> PyResult<Bound<'py, PyArray3<f64>>> {
         let points = arrays::points(points, Named("points", REGISTRATION))?;
-        let found = py.detach(|| self.core.jacobian(&points)).map_err(Failure)?;
+        let found = attempted(py, || self.core.jacobian(&points))?;
         let flat = found
             .into_iter()
             .map(|[a, b, c]| [a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]]);
@@ -97,12 +96,12 @@ impl PyThinPlateSpline {
     /// Where the map turns space inside out among `points` ((k, 3), mm).
     fn folds(&self, py: Python<'_>, points: &Bound<'_, PyAny>) -> PyResult<PyFolds> {
         let points = arrays::points(points, Named("points", REGISTRATION))?;
-        Ok(PyFolds { core: py.detach(|| self.core.folds(&points)).map_err(Failure)? })
+        Ok(PyFolds { core: attempted(py, || self.core.folds(&points))? })
     }
 
     /// Smallest determinant on the way to each landmark, over all directions.
-    fn landmark_folds(&self) -> PyFolds {
-        PyFolds { core: self.core.landmark_folds() }
+    fn landmark_folds(&self, py: Python<'_>) -> PyResult<PyFolds> {
+        Ok(PyFolds { core: detached(py, || self.core.landmark_folds())? })
     }
 
     /// Landmarks before the map, (n, 3) float64, mm, read-only.
@@ -241,7 +240,7 @@ pub fn rigid_fit(
         None => None,
     };
     let options = RigidFitOptions { weights: weights.as_deref(), scale };
-    let core = py.detach(|| core_rigid_fit(&moving, &fixed, &options)).map_err(Failure)?;
+    let core = attempted(py, || core_rigid_fit(&moving, &fixed, &options))?;
     Ok(PyRigidFit { core })
 }
 
@@ -304,7 +303,7 @@ pub fn icp(
     initial: Option<&Bound<'_, PyAny>>,
     trim: f64,
     method: Option<&str>,
-    max_iterations: usize,
+    max_iterations: &Bound<'_, PyAny>,
     tolerance: f64,
     max_distance: Option<f64>,
     max_angle: Option<f64>,
@@ -320,7 +319,7 @@ pub fn icp(
         Ok(surface) => Goal::Surface(surface.get().core.clone()),
         Err(_) => {
             let points = arrays::points(fixed, Named("fixed", REGISTRATION))?;
-            Goal::Points(py.detach(|| PointTree::new(&points)).map_err(Failure)?)
+            Goal::Points(attempted(py, || PointTree::new(&points))?)
         }
     };
     let defaults = IcpOptions::default();
@@ -328,6 +327,8 @@ pub fn icp(
         Some(matrix) => arrays::square4(matrix, Named("initial", REGISTRATION))?,
         None => defaults.initial,
     };
+    let named = Named("max_iterations", REGISTRATION);
+    let max_iterations = arrays::whole(max_iterations, named, 1..=u32::MAX.into())?;
     let method = method.map(IcpMethod::from_name).transpose().map_err(Failure)?;
     let options = IcpOptions {
         method,

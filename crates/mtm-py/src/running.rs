@@ -1,4 +1,5 @@
-//! Long core calls on a thread of their own, so that Ctrl-C works while they run.
+//! How core calls run: without the GIL, in the thread pool of this process, and long ones on a thread
+//! of their own, so that Ctrl-C works. Whatever may work in parallel passes one of these doors.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -6,6 +7,7 @@ use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::Duration;
 
 use mtm_core::error::MtmError;
+use mtm_core::pool;
 use pyo3::prelude::*;
 
 use crate::errors::{self, Failure};
@@ -14,6 +16,24 @@ use crate::errors::{self, Failure};
 const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
 /// Stack of the worker: factorisations recurse.
 const STACK_BYTES: usize = 16 << 20;
+
+/// Result of `work`, run without the GIL on threads of this process.
+pub fn detached<T, W>(py: Python<'_>, work: W) -> PyResult<T>
+where
+    T: Send,
+    W: FnOnce() -> T + Send,
+{
+    Ok(py.detach(|| pool::run(work)).map_err(Failure)?)
+}
+
+/// The same of `work` that may fail.
+pub fn attempted<T, W>(py: Python<'_>, work: W) -> PyResult<T>
+where
+    T: Send,
+    W: FnOnce() -> Result<T, MtmError> + Send,
+{
+    Ok(detached(py, work)?.map_err(Failure)?)
+}
 
 /// Result of `work`, run without the GIL; `work` is told through its argument when Python was interrupted.
 ///
@@ -32,7 +52,8 @@ where
         .stack_size(STACK_BYTES)
         .spawn(move || {
             // The receiver is gone after an interruption: then nobody wants the result.
-            let _ = sender.send(work(&|| flag.load(Ordering::Relaxed)));
+            let done = pool::run(|| work(&|| flag.load(Ordering::Relaxed)));
+            let _ = sender.send(done.and_then(|result| result));
         })
         .map_err(|e| errors::internal(format!("no thread could be started: {e}")))?;
     // `Receiver` is not `Sync`: it travels into the detached closure and back.

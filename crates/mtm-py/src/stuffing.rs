@@ -37,7 +37,7 @@ pub fn stuff_image<'py>(
     spacing: [f64; 3],
     edge_length: f64,
     origin: [f64; 3],
-    refinements: u32,
+    refinements: &Bound<'py, PyAny>,
     least_body: f64,
     allowed: Option<&Bound<'py, PyAny>>,
     needed: Option<&Bound<'py, PyAny>>,
@@ -47,6 +47,7 @@ pub fn stuff_image<'py>(
         value.map(|value| arrays::counts(value, Named(name, MESH))).transpose()
     };
     let (allowed, needed) = (counts(allowed, "allowed")?, counts(needed, "needed")?);
+    let refinements = arrays::whole(refinements, Named("refinements", MESH), 0..=u32::MAX.into())?;
     let options = StuffingOptions { edge_length, refinements, least_body };
     let made: Stuffed = interruptible(py, move |_| {
         let level = match image {

@@ -28,7 +28,7 @@ from cmfsim.io.template_archives import (
     read_template_archive,
     write_template_archive,
 )
-from cmfsim.musculature import MUSCLE_KINDS, MUSCLE_SIDES, MuscleSurface
+from cmfsim.musculature import MOST_BOXES, MUSCLE_KINDS, MUSCLE_SIDES, MuscleSurface
 from cmfsim.patient import FRAMES, UNITS
 from cmfsim.scene import SurfaceData
 from cmfsim.template_data import TemplateData
@@ -50,8 +50,6 @@ KEYS = (
     "muscles",
 )
 MUSCLE_KEYS = ("name", "side", "kind", "file", "boxes", "course", "concepts")
-# Number of boxes along one muscle that a template may ask for.
-MAX_BOXES = 64
 # File and line at the start of an error's text.
 PLACE = re.compile(r"([^\s:]+(?::\d+)?): (.*)", re.DOTALL)
 MISSING = "template-file-missing"
@@ -264,7 +262,7 @@ def _surface(table: Table, key: str, folder: Path, units: str, frame: str) -> Su
 
 def _muscle(table: Table, folder: Path, units: str, frame: str) -> MuscleSurface:
     table.only(*MUSCLE_KEYS)
-    boxes = table.number("boxes", low=1, high=MAX_BOXES)
+    boxes = table.number("boxes", low=1, high=MOST_BOXES)
     if boxes is not None and boxes != int(boxes):
         table.fail("boxes", f"is {boxes:g}: a whole number is needed")
     name = table.text("name")

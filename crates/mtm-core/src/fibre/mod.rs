@@ -42,6 +42,12 @@ const NEGLIGIBLE: f64 = 75.0;
 /// Fewest boxes that go round an opening.
 const LEAST_ROUND: usize = 3;
 
+/// Most boxes that may be asked for of one muscle.
+///
+/// Boxes of a real muscle would be less than 1 mm long beyond it; cutting a surface into 100 000 of them
+/// takes minutes and gigabytes.
+pub const MOST_BOXES: usize = 64;
+
 /// Points a thread takes at once.
 const POINTS_PER_TASK: usize = 256;
 
@@ -123,18 +129,19 @@ impl MuscleFibres {
     ///
     /// `surface`: areas alone count, it may have holes and flipped triangles; pieces that do not
     /// belong to the muscle must be taken away first. `boxes`: how many, in series (strap, sheet),
-    /// side by side (fan) or round the opening (ring, at least 3); none: as the shape needs.
+    /// side by side (fan) or round the opening (ring, at least 3), [`MOST_BOXES`] at most; none: as the
+    /// shape needs.
     ///
     /// # Errors
     /// [`MtmError::OutOfRange`] for the number of boxes.
     pub fn from_surface(surface: &Surface, kind: MuscleKind, boxes: Option<usize>) -> Result<Self> {
         let least = if kind == MuscleKind::Ring { LEAST_ROUND } else { 1 };
-        if let Some(count) = boxes.filter(|&count| count < least) {
+        if let Some(count) = boxes.filter(|count| !(least..=MOST_BOXES).contains(count)) {
             return Err(MtmError::OutOfRange {
                 what: "number of fibre boxes".to_owned(),
                 index: 0,
                 value: count as f64,
-                allowed: "1 or more, round an opening 3 or more",
+                allowed: "1 to 64, round an opening 3 to 64",
                 kind: ErrorKind::Mesh,
             });
         }

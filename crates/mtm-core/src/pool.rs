@@ -1,0 +1,103 @@
+//! The threads that parallel work runs on, also in a process that was forked.
+//!
+//! rayon keeps one pool for a process. The child of a `fork` inherits the pool's memory without its
+//! threads: work handed to it would wait for ever. So a child makes a pool of its own when it first
+//! needs one.
+
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use rayon::{ThreadPool, ThreadPoolBuilder};
+
+use crate::error::{MtmError, Result};
+
+/// Stack of a thread of a child's pool, bytes: factorisations recurse, and here all of `work` runs on it.
+const STACK_BYTES: usize = 16 << 20;
+
+/// The process that rayon's own pool belongs to: the first that ran something. 0: none yet.
+static HOME: AtomicU32 = AtomicU32::new(0);
+
+/// The pools of the forked processes, from the first child down to this process: a list that grows only.
+static FORKED: OnceLock<Box<Forked>> = OnceLock::new();
+
+/// The pool of a forked process.
+struct Forked {
+    process: u32,
+    pool: ThreadPool,
+    /// The pool of a child of this child.
+    next: OnceLock<Box<Forked>>,
+}
+
+impl Forked {
+    fn new(process: u32) -> Result<Box<Self>> {
+        let built = ThreadPoolBuilder::new().stack_size(STACK_BYTES).build();
+        let pool = built.map_err(|error| MtmError::NoThreads { reason: error.to_string() })?;
+        Ok(Box::new(Self { process, pool, next: OnceLock::new() }))
+    }
+}
+
+/// Result of `work`, whose parallel parts run on threads of this process.
+///
+/// In the process that calls this first, `work` runs on the calling thread and its parallel parts in
+/// rayon's own pool. In a process forked from it, all of `work` runs in a pool made for that process.
+/// Either pool has as many threads as `RAYON_NUM_THREADS` asks for, or as there are processors.
+/// Whatever may run in a forked process has to pass this door.
+///
+/// # Errors
+/// [`MtmError::NoThreads`] if a forked process can start none.
+pub fn run<T, W>(work: W) -> Result<T>
+where
+    T: Send,
+    W: FnOnce() -> T + Send,
+{
+    let process = std::process::id();
+    let home = match HOME.compare_exchange(0, process, Ordering::Relaxed, Ordering::Relaxed) {
+        Ok(_) => process,
+        Err(home) => home,
+    };
+    if home == process {
+        return Ok(work());
+    }
+    Ok(pool_of(process)?.install(work))
+}
+
+/// The pool of the forked process `process`, which is this one.
+///
+/// No lock is taken: another thread of the parent may have held it when this process was forked. The
+/// parent's pool is left as it is: to drop it would be to wait for its threads.
+fn pool_of(process: u32) -> Result<&'static ThreadPool> {
+    let (mut cell, mut made) = (&FORKED, None);
+    loop {
+        match cell.get() {
+            // Another thread of this process may have been faster: its pool is as good as `made`.
+            Some(forked) if forked.process == process => return Ok(&forked.pool),
+            Some(forked) => cell = &forked.next,
+            None => {
+                let forked = made.take().map_or_else(|| Forked::new(process), Ok)?;
+                made = cell.set(forked).err();
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_that_was_not_forked_works_on_its_own_thread() {
+        let here = std::thread::current().id();
+        assert_eq!(run(|| std::thread::current().id()), Ok(here));
+    }
+
+    #[test]
+    fn each_process_of_a_line_has_one_pool_of_its_own() {
+        let sums: Vec<_> = [11, 12, 13, 12, 11]
+            .map(|process| pool_of(process).unwrap())
+            .map(|pool| (std::ptr::from_ref(pool), pool.install(|| rayon::join(|| 1, || 2))))
+            .to_vec();
+        assert!(sums.iter().all(|(_, sum)| *sum == (1, 2)));
+        assert_eq!((sums[0].0, sums[1].0), (sums[4].0, sums[3].0));
+        assert!(sums[0].0 != sums[1].0 && sums[1].0 != sums[2].0 && sums[0].0 != sums[2].0);
+    }
+}
