@@ -62,6 +62,7 @@ CORE: Mapping[str, frozenset[str]] = {
         "nodal_pressure": "blocks material mesh",
         "tensors": "blocks element material mesh nodal_pressure quadratic",
         "polar": "",
+        "pool": "",
         "density": "kinematics material polar",
         "strain_energy": "blocks density element kinematics nodal_pressure tensors",
         "motion": "surface mesh triangle",
@@ -166,22 +167,23 @@ PYTHON: Mapping[str, frozenset[str]] = {
     name: frozenset(allowed.split())
     for name, allowed in {
         "errors": "_core",
+        "pickling": "",
         "checks": "errors",
-        "scene": "checks errors planning",
-        "case": "checks errors scene",
-        "patient": "checks errors",
-        "model": "case checks musculature osteotomy scene",
+        "scene": "checks errors pickling planning",
+        "case": "checks errors pickling scene",
+        "patient": "checks errors pickling",
+        "model": "case checks musculature osteotomy pickling scene",
         "io": (
             "case checks errors model musculature patient planning prediction scene template_data"
         ),
         "imaging": "case checks errors scene _core",
         "meshing": "case checks errors scene _core",
-        "musculature": "case checks errors scene",
+        "musculature": "case checks errors pickling scene _core",
         "registration": "case checks errors scene _core",
         "equivalent": "case checks errors musculature scene _core",
         "landmark_sites": "",
-        "template_data": "case checks errors musculature scene",
-        "prediction": "case checks model musculature scene _core",
+        "template_data": "case checks errors musculature pickling scene",
+        "prediction": "case checks model musculature pickling scene _core",
         "template": (
             "case checks errors io landmark_sites musculature phantom registration scene "
             "surface_checks surface_repair template_data _core"
@@ -189,7 +191,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "phantom": "case checks errors scene",
         "planning": "errors _core",
         "clinical_plan": "checks errors planning scene _core",
-        "achieved": "case checks errors planning registration scene _core",
+        "achieved": "case checks errors pickling planning registration scene _core",
         "bone_motion": "checks errors scene surface_checks topology _core",
         "osteotomy": "case checks errors planning scene _core",
         "node_kinds": "case checks errors scene _core",

@@ -28,6 +28,7 @@ from cmfsim.checks import (
     frozen,
 )
 from cmfsim.errors import RegistrationError, RegistrationInputError
+from cmfsim.pickling import Frozen
 from cmfsim.planning import RigidMotion, decompose_motion, rigid_matrix
 from cmfsim.registration import icp
 from cmfsim.scene import MovedSurface, SurfaceData
@@ -111,7 +112,7 @@ class MatchOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class AchievedMotion:
+class AchievedMotion(Frozen):
     """Where a bone segment went.
 
     Attributes
@@ -164,7 +165,7 @@ class AchievedMotion:
 
 
 @dataclass(frozen=True, eq=False)
-class AchievedPlan:
+class AchievedPlan(Frozen):
     """What each bone segment did in an operation.
 
     Attributes

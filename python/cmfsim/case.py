@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import Floats, as_rows, as_text, check_instance, check_one_of, frozen
 from cmfsim.errors import CaseInputError
+from cmfsim.pickling import Frozen
 from cmfsim.scene import SurfaceData
 
 __all__ = [
@@ -33,7 +34,7 @@ NODE_KINDS = ("free", "fixed", "joined", "sliding")
 
 
 @dataclass(frozen=True, eq=False)
-class ImageData:
+class ImageData(Frozen):
     """A scalar image on an axis-aligned grid: values[i, j, k] lies at origin + (i, j, k)·spacing.
 
     Attributes
@@ -166,7 +167,7 @@ class Finding:
 
 
 @dataclass(frozen=True, eq=False)
-class Anatomy:
+class Anatomy(Frozen):
     """A head as level images on one grid: positive inside, zero on the surface.
 
     Attributes
@@ -211,7 +212,7 @@ class Anatomy:
 
 
 @dataclass(frozen=True, eq=False)
-class BoneSegment:
+class BoneSegment(Frozen):
     """A piece of bone that moves as one, or that stays.
 
     Attributes
@@ -235,7 +236,7 @@ class BoneSegment:
 
 
 @dataclass(frozen=True, eq=False)
-class NodeKinds:
+class NodeKinds(Frozen):
     """What each node of a mesh does (paper 2.5, Figure 4).
 
     Attributes

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cmfsim.case import Anatomy, BoneSegment, Finding, NodeKinds
 from cmfsim.checks import Floats, Indices
 from cmfsim.osteotomy import surface_of_level
+from cmfsim.pickling import Frozen
 from cmfsim.scene import Scene, SurfaceData, TissueData
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class PatientModel:
+class PatientModel(Frozen):
     """A patient's soft tissue with everything that holds and moves it.
 
     Attributes

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim.checks import Floats, as_rows, as_text, check_one_of
 from cmfsim.errors import CaseInputError
+from cmfsim.pickling import Frozen
 
 __all__ = [
     "DIRECTIONS",
@@ -66,7 +67,7 @@ CLEFT = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class Plane(Frozen):
     """A plane in space.
 
     Attributes
@@ -283,7 +284,7 @@ class CaseOsteotomy:
 
 
 @dataclass(frozen=True, eq=False)
-class CaseMotion:
+class CaseMotion(Frozen):
     """How one segment moves: a matrix, a transform file, or a surface before and after.
 
     Attributes

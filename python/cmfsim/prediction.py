@@ -15,6 +15,7 @@ from cmfsim._core import Surface, SurfaceMotion
 from cmfsim.case import Finding
 from cmfsim.checks import Floats, as_rows, check_one_of
 from cmfsim.model import PatientModel
+from cmfsim.pickling import Frozen
 from cmfsim.scene import MovedSurface, Scene, SceneResult, SurfaceData
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def carried_points(before: SurfaceData, displacements: Floats, points: ArrayLike
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class Prediction(Frozen):
     """The face that one model predicts for one patient and plan.
 
     Attributes

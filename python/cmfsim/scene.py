@@ -30,6 +30,7 @@ from cmfsim.checks import (
     frozen,
 )
 from cmfsim.errors import CaseInputError
+from cmfsim.pickling import Frozen
 from cmfsim.planning import rigid_matrix
 
 __all__ = [
@@ -70,7 +71,7 @@ MIXINGS = ("moduli", "stiffness")
 
 
 @dataclass(frozen=True, eq=False)
-class TissueData:
+class TissueData(Frozen):
     """What the tets are made of, as the arrays that `cmfsim.Tissue` takes.
 
     Every array holds one value per tet, or a single one for all tets.
@@ -149,7 +150,7 @@ class TissueData:
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceData:
+class SurfaceData(Frozen):
     """A triangle surface.
 
     Attributes
@@ -180,7 +181,7 @@ class SurfaceData:
 
 
 @dataclass(frozen=True, eq=False)
-class MovedSurface:
+class MovedSurface(Frozen):
     """A motion of a segment given by a surface before and after.
 
     Attributes
@@ -211,7 +212,7 @@ class MovedSurface:
 
 
 @dataclass(frozen=True, eq=False)
-class SegmentData:
+class SegmentData(Frozen):
     """A bone segment: the nodes that it carries and the surface that others slide on.
 
     Attributes
@@ -325,7 +326,7 @@ class SolverOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class Scene(Frozen):
     """Everything that one solve needs: mesh, tissue, node kinds, plan and options.
 
     Attributes
@@ -514,7 +515,7 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class SceneResult:
+class SceneResult(Frozen):
     """The answer to a scene, with what is needed to draw it and to trace it back.
 
     Attributes

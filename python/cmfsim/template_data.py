@@ -12,6 +12,7 @@ from cmfsim.case import Finding
 from cmfsim.checks import Floats, as_rows, as_text, check_instance
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.musculature import MuscleSurface, Musculature
+from cmfsim.pickling import Frozen
 from cmfsim.scene import SurfaceData
 
 __all__ = ["TemplateData", "as_landmarks", "is_template_name"]
@@ -25,7 +26,7 @@ def is_template_name(name: object) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class TemplateData:
+class TemplateData(Frozen):
     """What a template holds, with its names checked.
 
     `MuscleTemplate` is what works with it, and describes the attributes.
