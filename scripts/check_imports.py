@@ -228,8 +228,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "surface_checks": "checks crossings scene topology",
         "surface_repair": "capping case checks errors scene surface_checks topology _core",
         "doctor": (
-            "case checks clinical_plan errors io osteotomy patient planning registration scene "
-            "surface_checks surface_repair template topology _core"
+            "bone_motion case checks clinical_plan errors io osteotomy patient planning "
+            "registration scene surface_checks surface_repair template topology _core"
         ),
         "cli": (
             "bench build case checks clinical_plan cmfsim demo doctor errors evaluation "

@@ -98,13 +98,15 @@ class ClinicalMotion:
         """The motion in words, such as "5.0 mm forwards, 0.5 mm up at the upper incisors …"."""
         if self.stays:
             return "stays"
+        # Of a measured motion tiny parts are noise; of a computed one they may be metres.
+        is_exact = self.residual is None or self.residual < PRINTED
         shifts = _parts(
             (
                 (self.forwards, "mm forwards", "mm backwards"),
                 (self.up, "mm up", "mm down"),
                 (self.left, "mm to the left", "mm to the right"),
             ),
-            NOTHING,
+            NOTHING if is_exact else PRINTED,
         )
         moved = ", ".join(f"{size} {words}" for _, size, words in shifts) or "0.0 mm"
         at = f" at the {self.place}" if self.place else ""
@@ -114,7 +116,7 @@ class ClinicalMotion:
                 (self.yaw, "yaw|front to the left", "yaw|front to the right"),
                 (self.roll, "roll|left side up", "roll|left side down"),
             ),
-            LEAST_TURN,
+            LEAST_TURN if is_exact else PRINTED,
         )
         turned = [
             f"{words.split('|')[0]} {sign}{size}° ({words.split('|')[1]})"

@@ -298,6 +298,21 @@ def test_a_moved_bone_that_turns_too_far_is_said(tmp_path):
     assert "pitch −25.0° (front down)" in examined.plan["mandible"].text
 
 
+def test_the_pieces_of_a_bone_that_was_cut_are_stated_one_by_one(tmp_path):
+    """The front of the jaw advanced by 6 mm, the rest where it was: no average of both."""
+    head = HeadCase(rounds=4)
+    jaw = head.surfaces["mandible"]
+    vertices = np.asarray(jaw.vertices)
+    front = vertices[:, 1] < -135.0
+    shift = np.where(front[:, None], [0.0, -6.0, 0.0], 0.0)
+    head.surfaces["after"] = cmfsim.SurfaceData(vertices + shift, jaw.triangles)
+    head.replace(TYPED, 'moved = "after.ply"')
+    plan = cmfsim.examine(cmfsim.Case.load(head.write(tmp_path))).plan
+    texts = sorted(motion.text for motion in plan.values())
+    assert list(plan) == ["mandible", "mandible_2"]
+    assert texts == ["6.0 mm forwards at the lower incisors (infradentale)", "stays"]
+
+
 def test_the_doctor_gives_machines_the_plan_in_numbers(tmp_path, capsys):
     head = HeadCase()
     assert main(["doctor", str(head.write(tmp_path)), "--json", "-q"]) == 0

@@ -352,6 +352,8 @@ def test_units_and_frame_of_the_case_file_are_used(tmp_path):
     turned(head)
     scaled(head, 0.001)
     head.replace('units = "mm"\nframe = "LPS"', 'units = "m"\nframe = "RAS"')
+    # The plan's own frame must be stated beside surfaces in RAS.
+    head.replace("[plan.mandible]", '[plan.mandible]\nframe = "LPS"')
     assert serious(tmp_path, head) == []
 
 
@@ -517,7 +519,9 @@ def test_the_command_prints_plain_lines_and_exits_with_0(tmp_path, capsys):
     """No colour in a pipe, no errors: 0."""
     assert main(["doctor", str(HeadCase().write(tmp_path))]) == 0
     out, err = capsys.readouterr()
-    assert out == "nothing found\n"
+    plan, findings = out.splitlines()
+    assert plan.startswith("plan: mandible: 4.0 mm forwards")
+    assert findings == "nothing found"
     assert "\x1b" not in out + err
 
 

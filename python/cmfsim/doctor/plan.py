@@ -2,12 +2,17 @@
 
 from collections.abc import Mapping
 
+from cmfsim.bone_motion import sound_motion, torn_pieces
 from cmfsim.checks import Floats
 from cmfsim.clinical_plan import ClinicalMotion, clinical_motion
 from cmfsim.doctor.evidence import Evidence
+from cmfsim.errors import CmfsimError
 from cmfsim.scene import MovedSurface
 
 __all__ = ["state_plan"]
+
+# A bone whose vertices deviate by less than this from a rigid motion, mm RMS, was not cut.
+BENT = 0.5
 
 
 def state_plan(
@@ -25,22 +30,41 @@ def state_plan(
     """
     found: dict[str, ClinicalMotion] = {}
     for name, given in evidence.case.plan.items():
-        motion: Floats | MovedSurface
-        if name in evidence.motions:
-            motion = evidence.motions[name]
-        else:
+        if name not in evidence.motions:
             moved = evidence.moved.get(name)
-            if not isinstance(moved, MovedSurface):
-                continue
-            motion = moved
+            if isinstance(moved, MovedSurface):
+                found |= _of_surface(evidence, name, moved, given.source())
+            continue
         piece = pieces.get(name)
         read = evidence.transforms.get(name)
         found[name] = clinical_motion(
             name,
-            motion,
+            evidence.motions[name],
             landmarks=evidence.skull_landmarks,
             vertices=None if piece is None else piece[:, :3],
             centre=given.centre,
             source=given.source("" if read is None else read.text),
         )
     return found
+
+
+def _of_surface(
+    evidence: Evidence, name: str, moved: MovedSurface, source: str
+) -> dict[str, ClinicalMotion]:
+    """A bone's motion, or that of each piece of a bone that was cut, as `build` names them."""
+    marks = evidence.skull_landmarks
+    whole = clinical_motion(name, moved, landmarks=marks, source=source)
+    if whole.residual is None or whole.residual < BENT:
+        return {name: whole}
+    try:
+        pieces = torn_pieces(sound_motion(moved))
+    except CmfsimError:
+        # Reported where bones before and after are compared.
+        return {name: whole}
+    if len(pieces) == 1:
+        return {name: whole}
+    named = {name if n == 0 else f"{name}_{n + 1}": piece for n, piece in enumerate(pieces)}
+    return {
+        part: clinical_motion(part, piece, landmarks=marks, source=source)
+        for part, piece in named.items()
+    }
