@@ -109,14 +109,18 @@ class CaseImage:
     ----------
     file : Path
         NRRD, NIfTI, MetaImage, or a folder of DICOM slices.
-    skin_threshold, bone_threshold : float or None, HU
+    skin_threshold, bone_threshold, metal_threshold : float or None, HU
     working_spacing : float or None, mm
+    series : str or None
+        UID or number of the DICOM series that is meant, where the folder holds several.
     """
 
     file: Path
     skin_threshold: float | None = None
     bone_threshold: float | None = None
     working_spacing: float | None = None
+    metal_threshold: float | None = None
+    series: str | None = None
 
 
 @dataclass(frozen=True)
@@ -386,6 +390,8 @@ class CasePostoperative:
         Whether it lies in the frame of the data before the operation already.
     units, frame : str
         Of the surface files.
+    series : str or None
+        UID or number of the DICOM series of the image, where its folder holds several.
     """
 
     skin: Path | None = None
@@ -395,6 +401,7 @@ class CasePostoperative:
     aligned: bool = True
     units: str = "mm"
     frame: str = "LPS"
+    series: str | None = None
 
     def __post_init__(self) -> None:
         if self.image is not None and (self.skin is not None or self.bones):

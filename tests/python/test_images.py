@@ -119,7 +119,7 @@ def test_the_largest_of_several_series_is_taken_and_said(tmp_path):
     found = read_image_file(tmp_path / "ct")
     assert found.image.values.shape == SHAPE
     assert [f.code for f in found.findings] == ["dicom-series"]
-    assert "'thin' with 8 slices" in found.findings[0].what
+    assert "'thin' (number -, 8 slices" in found.findings[0].what
 
 
 def test_equal_series_are_refused(tmp_path):

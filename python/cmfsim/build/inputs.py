@@ -76,7 +76,7 @@ def read_anatomy(
         from cmfsim.imaging import segment_head  # noqa: PLC0415
 
         progress("reading the image")
-        read = read_image_file(case.image.file)
+        read = read_image_file(case.image.file, series=case.image.series)
         anatomy = segment_head(
             read.image,
             segment_options(case),
@@ -110,7 +110,7 @@ def segment_options(case: Case) -> SegmentOptions:
         return SegmentOptions()
     given = {
         name: getattr(case.image, name)
-        for name in ("skin_threshold", "bone_threshold", "working_spacing")
+        for name in ("skin_threshold", "bone_threshold", "metal_threshold", "working_spacing")
         if getattr(case.image, name) is not None
     }
     return SegmentOptions(**given)

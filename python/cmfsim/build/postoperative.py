@@ -149,7 +149,7 @@ def _trimmed_fit(moving: Floats, fixed: Floats) -> Floats:
 
 def _scanned(case: Case, given: CasePostoperative) -> Postoperative:
     """Skin and bone from a CT after the operation."""
-    read = read_image_file(Path(str(given.image)))
+    read = read_image_file(Path(str(given.image)), series=given.series)
     skull = read_case_landmarks(case)[0].get("skull", {})
     matrix = np.eye(4) if given.aligned else _registered(case, read.image, skull)
     # The jaws have moved since, but not so far that a flood from their landmarks would miss them.
@@ -175,7 +175,7 @@ def _registered(case: Case, after: ImageData, skull: Mapping[str, Floats]) -> Fl
             f"{case.where('postoperative.image')}: aligning it needs the CT before the operation "
             "([image]) and skull landmarks"
         )
-    before = read_image_file(case.image.file).image
+    before = read_image_file(case.image.file, series=case.image.series).image
     from cmfsim.imaging import register_volumes, undeformed_mask  # noqa: PLC0415
 
     matrix = register_volumes(after, before, mask=undeformed_mask(before, skull)).matrix

@@ -243,7 +243,7 @@ def _image(case: Case, findings: list[Finding]) -> ImageData | None:
     if not _check_file(case, "image.file", path, findings, folder=True):
         return None
     try:
-        found = read_image_file(path)
+        found = read_image_file(path, series=case.image.series)
     except (CmfsimError, MemoryError) as error:
         findings.append(
             Finding(

@@ -74,6 +74,8 @@ SAMPLES = (1, 100_000)
 # Edge lengths that make a mesh of a head, mm: below, more tets than any memory; above, no face.
 EDGE_LENGTHS = (0.3, 30.0)
 MOST_CLEFT = 20.0
+# CT values above this are clipped, HU.
+MOST_HU = 4000.0
 # Grid spacings that a head can be worked on at, mm.
 WORKING_SPACINGS = (0.2, 5.0)
 
@@ -284,14 +286,30 @@ def _output(table: Table, folder: Path) -> Path:
 
 
 def _image(table: Table, folder: Path) -> CaseImage:
-    table.only("file", "skin_threshold", "bone_threshold", "working_spacing")
+    table.only(
+        "file", "skin_threshold", "bone_threshold", "metal_threshold", "working_spacing", "series"
+    )
     skin = table.number("skin_threshold", "HU", low=-1024.0, high=3071.0)
     bone = table.number("bone_threshold", "HU", low=-1024.0, high=3071.0)
+    metal = table.number("metal_threshold", "HU", low=-1024.0, high=MOST_HU)
     if skin is not None and bone is not None and skin >= bone:
         table.fail("skin_threshold", f"is {skin:g}, bone_threshold {bone:g}: it must be below")
+    if bone is not None and metal is not None and bone >= metal:
+        table.fail("bone_threshold", f"is {bone:g}, metal_threshold {metal:g}: it must be below")
     low, high = WORKING_SPACINGS
     spacing = table.number("working_spacing", "mm", low=low, high=high)
-    return CaseImage(_file(table, "file", folder), skin, bone, spacing)
+    path = _file(table, "file", folder)
+    return CaseImage(path, skin, bone, spacing, metal, _dicom_series(table))
+
+
+def _dicom_series(table: Table) -> str | None:
+    """The DICOM series that is meant, by its number or UID."""
+    if "series" not in table:
+        return None
+    given = table.plain("series")
+    if isinstance(given, bool) or not isinstance(given, int | str) or not str(given).strip():
+        table.fail("series", f'is {given!r}: the number or UID of a DICOM series, such as "3"')
+    return str(given)
 
 
 def _surfaces(table: Table, folder: Path) -> CaseSurfaces:
@@ -528,12 +546,14 @@ def _muscles(table: Table, folder: Path) -> CaseMuscles:
 
 
 def _postoperative(table: Table, folder: Path) -> CasePostoperative:
-    table.only("skin", "image", "landmarks", "bones", "aligned", "units", "frame")
+    table.only("skin", "image", "landmarks", "bones", "aligned", "units", "frame", "series")
     bones = table.table("bones")
     if "skin" in table and "image" in table:
         table.fail("image", "stands beside skin: give one of them")
     if "image" in table and "bones" in table:
         table.fail("bones", "stands beside image, from which bones are read: give one of them")
+    if "series" in table and "image" not in table:
+        table.fail("series", "chooses among the DICOM series of an image, and there is no image")
     if "skin" not in table and "image" not in table and not list(bones):
         table.fail(None, "lacks skin, image or bones")
     return CasePostoperative(
@@ -544,6 +564,7 @@ def _postoperative(table: Table, folder: Path) -> CasePostoperative:
         table.flag("aligned", default=True),
         table.text("units", "mm", tuple(UNITS)),
         table.text("frame", "LPS", FRAMES),
+        _dicom_series(table),
     )
 
 

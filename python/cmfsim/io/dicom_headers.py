@@ -1,0 +1,335 @@
+"""Headers of DICOM files: the few elements that place a slice, read by this module's own code.
+
+Only what stands before the pixels is read. Nested sequences are read as well, for the frames of an
+enhanced multi-frame image are placed there. Pixels are decoded elsewhere, by a third-party reader.
+"""
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.errors import ImageInputError
+
+__all__ = ["DicomHeader", "Frame", "Tags", "dicom_header"]
+
+# Elements that are kept, by their tag.
+NAMES: Mapping[int, str] = {
+    0x00020010: "transfer_syntax",
+    0x00041220: "directory_records",
+    0x00080008: "image_type",
+    0x00080016: "sop_class",
+    0x00080022: "acquisition_date",
+    0x00080032: "acquisition_time",
+    0x00080060: "modality",
+    0x0008103E: "series_description",
+    0x00100020: "patient_id",
+    0x00181120: "gantry_tilt",
+    0x0020000D: "study_uid",
+    0x0020000E: "series_uid",
+    0x00200011: "series_number",
+    0x00200012: "acquisition_number",
+    0x00200013: "instance_number",
+    0x00200032: "position",
+    0x00200037: "orientation",
+    0x00200052: "frame_of_reference",
+    0x00280002: "samples",
+    0x00280004: "photometric",
+    0x00280008: "n_frames",
+    0x00280010: "rows",
+    0x00280011: "columns",
+    0x00280030: "pixel_spacing",
+    0x00280100: "bits",
+    0x00281052: "intercept",
+    0x00281053: "slope",
+    0x00281054: "rescale_type",
+}
+# Sequences that are read, and what is in them.
+SEQUENCES: Mapping[int, str] = {
+    0x52009229: "shared",
+    0x52009230: "per_frame",
+    0x00209111: "content",
+    0x00209113: "plane_position",
+    0x00209116: "plane_orientation",
+    0x00289110: "pixel_measures",
+    0x00289145: "value_transformation",
+}
+# Whole numbers of 16 bits in binary; all others are text.
+BINARY = frozenset({"samples", "rows", "columns", "bits"})
+PIXELS = 0x7FE00010
+FLOAT_PIXELS = frozenset({0x7FE00008, 0x7FE00009})
+ITEM, ITEM_END, SEQUENCE_END = 0xFFFEE000, 0xFFFEE00D, 0xFFFEE0DD
+UNDEFINED = 0xFFFFFFFF
+# Value representations whose length takes four bytes, after two that are reserved.
+LONG = frozenset((b"OB", b"OD", b"OF", b"OL", b"OV", b"OW", b"SQ", b"SV", b"UC", b"UN", b"UR", b"UT", b"UV"))  # fmt: skip # noqa: E501
+EXPLICIT_BIG, DEFLATED, IMPLICIT = "1.2.840.10008.1.2.2", "1.2.840.10008.1.2.1.99", "1.2.840.10008.1.2"  # fmt: skip # noqa: E501
+PREAMBLE = 128
+# The group that states how all others are written.
+META_GROUP = 2
+# Longer values are none that is kept, bytes; deeper nesting and more elements are no image's.
+MOST_VALUE = 4096
+MOST_DEPTH = 16
+MOST_ELEMENTS = 3_000_000
+
+
+Tags = Mapping[str, str | int]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a multi-frame image states of one frame, by the names of `DicomHeader.tags`."""
+
+    tags: Tags
+
+
+@dataclass(frozen=True)
+class DicomHeader:
+    """What a DICOM file states before its pixels.
+
+    Attributes
+    ----------
+    path : Path
+    tags : mapping of str to str or int
+        By name; absent where the file does not state it.
+    has_pixels : bool
+    frames : tuple of Frame
+        Of an enhanced multi-frame image, in the order of its pixels.
+    """
+
+    path: Path
+    tags: Tags
+    has_pixels: bool = False
+    frames: tuple[Frame, ...] = ()
+
+    def text(self, name: str) -> str:
+        """A value as text; empty where the file does not state it."""
+        return str(self.tags.get(name, ""))
+
+    def numbers(self, name: str, count: int) -> NDArray[np.float64] | None:
+        """The finite numbers of a value; None where the file states something else."""
+        return numbers_of(self.text(name), count)
+
+
+@dataclass
+class _Found:
+    """What one data set holds so far."""
+
+    tags: dict[str, str | int] = field(default_factory=dict)
+    sequences: dict[str, list["_Found"]] = field(default_factory=dict)
+
+
+def numbers_of(text: str, count: int) -> NDArray[np.float64] | None:
+    r"""The finite numbers of a text "1\2\3"; None where it holds something else."""
+    try:
+        values = np.array([float(v) for v in text.split("\\")])
+    except ValueError:
+        return None
+    return values if values.shape == (count,) and np.isfinite(values).all() else None
+
+
+def dicom_header(path: Path) -> DicomHeader | None:
+    """What a DICOM file states; None where the file is no DICOM.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) A DICOM file that is cut short, damaged or packed as a whole.
+    """
+    with path.open("rb") as stream:
+        begin = stream.read(PREAMBLE + 4)
+        marked = begin[PREAMBLE:] == b"DICM"
+        if not marked:
+            if not _bare(begin):
+                return None
+            stream.seek(0)
+        try:
+            return _Reader(path, stream).header()
+        except (EOFError, struct.error, ValueError) as error:
+            if not marked:
+                return None
+            if isinstance(error, ImageInputError):
+                raise
+            raise ImageInputError(
+                f"{path.name}: is cut short or damaged ({error}); copy it again"
+            ) from error
+
+
+def _bare(begin: bytes) -> bool:
+    """Whether a file without preamble begins as an old DICOM data set does."""
+    if len(begin) < 8:
+        return False
+    group, element, length = struct.unpack("<HHI", begin[:8])
+    explicit = begin[4:6].isalpha() and begin[4:6].isupper()
+    return group in {2, 8} and element <= 0x60 and (explicit or length < MOST_VALUE)
+
+
+class _Reader:
+    """Walks through the elements of one file."""
+
+    def __init__(self, path: Path, stream: BinaryIO) -> None:
+        self.path = path
+        self.stream = stream
+        self.size = path.stat().st_size
+        self.order = "<"
+        self.explicit = True
+        self.elements = 0
+        self.pixels: int | None = None
+
+    def header(self) -> DicomHeader:
+        found = _Found()
+        begin = self.stream.tell()
+        first = self.stream.read(8)
+        self.stream.seek(begin)
+        if len(first) == 8 and struct.unpack("<H", first[:2])[0] == META_GROUP:
+            self._data_set(found, self.size, 0, stop_after_meta=True)
+            syntax = str(found.tags.get("transfer_syntax", ""))
+            if syntax == DEFLATED:
+                raise ImageInputError(
+                    f"{self.path.name}: is packed as a whole (deflated transfer syntax): export it "
+                    "uncompressed"
+                )
+            self.order = ">" if syntax == EXPLICIT_BIG else "<"
+            self.explicit = syntax != IMPLICIT
+        else:
+            self.explicit = first[4:6].isalpha()
+        self._data_set(found, self.size, 0)
+        self._check_pixels(found)
+        return DicomHeader(self.path, found.tags, self.pixels is not None, tuple(_frames(found)))
+
+    def _data_set(
+        self, found: _Found, end: int, depth: int, *, stop_after_meta: bool = False
+    ) -> None:
+        """Reads elements until an end, an end mark, or the pixels."""
+        if depth > MOST_DEPTH:
+            message = f"sequences are nested deeper than {MOST_DEPTH}"
+            raise ValueError(message)
+        while self.stream.tell() < end:
+            if stop_after_meta and self._next_group() != META_GROUP:
+                return
+            tag, kind, length = self._element()
+            if tag in {ITEM_END, SEQUENCE_END}:
+                return
+            if (tag == PIXELS or tag in FLOAT_PIXELS) and depth == 0:
+                self.pixels = length
+                return
+            if kind == b"SQ" or length == UNDEFINED:
+                explicit = self.explicit
+                # A sequence of unknown kind is written without kinds inside.
+                self.explicit = explicit and kind != b"UN"
+                self._sequence(found, tag, length, depth)
+                self.explicit = explicit
+                continue
+            if length > self.size - self.stream.tell():
+                message = f"element {tag:08x} has {length} bytes, more than are left"
+                raise EOFError(message)
+            name = NAMES.get(tag)
+            if name is None or length > MOST_VALUE:
+                self.stream.seek(length, 1)
+            else:
+                found.tags[name] = self._value(name, self._bytes(length))
+
+    def _next_group(self) -> int:
+        """The group of the element to come: what follows the first group has another encoding."""
+        group = self._bytes(2)
+        self.stream.seek(-2, 1)
+        return int(struct.unpack("<H", group)[0])
+
+    def _element(self) -> tuple[int, bytes, int]:
+        """Tag, value representation (empty where it is not stated) and length of an element."""
+        self.elements += 1
+        if self.elements > MOST_ELEMENTS:
+            message = f"more than {MOST_ELEMENTS} elements"
+            raise ValueError(message)
+        head = self._bytes(8)
+        group, element = struct.unpack(f"{self.order}HH", head[:4])
+        tag = group << 16 | element
+        if not self.explicit or group == 0xFFFE:
+            return tag, b"SQ" if tag in SEQUENCES else b"", self._long(head[4:])
+        kind = head[4:6]
+        if kind in LONG:
+            return tag, kind, self._long(self._bytes(4))
+        if not kind.isalpha():
+            message = f"element {tag:08x} has no known kind"
+            raise ValueError(message)
+        return tag, kind, struct.unpack(f"{self.order}H", head[6:])[0]
+
+    def _sequence(self, found: _Found, tag: int, length: int, depth: int) -> None:
+        """Reads the items of a sequence, or passes over it."""
+        begin = self.stream.tell()
+        name = SEQUENCES.get(tag)
+        if length != UNDEFINED:
+            if length > self.size - begin:
+                message = f"sequence {tag:08x} has {length} bytes, more than are left"
+                raise EOFError(message)
+            if name is None:
+                self.stream.seek(length, 1)
+                return
+        end = self.size if length == UNDEFINED else begin + length
+        items = found.sequences.setdefault(name or "", [])
+        while self.stream.tell() < end:
+            mark, _, size = self._element()
+            if mark == SEQUENCE_END:
+                return
+            if mark != ITEM:
+                message = f"sequence {tag:08x} holds {mark:08x} in place of an item"
+                raise ValueError(message)
+            item = _Found()
+            stop = self.size if size == UNDEFINED else self.stream.tell() + size
+            if name is None and size != UNDEFINED:
+                self.stream.seek(min(stop, self.size))
+                continue
+            self._data_set(item, min(stop, self.size), depth + 1)
+            if name is not None:
+                items.append(item)
+
+    def _value(self, name: str, data: bytes) -> str | int:
+        if name in BINARY:
+            if len(data) < 2:
+                message = f"{name} is empty"
+                raise ValueError(message)
+            return int(struct.unpack(f"{self.order}H", data[:2])[0])
+        return data.decode("latin-1").strip("\0 ")
+
+    def _long(self, data: bytes) -> int:
+        return int(struct.unpack(f"{self.order}I", data)[0])
+
+    def _bytes(self, count: int) -> bytes:
+        data = self.stream.read(count)
+        if len(data) < count:
+            message = f"it ends at byte {self.size}"
+            raise EOFError(message)
+        return data
+
+    def _check_pixels(self, found: _Found) -> None:
+        """Refuses a file that holds fewer pixels than it states: readers give zeros for them."""
+        if self.pixels is None or self.pixels == UNDEFINED:
+            return
+        left = self.size - self.stream.tell()
+        tags = found.tags
+        needed = self.pixels
+        if all(name in tags for name in ("rows", "columns", "bits")):
+            frames = numbers_of(str(tags.get("n_frames", "") or "1"), 1)
+            each = int(tags["rows"]) * int(tags["columns"]) * int(tags.get("samples", 1))
+            needed = each * (int(tags["bits"]) // 8) * (1 if frames is None else int(frames[0]))
+        if left < needed:
+            message = f"{left} of {needed} bytes of pixels"
+            raise EOFError(message)
+
+
+def _frames(found: _Found) -> list[Frame]:
+    """The frames of an enhanced image: what all share, and what each states itself."""
+    shared = _flat(found.sequences.get("shared", []))
+    return [Frame({**shared, **_flat([item])}) for item in found.sequences.get("per_frame", [])]
+
+
+def _flat(items: list[_Found]) -> dict[str, str | int]:
+    tags: dict[str, str | int] = {}
+    for item in items:
+        tags |= item.tags
+        for inner in item.sequences.values():
+            tags |= _flat(inner)
+    return tags

@@ -1,0 +1,258 @@
+"""Voxels brought from the grid of their file to one along the patient's axes, LPS."""
+
+import math
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.case import ImageData
+from cmfsim.errors import ImageInputError
+from cmfsim.io.image_headers import MOST_VOXELS
+
+__all__ = ["OUTSIDE", "aligned", "of_slices", "shear_of", "turn_of", "upright"]
+
+# An axis farther than this from a patient's axis (as a sine), or from a right angle with another,
+# is resampled: 0.06 degrees, which is 0.25 mm over a head.
+OBLIQUE = 1e-3
+# Outside a rotated image there is air, HU; images without negative values get their least.
+OUTSIDE = -1024.0
+# Slices farther apart than this are divided when they are resampled, mm: one interpolation between
+# them, at the places that the working grid will have, in place of two.
+FINE = 1.0
+# A place this near to a voxel's centre, in voxels, is that voxel.
+SAME = 1e-6
+
+
+def aligned(values: NDArray[Any], affine: NDArray[np.float64]) -> ImageData | None:
+    """Voxels whose axes run along the patient's, in the order and direction of these.
+
+    Parameters
+    ----------
+    values : (n, m, k) array
+        values[i, j, k] lies at affine · (i, j, k, 1).
+    affine : (3, 4) float64, mm
+
+    Returns
+    -------
+    ImageData or None
+        None where an axis runs obliquely.
+    """
+    directions = affine[:, :3] / np.linalg.norm(affine[:, :3], axis=0)
+    order = np.argmax(np.abs(directions), axis=1)
+    if len(set(order.tolist())) < 3:
+        return None
+    turned = directions[:, order]
+    signs = np.sign(np.diag(turned))
+    if float(np.abs(turned - np.diag(signs)).max()) > OBLIQUE:
+        return None
+    first = np.where(signs[np.argsort(order)] < 0.0, np.array(values.shape) - 1, 0)
+    origin = affine @ np.append(first, 1.0)
+    flips = tuple(slice(None, None, -1 if s < 0.0 else 1) for s in signs)
+    spacing = np.linalg.norm(affine[:, :3], axis=0)[order]
+    return ImageData(np.transpose(values, order)[flips], spacing, origin)
+
+
+def turn_of(affine: NDArray[np.float64]) -> float:
+    """The angle between the image's axes and the patient's, degrees: of the least turn."""
+    directions = affine[:, :3] / np.linalg.norm(affine[:, :3], axis=0)
+    u, _, v = np.linalg.svd(directions)
+    rotation = u @ v
+    order = np.argmax(np.abs(rotation), axis=1)
+    if len(set(order.tolist())) < 3:
+        order = np.arange(3)
+    turned = rotation[:, order]
+    turned = turned * np.sign(np.diag(turned))
+    # The axial vector has the sine, the trace the cosine: exact for small angles and large ones.
+    sine = 0.5 * math.sqrt(
+        (turned[2, 1] - turned[1, 2]) ** 2
+        + (turned[0, 2] - turned[2, 0]) ** 2
+        + (turned[1, 0] - turned[0, 1]) ** 2
+    )
+    return math.degrees(math.atan2(sine, 0.5 * (float(np.trace(turned)) - 1.0)))
+
+
+def shear_of(affine: NDArray[np.float64]) -> float:
+    """The largest departure of two axes from a right angle, degrees."""
+    largest = 0.0
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        one, other = affine[:, a], affine[:, b]
+        across = float(np.linalg.norm(np.cross(one, other)))
+        largest = max(largest, math.atan2(abs(float(one @ other)), across))
+    return math.degrees(largest)
+
+
+def upright(values: NDArray[Any], affine: NDArray[np.float64], name: str) -> ImageData:
+    """Voxels on oblique or sheared axes, linearly on the least grid in LPS that holds them.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) The grid would have too many voxels.
+    """
+    itk = import_module("SimpleITK")
+    image = itk.GetImageFromArray(values.T)
+    last = np.array(values.shape) - 1.0
+    corners = np.array(
+        [affine @ [*(last * [(c >> a) & 1 for a in range(3)]), 1.0] for c in range(8)]
+    )
+    lengths = np.linalg.norm(affine[:, :3], axis=0)
+    # Each new axis takes the spacing of the old axis nearest to it.
+    spacing = lengths[np.argmax(np.abs(affine[:, :3] / lengths), axis=1)]
+    low, count = _grid(corners, spacing, name)
+    back = np.linalg.inv(affine[:, :3])
+    to_index = itk.AffineTransform(3)
+    to_index.SetMatrix(back.ravel().tolist())
+    to_index.SetTranslation((-back @ affine[:, 3]).tolist())
+    resampler = itk.ResampleImageFilter()
+    resampler.SetSize([int(n) for n in count])
+    resampler.SetOutputSpacing([float(s) for s in spacing])
+    resampler.SetOutputOrigin([float(o) for o in low])
+    resampler.SetTransform(to_index)
+    resampler.SetInterpolator(itk.sitkLinear)
+    resampler.SetDefaultPixelValue(_outside(values))
+    made = resampler.Execute(image)
+    return ImageData(itk.GetArrayFromImage(made).T, spacing, low)
+
+
+def of_slices(
+    values: NDArray[Any],
+    positions: NDArray[np.float64],
+    axes: NDArray[np.float64],
+    spacing: tuple[float, float],
+    name: str,
+) -> ImageData:
+    """Parallel slices, each at its own place, on a grid in LPS that holds them all.
+
+    Between two slices the value is interpolated along their normal, from both at that place; so
+    slices along the patient's axes keep their values wherever the grid meets their pixels.
+
+    Parameters
+    ----------
+    values : (slices, rows, columns) array
+    positions : (slices, 3) float64, mm
+        Of the first pixel of each slice, in ascending order along the normal.
+    axes : (2, 3) float64
+        Unit vectors along a row (from column to column) and along a column.
+    spacing : tuple of float, mm
+        Between columns and between rows.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) The grid would have too many voxels.
+    """
+    values, positions, axes = _rows_to_left(values, positions, axes, spacing[0])
+    along_row, along_column = axes
+    normal = np.cross(along_row, along_column)
+    heights = positions @ normal
+    ends = np.array([values.shape[2] - 1.0, values.shape[1] - 1.0]) * spacing
+    corners = np.concatenate(
+        [positions + a * ends[0] * along_row + b * ends[1] * along_column
+         for a in (0, 1) for b in (0, 1)]
+    )  # fmt: skip
+    gap = float(np.median(np.diff(heights)))
+    steps = np.array([*spacing, gap / math.ceil(gap / max(FINE, *spacing) - SAME)])
+    nearest = np.argmax(np.abs(np.array([along_row, along_column, normal])), axis=0)
+    low, count = _grid(corners, steps[nearest], name)
+    grid = steps[nearest]
+    x, y, z = (low[a] + grid[a] * np.arange(count[a]) for a in range(3))
+    outside = _outside(values)
+    made = np.empty((count[2], count[1], count[0]), dtype=values.dtype)
+    starts = positions @ np.array([along_row, along_column]).T
+    # Rows along the patient's first axis, as a gantry tilts: the grid has their pixels.
+    by_rows = float(np.abs(along_row - [1.0, 0.0, 0.0]).max()) <= SAME
+    by_rows &= float(np.ptp(starts[:, 0])) <= SAME * spacing[0]
+    vectors = (along_row, along_column, normal)
+    plane = [y * v[1] if by_rows else np.add.outer(y * v[1], x * v[0]) for v in vectors]
+    for number, height in enumerate(z):
+        across, down, up = (p + v[2] * height for p, v in zip(plane, vectors, strict=True))
+        place = np.interp(up, heights, np.arange(len(heights)))
+        slack = SAME * gap
+        beyond = (up < heights[0] - slack) | (up > heights[-1] + slack)
+        below = np.minimum(place.astype(np.intp), len(heights) - 2)
+        part = place - below
+        layer = np.zeros((len(y), len(x)))
+        for side in (0, 1):
+            weight = part if side else 1.0 - part
+            k = below + side
+            v = (down - starts[k, 1]) / spacing[1]
+            if by_rows:
+                found = _rows(values, k, v, outside)
+            else:
+                found = _in_slice(values, k, (across - starts[k, 0]) / spacing[0], v, outside)
+            # A slice that the place belongs to wholly decides alone.
+            weight = np.where(weight > SAME, weight, 0.0)
+            layer += (weight if weight.ndim == 2 else weight[:, None]) * found
+        layer[beyond] = outside
+        made[number] = np.rint(layer) if values.dtype.kind in "iu" else layer
+    return ImageData(made.T, grid, low)
+
+
+def _rows_to_left(
+    values: NDArray[Any],
+    positions: NDArray[np.float64],
+    axes: NDArray[np.float64],
+    spacing: float,
+) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float64]]:
+    """The same slices with rows that run to the patient's left, in ascending order again."""
+    if axes[0, 0] >= 0.0:
+        return values, positions, axes
+    last = (values.shape[2] - 1) * spacing * axes[0]
+    turned = np.array([-axes[0], axes[1]])
+    return np.ascontiguousarray(values[::-1, :, ::-1]), (positions + last)[::-1], turned
+
+
+def _rows(
+    values: NDArray[Any], k: NDArray[np.intp], v: NDArray[np.float64], outside: float
+) -> NDArray[np.float64]:
+    """Whole rows at row v of slice k, linear between rows; the value outside beyond the border."""
+    rows = values.shape[1]
+    inside = (v > -SAME) & (v < rows - 1 + SAME)
+    v = np.clip(v, 0.0, rows - 1.0)
+    j = np.minimum(v.astype(np.intp), max(rows - 2, 0))
+    part = (v - j)[:, None]
+    found: NDArray[np.float64] = values[k, j] * (1.0 - part) + values[k, j + 1] * part
+    found[~inside] = outside
+    return found
+
+
+def _in_slice(
+    values: NDArray[Any],
+    k: NDArray[np.intp],
+    u: NDArray[np.float64],
+    v: NDArray[np.float64],
+    outside: float,
+) -> NDArray[np.float64]:
+    """Bilinear values at column u and row v of slice k; the value outside beyond its border."""
+    rows, columns = values.shape[1:]
+    inside = (u > -SAME) & (u < columns - 1 + SAME) & (v > -SAME) & (v < rows - 1 + SAME)
+    u, v = np.clip(u, 0.0, columns - 1.0), np.clip(v, 0.0, rows - 1.0)
+    i = np.minimum(u.astype(np.intp), max(columns - 2, 0))
+    j = np.minimum(v.astype(np.intp), max(rows - 2, 0))
+    u, v = u - i, v - j
+    flat = values.reshape(-1)
+    first = (k * rows + j) * columns + i
+    upper = flat[first] * (1.0 - u) + flat[first + 1] * u
+    lower = flat[first + columns] * (1.0 - u) + flat[first + columns + 1] * u
+    found: NDArray[np.float64] = np.where(inside, upper * (1.0 - v) + lower * v, outside)
+    return found
+
+
+def _grid(
+    corners: NDArray[np.float64], spacing: NDArray[np.float64], name: str
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """First place and number of voxels of the grid that holds the corners."""
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    count = np.ceil((high - low) / spacing - SAME).astype(np.int64) + 1
+    if math.prod(count.tolist()) > MOST_VOXELS:
+        raise ImageInputError(
+            f"{name}: on the patient's axes it would need {' × '.join(map(str, count))} voxels: "
+            f"at most {MOST_VOXELS} are read"
+        )
+    return low, count
+
+
+def _outside(values: NDArray[Any]) -> float:
+    return max(float(values.min()), OUTSIDE)

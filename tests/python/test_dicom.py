@@ -1,0 +1,369 @@
+"""DICOM series as scanners and archives give them: placed rightly, or refused by name."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import cmfsim
+import ct_variants as variants
+from cmfsim import ImageData, ImageError
+from cmfsim.io.images import read_image_file
+from dicom_series import axial, tilted, write_enhanced, write_series
+from real_heads import data_folder
+
+pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
+SHAPE = (12, 10, 8)
+
+
+def smooth(shape=SHAPE, spacing=(0.5, 0.75, 2.0), origin=(-20.0, 7.0, 100.0)):
+    """Values linear in space, which linear interpolation keeps."""
+    image = ImageData(np.zeros(shape), spacing, origin)
+    x, y, z = image.axes()
+    return image.with_values(np.round(20.0 * x + 10.0 * y - 15.0 * z).astype(np.int16))
+
+
+def noisy():
+    values = np.random.default_rng(3).integers(-1000, 2000, SHAPE).astype(np.int16)
+    return ImageData(values, (0.5, 0.75, 2.0), (-20.0, 7.0, 100.0))
+
+
+def moved(slices, shift_of):
+    """The same pixels, each slice shifted by shift_of(number) mm."""
+    return [replace(s, position=s.position + shift_of(k)) for k, s in enumerate(slices)]
+
+
+def codes(found):
+    return {f.code for f in found.findings}
+
+
+def refused(folder, *words, **options):
+    with pytest.raises(ImageError) as caught:
+        read_image_file(folder, **options)
+    assert isinstance(caught.value, ValueError)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def same(found, image):
+    np.testing.assert_array_equal(found.image.values, image.values)
+    np.testing.assert_allclose(found.image.spacing, image.spacing, atol=1e-6)
+    np.testing.assert_allclose(found.image.lowest, image.lowest, atol=1e-6)
+
+
+# Places ----------------------------------------------------------------------------------------
+
+
+def test_slices_are_ordered_by_their_places_not_by_their_names(tmp_path):
+    slices = axial(noisy())
+    order = np.random.default_rng(1).permutation(len(slices))
+    # Names and instance numbers both run in another order; no file has an ending.
+    write_series(tmp_path / "ct", [slices[i] for i in order], names=[f"I{k}" for k in range(8)])
+    found = read_image_file(tmp_path / "ct")
+    same(found, noisy())
+    assert not found.findings
+
+
+def test_feet_first_slices_are_turned(tmp_path):
+    image = noisy()
+    turned = [
+        replace(
+            s,
+            pixels=s.pixels[:, ::-1],
+            position=s.position + [11 * 0.5, 0.0, 0.0],
+            row=(-1.0, 0.0, 0.0),
+        )
+        for s in axial(image)
+    ]
+    write_series(tmp_path / "ct", turned)
+    same(read_image_file(tmp_path / "ct"), image)
+
+
+def test_slices_shifted_by_whole_pixels_keep_their_values(tmp_path):
+    slices = axial(noisy())
+    write_series(tmp_path / "ct", moved(slices, lambda k: [0.0, 0.75 * k, 0.0]))
+    found = read_image_file(tmp_path / "ct")
+    assert "dicom-tilted" in codes(found)
+    # Planes between slices are added; each slice is where it states.
+    assert found.image.lowest == pytest.approx([-20.0, 7.0, 100.0])
+    assert found.image.spacing == pytest.approx([0.5, 0.75, 1.0])
+    for k, one in enumerate(slices):
+        np.testing.assert_array_equal(found.image.values[:, k : k + 10, 2 * k], one.pixels.T)
+        rest = np.delete(found.image.values[:, :, 2 * k], np.s_[k : k + 10], axis=1)
+        assert (rest == max(-1024, noisy().values.min())).all()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_tilted_scan_keeps_each_value_at_its_place(tmp_path, turned):
+    image = smooth((24, 24, 30), (1.0, 1.0, 1.0), (-10.0, -12.0, 90.0))
+    slices = tilted(image, -18.5, 2.0, 1.0)
+    if turned:
+        # About z as well: rows are then oblique.
+        c, s = np.cos(0.2), np.sin(0.2)
+        about = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        slices = [
+            replace(
+                one,
+                position=about @ one.position,
+                row=tuple(about @ one.row),
+                column=tuple(about @ one.column),
+            )
+            for one in slices
+        ]
+    else:
+        about = np.eye(3)
+    write_series(tmp_path / "ct", slices)
+    found = read_image_file(tmp_path / "ct")
+    (tilt,) = [f for f in found.findings if f.code == "dicom-tilted"]
+    assert "gantry tilt −18.5°" in tilt.what
+    points = np.stack(np.meshgrid([-5.0, 0.0, 6.0], [-4.0, 0.0, 5.0], [102.0, 106.0, 110.0]), -1)
+    points = points.reshape(-1, 3)
+    expected = image.sample(points)
+    assert found.image.sample(points @ about.T) == pytest.approx(expected, abs=2.5)
+
+
+def test_a_tilt_that_positions_do_not_show_is_reported(tmp_path):
+    write_series(tmp_path / "ct", [s.with_tags(t0018_1120="-18.5") for s in axial(noisy())])
+    found = read_image_file(tmp_path / "ct")
+    (finding,) = [f for f in found.findings if f.code == "dicom-tilt-unclear"]
+    assert "-18.5°" in finding.what
+    assert "0.0°" in finding.what
+
+
+def test_uneven_slices_are_resampled_by_their_places(tmp_path):
+    image = smooth()
+    heights = np.array([0.0, 2.0, 4.3, 6.0, 8.0, 9.7, 12.0, 14.0])
+    slices = moved(axial(image), lambda k: [0.0, 0.0, heights[k] - 2.0 * k])
+    slices = [
+        replace(s, pixels=s.pixels - np.int16(np.round(15 * (heights[k] - 2 * k))))
+        for k, s in enumerate(slices)
+    ]
+    write_series(tmp_path / "ct", slices)
+    found = read_image_file(tmp_path / "ct")
+    (finding,) = [f for f in found.findings if f.code == "dicom-uneven"]
+    assert "2.3 mm between 102.00 and 104.30 mm" in finding.what
+    points = np.array([[-18.0, 9.0, 103.4], [-16.0, 12.0, 108.9], [-17.0, 8.0, 113.0]])
+    assert found.image.sample(points) == pytest.approx(image.sample(points), abs=1.5)
+
+
+def test_a_drift_too_small_for_each_step_is_still_followed(tmp_path):
+    # 1 % more in the second half: 5 mm at the end of a head.
+    heights = np.r_[np.arange(20) * 2.0, 40.0 + np.arange(20) * 2.02]
+    slices = axial(smooth((6, 5, 40)))
+    write_series(tmp_path / "ct", moved(slices, lambda k: [0.0, 0.0, heights[k] - 2.0 * k]))
+    found = read_image_file(tmp_path / "ct")
+    assert "dicom-uneven" in codes(found)
+    assert found.image.highest[2] == pytest.approx(100.0 + heights[-1], abs=1.1)
+
+
+# Missing and surplus slices --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lost", [[3], [3, 4]])
+def test_missing_slices_are_refused_by_name(tmp_path, lost):
+    kept = [s for k, s in enumerate(axial(noisy())) if k not in lost]
+    write_series(tmp_path / "ct", kept)
+    gap = 2.0 * (len(lost) + 1)
+    words = f"{gap:g} mm between 104.00 and {104.0 + gap:.2f} mm (1.2.3_0002.dcm, 1.2.3_0003.dcm)"
+    refused(tmp_path / "ct", f"{len(lost)} slice", "missing", words)
+
+
+def test_a_gap_of_no_whole_number_of_slices_is_refused(tmp_path):
+    slices = axial(noisy())
+    write_series(tmp_path / "ct", moved(slices, lambda k: [0.0, 0.0, 1.3 if k > 4 else 0.0]))
+    refused(tmp_path / "ct", "unevenly spaced", "3.3 mm between 108.00 and 111.30 mm")
+
+
+def test_a_copy_of_a_slice_is_skipped_and_reported(tmp_path):
+    slices = axial(noisy())
+    write_series(tmp_path / "ct", [*slices, slices[4]])
+    found = read_image_file(tmp_path / "ct")
+    same(found, noisy())
+    (finding,) = found.findings
+    assert finding.code == "dicom-copies"
+    assert "1.2.3_0008.dcm" in finding.what
+
+
+def test_two_slices_at_one_place_are_refused_by_name(tmp_path):
+    slices = axial(noisy())
+    other = replace(slices[4], pixels=slices[4].pixels + np.int16(1))
+    write_series(tmp_path / "ct", [*slices, other])
+    refused(tmp_path / "ct", "1.2.3_0004.dcm and 1.2.3_0008.dcm", "108.00")
+
+
+def test_two_acquisitions_between_one_another_are_refused(tmp_path):
+    # Each is even, and so nearly are both together.
+    second = [s.with_tags(t0020_0012="2") for s in axial(noisy())]
+    second = moved(second, lambda _k: [0.0, 0.0, 0.8])
+    write_series(tmp_path / "ct", [*axial(noisy()), *second])
+    refused(tmp_path / "ct", "acquisitions 1 and 2")
+
+
+def test_acquisitions_one_after_the_other_are_one_scan(tmp_path):
+    slices = [s.with_tags(t0020_0012=str(k)) for k, s in enumerate(axial(noisy()))]
+    write_series(tmp_path / "ct", slices)
+    same(read_image_file(tmp_path / "ct"), noisy())
+
+
+def test_scouts_are_skipped_and_reported(tmp_path):
+    slices = axial(noisy())
+    scout = slices[0].with_tags(t0008_0008="ORIGINAL\\PRIMARY\\LOCALIZER")
+    scout = replace(scout, column=(0.0, 0.0, -1.0))
+    side = replace(slices[0], column=(0.0, 0.0, -1.0))
+    write_series(tmp_path / "ct", [scout, *slices, side])
+    found = read_image_file(tmp_path / "ct")
+    same(found, noisy())
+    (finding,) = found.findings
+    assert (finding.code, finding.severity) == ("dicom-scouts", "warning")
+    assert "1.2.3_0000.dcm, 1.2.3_0009.dcm" in finding.what
+
+
+def test_many_slices_of_another_orientation_are_refused(tmp_path):
+    slices = axial(noisy())
+    side = [replace(s, column=(0.0, 0.0, -1.0)) for s in slices[:5]]
+    write_series(tmp_path / "ct", [*slices, *side])
+    refused(tmp_path / "ct", "2 orientations", "8 slices", "5 slices")
+
+
+@pytest.mark.parametrize("what", ["size", "spacing"])
+def test_slices_of_another_size_or_spacing_are_refused_by_name(tmp_path, what):
+    slices = axial(noisy())
+    changes = {"size": {"pixels": slices[5].pixels[:, :8]}, "spacing": {"spacing": (0.6, 0.75)}}
+    slices[5] = replace(slices[5], **changes[what])
+    write_series(tmp_path / "ct", slices)
+    refused(
+        tmp_path / "ct", f"another {'size' if what == 'size' else 'pixel spacing'}", "1.2.3_0005"
+    )
+
+
+def test_each_slice_has_its_own_scale(tmp_path):
+    slices = axial(noisy())
+    for k in (2, 5):
+        slices[k] = replace(slices[k], slope=2.0, intercept=-1000.0)
+        even = slices[k].pixels // 2 * 2
+        slices[k] = replace(slices[k], pixels=even)
+    write_series(tmp_path / "ct", slices)
+    expected = noisy().values.copy()
+    expected[:, :, [2, 5]] = expected[:, :, [2, 5]] // 2 * 2
+    same(read_image_file(tmp_path / "ct"), noisy().with_values(expected))
+
+
+def test_a_scale_other_than_hu_is_reported(tmp_path):
+    write_series(tmp_path / "ct", [s.with_tags(t0028_1054="MGML") for s in axial(noisy())])
+    assert "dicom-not-hu" in codes(read_image_file(tmp_path / "ct"))
+
+
+def test_other_files_are_skipped_and_a_damaged_slice_is_not(tmp_path):
+    write_series(tmp_path / "ct", axial(noisy()))
+    (tmp_path / "ct" / "README").write_text("from the archive")
+    found = read_image_file(tmp_path / "ct")
+    assert codes(found) == {"dicom-other-files"}
+    last = tmp_path / "ct" / "1.2.3_0007.dcm"
+    last.write_bytes(last.read_bytes()[:-40])
+    refused(tmp_path / "ct", "1.2.3_0007.dcm", "cut short")
+    last.write_bytes(last.read_bytes()[:300])
+    refused(tmp_path / "ct", "1.2.3_0007.dcm", "cut short")
+
+
+def test_a_slice_without_a_place_is_refused_by_name(tmp_path):
+    write_series(tmp_path / "ct", axial(noisy()))
+    path = tmp_path / "ct" / "1.2.3_0003.dcm"
+    path.write_bytes(path.read_bytes().replace(b"-20\\7\\106", b"-20\\7\\ nan"[:9]))
+    refused(tmp_path / "ct", "1.2.3_0003.dcm", "0020,0032")
+
+
+# Series ----------------------------------------------------------------------------------------
+
+
+def test_a_series_is_chosen_by_number_or_uid(tmp_path):
+    write_series(tmp_path / "ct", axial(noisy()), uid="1.2.3", number="4", description="soft")
+    other = noisy().with_values(noisy().values + np.int16(5))
+    write_series(tmp_path / "ct", axial(other), uid="1.2.4", number="5", description="sharp")
+    refused(tmp_path / "ct", "'soft'", "'sharp'", "number 4", "8 slices", "2 mm apart", "series =")
+    for wanted in ("5", "1.2.4"):
+        same(read_image_file(tmp_path / "ct", series=wanted), other)
+    refused(tmp_path / "ct", "'6'", "'soft'", series="6")
+
+
+def test_series_of_two_patients_or_studies_are_never_chosen_from(tmp_path):
+    long = smooth((6, 5, 40))
+    write_series(tmp_path / "ct", axial(long), uid="1.2.3", study="1.2")
+    write_series(tmp_path / "ct", axial(long)[:12], uid="1.2.4", study="1.5")
+    refused(tmp_path / "ct", "2 CT series")
+
+
+def test_other_modalities_under_one_series_are_skipped_and_reported(tmp_path):
+    write_series(tmp_path / "ct", axial(noisy()))
+    write_series(tmp_path / "ct", axial(noisy())[:2], modality="OT", names=["a", "b"])
+    found = read_image_file(tmp_path / "ct")
+    same(found, noisy())
+    assert codes(found) == {"dicom-series"}
+
+
+def test_a_series_asked_for_in_a_file_is_an_error(tmp_path):
+    cmfsim.write_image(noisy(), tmp_path / "a.nrrd")
+    refused(tmp_path / "a.nrrd", "series = '3'", series="3")
+
+
+# Frames ----------------------------------------------------------------------------------------
+
+
+def test_frames_are_placed_by_what_each_states(tmp_path):
+    slices = axial(noisy())
+    write_enhanced(tmp_path / "ct.dcm", [slices[i] for i in (3, 1, 0, 2, 7, 5, 6, 4)])
+    same(read_image_file(tmp_path / "ct.dcm"), noisy())
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "ct.dcm").rename(tmp_path / "folder" / "ct")
+    same(read_image_file(tmp_path / "folder"), noisy())
+
+
+def test_missing_frames_and_frames_of_several_scales_are_refused(tmp_path):
+    slices = axial(noisy())
+    write_enhanced(tmp_path / "gap.dcm", [s for k, s in enumerate(slices) if k != 3])
+    refused(tmp_path / "gap.dcm", "1 slice missing", "104.00 and 108.00 mm")
+    slices[2] = replace(slices[2], intercept=-1000.0)
+    write_enhanced(tmp_path / "scales.dcm", slices)
+    refused(tmp_path / "scales.dcm", "different rescale")
+
+
+# Real data -------------------------------------------------------------------------------------
+
+
+def test_a_real_tilted_series_lies_where_its_slices_state():
+    found = read_image_file(data_folder() / "ct_tilted")
+    (tilt,) = [f for f in found.findings if f.code == "dicom-tilted"]
+    assert "gantry tilt −18.5°" in tilt.what
+    assert "dicom-tilt-unclear" not in codes(found)
+    image = found.image
+    # The first pixel of the last slice: an orthogonal stack puts it at y = 26.4, z = 868.0.
+    assert image.lowest[:2] == pytest.approx([-123.5, -15.64], abs=0.01)
+    assert image.highest[2] == pytest.approx(874.8, abs=0.8)
+    # Above the first row of the last slice, and in front of the rest, there is air alone.
+    z = image.axes()[2].ravel()
+    assert (image.values[:, :, z > 874.9] == -1024).all()
+    assert (image.values[:, 1, z < 740.0] == -1024).all()
+
+
+def test_the_skin_of_a_tilted_head_is_that_of_the_upright_one(tmp_path):
+    measure = pytest.importorskip("skimage.measure")
+    whole = cmfsim.read_image(data_folder() / "ct_phantom" / "ct.nii.gz")
+    face = variants.cropped(variants.coarser(whole, (2, 2, 1)), 1, high=-215.0)
+    face = variants.cropped(variants.cropped(face, 2, low=340.0, high=420.0), 0, low=-10.0)
+    write_series(tmp_path / "ct", tilted(face, -18.5, 0.7, 0.7))
+    found = read_image_file(tmp_path / "ct")
+    assert "dicom-tilted" in codes(found)
+    image = found.image
+    skin = measure.marching_cubes(
+        np.asarray(image.values, dtype=np.float32), -300.0, spacing=tuple(image.spacing)
+    )[0]
+    points = skin + image.lowest
+    inner = (points > face.lowest + 4.0) & (points < face.highest - 4.0)
+    points = points[inner.all(axis=1)]
+    # How far the upright head's own surface is, by its value and slope there.
+    step = 0.05 * np.eye(3)
+    slope = np.stack([face.sample(points + s) - face.sample(points - s) for s in step], axis=1)
+    steep = np.linalg.norm(slope / 0.1, axis=1)
+    apart = np.abs(face.sample(points) + 300.0)[steep > 50.0] / steep[steep > 50.0]
+    assert len(apart) > 10_000
+    assert np.median(apart) < 0.02
+    assert np.percentile(apart, 95.0) < 0.1
