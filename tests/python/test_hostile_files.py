@@ -108,15 +108,34 @@ def bomb():
 
 
 def test_members_that_nobody_asks_for_are_not_unpacked(scene):
-    """A bomb, a text and a pickle beside the arrays of a scene change nothing."""
+    """A bomb and a pickle beside the arrays that are read change nothing."""
     more = {
         "bomb.npy": bomb(),
         "zeros.npy": packed(np.zeros(2**24)),
         "readme.txt": b"x",
         "object.npy": packed(np.array([{}], dtype=object)),
     }
-    wanted = cmfsim.read_scene(scene).sha256()
-    assert cmfsim.read_scene(rewritten(scene, more)).sha256() == wanted
+    header, arrays = read_archive(rewritten(scene, more), "cmfsim-scene", "scene")
+    assert header["segments"][0]["name"] == "bone"
+    assert np.array_equal(arrays["nodes"], NODES)
+
+
+@pytest.mark.parametrize("name", ["loadt", "segment.1.joined", "tissue.fraction", "Nodes"])
+def test_a_scene_takes_no_array_that_is_none_of_its_own(name, scene):
+    """`loads` with one letter changed would be no loads at all."""
+    path = rewritten(scene, {f"{name}.npy": packed(np.zeros(3))})
+    refused(lambda: cmfsim.read_scene(path), f"has the array '{name}', which is none of this scen")
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"conflictt": "resolve"},
+        {"segments": [{"name": "bone", "motion": "array", "creasd_angle": 20.0}]},
+    ],
+)
+def test_a_scene_takes_no_key_that_is_none_of_its_own(header, scene):
+    refused(lambda: cmfsim.read_scene(rewritten(scene, {}, header)), "has the unknown key")
 
 
 def test_an_array_that_states_more_than_it_has_is_refused_before_memory_is_taken(scene):
@@ -184,6 +203,22 @@ def test_concepts_of_an_archive_are_a_list(tmp_path):
     arrays |= {"triangle_steps": np.zeros(0, np.int32), "landmarks": np.zeros((0, 3))}
     np.savez(path, template=np.array(json.dumps({**head, "skull": {}})), **arrays)
     refused(lambda: read_template_archive(path), "concepts of a are 5")
+
+
+def test_a_name_twice_in_one_table_is_refused(scene, tmp_path):
+    """JSON's usual reader takes the last of two values in silence."""
+    given = cmfsim.read_scene(scene)
+    (tmp_path / "plan.json").write_text(
+        '{"plan": {"bone": {"translation": [0, 0, 5], "translation": [0, 0, -5]}}}'
+    )
+    refused(
+        lambda: cmfsim.read_plan(tmp_path / "plan.json", given), "'translation' stands there tw"
+    )
+    (tmp_path / "a.mrk.json").write_text(
+        '{"markups": [{"controlPoints": [{"label": "a", "position": [0, 0, 0], '
+        '"position": [0, 0, 1]}]}]}'
+    )
+    refused(lambda: cmfsim.read_landmarks(tmp_path / "a.mrk.json"), "'position' stands there twice")
 
 
 # Long numbers and deep keys.

@@ -23,7 +23,7 @@ from cmfsim.io.files import (
     check_readable,
     check_units,
     check_version,
-    refuse_constant,
+    parsed_json,
     replacing,
 )
 
@@ -179,7 +179,7 @@ def read_archive(
     if text.shape != () or text.dtype.kind != "U" or text.dtype.itemsize > 4 * MAX_TEXT:
         raise CaseInputError(f"member {text_name!r} is not a text of at most {MAX_TEXT} characters")
     try:
-        header = json.loads(str(text), parse_constant=refuse_constant)
+        header = parsed_json(str(text))
     except (ValueError, RecursionError) as error:
         raise CaseInputError(f"member {text_name!r} is not JSON ({error})") from error
     if not isinstance(header, dict):

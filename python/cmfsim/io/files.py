@@ -31,6 +31,7 @@ __all__ = [
     "check_version",
     "known_keys",
     "named",
+    "parsed_json",
     "read_document",
     "refuse_constant",
     "replacing",
@@ -167,7 +168,7 @@ def read_document(path: Path) -> dict[str, Any]:
     try:
         text = path.read_bytes().decode("utf-8-sig")
         if path.suffix == ".json":
-            document = json.loads(text, parse_constant=refuse_constant)
+            document = parsed_json(text)
         else:
             check_plain_toml(text)
             document = toml_module().loads(text.replace("\r\n", "\n"))
@@ -226,10 +227,32 @@ def toml_module() -> Any:
     raise CaseInputError("Python 3.10 reads TOML with tomli: pip install tomli, or use .json")
 
 
+def parsed_json(text: str) -> Any:
+    """The value of a JSON text; NaN, Infinity and a name twice in one table are refused.
+
+    Raises
+    ------
+    ValueError, RecursionError
+        Not JSON, or nested too deeply.
+    """
+    return json.loads(text, parse_constant=refuse_constant, object_pairs_hook=_refuse_twice)
+
+
 def refuse_constant(name: str) -> float:
     """Refuses NaN and Infinity, which JSON has not."""
     message = f"{name} is not a JSON number"
     raise ValueError(message)
+
+
+def _refuse_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The table of its pairs: of two values of one name, nobody knows which is meant."""
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        message = f"{twice[:40]!r} stands there twice"
+        raise ValueError(message)
+    return table
 
 
 def known_keys(where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
-from cmfsim.io.files import MAX_WHOLE, check_readable, refuse_constant, replacing
+from cmfsim.io.files import MAX_WHOLE, check_readable, parsed_json, replacing
 
 __all__ = [
     "Markup",
@@ -83,7 +83,7 @@ def markup_text(path: Path) -> str:
 def markups_of(text: str, unstated: str) -> list[Markup]:
     """The markups of a JSON text, in LPS mm; `unstated` is the frame of one that states none."""
     try:
-        document = json.loads(text, parse_constant=refuse_constant)
+        document = parsed_json(text)
     except (ValueError, RecursionError) as error:
         raise LandmarkInputError(f"is not JSON ({error})") from error
     markups = document.get("markups") if isinstance(document, dict) else None

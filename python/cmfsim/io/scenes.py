@@ -40,6 +40,16 @@ SCENE_KEYS = (
     *("format", "version", "units", "mesh", "conflicts"),
     *("tissue", "segments", "plan", "solver"),
 )
+# Keys of the JSON text of an archive, and of an entry of its segments.
+ARCHIVE_KEYS = ("format", "version", "units", "tissue", "segments", "conflicts", "solver")
+ENTRY_KEYS = ("name", "crease_angle", "gap", "motion", "motion_crease_angle")
+# Arrays of an archive, and of its segment number N as segment.N.…; a name that is none of these is
+# refused, for an array that may be absent would else be lost by one letter.
+ARCHIVE_ARRAYS = ("nodes", "tets", "fixed", "loads")
+SEGMENT_ARRAYS = (
+    *("joined", "sliding", "gap", "contact.vertices", "contact.triangles"),
+    *("motion", "motion.vertices", "motion.triangles", "motion.moved_vertices"),
+)
 PLAN_KEYS = ("format", "version", "name", "note", "units", "plan")
 # Texts of a tissue, beside its arrays.
 TISSUE_TEXTS = ("kind", "law", "preset", "mixing")
@@ -152,6 +162,7 @@ def read_plan(path: str | os.PathLike[str], scene: Scene) -> dict[str, NDArray[A
 
 
 def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray[Any]]) -> Scene:
+    known_keys("scene", header, ARCHIVE_KEYS)
     tissue = table_of(header, "tissue")
     kind = _tissue_kind(tissue)
     arrays = {n: members[f"tissue.{n}"] for n in TISSUE_ARRAYS[kind] if f"tissue.{n}" in members}
@@ -165,6 +176,7 @@ def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray
         if not isinstance(entry, dict) or not isinstance(entry.get("name"), str):
             raise CaseInputError(f"segments[{number}] has no name")
         name = entry["name"]
+        known_keys(f"segments[{number}]", entry, ENTRY_KEYS)
         if name in segments:
             raise CaseInputError(f"segments[{number}] is {name!r} again")
         contact = None
@@ -187,6 +199,15 @@ def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray
             plan[name] = MovedSurface(surface, member_of(members, f"{key}.motion.moved_vertices"))
         else:
             plan[name] = member_of(members, f"{key}.motion")
+    known = {
+        "scene",
+        *ARCHIVE_ARRAYS,
+        *(f"tissue.{name}" for name in TISSUE_ARRAYS[kind]),
+        *(f"segment.{i}.{name}" for i in range(len(entries)) for name in SEGMENT_ARRAYS),
+    }
+    for member in members:
+        if member not in known:
+            raise CaseInputError(f"has the array {member!r}, which is none of this scene's")
     return Scene(
         nodes=member_of(members, "nodes"),
         tets=member_of(members, "tets"),
