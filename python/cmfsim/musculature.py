@@ -6,6 +6,7 @@ A template's muscles, the same muscles in a patient, and surfaces that a user br
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -82,7 +83,7 @@ class MuscleSurface(Frozen):
         object.__setattr__(self, "course", tuple(lines))
 
 
-def _checked_boxes(name: str, boxes: object) -> int:
+def _checked_boxes(name: str, boxes: Any) -> int:
     """A number of boxes that the core takes, whether from a template, an archive or code."""
     if isinstance(boxes, bool) or not isinstance(boxes, int | np.integer):
         raise CaseInputError(

@@ -434,7 +434,7 @@ def test_nan_in_a_surface_is_named_with_its_row(tmp_path):
     path.write_text(path.read_text("utf-8").replace("skin.ply", "skin.obj"), encoding="utf-8")
     (finding,) = cmfsim.diagnose(cmfsim.Case.load(path))
     assert finding.code == "surface-unreadable"
-    assert "must be finite" in finding.what
+    assert "line 2: 'nan' is not finite" in finding.what
 
 
 # Cuts, transforms, images.
