@@ -99,7 +99,7 @@ def predict_patient(patient: PatientModel, model: str = "M+S") -> Prediction:
         **patient.summary,
         "model": model,
         "case_key": _case_key(patient, scene),
-        "plan": {name: _motion(patient, name, m) for name, m in scene.plan.items()},
+        "plan": {name: _motion(patient, scene, name) for name in scene.plan},
         "skin": {
             "mean": float(moved.mean()),
             "p95": float(np.percentile(moved, 95)),
@@ -139,16 +139,17 @@ def _arrays(scene: Scene) -> Iterator[tuple[str, NDArray[Any]]]:
             yield f"motion of {name}", np.asarray(motion)
 
 
-def _motion(patient: PatientModel, name: str, motion: Any) -> dict[str, Any]:
+def _motion(patient: PatientModel, scene: Scene, name: str) -> dict[str, Any]:
     """A segment's motion in a planner's numbers, and in a surgeon's.
 
     A planner's are those about the segment's own centre (paper, Table 2).
     """
+    motion = scene.plan[name]
     surfaces = {segment.name: segment.surface for segment in patient.segments}
     if isinstance(motion, MovedSurface) or np.shape(motion) == (4, 4):
         vertices = np.asarray(surfaces[name].vertices)
     else:
-        vertices = np.asarray(patient.scene.nodes)[np.asarray(patient.scene.segments[name].joined)]
+        vertices = np.asarray(scene.nodes)[np.asarray(scene.segments[name].joined)]
     clinical = clinical_motion(
         name,
         motion,
