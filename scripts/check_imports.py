@@ -174,12 +174,13 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "patient": "checks errors pickling",
         "model": "case checks musculature osteotomy pickling scene",
         "io": (
-            "case checks errors model musculature patient planning prediction scene template_data"
+            "case checks errors landmark_sites model musculature patient planning prediction scene "
+            "template_data"
         ),
         "imaging": "case checks errors scene _core",
         "meshing": "case checks errors scene _core",
         "musculature": "case checks errors pickling scene _core",
-        "registration": "case checks errors scene _core",
+        "registration": "case checks errors landmark_sites scene _core",
         "equivalent": "case checks errors musculature scene _core",
         "landmark_sites": "",
         "template_data": "case checks errors musculature pickling scene",
@@ -201,7 +202,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "checks clinical_plan errors model planning prediction scene simulation _core"
         ),
         "deferred": "",
-        "evaluation": "case checks errors registration scene topology _core",
+        "evaluation": "case checks errors landmark_sites registration scene topology _core",
         "build": (
             "achieved bone_motion case checks deferred doctor equivalent errors imaging io "
             "meshing model "

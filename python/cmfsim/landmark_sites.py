@@ -1,9 +1,28 @@
-"""The bone sites by which a muscle template is fitted: their names and where they lie."""
+"""The landmarks of skull and skin: their names, and where the bone sites of a template lie."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
 
-__all__ = ["SKULL_LANDMARKS"]
+__all__ = ["SKIN_LANDMARKS", "SKULL_LANDMARKS", "label_key"]
+
+# The fourteen landmarks of the skin, after Kim et al. (2010), Figure 8: the figure's names are not
+# in its text, so the choice is ours.
+SKIN_LANDMARKS = (
+    "nasion",
+    "pronasale",
+    "subnasale",
+    "labiale_superius",
+    "labiale_inferius",
+    "pogonion",
+    "exocanthion_L",
+    "exocanthion_R",
+    "endocanthion_L",
+    "endocanthion_R",
+    "alare_L",
+    "alare_R",
+    "cheilion_L",
+    "cheilion_R",
+)
 
 _MIDLINE: Mapping[str, str] = {
     "supraglabella": "frontal bone above the glabella, where the forehead begins to rise upright",
@@ -43,3 +62,8 @@ def _definitions() -> dict[str, str]:
 # 10 in the midline and 11 on either side, after the sites at which Rhine & Campbell (1980) and
 # Phillips & Smuts (1996) measured the soft tissue; left and right are the patient's.
 SKULL_LANDMARKS: Mapping[str, str] = MappingProxyType(_definitions())
+
+
+def label_key(label: str) -> str:
+    """What two spellings of a label have in common: neither capitals nor what parts the words."""
+    return "_".join(label.casefold().replace("-", " ").replace("_", " ").split())

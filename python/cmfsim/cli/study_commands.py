@@ -21,7 +21,7 @@ from cmfsim.cli.results import (
 from cmfsim.cli.terminal import StageProgress, end_with_input, escaped
 from cmfsim.clinical_plan import plan_lines
 from cmfsim.errors import CmfsimError
-from cmfsim.io import Cohort, read_landmarks, replacing
+from cmfsim.io import Cohort, read_landmark_file, replacing
 from cmfsim.prediction import MODELS, Prediction
 from cmfsim.study import CaseOutcome, StudyReport, predict_models, run_study
 from cmfsim.study import evaluate as evaluate_case
@@ -42,7 +42,7 @@ def predict(options: argparse.Namespace) -> int:
     models = models_of(options.model, ("M+S",))
     prepare(case, report=not options.no_report)
     notices = Notices(quiet=options.quiet)
-    findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
+    findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
     failed: dict[str, CmfsimError] = {}
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         predictions = predict_models(
@@ -100,7 +100,7 @@ def evaluate(options: argparse.Namespace) -> int:
     models = models_of(options.model, MODELS)
     prepare(case, report=not options.no_report, evaluation=True)
     notices = Notices(quiet=options.quiet)
-    findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
+    findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         found = evaluate_case(
             case,
@@ -156,7 +156,9 @@ def sensitivity(options: argparse.Namespace) -> int:
     case = case_of(options)
     prepare(case)
     notices = Notices(quiet=options.quiet)
-    findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
+    findings = (
+        () if options.no_doctor else checked(case, notices, (options.model,), quiet=options.quiet)
+    )
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         found = landmark_sensitivity(
             case,
@@ -197,7 +199,7 @@ def _trials(options: argparse.Namespace) -> Any:
     """The number of trials to draw, or the landmarks of each file."""
     if not options.landmarks:
         return options.trials
-    return [read_landmarks(path) for path in options.landmarks]
+    return [read_landmark_file(path).points for path in options.landmarks]
 
 
 def _mean(values: Sequence[float]) -> float:

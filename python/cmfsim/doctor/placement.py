@@ -9,6 +9,7 @@ from cmfsim.case import Finding
 from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Body, Evidence
 from cmfsim.doctor.places import place_text
+from cmfsim.patient import UNITS
 from cmfsim.registration import side_vectors, wrong_sides
 
 __all__ = ["check_placement"]
@@ -94,6 +95,19 @@ def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
     if low <= extent <= high:
         return
     stated = evidence.case.surfaces.units if evidence.case.surfaces else "mm"
+    # As the file has it: where other units are stated, its numbers may simply be mm.
+    numbers = extent / UNITS[stated]
+    if low <= numbers <= high:
+        yield Finding(
+            "error",
+            "surface-units",
+            f"the skin is {numbers:.4g} long in the file's own numbers: these look like mm, and "
+            f"are read as {stated} ({extent:.4g} mm)",
+            evidence.skin.where,
+            "every length of the case is mm; a head is 110 to 420 mm long",
+            'write units = "mm" under [surfaces], or leave units out',
+        )
+        return
     for name, least, most, factor in OTHER_UNITS:
         if least <= extent <= most:
             mend = (

@@ -9,27 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import Floats, as_floats, as_rows
 from cmfsim.errors import LandmarkInputError
+from cmfsim.landmark_sites import SKIN_LANDMARKS
 
 __all__ = ["REGIONS", "SKIN_LANDMARKS", "skin_regions"]
 
-# The fourteen landmarks of the skin, after Kim et al. (2010), Figure 8: the figure's names are not
-# in its text, so the choice is ours.
-SKIN_LANDMARKS = (
-    "nasion",
-    "pronasale",
-    "subnasale",
-    "labiale_superius",
-    "labiale_inferius",
-    "pogonion",
-    "exocanthion_L",
-    "exocanthion_R",
-    "endocanthion_L",
-    "endocanthion_R",
-    "alare_L",
-    "alare_R",
-    "cheilion_L",
-    "cheilion_R",
-)
 PAIRS = ("exocanthion", "endocanthion", "alare", "cheilion")
 REGIONS: Mapping[str, str] = MappingProxyType(
     {

@@ -8,7 +8,7 @@ import csv
 import logging
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -27,6 +27,7 @@ from cmfsim.io.markups import (
     markups_of,
     write_markups,
 )
+from cmfsim.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, label_key
 
 __all__ = ["LandmarkFile", "read_landmark_file", "read_landmarks", "write_landmarks"]
 
@@ -96,7 +97,7 @@ def read_landmarks(path: str | os.PathLike[str], *, frame: str | None = None) ->
     >>> landmarks["nasion"].shape  # doctest: +SKIP
     (3,)
     """
-    found = read_landmark_file(path, frame=frame)
+    found = _read(path, frame)
     for finding in found.findings:
         if finding.severity == "warning":
             logging.getLogger(__name__).warning("%s: %s", finding.where, finding.what)
@@ -104,7 +105,50 @@ def read_landmarks(path: str | os.PathLike[str], *, frame: str | None = None) ->
 
 
 def read_landmark_file(path: str | os.PathLike[str], *, frame: str | None = None) -> LandmarkFile:
-    """The landmarks of a file with its frame and findings; see `read_landmarks`."""
+    """The landmarks of a file with its frame and findings; see `read_landmarks`.
+
+    Labels that differ from those of `SKULL_LANDMARKS` and `SKIN_LANDMARKS` in spelling alone
+    (capitals, spaces, hyphens) get theirs, and a finding reports it: `Nasion` is `nasion` wherever
+    a case uses it.
+    """
+    found = _read(path, frame)
+    points, findings = _known_labels(found.points, Path(path).name)
+    return replace(found, points=points, findings=(*found.findings, *findings))
+
+
+def _known_labels(
+    points: Mapping[str, Floats], where: str
+) -> tuple[Mapping[str, Floats], list[Finding]]:
+    """The landmarks with the labels by which the package knows them."""
+    known = {label_key(name): name for name in (*SKULL_LANDMARKS, *SKIN_LANDMARKS)}
+    labels = {label: known.get(label_key(label), label) for label in points}
+    for label, name in labels.items():
+        if label != name and name in points:
+            raise LandmarkInputError(
+                f"{where}: has {name!r} and {label!r}, which differ in spelling alone: remove or "
+                "rename one"
+            )
+    renamed = [f"{label!r} is {name!r}" for label, name in labels.items() if label != name]
+    if len(set(labels.values())) < len(labels):
+        raise LandmarkInputError(
+            f"{where}: has a landmark twice, in two spellings ({', '.join(renamed[:4])}): remove "
+            "or rename one"
+        )
+    if not renamed:
+        return points, []
+    more = f" and {len(renamed) - 4} more" if len(renamed) > 4 else ""
+    finding = Finding(
+        "note",
+        "landmark-spelling",
+        f"{len(renamed)} labels are spelled differently: {', '.join(renamed[:4])}{more}",
+        where,
+        "they are used under the second name",
+        "nothing has to be done; spelled alike they are easier to find",
+    )
+    return MappingProxyType({labels[label]: point for label, point in points.items()}), [finding]
+
+
+def _read(path: str | os.PathLike[str], frame: str | None) -> LandmarkFile:
     path = Path(path)
     if frame is not None:
         check_one_of("frame", frame, ("LPS", "RAS"))

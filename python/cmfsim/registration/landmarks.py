@@ -10,6 +10,7 @@ from cmfsim._core import ThinPlateSpline, rigid_fit
 from cmfsim.case import Finding
 from cmfsim.checks import Floats, frozen
 from cmfsim.errors import LandmarkInputError, RegistrationError
+from cmfsim.landmark_sites import label_key
 from cmfsim.registration.sides import swapped_pairs, wrong_sides
 
 __all__ = ["LandmarkMatch", "match_landmarks"]
@@ -93,7 +94,7 @@ def match_landmarks(
     """
     sets = {"source": _points("source", source), "target": _points("target", target)}
     keys = {name: _keys(name, points) for name, points in sets.items()}
-    wanted = [_key(n) for n in required] if required is not None else list(keys["source"])
+    wanted = [label_key(n) for n in required] if required is not None else list(keys["source"])
     asked = dict(zip(wanted, required, strict=True)) if required is not None else keys["source"]
     for name in ("source", "target"):
         missing = [asked[key] for key in wanted if key not in keys[name]]
@@ -142,15 +143,10 @@ def _points(name: str, landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:
     return points
 
 
-def _key(label: str) -> str:
-    """What two spellings of a label have in common."""
-    return "_".join(label.casefold().replace("-", " ").replace("_", " ").split())
-
-
 def _keys(name: str, points: Mapping[str, Floats]) -> dict[str, str]:
     found: dict[str, str] = {}
     for label in points:
-        key = _key(label)
+        key = label_key(label)
         if key in found:
             raise LandmarkInputError(
                 f"the {name} has {found[key]!r} and {label!r}, which differ in spelling alone: "
