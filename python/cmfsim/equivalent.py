@@ -254,7 +254,7 @@ def equivalent_material(
         shares=shares,
     )
     for finding in mixture.findings:
-        _log.info("%s: %s", finding.severity, finding.what)
+        _log.debug("%s: %s", finding.severity, finding.what)
     held, points = mixture.summary["muscle_tets"], mixture.samples
     _log.info("muscle in %d of %d tets, %d points", held, mesh.n_tets, points)
     return mixture

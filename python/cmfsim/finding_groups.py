@@ -16,7 +16,6 @@ TITLES: Mapping[str, str] = {
     "muscle-open": "{n} muscle surfaces are not closed",
     "muscle-sheet": "{n} muscles are sheets, whose outline hardly shows the direction of fibres",
     "landmark-far": "{n} landmarks lie far from their surface",
-    "landmark-spelling": "{n} landmarks are spelled differently",
     "surface-closed": "{n} surfaces were open and were closed",
     "surface-open": "{n} surfaces are open",
 }

@@ -192,7 +192,9 @@ def _inverted(solver: StaticSolver, solution: Solution) -> tuple[int | None, lis
     count, found = inversion_finding(solver.tensors, solution.all_displacements)
     if found is None:
         return count, []
-    _log.warning("%s: %s, %s: %s; %s", found.code, found.what, found.where, found.why, found.mend)
+    # The command line prints findings itself.
+    words = (found.code, found.what, found.where, found.why, found.mend)
+    _log.warning("%s: %s, %s: %s; %s", *words, extra={"is_finding": True})
     return count, [asdict(found)]
 
 

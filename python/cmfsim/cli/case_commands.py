@@ -20,6 +20,7 @@ from cmfsim.clinical_plan import plan_lines
 from cmfsim.doctor import Examination, examine, findings_text
 from cmfsim.io import Case
 from cmfsim.io.models import is_model_file
+from cmfsim.study.prediction import case_for_models
 
 __all__ = ["build", "case_of", "checked", "doctor", "print_findings"]
 
@@ -88,8 +89,10 @@ def case_of(options: argparse.Namespace) -> Case:
     return case
 
 
-def checked(case: Case, notices: Notices, *, quiet: bool) -> tuple[Finding, ...]:
-    """What the doctor finds, with its warnings printed.
+def checked(
+    case: Case, notices: Notices, models: Sequence[str] | None = None, *, quiet: bool
+) -> tuple[Finding, ...]:
+    """What the doctor finds of a case for some models, with its warnings printed.
 
     Raises
     ------
@@ -98,7 +101,8 @@ def checked(case: Case, notices: Notices, *, quiet: bool) -> tuple[Finding, ...]
     """
     with StageProgress(sys.stderr, quiet=quiet) as progress:
         progress.stage("checking the case")
-        found = examine(case)
+        asked = case if models is None else case_for_models(case, models)
+        found = examine(asked, models=models)
     if not quiet:
         # Before the work: a reversed plan is seen here, not in the face.
         for line in plan_lines(_plan_values(found)):

@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from cmfsim.case import Finding
 from cmfsim.cli.exit_codes import DONE
+from cmfsim.cli.notices import Notices
 from cmfsim.cli.terminal import escaped
 from cmfsim.errors import CaseInputError
 from cmfsim.io import read_plan, read_scene, result_suffixes, write_result
@@ -30,6 +32,7 @@ def solve(options: argparse.Namespace) -> int:
     write_result(options.output, result)
     logging.getLogger("cmfsim").info("wrote %s", options.output)
     summary = dict(result.summary)
+    Notices(quiet=options.quiet).add(Finding(**entry) for entry in summary["findings"])
     size = np.linalg.norm(result.displacements, axis=1)
     if options.json:
         extra = {"output": str(options.output), "seconds": seconds, "largest": float(size.max())}

@@ -34,9 +34,10 @@ class ProgressHandler(logging.Handler):
     """Log lines on the standard error of the moment."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Drops what imaging says of its stages: the display of progress names them already."""
-        told = record.name.startswith("cmfsim.imaging") and record.levelno <= logging.INFO
-        return not told and bool(super().filter(record))
+        """Drops what is printed elsewhere: findings, and the stages of imaging."""
+        shown = record.name.startswith("cmfsim.imaging") and record.levelno <= logging.INFO
+        shown = shown or getattr(record, "is_finding", False)
+        return not shown and bool(super().filter(record))
 
     def emit(self, record: logging.LogRecord) -> None:
         """Prints one line, over the line of the stage where there is one."""

@@ -171,7 +171,8 @@ def _alerts(findings: Sequence[Finding], left_out: str) -> list[Alert]:
         alerts.append(Alert(group.severity, group.line, tuple(d for d in details if d)))
     notes = [finding for finding in findings if finding.severity == "note"]
     if notes:
-        alerts.append(Alert("note", f"{counted(notes)}, listed below under Findings"))
+        lines = tuple(group.line for group in grouped(notes))
+        alerts.append(Alert("note", f"{counted(notes)}, in full below under Findings", lines))
     return alerts
 
 

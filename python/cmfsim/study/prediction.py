@@ -8,13 +8,13 @@ from cmfsim.build import Postoperative, build_model, case_key, input_hashes
 from cmfsim.case import Anatomy, Finding
 from cmfsim.checks import check_one_of
 from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
-from cmfsim.io import CaseOrPath, as_case
+from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.model import PatientModel
 from cmfsim.patient import CaseMuscles
 from cmfsim.patient_prediction import predict_patient
 from cmfsim.prediction import MODELS, Prediction
 
-__all__ = ["build_patient", "predict", "predict_models"]
+__all__ = ["build_patient", "case_for_models", "named_models", "predict", "predict_models"]
 
 _log = logging.getLogger(__name__)
 
@@ -157,6 +157,13 @@ def named_models(models: str | Sequence[str]) -> tuple[str, ...]:
     return named
 
 
+def case_for_models(case: Case, models: Sequence[str]) -> Case:
+    """The case as models need it: with muscles, if one of them has muscles, and only then."""
+    if not any(model.startswith("M") for model in models):
+        return replace(case, muscles=None)
+    return case if case.muscles is not None else replace(case, muscles=CaseMuscles())
+
+
 def build_patient(
     case: CaseOrPath,
     models: Sequence[str],
@@ -179,13 +186,8 @@ def build_patient(
     # Before the files are read: the key must be that of what is built.
     hashes = input_hashes(case)
     key = case_key(case, hashes)
-    wanted = any(model.startswith("M") for model in models)
-    if not wanted:
-        case = replace(case, muscles=None)
-    elif case.muscles is None:
-        case = replace(case, muscles=CaseMuscles())
     patient = build_model(
-        case,
+        case_for_models(case, models),
         progress=progress,
         check=check,
         findings=findings,
