@@ -112,8 +112,13 @@ def upright(values: NDArray[Any], affine: NDArray[np.float64], name: str) -> Ima
     resampler.SetTransform(to_index)
     resampler.SetInterpolator(itk.sitkLinear)
     resampler.SetDefaultPixelValue(_outside(values))
-    made = resampler.Execute(image)
-    return ImageData(itk.GetArrayFromImage(made).T, spacing, low)
+    if values.dtype.kind in "iu":
+        # ITK would cut whole numbers off, not round them.
+        resampler.SetOutputPixelType(itk.sitkFloat32)
+    made = itk.GetArrayFromImage(resampler.Execute(image)).T
+    if values.dtype.kind in "iu":
+        made = np.rint(made, out=made).astype(values.dtype)
+    return ImageData(made, spacing, low)
 
 
 def of_slices(

@@ -16,13 +16,20 @@ from cmfsim.errors import ImageError, ImageInputError
 from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
 from cmfsim.io.dicom import read_dicom_file, read_dicom_folder
 from cmfsim.io.image_grids import aligned, shear_of, turn_of, upright
-from cmfsim.io.image_headers import ImageHeader, image_header
+from cmfsim.io.image_headers import KNOWN, ImageHeader, apart
 from cmfsim.io.leftovers import abandoned, temporary_folder
+from cmfsim.io.metaimage import is_meta, meta_header
+from cmfsim.io.nifti import GZIP, is_nifti, read_nifti
+from cmfsim.io.nrrd import nrrd_header
 
 __all__ = ["ImageFile", "read_image", "read_image_file", "write_image"]
 
 # What is written; reading goes by content.
 SUFFIXES = (".nrrd", ".nii", ".nii.gz", ".mha")
+# Names of files that are no DICOM, whose content is none of their formats.
+OTHER_SUFFIXES = (".nrrd", ".nhdr", ".nii", ".gz", ".mha", ".mhd", ".hdr")
+# What tells formats apart.
+FIRST_BYTES = 1024
 # The header as read here and by ITK agree on the place of each corner to this, mm.
 READERS_AGREE = 0.1
 # Axes farther from a right angle than this are reported as sheared, degrees.
@@ -95,9 +102,22 @@ def read_image_file(path: str | os.PathLike[str], *, series: str | None = None) 
             f"{path.name}: series = {series!r} chooses among the series of a DICOM folder, and "
             "this is a file: remove it, or name the folder"
         )
-    header = image_header(path)
+    with path.open("rb") as file:
+        begin = file.read(FIRST_BYTES)
+    if not begin:
+        raise ImageInputError(f"{path.name}: is empty")
     _simpleitk()
-    return ImageFile(*read_dicom_file(path)) if header is None else _read_file(path, header)
+    # A DICOM file may begin with anything.
+    if begin[128:132] != b"DICM":
+        if begin.startswith(GZIP) or is_nifti(begin):
+            return _placed(path, *read_nifti(path))
+        if begin.startswith(b"NRRD000"):
+            return _read_file(path, nrrd_header(path))
+        if is_meta(begin):
+            return _read_file(path, meta_header(path))
+        if path.name.lower().endswith(OTHER_SUFFIXES):
+            raise ImageInputError(f"{path.name}: is no image that can be read; {KNOWN}")
+    return ImageFile(*read_dicom_file(path))
 
 
 def write_image(image: ImageData, path: str | os.PathLike[str]) -> None:
@@ -178,36 +198,39 @@ def _read_file(path: Path, header: ImageHeader) -> ImageFile:
             f"{path.name}: its header states {header.size} voxels, and {values.shape} were read: "
             "is it damaged?"
         )
-    if values.dtype.kind == "f":
-        _check_finite(values, path)
     theirs = _affine_of(answer.values)
     affine = header.affine
     if affine is None:
         affine = theirs
-    elif not header.scaled and (apart := _apart(affine, theirs, header.size)) > READERS_AGREE:
+    elif not header.scaled and (off := apart(affine, theirs, header.size)) > READERS_AGREE:
         raise ImageInputError(
-            f"{path.name}: two readings of its header disagree by {apart:.4g} mm on where it lies "
+            f"{path.name}: two readings of its header disagree by {off:.4g} mm on where it lies "
             f"({affine.round(4).tolist()} and {theirs.round(4).tolist()}): export the image again"
         )
-    findings = [*header.findings]
+    return _placed(path, values, affine, header.findings)
+
+
+def _placed(
+    path: Path,
+    values: NDArray[Any],
+    affine: NDArray[np.float64],
+    findings: tuple[Finding, ...],
+) -> ImageFile:
+    """The image of voxels with their map to LPS, on axes of the patient."""
+    if values.dtype.kind == "f":
+        _check_finite(values, path)
     image = aligned(values, affine)
     if image is None:
-        image = upright(values, affine, path.name)
-        findings.append(_resampled(path, affine))
-    return ImageFile(image, "", tuple(findings))
+        return ImageFile(
+            upright(values, affine, path.name), "", (*findings, _resampled(path, affine))
+        )
+    return ImageFile(image, "", findings)
 
 
 def _affine_of(place: Any) -> NDArray[np.float64]:
     """The map from index to place of an ITK image, (3, 4)."""
     direction = np.array(place["direction"]).reshape(3, 3)
     return np.column_stack([direction * np.array(place["spacing"]), place["origin"]])
-
-
-def _apart(a: NDArray[np.float64], b: NDArray[np.float64], size: tuple[int, int, int]) -> float:
-    """How far two maps lie apart at the corners of an image, mm."""
-    last = np.array(size) - 1.0
-    corners = [[*(last * [(c >> k) & 1 for k in range(3)]), 1.0] for c in range(8)]
-    return float(np.linalg.norm(np.array(corners) @ (a - b).T, axis=1).max())
 
 
 def _resampled(path: Path, affine: NDArray[np.float64]) -> Finding:
