@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim._core import TetMesh, __version__
+from cmfsim._core import Surface, TetMesh, __version__
 from cmfsim.build.clefts import without_clefts
 from cmfsim.build.held import held_part
 from cmfsim.build.inputs import (
@@ -28,6 +28,12 @@ from cmfsim.build.tissue_mesh import end_planes, region_of, tissue_mesh
 from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, NodeKinds
 from cmfsim.checks import Floats
 from cmfsim.doctor import SizedMotion, check_motion_size, diagnose
+from cmfsim.doctor.landmarks import (
+    LANDMARK_CODES,
+    check_landmarks,
+    nearest_of_level,
+    nearest_of_surfaces,
+)
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Case, CaseOrPath, as_case, write_model
 from cmfsim.meshing import (
@@ -172,6 +178,10 @@ def build_model(
     bones = planned_bones(case, cut.segments, after)
     findings += bones.findings
     findings += _plan_sizes(case, bones, findings)
+    if case.image is not None:
+        # What was compared with the voxels of the CT is compared with the bones made of them.
+        findings[:] = [f for f in findings if f.code not in LANDMARK_CODES]
+        findings += _misplaced(case, landmarks, anatomy, cut.segments)
     # Again for all of them together: pieces of two bones never met before.
     check_segments(bones.segments)
     moved = [*dict.fromkeys([*_cut_segments(case), *bones.motions])]
@@ -292,6 +302,29 @@ def _checked(case: Case) -> tuple[Finding, ...]:
         more = f" ({len(errors) - 1} more: cmfsim doctor shows them)" if len(errors) > 1 else ""
         raise CaseInputError(f"{first.where}: {first.what}; {first.mend}{more}")
     return findings
+
+
+def _misplaced(
+    case: Case,
+    landmarks: Mapping[str, Mapping[str, Floats]],
+    anatomy: Anatomy,
+    segments: tuple[BoneSegment, ...],
+) -> list[Finding]:
+    """Findings about landmarks that do not lie on the bones and the skin that were segmented."""
+    surfaces = [Surface(s.surface.vertices, s.surface.triangles) for s in segments]
+    findings: list[Finding] = []
+    for key, places in landmarks.items():
+        where = case.where(f"landmarks.{key}")
+        on_bone = key == "skull"
+        nearest = (
+            nearest_of_surfaces(surfaces)
+            if on_bone
+            else nearest_of_level(anatomy.skin, 0.0, places)
+        )
+        findings += check_landmarks(key, places, where, nearest)
+    # What is too far from the bone of the CT has ended the work before; what only lies far from the
+    # bone that was segmented may lie on bone that was lost.
+    return [replace(f, severity="warning") if f.severity == "error" else f for f in findings]
 
 
 def _procedures(case: Case, landmarks: Mapping[str, Floats]) -> list[Procedure]:

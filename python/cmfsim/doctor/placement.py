@@ -8,6 +8,12 @@ from numpy.typing import NDArray
 from cmfsim.case import Finding
 from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Body, Evidence
+from cmfsim.doctor.landmarks import (
+    Nearest,
+    check_landmarks,
+    nearest_of_level,
+    nearest_of_surfaces,
+)
 from cmfsim.doctor.places import place_text
 from cmfsim.patient import UNITS
 from cmfsim.registration import side_vectors, wrong_sides
@@ -33,11 +39,15 @@ ELSEWHERE_SHARE = 0.4
 FITTING_SHARE = 0.05
 # Depth by which a bone may pass the skin before it is said, mm: the accuracy of two surfaces.
 THROUGH_SKIN = 0.1
-# Distance of a landmark from its surface, mm: twice the placing error of an operator, and so far
-# that it lies on something else.
+# Distances of a set of landmarks from its surface, mm, at which it fits, and at which another frame
+# or unit is tried.
 LANDMARK_WARNING, LANDMARK_ERROR = 5.0, 15.0
 # So many landmarks on a bone that is given alone are no accident.
 OF_ONE_BONE = 4
+# Share of the landmarks that then lie far from it.
+OF_OTHERS = 0.25
+# HU at which bone and skin begin where the case does not state it, as in `SegmentOptions`.
+THRESHOLDS = {"skull": 250.0, "skin": -300.0}
 # Distance of two groups of landmarks below which they give no direction, mm.
 SHORTEST = 5.0
 # Share of the length of a direction that its main axis must have for the head to be upright.
@@ -70,7 +80,10 @@ def check_placement(evidence: Evidence) -> list[Finding]:
             turned = turned or any(f.code == "frame-turned" for f in wrong)
         if not wrong:
             wrong = list(_check_sides(evidence, key, landmarks))
-            wrong += _check_distances(evidence, key, landmarks)
+            if not wrong:
+                where = evidence.case.where(f"landmarks.{key}")
+                nearest = _nearest_point(evidence, key, landmarks)
+                wrong = check_landmarks(key, landmarks, where, nearest)
         findings += wrong
     if not turned:
         findings += _check_bone_directions(evidence)
@@ -182,7 +195,7 @@ def _check_landmark_fit(
     median = float(np.median(nearest))
     if median <= LANDMARK_ERROR:
         return
-    if key == "skull" and len(bodies) == 1 and (nearest <= LANDMARK_WARNING).sum() >= OF_ONE_BONE:
+    if key == "skull" and _is_part(bodies, points):
         # The others belong to the bone that is not given.
         return
     where = evidence.case.where(f"landmarks.{key}")
@@ -359,25 +372,28 @@ def _check_sides(
         )
 
 
-def _check_distances(
-    evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
-) -> Iterator[Finding]:
+def _nearest_point(evidence: Evidence, key: str, landmarks: Mapping[str, Floats]) -> Nearest | None:
+    """Closest points on the bones or the skin of the case, if it has them."""
     bodies = _bodies(evidence, key)
-    if not bodies:
-        return
-    distances = _nearest(bodies, np.stack(list(landmarks.values())))
-    surface = "bone" if key == "skull" else "skin"
-    for (name, point), distance in zip(landmarks.items(), distances, strict=True):
-        if distance <= LANDMARK_WARNING:
-            continue
-        yield Finding(
-            "error" if distance > LANDMARK_ERROR else "warning",
-            "landmark-far",
-            f"{name} lies {distance:.1f} mm from the {surface}, at {place_text(point)}",
-            evidence.case.where(f"landmarks.{key}"),
-            f"more than {LANDMARK_WARNING:g} mm is no placing error",
-            "place it again, or correct its label",
-        )
+    if key == "skull" and _is_part(bodies, np.stack(list(landmarks.values()))):
+        return None
+    if bodies:
+        return nearest_of_surfaces([body.index for body in bodies])
+    given, image = evidence.case.image, evidence.image
+    if given is None or image is None:
+        return None
+    stated = given.bone_threshold if key == "skull" else given.skin_threshold
+    return nearest_of_level(image, THRESHOLDS[key] if stated is None else stated, landmarks)
+
+
+def _is_part(bodies: Sequence[Body], points: Floats) -> bool:
+    """Whether the landmarks belong to a skull of which one bone alone is given."""
+    if len(bodies) != 1:
+        return False
+    nearest = _nearest(bodies, points)
+    return int((nearest <= LANDMARK_WARNING).sum()) >= OF_ONE_BONE and bool(
+        np.quantile(nearest, 1.0 - OF_OTHERS) > LANDMARK_ERROR
+    )
 
 
 def _check_bone_directions(evidence: Evidence) -> Iterator[Finding]:

@@ -5,18 +5,30 @@ The splines and fits themselves are `cmfsim.ThinPlateSpline` and `cmfsim.rigid_f
 
 from cmfsim.registration.agreement import LandmarkAgreement, leave_one_out
 from cmfsim.registration.closest import icp
+from cmfsim.registration.consistency import (
+    CommonShift,
+    common_shift,
+    mirror_agreement,
+    swapped_names,
+)
 from cmfsim.registration.folds import FoldReport, fold_report
 from cmfsim.registration.landmarks import LandmarkMatch, match_landmarks
+from cmfsim.registration.reference import REFERENCE_PLACES
 from cmfsim.registration.sides import side_vectors, wrong_sides
 
 __all__ = [
+    "REFERENCE_PLACES",
+    "CommonShift",
     "FoldReport",
     "LandmarkAgreement",
     "LandmarkMatch",
+    "common_shift",
     "fold_report",
     "icp",
     "leave_one_out",
     "match_landmarks",
+    "mirror_agreement",
     "side_vectors",
+    "swapped_names",
     "wrong_sides",
 ]

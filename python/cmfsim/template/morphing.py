@@ -191,10 +191,10 @@ def _agreement(matched: LandmarkMatch) -> tuple[LandmarkAgreement | None, list[F
         why = "a misplaced landmark would not be noticed"
         finding = Finding("note", "template-landmarks-few", what, "landmarks", why, "place more")
         return None, [finding]
-    if not left_out.outliers:
+    if not left_out.misplaced:
         return left_out, []
     distances = dict(zip(left_out.names, left_out.distances, strict=True))
-    away = [f"{name} {distances[name]:.1f} mm" for name in left_out.outliers]
+    away = [f"{name} {distances[name]:.1f} mm" for name in left_out.misplaced]
     listed = ", ".join(away[:MOST_NAMES]) + (", …" if len(away) > MOST_NAMES else "")
     finding = Finding(
         "warning",
