@@ -89,10 +89,11 @@ def _checked_boxes(name: str, boxes: Any) -> int:
         raise CaseInputError(
             f"boxes of {name} is {boxes!r:.40}: a whole number from 1 to {MOST_BOXES} is needed"
         )
-    if not 1 <= boxes <= MOST_BOXES:
-        shown = str(boxes) if abs(boxes) < 10**18 else "a number of more than 18 digits"
+    count = int(boxes)
+    if not 1 <= count <= MOST_BOXES:
+        shown = str(count) if abs(count) < 10**18 else "a number of more than 18 digits"
         raise CaseInputError(f"boxes of {name} is {shown}: allowed is 1 to {MOST_BOXES}")
-    return int(boxes)
+    return count
 
 
 @dataclass(frozen=True, eq=False)
