@@ -9,6 +9,9 @@ import pytest
 
 import cmfsim
 from cmfsim.cli import main
+from cmfsim.doctor.evidence import gather
+from cmfsim.doctor.muscles import check_muscles
+from cmfsim.registration import REFERENCE_PLACES
 from head_case import HeadCase
 
 DATA = Path(os.environ.get("CMFSIM_DATA") or Path(__file__).parents[3] / "shared/data")
@@ -482,6 +485,50 @@ def test_a_transform_file_is_read_for_its_motion(tmp_path):
     assert serious(tmp_path, head) == [("warning", "plan-far")]
     (tmp_path / "jaw.txt").write_text("1 2 3\n", encoding="utf-8")
     assert serious(tmp_path, head) == [("error", "transform-unreadable")]
+
+
+def with_muscles(head, kept=None):
+    """The case with muscles, and the landmarks of an average head that are kept."""
+    head.toml += "\n[muscles]\n"
+    places = REFERENCE_PLACES["skull"]
+    # On no surface of the ellipsoids: what is asked for here is names alone.
+    head.skull = {name: places[name] + [3.0, -100.0, 1500.0] for name in kept or places}
+    return head
+
+
+def muscle_findings(folder, head):
+    """Severity, code and text of findings about muscles."""
+    case = cmfsim.Case.load(head.write(folder))
+    codes = ("muscles-landmarks", "muscles-without-landmarks", "template-landmarks-missing")
+    return [(f.severity, f.code, f.what) for f in check_muscles(gather(case)) if f.code in codes]
+
+
+def test_missing_landmarks_are_a_warning_that_names_them(tmp_path):
+    """One of 32 was an error that blocked every model; six are enough, three are not."""
+    names = [*HeadCase().skull]
+    assert muscle_findings(tmp_path, with_muscles(HeadCase())) == []
+    head = with_muscles(HeadCase())
+    del head.skull["nasion"]
+    ((severity, code, what),) = muscle_findings(tmp_path, head)
+    assert (severity, code) == ("warning", "template-landmarks-missing")
+    assert "1 of the template's 32 landmarks are missing: nasion;" in what
+    six = ("nasion", "menton", "gonion_L", "gonion_R", "zygomatic_arch_L", "zygomatic_arch_R")
+    ((severity, _, what),) = muscle_findings(tmp_path, with_muscles(HeadCase(), six))
+    assert severity == "warning"
+    assert "26 of" in what
+    found = muscle_findings(tmp_path, with_muscles(HeadCase(), names[:3]))
+    assert [(s, c) for s, c, _ in found] == [("error", "muscles-landmarks")]
+
+
+def test_muscles_are_checked_only_for_models_that_have_them(tmp_path):
+    """The landmarks lie in one plane: no muscle can be placed, a homogeneous model needs none."""
+    head = HeadCase()
+    head.toml += "\n[muscles]\n"
+    head.skull = {n: head.skull[n] for n in ("nasion", "menton", "pogonion")}
+    for models, count in ((["H"], 0), (["H", "H+S"], 0), (["M"], 1), (["H", "M+S"], 1), (None, 1)):
+        case = cmfsim.Case.load(head.write(tmp_path))
+        found = [f for f in cmfsim.diagnose(case, models=models) if f.code == "muscles-landmarks"]
+        assert len(found) == count, models
 
 
 def image_case(folder, spacing):

@@ -111,7 +111,9 @@ def test_four_landmarks_are_enough_and_the_others_are_named(template, patient):
     assert set(muscles.missing) == set(template.landmarks) - set(four)
     assert muscles.leave_one_out is None
     found = {f.code: f.what for f in muscles.findings}
-    assert found["landmark-extra"].startswith("28 landmarks")
+    missing = found["template-landmarks-missing"]
+    assert missing.startswith("28 of the template's 32 landmarks are missing: ")
+    assert missing.endswith("placed by the other 4")
     assert "judged" in found["template-landmarks-few"]
 
 

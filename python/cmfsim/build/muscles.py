@@ -72,7 +72,10 @@ def with_muscles(
         "placing the muscles": placed - begun,
         "sampling the muscles": time.perf_counter() - placed,
     }
-    findings = tuple(dict.fromkeys([*patient.findings, *muscles.findings, *mixture.findings]))
+    # What the doctor found already has the line of the case.
+    known = {f.code for f in patient.findings} & {"template-landmarks-missing"}
+    more = [f for f in muscles.findings if f.code not in known]
+    findings = tuple(dict.fromkeys([*patient.findings, *more, *mixture.findings]))
     summary = {
         **patient.summary,
         "timings": timings,

@@ -7,6 +7,7 @@ from cmfsim.doctor.evidence import Evidence
 from cmfsim.errors import CmfsimError
 from cmfsim.registration import match_landmarks
 from cmfsim.template import MuscleTemplate
+from cmfsim.template.morphing import missing_landmarks
 
 __all__ = ["check_muscles"]
 
@@ -40,7 +41,7 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
         )
         return
     try:
-        yield from match_landmarks(template.landmarks, evidence.skull_landmarks).findings
+        matched = match_landmarks(template.landmarks, evidence.skull_landmarks, required=())
     except CmfsimError as error:
         yield Finding(
             "error",
@@ -50,3 +51,6 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
             "the template cannot be carried to the patient by these landmarks",
             'correct the landmarks; "cmfsim template morph" shows each one\'s error',
         )
+        return
+    yield from (finding for finding in matched.findings if finding.code != "landmark-extra")
+    yield from missing_landmarks(template, matched.names, evidence.case.where("landmarks.skull"))

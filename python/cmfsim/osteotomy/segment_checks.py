@@ -68,15 +68,16 @@ def _key(segment: BoneSegment) -> bytes:
 
 def _check_lies_on_level(segment: BoneSegment) -> None:
     level = segment.level
+    spacing = np.asarray(level.spacing, dtype=np.float64)
     values = np.asarray(level.values)
     vertices = np.asarray(segment.surface.vertices)
     inside = values > 0.0
-    share = float(_on_zero_set(inside, (vertices - level.lowest) / level.spacing).mean())
+    share = float(_on_zero_set(inside, (vertices - level.lowest) / spacing).mean())
     why = "its surface was exchanged or damaged on the way: report this as a defect of cmfsim"
     if share < LEAST_SHARE:
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         first, past = block_of(inside)
-        box = level.lowest + first * level.spacing, level.lowest + (past - 1) * level.spacing
+        box = level.lowest + first * spacing, level.lowest + (past - 1) * spacing
         raise CaseError(
             f"the surface of segment {segment.name!r} is not that of its bone: {share:.0%} of its "
             f"vertices lie on the bone (at least {LEAST_SHARE:.0%} is needed); the surface reaches "
@@ -84,7 +85,7 @@ def _check_lies_on_level(segment: BoneSegment) -> None:
             f"{_place(box[1])} mm; {why}"
         )
     count = int(np.count_nonzero(inside))
-    ratio = _volume(segment) / (count * float(np.prod(level.spacing)))
+    ratio = _volume(segment) / (count * float(np.prod(spacing)))
     if count >= LEAST_VOXELS and not VOLUME_RATIO[0] <= ratio <= VOLUME_RATIO[1]:
         raise CaseError(
             f"the surface of segment {segment.name!r} encloses {ratio:.2f} times the volume of its "

@@ -1,7 +1,7 @@
 """A template's muscles carried to a patient by landmarks, and what the landmarks say of it."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
@@ -25,10 +25,12 @@ from cmfsim.registration import (
 from cmfsim.scene import SurfaceData
 from cmfsim.template_data import TemplateData
 
-__all__ = ["MorphedMusculature", "morph_template"]
+__all__ = ["MorphedMusculature", "missing_landmarks", "morph_template"]
 
 # How many landmarks a finding lists.
 MOST_NAMES = 6
+# Landmarks below which a map is little more than affine.
+FEW_LANDMARKS = 6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -159,7 +161,8 @@ def morph_template(
         findings += file.findings
         landmarks = file.points
     matched = match_landmarks(template.landmarks, landmarks, required=())
-    findings += matched.findings
+    findings += [f for f in matched.findings if f.code != "landmark-extra"]
+    findings += missing_landmarks(template, matched.names)
     warp = ThinPlateSpline(matched.source, matched.target, smoothing=smoothing)
     left_out, doubts = _agreement(matched)
     findings += doubts
@@ -179,6 +182,40 @@ def morph_template(
         leave_one_out=left_out,
         missing=tuple(name for name in template.landmarks if name not in matched.names),
         folds=MappingProxyType(folds),
+    )
+
+
+def missing_landmarks(
+    template: TemplateData, used: Collection[str], where: str = "landmarks"
+) -> tuple[Finding, ...]:
+    """A warning that names the template's landmarks that a patient lacks; none if there are all.
+
+    Parameters
+    ----------
+    template : TemplateData
+    used : collection of str
+        The template's names of the landmarks that the patient has.
+    where : str
+    """
+    missing = [name for name in template.landmarks if name not in used]
+    if not missing:
+        return ()
+    listed = ", ".join(missing[:MOST_NAMES])
+    listed += f" and {len(missing) - MOST_NAMES} more" if len(missing) > MOST_NAMES else ""
+    few = len(used) < FEW_LANDMARKS
+    return (
+        Finding(
+            "warning",
+            "template-landmarks-missing",
+            f"{len(missing)} of the template's {len(template.landmarks)} landmarks are missing: "
+            f"{listed}; muscles are placed by the other {len(used)}",
+            where,
+            f"fewer than {FEW_LANDMARKS} scale and turn the muscles, but do not shape them"
+            if few
+            else "muscles near them follow their neighbours; with six landmarks in all, well "
+            "spread, the predicted skin changes by about 0.3 mm",
+            "place them, or take a homogeneous model",
+        ),
     )
 
 
