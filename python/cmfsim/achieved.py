@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import IcpFit, Surface, rigid_fit
+from cmfsim.bone_motion import RemovedBone, missing_patches
 from cmfsim.case import BoneSegment
 from cmfsim.checks import (
     Floats,
@@ -132,6 +133,9 @@ class AchievedMotion(Frozen):
         Share of the vertices that were kept.
     moved : MovedSurface or None
         The motion vertex by vertex, where the triangles are the same.
+    removed : tuple of RemovedBone
+        Patches of the segment that are not there after the operation, where it was searched for:
+        they lie outside the bone after it. They have no say in the motion.
     """
 
     matrix: Floats
@@ -142,6 +146,7 @@ class AchievedMotion(Frozen):
     worst: float
     share: float
     moved: MovedSurface | None
+    removed: tuple[RemovedBone, ...] = ()
 
     @property
     def plan(self) -> Floats | MovedSurface:
@@ -161,6 +166,10 @@ class AchievedMotion(Frozen):
             "rms_mm": self.rms,
             "worst_mm": self.worst,
             "share": self.share,
+            "removed": [
+                {"area_mm2": p.area, "depth_mm": p.depth, "place_mm": p.place.tolist()}
+                for p in self.removed
+            ],
         }
 
 
@@ -422,6 +431,7 @@ def _matched(
         worst=worst,
         share=float(fit.kept_fraction),
         moved=None,
+        removed=missing_patches(segment, core, fit.matrix),
     )
 
 

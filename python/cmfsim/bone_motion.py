@@ -3,8 +3,13 @@
 A skull whose jaw was cut off and moved may come as one surface, before and after. Across the cut
 neighbouring vertices move apart, and the triangles between them are torn: what they cover is no
 bone. `torn_pieces` takes them out and gives the pieces that moved each as one.
+
+Where bone was ground away, the vertices after lie inside the bone before: they went nowhere, their
+bone is gone. `without_removed` lets them follow the rest of the piece.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -18,7 +23,15 @@ from cmfsim.scene import MovedSurface, SurfaceData
 from cmfsim.surface_checks import duplicate_triangles, has_three_corners, thin_triangles
 from cmfsim.topology import connected_labels, edges_of
 
-__all__ = ["moves_as_one", "smooth_motion", "sound_motion", "torn_pieces"]
+__all__ = [
+    "RemovedBone",
+    "missing_patches",
+    "moves_as_one",
+    "smooth_motion",
+    "sound_motion",
+    "torn_pieces",
+    "without_removed",
+]
 
 # An edge is torn if its ends move apart by more than this, mm, and by more than this share of its
 # length: noise of 0.3 mm per vertex does the first to one edge in 10 000, and a turn of 15° the
@@ -39,7 +52,43 @@ REACH = 2.0
 # Noise that is let be, mm rms: a tenth of what a segmented bone is known to.
 QUIET = 0.03
 
+# A patch of bone was removed if a vertex of it went further than the first from where the rest of
+# the piece would take it, mm, and lies deeper than the second inside the bone before; the patch
+# reaches as far as its vertices are off by the third: three times the noise of a segmented bone.
+REMOVED, REMOVED_DEPTH, REMOVED_RIM = 1.5, 0.75, 0.75
+# Such a patch ends abruptly: around it, this far, vertices are off by this share of its worst at
+# most (median). A bone that bends is off all around.
+RING, RING_SHARE = 6.0, 0.35
+# A larger share of a piece is not what is ground away, but how it moved.
+MOST_REMOVED = 0.2
+# Vertices that a motion is fitted to; rounds of fitting, each to the share of vertices nearest.
+LEAST_FITTED, FIT_ROUNDS, FIT_SHARE = 50, 20, 0.75
+# What lies further from the bone after than this, mm, is not shown by its scan; patches smaller
+# than this, mm², are corners of a cut.
+SHOWN, LEAST_PATCH = 10.0, 10.0
+# Volume that a map must keep for its inverse to mean something.
+LEAST_DETERMINANT = 0.1
+
 Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class RemovedBone:
+    """A patch of bone that is not there after the operation.
+
+    Attributes
+    ----------
+    area : float, mm²
+        Of the surface before.
+    depth : float, mm
+        The greatest distance of a vertex from where the rest of the piece would have taken it.
+    place : (3,) float64, mm
+        Where that is, before.
+    """
+
+    area: float
+    depth: float
+    place: Floats
 
 
 def sound_motion(motion: MovedSurface) -> MovedSurface:
@@ -137,6 +186,139 @@ def smooth_motion(motion: MovedSurface) -> tuple[MovedSurface, float]:
     if noise <= QUIET:
         return motion, noise
     return MovedSurface(motion.surface, there - rest + smooth), noise
+
+
+def without_removed(motion: MovedSurface) -> tuple[MovedSurface, tuple[RemovedBone, ...]]:
+    """The motion with vertices over removed bone carried as the rest, and the patches they are of.
+
+    The rest is an affine map fitted to the vertices that agree best: a bone that bends a little, or
+    that is measured a few per cent too small, has lost nothing by that.
+
+    Parameters
+    ----------
+    motion : MovedSurface
+        Of one piece (`torn_pieces`).
+
+    Returns
+    -------
+    motion : MovedSurface
+        As given if no bone was removed.
+    removed : tuple of RemovedBone
+        The largest first.
+
+    Notes
+    -----
+    Mechanics: bone that is ground away does not pull the tissue over it to the new surface. Tissue
+    that was joined to it goes on as if it were joined to the segment; that it sinks into the space
+    afterwards is not computed.
+    """
+    here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
+    triangles = np.asarray(motion.surface.triangles).astype(np.int64)
+    if len(here) < LEAST_FITTED:
+        return motion, ()
+    expected = _rest_of(here, there)
+    if expected is None:
+        return motion, ()
+    went, back = expected
+    off = np.linalg.norm(there - went, axis=1)
+    if not (off > REMOVED).any():
+        return motion, ()
+    # In the frame before: where a vertex is now, as the rest of the bone sees it.
+    seen = back(there)
+    surface = Surface(motion.surface.vertices, motion.surface.triangles)
+    far = np.flatnonzero(off > REMOVED_RIM)
+    depth = np.zeros(len(here))
+    inside = surface.winding_number(seen[far]) > 0.5
+    deep = far[inside]
+    depth[deep] = np.linalg.norm(surface.closest(seen[deep])[0] - seen[deep], axis=1)
+    seed = (off > REMOVED) & (depth > REMOVED_DEPTH)
+    if not seed.any():
+        return motion, ()
+    ends = edges_of(triangles).ends
+    loose = off > REMOVED_RIM
+    label = connected_labels(ends[loose[ends].all(axis=1)], len(here))
+    areas = _areas(here, triangles)
+    total = float(areas.sum())
+    corrected, found = there.copy(), []
+    for number in np.unique(label[seed]):
+        patch = (label == number) & loose
+        area = float(areas[patch[triangles].any(axis=1)].sum())
+        box = (here >= here[patch].min(axis=0) - RING) & (here <= here[patch].max(axis=0) + RING)
+        ring = box.all(axis=1) & ~patch
+        worst = int(np.argmax(np.where(patch, off, 0.0)))
+        if area > MOST_REMOVED * total or not ring.any():
+            continue
+        if float(np.median(off[ring])) > RING_SHARE * off[worst]:
+            continue
+        corrected[patch] = went[patch]
+        found.append(RemovedBone(area, float(off[worst]), here[worst].copy()))
+    if not found:
+        return motion, ()
+    found.sort(key=lambda patch: -patch.area)
+    return MovedSurface(motion.surface, corrected), tuple(found)
+
+
+def missing_patches(segment: SurfaceData, bone: Surface, matrix: Floats) -> tuple[RemovedBone, ...]:
+    """Patches of a segment that are not there once it is laid on the bone after the operation.
+
+    Parameters
+    ----------
+    segment : SurfaceData
+        Before.
+    bone : Surface
+        After; what is not closed by it encloses nothing, and nothing is then found.
+    matrix : (4, 4) float64, mm
+        The motion of the segment.
+
+    Returns
+    -------
+    tuple of RemovedBone
+        The largest first; without what lies so far off that the scan after does not show it.
+    """
+    here = np.asarray(segment.vertices)
+    triangles = np.asarray(segment.triangles).astype(np.int64)
+    moved = here @ np.asarray(matrix)[:3, :3].T + np.asarray(matrix)[:3, 3]
+    off = np.linalg.norm(bone.closest(moved)[0] - moved, axis=1)
+    far = np.flatnonzero((off > REMOVED_RIM) & (off < SHOWN))
+    gone = np.zeros(len(here), dtype=bool)
+    if bone.is_closed:
+        gone[far[bone.winding_number(moved[far]) < 0.5]] = True
+    if not (off[gone] > REMOVED).any():
+        return ()
+    ends = edges_of(triangles).ends
+    label = connected_labels(ends[gone[ends].all(axis=1)], len(here))
+    areas = _areas(here, triangles)
+    found = []
+    for number in np.unique(label[gone & (off > REMOVED)]):
+        patch = (label == number) & gone
+        area = float(areas[patch[triangles].all(axis=1)].sum())
+        worst = int(np.argmax(np.where(patch, off, 0.0)))
+        if area >= LEAST_PATCH:
+            found.append(RemovedBone(area, float(off[worst]), here[worst].copy()))
+    return tuple(sorted(found, key=lambda patch: -patch.area))
+
+
+def _rest_of(here: Floats, there: Floats) -> tuple[Floats, Callable[[Floats], Floats]] | None:
+    """Where the affine map of most vertices takes all of them, and that map's inverse."""
+    middle = here.mean(axis=0)
+    columns = np.column_stack([here - middle, np.ones(len(here))])
+    kept = np.ones(len(here), dtype=bool)
+    for _ in range(FIT_ROUNDS):
+        # A flat piece leaves the map across it open: the smallest one is taken.
+        coefficients = np.linalg.lstsq(columns[kept], there[kept], rcond=1e-6)[0]
+        off = np.linalg.norm(columns @ coefficients - there, axis=1)
+        nearest = off <= max(float(np.quantile(off, FIT_SHARE)), REMOVED_RIM / 3.0)
+        if np.array_equal(nearest, kept):
+            break
+        kept = nearest
+    linear = coefficients[:3]
+    if abs(float(np.linalg.det(linear))) < LEAST_DETERMINANT:
+        return None
+
+    def back(points: Floats) -> Floats:
+        return np.asarray(np.linalg.solve(linear.T, (points - coefficients[3]).T).T + middle)
+
+    return np.asarray(columns @ coefficients), back
 
 
 def _averaged(points: Floats, values: Floats) -> Floats:

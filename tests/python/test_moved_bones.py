@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.bone_motion import moves_as_one, smooth_motion, sound_motion, torn_pieces
+from cmfsim.bone_motion import (
+    missing_patches,
+    moves_as_one,
+    smooth_motion,
+    sound_motion,
+    torn_pieces,
+    without_removed,
+)
 from head_case import ELLIPSOIDS, HeadCase
 from meshes import icosphere
 
@@ -254,3 +261,118 @@ def test_a_skull_that_moved_in_part_carries_the_tissue_in_part(tmp_path):
 
 def _above(surface, triangles, height):
     return (np.asarray(surface.vertices)[triangles][:, :, 2] > height).all(axis=1)
+
+
+# Bone that was removed.
+
+
+def spined_ball(level=4):
+    """A ball with a spine in front, as the maxilla has below the nose; which vertices are of it."""
+    vertices, triangles = icosphere(level, 30.0)
+    out = vertices / 30.0
+    spine = np.exp(-(((out[:, 0] ** 2 + out[:, 2] ** 2) / 0.1**2) ** 2)) * (out[:, 1] < 0)
+    grown = vertices + 8.0 * spine[:, None] * [0.0, -1.0, 0.0]
+    return cmfsim.SurfaceData(grown, triangles), vertices, spine
+
+
+def test_a_trimmed_spine_follows_the_bone_and_does_not_pull_back():
+    """The spine is cut to the level of the bone round it, and the bone moves 5 mm forwards."""
+    before, trimmed, spine = spined_ball()
+    # As a surface drawn onto the bone after lies: the spine's vertices inside the bone before.
+    after = carried(trimmed - 1.0 * spine[:, None] * [0, -1, 0], FORWARDS)
+    motion = cmfsim.MovedSurface(before, after)
+    kept, (patch,) = without_removed(motion)
+    here = np.asarray(before.vertices)
+    wrong = np.linalg.norm(after - carried(here, FORWARDS), axis=1)
+    left = np.linalg.norm(np.asarray(kept.moved_vertices) - carried(here, FORWARDS), axis=1)
+    assert wrong.max() == pytest.approx(9.0, abs=0.2)
+    assert left.max() < 0.8
+    assert patch.depth == pytest.approx(9.0, abs=0.2)
+    assert patch.place[1] == pytest.approx(-38.0, abs=0.5)
+    assert 20.0 < patch.area < 400.0
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+def test_a_burred_patch_is_found_under_noise(noise):
+    """A cap of 11 mm radius is ground flat, 2 mm deep at its middle."""
+    surface = ball(4)
+    vertices = np.asarray(surface.vertices)
+    flat = vertices.copy()
+    flat[:, 1] = np.maximum(flat[:, 1], -28.0)
+    there = carried(flat, FORWARDS)
+    there = there + np.random.default_rng(5).normal(0.0, noise, there.shape)
+    kept, patches = without_removed(cmfsim.MovedSurface(surface, there))
+    assert len(patches) >= 1
+    assert patches[0].depth == pytest.approx(2.0, abs=3 * noise + 0.1)
+    left = np.linalg.norm(np.asarray(kept.moved_vertices) - carried(vertices, FORWARDS), axis=1)
+    assert left[vertices[:, 1] < -29.5].max() < 0.3 + 3 * noise
+
+
+def test_bone_that_moved_bent_grew_or_is_noisy_has_lost_nothing():
+    surface = ball(4)
+    vertices = np.asarray(surface.vertices)
+    there = carried(vertices, FORWARDS)
+    noise = np.random.default_rng(2).normal(0.0, 0.3, vertices.shape)
+    bent = np.outer((vertices[:, 0] / 15.0) ** 2, [0.0, 1.0, 0.0])
+    middle = there.mean(axis=0)
+    added = there + 4.0 * spined_ball()[2][:, None] * [0.0, -1.0, 0.0]
+    for moved in (there, there + noise, there + bent, middle + 0.955 * (there - middle), added):
+        motion = cmfsim.MovedSurface(surface, moved)
+        assert without_removed(motion) == (motion, ())
+
+
+def test_bone_that_is_gone_is_reported_where_a_segment_is_laid_on_the_bone_after():
+    """Other triangles: the motion is rigid, and says where the spine was."""
+    before, trimmed, _ = spined_ball()
+    fewer = ball(3)
+    assert len(fewer.vertices) != len(trimmed)
+    after = cmfsim.SurfaceData(carried(np.asarray(fewer.vertices), FORWARDS), fewer.triangles)
+    core = cmfsim.Surface(after.vertices, after.triangles)
+    (patch,) = missing_patches(before, core, FORWARDS)
+    assert patch.depth == pytest.approx(8.0, abs=0.3)
+    assert patch.place[1] == pytest.approx(-38.0, abs=0.5)
+    assert missing_patches(ball(3), core, FORWARDS) == ()
+
+
+def test_a_trimmed_bone_of_a_case_is_reported_and_its_tissue_follows_the_bone(tmp_path):
+    """The chin of the mandible is ground off: the nodes on it move with the mandible."""
+    plain = HeadCase(rounds=3)
+    mandible = plain.surfaces["mandible"]
+    vertices = np.asarray(mandible.vertices)
+    front = vertices[:, 1].min()
+    ground = vertices.copy()
+    ground[:, 1] = np.maximum(ground[:, 1], front + 3.0)
+    head = moved_head(lambda _, t: (carried(ground, FORWARDS), t), plain)
+    head.toml = head.toml.replace("edge_length = 4.0", "edge_length = 12.0")
+    model = cmfsim.build_model(cmfsim.Case.load(head.write(tmp_path)), check=False)
+    (finding,) = [f for f in model.findings if f.code == "bone-removed"]
+    assert finding.severity == "warning"
+    assert "mandible" in finding.what
+    plan = model.scene.plan["mandible"]
+    moved = np.asarray(plan.moved_vertices)
+    whole = carried(np.asarray(plan.surface.vertices), FORWARDS)
+    assert np.linalg.norm(moved - whole, axis=1).max() < 1.0
+
+
+@pytest.mark.parametrize(
+    ("ratio", "severity", "words"),
+    [
+        (0.955, "warning", "0.955 times as large after as before"),
+        (1.1, "warning", "near no ratio of two units"),
+        (10.0, "error", "mm read as cm"),
+        (25.4, "error", "mm read as inch"),
+        (0.001, "error", "m read as mm"),
+        (2.54, "error", "cm read as inch"),
+        (1 / 25.4, "error", "inch read as mm"),
+    ],
+)
+def test_only_a_ratio_of_units_is_an_error_of_size(ratio, severity, words, tmp_path):
+    """About its own middle: a bone that is 4.5 % smaller may be another scanner's."""
+
+    def scaled(v, t):
+        return v.mean(axis=0) + ratio * (v - v.mean(axis=0)), t
+
+    findings = cmfsim.diagnose(cmfsim.Case.load(moved_head(scaled).write(tmp_path)))
+    (found,) = [f for f in findings if f.code == "moved-scaled"]
+    assert found.severity == severity
+    assert words in found.what

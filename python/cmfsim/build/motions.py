@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cmfsim.bone_motion import smooth_motion, sound_motion, torn_pieces
+from cmfsim.bone_motion import (
+    RemovedBone,
+    smooth_motion,
+    sound_motion,
+    torn_pieces,
+    without_removed,
+)
 from cmfsim.build.inputs import motion_source, read_motion
 from cmfsim.build.postoperative import REFERENCES, Postoperative, read_postoperative
 from cmfsim.case import BoneSegment, Finding
@@ -103,7 +109,8 @@ def _with_motions(
         pieces = _parted(case, segment, motion, findings)
         for piece, its_own in pieces:
             parted.append(piece)
-            planned[piece.name] = _quiet(case, segment.name, piece.name, its_own, findings)
+            kept = _without_removed(case, segment.name, piece.name, its_own, findings)
+            planned[piece.name] = _quiet(case, segment.name, piece.name, kept, findings)
     return PlannedBones(tuple(parted), planned, tuple(findings), achieved)
 
 
@@ -151,7 +158,13 @@ def _achieved_bones(
             reference=reference,
         )
         motions |= {name: found for name, found in achieved.plan.items() if name != reference}
-    return _with_motions(case, segments, motions, achieved)
+    made = _with_motions(case, segments, motions, achieved)
+    noticed = [
+        _removed_finding(case, name, name, patch, "note")
+        for name, found in ({} if achieved is None else achieved.motions).items()
+        for patch in found.removed
+    ]
+    return replace(made, findings=(*made.findings, *noticed))
 
 
 def _sources(case: Case) -> tuple[str, ...]:
@@ -216,6 +229,33 @@ def _plan_key(case: Case, name: str) -> str:
 
 def _numbered(name: str, number: int) -> str:
     return name if number == 0 else f"{name}_{number + 1}"
+
+
+def _without_removed(
+    case: Case, bone: str, name: str, motion: MovedSurface, findings: list[Finding]
+) -> MovedSurface:
+    """The motion in which removed bone moves nothing, and a finding for each patch of it."""
+    sound, removed = without_removed(motion)
+    findings += [_removed_finding(case, bone, name, patch, "warning") for patch in removed]
+    return sound
+
+
+def _removed_finding(
+    case: Case, bone: str, name: str, patch: RemovedBone, severity: str
+) -> Finding:
+    at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
+    used = "its vertices are not used" if severity == "warning" else "it had no say in the motion"
+    return Finding(
+        severity,
+        "bone-removed",
+        f"{patch.area:.0f} mm² of {name} about ({at}) mm are no longer there after the operation, "
+        f"by up to {patch.depth:.1f} mm: taken as removed bone, not as motion",
+        case.where(_plan_key(case, bone)),
+        "bone that is ground away does not pull the tissue over it: that tissue follows the rest "
+        f"of the segment; {used}",
+        "look at the bone there; if it was pushed in (fracture, impaction), give that part as a "
+        "bone of its own",
+    )
 
 
 def _quiet(

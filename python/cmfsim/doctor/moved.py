@@ -22,8 +22,23 @@ __all__ = ["check_moved"]
 STILL = 1e-4
 # A motion that leaves less than this of its vertices' own, mm RMS, was computed, not measured.
 COMPUTED = 1e-3
-# A bone that is scaled by more than this was not measured in the same unit.
+# A bone that is scaled by more than this was not measured alike: segmentation alone changes 1 %.
 SCALED = 0.03
+# Ratios of units that files are exchanged in: what is read as mm, and what it was.
+UNIT_RATIOS = tuple(
+    (one, other, ratio)
+    for low, high, factor in (
+        ("mm", "cm", 10.0),
+        ("mm", "m", 1000.0),
+        ("cm", "m", 100.0),
+        ("mm", "inch", 25.4),
+        ("cm", "inch", 2.54),
+        ("mm", "um", 0.001),
+    )
+    for one, other, ratio in ((low, high, factor), (high, low, 1.0 / factor))
+)
+# How near a scale must be to such a ratio, and the scale below which nothing is left of a bone.
+UNIT_TOLERANCE, LEAST_SCALE = 0.02, 0.01
 # Cosine between an edge before and after the bone's own turn, on average: 1 of a rigid bone, above
 # 0.9 with noise, 0 where vertices have nothing to do with one another.
 ALONG = 0.5
@@ -55,7 +70,9 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
             continue
         here, there = np.asarray(moved.surface.vertices), np.asarray(moved.moved_vertices)
         wrong = list(_check_pairs(name, where, moved))
-        wrong = wrong or list(_check_distance(name, where, moved))
+        # A bone of another size goes on, and must not go far.
+        if all(finding.code == "moved-scaled" and finding.severity != "error" for finding in wrong):
+            wrong += _check_distance(name, where, moved)
         yield from wrong
         if not any(finding.severity == "error" for finding in wrong):
             least[name] = float(np.quantile(np.linalg.norm(there - here, axis=1), FEW))
@@ -98,14 +115,41 @@ def _check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding
             '[postoperative.bones] and write plan = "achieved"',
         )
     elif abs(scale - 1.0) > SCALED:
-        yield Finding(
+        yield _scaled(name, where, scale)
+
+
+def _scaled(name: str, where: str, scale: float) -> Finding:
+    """An error where the size can only be another unit's, else a warning with the evidence."""
+    unit = next(
+        (
+            (one, other)
+            for one, other, ratio in UNIT_RATIOS
+            if abs(scale / ratio - 1.0) < UNIT_TOLERANCE
+        ),
+        None,
+    )
+    what = f"{name} is {scale:.3g} times as large after as before (median of its edges)"
+    if unit is not None or scale < LEAST_SCALE:
+        between = f": that is {unit[0]} read as {unit[1]}" if unit is not None else ""
+        return Finding(
             "error",
             "moved-scaled",
-            f"{name} is {scale:.3g} times as large after as before",
+            f"{what}{between}",
             where,
             "bone does not grow in an operation: the files are in two units, or scaled",
             "export both in the unit that [surfaces] states",
         )
+    return Finding(
+        "warning",
+        "moved-scaled",
+        f"{what}: near no ratio of two units (2.54, 10, 25.4, 100, 1000)",
+        where,
+        "bone does not grow in an operation, so that the scans are calibrated or segmented "
+        f"differently by {abs(scale - 1.0):.1%}; each vertex is followed all the same, and the "
+        "difference counts as motion",
+        "check the voxel sizes of both scans and the thresholds of both segmentations, or align "
+        'the bone by shape: [postoperative.bones] and plan = "achieved"',
+    )
 
 
 def _edges(moved: MovedSurface) -> tuple[float, float]:
