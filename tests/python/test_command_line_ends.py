@@ -100,7 +100,7 @@ def test_a_home_folder_that_nobody_has_is_bad_input(tmp_path, capsys):
         'format = "cmfsim-cohort"\nversion = 1\n[[cases]]\nname = "a"\nfile = "~nosuchuser/x"\n'
     )
     assert main(["study", str(cohort)]) == 2
-    assert "there is no such user's folder" in capsys.readouterr().err
+    assert "cohort.toml:5: cases[0].file is '~nosuchuser/x'" in capsys.readouterr().err
 
 
 # Models by name.
