@@ -214,8 +214,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
         ),
         "demo": "case checks errors io osteotomy phantom scene",
         "study": (
-            "build case checks deferred errors evaluation io model musculature patient "
-            "patient_prediction prediction scene template _core"
+            "build case checks deferred errors evaluation finding_groups io model musculature "
+            "patient patient_prediction prediction scene template _core"
         ),
         "pictures": "case checks clinical_plan errors musculature prediction scene _core",
         "report": "case clinical_plan errors finding_groups io scene",

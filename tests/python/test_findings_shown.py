@@ -144,3 +144,33 @@ def test_warnings_stand_above_the_figures_of_a_report_and_fold_out(noticed):
     assert page.index("4 muscles partly outside") < page.index('<dl class="facts">')
     assert page.count("<details") >= 1
     assert "9.9% of muscle_2 lies outside the mesh" in page
+
+
+def test_a_study_states_what_is_doubtful_of_each_case_at_the_top():
+    """Its cases are worked on by other processes, whose output goes to a log."""
+    figures = {
+        **dict.fromkeys(("mean_mm", "std_mm", "median_mm", "rms_mm"), 1.0),
+        **dict.fromkeys(("p90_mm", "p95_mm", "max_mm", "signed_mean_mm"), 1.0),
+        "within": {"2 mm": 1.0},
+    }
+    evaluation = {
+        "models": {"H": {"regions": {"whole": figures}}},
+        "warnings": ["warning: the case is <doubtful>"],
+    }
+    cases = [
+        {"name": "one", "status": "done", "seconds": 1.0, "error": "", "evaluation": evaluation},
+        {"name": "two", "status": "failed", "seconds": 1.0, "error": "killed", "evaluation": {}},
+    ]
+    study = {"cohort": "all", "note": "", "models": ["H"], "seconds": 2.0, "cases": cases}
+    top = render_page(cmfsim.report.study_document(study)).partition("<main>")[0]
+    assert "one: 1 warning" in top
+    assert "the case is &lt;doubtful&gt;" in top
+    assert top.index("two failed") < top.index("one: 1 warning")
+
+
+def test_the_warnings_of_an_evaluation_are_those_of_all_that_led_to_it(noticed):
+    text = noticed.read_text("utf-8")
+    noticed.write_text(f'{text}\n[postoperative]\nskin = "skin.ply"\n', "utf-8")
+    found = cmfsim.evaluate(noticed, "H", check=False).as_dict()["warnings"]
+    assert "warning: solving is doubtful" in found
+    assert "warning: 4 muscles partly outside the tissue (largest: muscle_1 12.0 %)" in found

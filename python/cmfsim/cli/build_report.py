@@ -1,12 +1,10 @@
-"""What `cmfsim build` says at its end, as text."""
+"""What `cmfsim build` prints at its end, as text."""
 
 import textwrap
 from collections.abc import Mapping
 from typing import Any
 
-from cmfsim.case import Finding
 from cmfsim.cli.terminal import escaped
-from cmfsim.doctor import findings_text
 from cmfsim.meshing import MeshReport
 
 __all__ = ["WIDTH", "build_text"]
@@ -17,26 +15,23 @@ WIDTH = 100
 INDENT = 14
 
 
-def build_text(summary: Mapping[str, Any], *, colour: bool = False, width: int = WIDTH) -> str:
-    """The summary of a model as lines: nodes, mesh, findings, time per stage, files.
+def build_text(summary: Mapping[str, Any], *, width: int = WIDTH) -> str:
+    """The summary of a model as lines: nodes, mesh, time per stage, files.
 
     Parameters
     ----------
     summary : mapping
         Of a `PatientModel` that was written.
-    colour : bool
     width : int
-        Columns at which findings and names of files wrap.
+        Columns at which names of files wrap.
 
     Returns
     -------
     str
     """
-    findings = [Finding(**entry) for entry in summary["findings"]]
     parts = [
         [f"case          {escaped(summary['case'])}", *_nodes(summary)],
         MeshReport(**summary["mesh"]).as_text().splitlines(),
-        findings_text(findings, colour=colour, width=width, escape=escaped).splitlines(),
         _times(summary["timings"]),
         _files(summary, width),
     ]

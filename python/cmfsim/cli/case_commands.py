@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any, TextIO
 
 from cmfsim.case import SEVERITIES, Finding
@@ -64,13 +65,16 @@ def build(options: argparse.Namespace) -> int:
             case, progress=progress.stage, check=False, findings=findings, on_findings=notices.add
         )
     summary = dict(built.summary)
+    # Those of muscles are noticed after the last stage.
+    notices.add(Finding(**entry) for entry in summary["findings"])
     if not options.no_doctor:
         summary["timings"] = {"checking the case": seconds, **summary["timings"]}
     if options.json:
         print(json.dumps(summary, allow_nan=False))
         return DONE
     width = min(columns(), WIDTH) if sys.stdout.isatty() else WIDTH
-    print(build_text(summary, colour=in_colour(sys.stdout), width=width))
+    print(build_text(summary, width=width))
+    notices.summarise(str(Path(summary["output"]) / "build.json"))
     return DONE
 
 

@@ -302,6 +302,9 @@ def _study_text(found: StudyReport) -> str:
             mean = "–" if entry is None else f"{entry['regions']['whole']['mean_mm']:.2f}"
             cells += f"{mean:>8}"
         lines.append(f"  {escaped(outcome.name):<12} {cells}  {outcome.status}")
+    for outcome in found.outcomes:
+        warnings = outcome.evaluation.get("warnings", ())
+        lines += [f"  {escaped(outcome.name)}: {escaped(warning)}" for warning in warnings]
     return "\n".join(lines)
 
 

@@ -87,6 +87,7 @@ _EVALUATION = table(
         "notes": listing(text),
         "seconds": mapping(number(0.0, 1e9)),
         "findings": listing(finding),
+        "warnings": listing(text),
     },
 )
 

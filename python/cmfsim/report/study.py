@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cmfsim.report.document import NOTHING, Document, Figure, Note, Section, Table, number
+from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
 
 __all__ = ["PAPER_AVERAGES", "study_document"]
 
@@ -44,7 +44,23 @@ def study_document(study: Values, *, figures: Sequence[Figure] = ()) -> Document
         "time": f"{study['seconds']:.0f} s",
     }
     subtitle = "Errors are distances of the predicted skin from the skin after the operation, mm."
-    return Document(f"{study['cohort']}: study", subtitle, facts, sections)
+    title = f"{study['cohort']}: study"
+    return Document(title, subtitle, facts, sections, alerts=_alerts(study["cases"]))
+
+
+def _alerts(cases: Sequence[Values]) -> list[Alert]:
+    """What is doubtful about the figures of each case; cases that failed first."""
+    alerts = [
+        Alert("error", f"{case['name']} failed", tuple(case["error"].splitlines()))
+        for case in cases
+        if case["status"] == "failed"
+    ]
+    for case in cases:
+        lines = tuple(case["evaluation"].get("warnings", ()))
+        if lines:
+            several = "s" if len(lines) > 1 else ""
+            alerts.append(Alert("warning", f"{case['name']}: {len(lines)} warning{several}", lines))
+    return alerts
 
 
 PAPER_NOTE = (

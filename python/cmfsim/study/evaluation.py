@@ -13,6 +13,7 @@ from cmfsim.case import Anatomy, Finding
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.evaluation import NO_CHANGE, WHOLE, ModelComparison, compare_models
+from cmfsim.finding_groups import grouped
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.io.metrics import EVALUATION_FILE
 from cmfsim.prediction import MODELS, Prediction
@@ -77,6 +78,7 @@ class CaseEvaluation:
             "notes": [WILCOXON_NOTE] if tests else [],
             "seconds": timings,
             "findings": [asdict(finding) for finding in self.findings],
+            "warnings": self._warnings(),
         }
 
     @property
@@ -84,6 +86,12 @@ class CaseEvaluation:
         """What was noticed of the face after the operation, and of the comparison with it."""
         compared = [f for c in self.comparison.comparisons.values() for f in c.findings]
         return tuple(dict.fromkeys([*self.postoperative.findings, *compared]))
+
+    def _warnings(self) -> list[str]:
+        """Errors and warnings of everything that led to the figures, one line for each kind."""
+        found = [finding for prediction in self.predictions for finding in prediction.findings]
+        groups = grouped([*found, *self.findings])
+        return [f"{g.severity}: {g.line}" for g in groups if g.severity != "note"]
 
     def _of(self, name: str) -> dict[str, Any]:
         comparison = self.comparison
