@@ -192,9 +192,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "phantom": "case checks errors scene",
         "planning": "errors _core",
         "clinical_plan": "checks errors planning scene _core",
-        "achieved": (
-            "bone_motion case checks errors pickling planning registration scene _core"
-        ),
+        "achieved": ("bone_motion case checks errors pickling planning registration scene _core"),
         "bone_motion": "checks errors scene surface_checks topology _core",
         "osteotomy": "case checks errors planning scene _core",
         "node_kinds": "case checks errors scene _core",

@@ -181,3 +181,19 @@ def test_a_head_built_again_has_the_same_bytes(head, truth, tmp_path):
             whole.update(np.ascontiguousarray(array).tobytes())
         found.add(whole.hexdigest())
     assert len(found) == 1
+
+
+@pytest.mark.parametrize("inwards", [True, False])
+def test_a_given_bone_with_an_inner_wall_is_taken_as_it_is(inwards):
+    """Exports of skulls have walls of marrow and sinuses, and some of these face outwards."""
+    outer, inner = (surfaces.surface_of_level("b", ball(r)) for r in (20, 14))
+    skin = surfaces.surface_of_level("skin", ball(27))
+    walls = np.asarray(inner.triangles)
+    walls = walls[:, ::-1] if inwards else walls
+    hollow = cmfsim.SurfaceData(
+        np.concatenate([outer.vertices, inner.vertices]),
+        np.concatenate([outer.triangles, walls + len(np.asarray(outer.vertices))]),
+    )
+    anatomy = cmfsim.anatomy_from_surfaces(skin, {"cranium": hollow}, spacing=1.0)
+    (segment,) = cmfsim.segments_from_surfaces(anatomy.bones, anatomy.surfaces)
+    assert segment.surface is anatomy.surfaces["cranium"]

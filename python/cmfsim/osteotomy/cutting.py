@@ -203,7 +203,7 @@ def segments_from_surfaces(
         )
         for name, level in levels.items()
     )
-    check_segments(segments)
+    check_segments(segments, given=surfaces)
     return segments
 
 
