@@ -48,7 +48,8 @@ def test_stiffness_is_that_of_scikit_fem(element: str) -> None:
     ours = tensors.to_scipy().tocsr()
     flat = order.ravel()
     difference = abs(ours - reference[flat][:, flat]).max()
-    assert difference < 1e-14 * abs(reference).max()
+    # Both sum the same two dozen tets in another order.
+    assert difference < 1e-12 * abs(reference).max()
 
 
 @pytest.mark.parametrize("poisson", [0.3, 0.4999])

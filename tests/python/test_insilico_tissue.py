@@ -59,7 +59,7 @@ def test_stiffness_is_the_derivative_of_forces():
     matrix = body.stiffness(u)
     product = (matrix @ way.ravel()).reshape(-1, 3)
     assert np.abs(product - difference).max() < 1e-6 * np.abs(difference).max()
-    assert abs(matrix - matrix.T).max() < 1e-14 * abs(matrix).max()
+    assert abs(matrix - matrix.T).max() < 1e-12 * abs(matrix).max()
 
 
 def test_convex_stiffness_resists_every_deformation():
@@ -95,8 +95,8 @@ def test_turning_the_deformed_tissue_turns_its_stress():
     expected = np.einsum("ij,jkt->ikt", turn, tissue.stress(f))
     assert np.abs(tissue.stress(turned) - expected).max() < 1e-13 * np.abs(expected).max() * 100
     rigid = np.repeat(turn[:, :, None], 30, axis=2)
-    assert np.abs(tissue.stress(rigid)).max() < 1e-14
-    assert np.abs(tissue.energy(rigid)).max() < 1e-15
+    assert np.abs(tissue.stress(rigid)).max() < 1e-13
+    assert np.abs(tissue.energy(rigid)).max() < 1e-14
 
 
 def test_flattened_and_inverted_tets_have_finite_energy_that_pushes_them_back():
@@ -126,7 +126,7 @@ def test_convex_tangent_is_the_positive_part():
     values, vectors = np.linalg.eigh(true)
     assert (values[:, 0] < -1e-4).sum() > 10
     expected = (vectors * np.maximum(values, 0.0)[:, None]) @ vectors.transpose(0, 2, 1)
-    assert np.abs(convex - expected).max() < 1e-13
+    assert np.abs(convex - expected).max() < 1e-12
 
 
 @pytest.mark.parametrize("moduli", [FAT, MUSCLE])
