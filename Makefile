@@ -21,11 +21,11 @@ DEVELOP_STAMP := $(VENV)/.cmfsim-develop
 DOCS_STAMP := $(VENV)/.cmfsim-docs
 DEVELOP := VIRTUAL_ENV="$(VENV_PATH)" "$(BIN)/maturin" develop --release $(CARGO_FLAGS)
 RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 'Cargo.toml')
-PYTHON_DIRS := python tests/python scripts examples benches
+PYTHON_DIRS := python tests/python scripts examples benches fuzz
 CORE_FEATURES := --features mtm-core/metis
 
 .DEFAULT_GOAL := help
-.PHONY: help build test test-rust test-python lint format bench peers frontier demo docs clean
+.PHONY: help build test test-rust test-python lint format bench peers frontier fuzz demo docs clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sort | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 16
@@ -82,6 +82,9 @@ peers: $(BUILD_STAMP) ## compare with the peers that are installed (benches/peer
 frontier: $(BUILD_STAMP) ## measure error against run time (hours), and put it into docs/frontier.md
 	"$(PY)" -m cmfsim bench frontier -o target/frontier
 	"$(PY)" benches/fill_frontier.py target/frontier head
+
+fuzz: $(BUILD_STAMP) ## feed 10,000 damaged files to every reader, and put the table into docs/robustness.md
+	"$(PY)" fuzz/readers.py --mutants 10000 --seed 0 --fill docs/robustness.md
 
 demo: $(BUILD_STAMP) ## predict a face after surgery, and open its report
 	"$(BIN)/cmfsim" demo

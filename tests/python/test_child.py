@@ -77,4 +77,7 @@ def test_one_process_serves_many_files():
     read_in_child(f"{HERE}:arrays", count=1)
     process = child._children[0].process.pid
     assert isinstance(read_in_child(f"{HERE}:arrays", count=1), Answer)
+    with pytest.raises(cmfsim.ImageError):
+        read_in_child(f"{HERE}:fail", kind="ImageError")
+    assert isinstance(read_in_child(f"{HERE}:arrays", count=1), Answer)
     assert child._children[0].process.pid == process

@@ -112,7 +112,6 @@ def test_members_that_nobody_asks_for_are_not_unpacked(scene):
     more = {
         "bomb.npy": bomb(),
         "zeros.npy": packed(np.zeros(2**24)),
-        "readme.txt": b"x",
         "object.npy": packed(np.array([{}], dtype=object)),
     }
     header, arrays = read_archive(rewritten(scene, more), "cmfsim-scene", "scene")
@@ -188,6 +187,15 @@ def test_every_cut_of_an_archive_is_refused(scene):
     for length in range(0, len(whole), 37):
         scene.write_bytes(whole[:length])
         refused(lambda: cmfsim.read_scene(scene), "scene.npz: ")
+
+
+@pytest.mark.parametrize("name", ["readme.txt", "loads.npz", "", "load\0.npy"])
+def test_a_member_that_is_no_array_is_refused(name, scene):
+    """One letter of a name is not covered by any checksum: the loads would be gone."""
+    whole = rewritten(scene, {"loads.npy": packed(np.zeros((27, 3)))}).read_bytes()
+    at = whole.rindex(b"loads.npy")
+    scene.write_bytes(whole[:at] + name.encode().ljust(9, b"x")[:9] + whole[at + 9 :])
+    refused(lambda: cmfsim.read_scene(scene), "has the member|cannot be read|has the array")
 
 
 def test_two_members_of_one_name_are_refused(scene):

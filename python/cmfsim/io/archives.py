@@ -67,11 +67,11 @@ class _Members(Mapping[str, NDArray[Any]]):
         except Exception as error:
             raise CaseInputError(f"is not an .npz archive, or is cut short ({error})") from error
         infos = self._archive.infolist()
-        self._infos = {
-            info.filename.removesuffix(ENDING): info
-            for info in infos
-            if info.filename.endswith(ENDING)
-        }
+        self._infos = {info.filename.removesuffix(ENDING): info for info in infos}
+        # A damaged name must not make an array look absent.
+        other = next((i.filename for i in infos if not i.filename.endswith(ENDING)), None)
+        if other is not None:
+            raise CaseInputError(f"has the member {other[:60]!r}, which is no array")
         if len(infos) > MAX_MEMBERS:
             raise CaseInputError(f"has {len(infos)} members: at most {MAX_MEMBERS} are read")
         names = {info.filename for info in infos}

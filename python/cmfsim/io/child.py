@@ -140,7 +140,7 @@ class _Child:
             request = {"task": task, "arguments": dict(arguments)}
             self._send({**request, "seconds": limits.seconds, "memory": limits.memory})
             answer = self._receive()
-        except (EOFError, BrokenPipeError) as error:
+        except (EOFError, BrokenPipeError, ConnectionResetError) as error:
             raise ReaderError(self._reason(late=late.is_set())) from error
         except BaseException:
             # Ctrl-C: what is left of the answer must not become the next one.
@@ -148,6 +148,9 @@ class _Child:
             raise
         finally:
             timer.cancel()
+        # An error of the task is a whole answer: the process goes on to the next file.
+        if isinstance(answer, Exception):
+            raise answer
         return answer
 
     def end(self) -> None:
@@ -175,14 +178,14 @@ class _Child:
         stream.write(json.dumps(message).encode() + b"\n")
         stream.flush()
 
-    def _receive(self) -> Answer:
+    def _receive(self) -> Answer | Exception:
         stream = self.process.stdout
         if stream is None:
             raise EOFError
         (length,) = LENGTH.unpack(_exactly(stream, LENGTH.size))
         header = json.loads(_exactly(stream, length))
         if "error" in header:
-            raise _error_of(header["error"], header["text"])
+            return _error_of(header["error"], header["text"])
         arrays = {}
         for name, (dtype, shape) in header["arrays"].items():
             array = np.empty(shape, dtype=dtype)

@@ -7,6 +7,7 @@ and a finding says so.
 import csv
 import logging
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,6 +34,8 @@ __all__ = ["LandmarkFile", "read_landmark_file", "read_landmarks", "write_landma
 
 # What each format means where it does not say: Slicer's markups schema, and its fiducial reader.
 UNSTATED: Mapping[str, str] = MappingProxyType({".json": "LPS", ".fcsv": "RAS"})
+# A number as Slicer writes it; Python takes more for one, 1_0 among them.
+NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|[-+]?(?:nan|inf)")
 # Columns of a `.fcsv` file that does not name them.
 FCSV_COLUMNS = ("id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label")
 
@@ -247,10 +250,8 @@ def _from_fcsv(text: str, path: Path, frame: str | None) -> LandmarkFile:
         row = dict(zip(columns, cells, strict=False))
         numbers: list[object] = []
         for name in ("x", "y", "z"):
-            try:
-                numbers.append(float(row[name]))
-            except ValueError:
-                numbers.append(row[name])
+            cell = row[name].strip()
+            numbers.append(float(cell) if NUMBER.fullmatch(cell) else cell)
         points.append(
             _Point(number, _label(number, row["label"]), sign * as_position(number, numbers))
         )

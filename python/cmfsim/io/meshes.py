@@ -28,6 +28,8 @@ __all__ = ["read_mesh", "read_tet_mesh", "read_tets"]
 
 # Formats of meshio whose files name other files, which may lie anywhere, or hold no mesh.
 NAME_OTHERS = frozenset({".xdmf", ".xmf", ".hmf", ".node", ".ele", ".svg"})
+# Processor time, s, and memory, bytes, that meshio may take for a small file.
+SECONDS, MEMORY = 3.0, 2**30
 # Cells that lie on or in the tets of a file without being part of the tissue.
 PASSED_OVER = frozenset({"vertex", "line", "triangle", "quad", "tetra"})
 
@@ -97,7 +99,9 @@ def _by_meshio(path: Path) -> PlainMesh:
             f"files of {suffix} are read with meshio: pip install 'cmfsim[mesh]'; "
             f"{', '.join(READERS)} need nothing more"
         )
-    limits = ReadLimits.of_bytes(path.stat().st_size)
+    size = path.stat().st_size
+    # meshio's slowest readers take a MB a second, and less than 200 bytes for each.
+    limits = ReadLimits(SECONDS + size / 1e6, MEMORY + 200 * size)
     try:
         answer = read_in_child("cmfsim.io.meshes:meshio_answer", limits, path=os.path.abspath(path))  # noqa: PTH100
     except ReaderError as error:

@@ -21,7 +21,9 @@ PASSED_OVER = frozenset(
     b"trace_obj".split()
 )
 # What follows a vertex in a corner, 1/2/3, 1//3 or 1/2, if it is none of these.
-BAD_REFERENCE = re.compile(rb"/(?!(?:-?[0-9]+)?(?:/-?[0-9]+)?(?:[ \t\r\n]|$))[^ \t\r\n]*")
+BAD_REFERENCE = re.compile(
+    rb"(?<![0-9/])/[^ \t\r\n]*|/(?!(?:-?[0-9]+)?(?:/-?[0-9]+)?(?:[ \t\r\n]|$))[^ \t\r\n]*"
+)
 REFERENCE = re.compile(rb"/[^ \t\r\n]*")
 # Counts that this program, MeshLab and 3ds Max state in comments of their own.
 STATED = re.compile(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.case import NODE_KINDS
+from cmfsim.checks import as_floats
 from cmfsim.errors import CaseInputError
 from cmfsim.io.archives import member_of, read_archive, write_archive
 from cmfsim.io.files import (
@@ -180,9 +181,9 @@ def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray
         if name in segments:
             raise CaseInputError(f"segments[{number}] is {name!r} again")
         contact = None
-        if f"{key}.contact.vertices" in members:
+        if any(f"{key}.contact.{part}" in members for part in ("vertices", "triangles")):
             contact = SurfaceData(
-                members[f"{key}.contact.vertices"],
+                member_of(members, f"{key}.contact.vertices"),
                 member_of(members, f"{key}.contact.triangles"),
                 entry.get("crease_angle", 60.0),
             )
@@ -307,14 +308,19 @@ def _motion(name: str, plans: Mapping[str, Any], folder: Path) -> NDArray[Any] |
     where = f"plan.{name}"
     table = table_of(plans, name)
     if "matrix" in table:
-        return np.asarray(known_keys(where, table, ("matrix",))["matrix"])
+        return as_floats(f"{where}.matrix", known_keys(where, table, ("matrix",))["matrix"])
     if "moved_surface" in table:
         files = known_keys(where, table, ("surface", "moved_surface"))
         return read_moved_surface(
             beside(folder, f"{where}.surface", files.get("surface")),
             beside(folder, f"{where}.moved_surface", files["moved_surface"]),
         )
-    return rigid_motion(**known_keys(where, table, ("translation", "angle", "axis", "centre")))
+    numbers = known_keys(where, table, ("translation", "angle", "axis", "centre"))
+    with np.errstate(over="ignore", invalid="ignore"):
+        matrix = rigid_motion(**numbers)
+    if not np.isfinite(matrix).all():
+        raise CaseInputError(f"{where} has numbers so large that its motion is not finite")
+    return matrix
 
 
 def _node_integers(mesh: Any, name: str, count: int, path: Path) -> NDArray[np.int64]:

@@ -54,6 +54,14 @@ class _Element:
         """The children of a name."""
         return [child for child in self.children if child.name == name]
 
+    def only(self, *known: str) -> None:
+        """Refuses other children: a name that is misspelt would be an array less."""
+        for child in self.children:
+            if child.name not in known:
+                raise CaseInputError(
+                    f"{self.name} has the element {child.name[:40]!r}: {', '.join(known)} are known"
+                )
+
     def count(self, name: str, default: int | None = None) -> int:
         """An attribute that is a whole number from 0 on."""
         value = self.attributes.get(name)
@@ -83,9 +91,11 @@ def read_vtk_xml(data: bytes, kind: str) -> PlainMesh:
     if root.name != "VTKFile" or root.attributes.get("type") != kind:
         found = root.attributes.get("type", root.name)
         raise CaseInputError(f"holds {found!r}: VTKFile type={kind!r} is needed")
+    root.only(kind)
     bodies = root.all(kind)
     if len(bodies) != 1:
         raise CaseInputError(f"has {len(bodies)} elements {kind!r}: one is needed")
+    bodies[0].only("FieldData", "Piece")
     # Surfaces have no use for their faces' values.
     read = _surface_piece if kind == "PolyData" else _volume_piece
     meshes = [read(piece, file) for piece in bodies[0].all("Piece")]
@@ -96,11 +106,13 @@ def read_vtk_xml(data: bytes, kind: str) -> PlainMesh:
 
 
 def _surface_piece(piece: _Element, file: "_Arrays") -> PlainMesh:
+    piece.only("PointData", "CellData", "Points", "Verts", "Lines", "Strips", "Polys")
     if piece.count("NumberOfStrips", 0):
         raise CaseInputError("has triangle strips: turn them into triangles before it is saved")
     points, point_data = _points(piece, file)
     n = piece.count("NumberOfPolys", 0)
     if not n:
+        _check_empty(piece.all("Polys"), file)
         return PlainMesh(points, (), point_data)
     corners, counts = _connectivity(_one(piece, "Polys"), n, file)
     triangles = triangles_of(points, counts, corners)
@@ -108,9 +120,11 @@ def _surface_piece(piece: _Element, file: "_Arrays") -> PlainMesh:
 
 
 def _volume_piece(piece: _Element, file: "_Arrays") -> PlainMesh:
+    piece.only("PointData", "CellData", "Points", "Cells")
     points, point_data = _points(piece, file)
     n = piece.count("NumberOfCells")
     if not n:
+        _check_empty(piece.all("Cells"), file)
         return PlainMesh(points, (), point_data)
     cells = _one(piece, "Cells")
     corners, counts = _connectivity(cells, n, file)
@@ -121,6 +135,13 @@ def _volume_piece(piece: _Element, file: "_Arrays") -> PlainMesh:
         for name, values in _data(piece, "CellData", n, file).items()
     }
     return PlainMesh(points, blocks, point_data, cell_data)
+
+
+def _check_empty(groups: Sequence[_Element], file: "_Arrays") -> None:
+    """Refuses cells where none are stated."""
+    for group in groups:
+        for array in group.all("DataArray"):
+            file.values(array, 0)
 
 
 def _points(
@@ -139,6 +160,7 @@ def _points(
 def _data(piece: _Element, name: str, n: int, file: "_Arrays") -> dict[str, NDArray[Any]]:
     found: dict[str, NDArray[Any]] = {}
     for group in piece.all(name):
+        group.only("DataArray", "Array")
         for array in group.all("DataArray"):
             label = array.attributes.get("Name", "")
             if label in found:
@@ -372,7 +394,7 @@ def _tree(text: bytes) -> _Element:
     # The encoding is UTF-8 whatever the text states: nothing hides behind another one.
     if b"\0" in text:
         raise CaseInputError("is not XML in UTF-8: it holds zero bytes")
-    parser = expat.ParserCreate("UTF-8")
+    parser = expat.ParserCreate("UTF-8", " ")
     parser.buffer_text = True
     parser.buffer_size = 2**20
     top = _Element("", {})
