@@ -474,6 +474,9 @@ def test_an_output_that_cannot_be_is_found_before_the_work(ellipsoids, monkeypat
     def work(*_, **__):
         raise AssertionError
 
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
     monkeypatch.setattr(case_model, "build_model", work)
     taken = ellipsoids.parent / "taken"
     taken.write_text("", encoding="utf-8")
@@ -488,7 +491,8 @@ def test_an_output_that_cannot_be_is_found_before_the_work(ellipsoids, monkeypat
     assert code == 2
     assert "would replace this input" in err
     assert (ellipsoids.parent / "skin.ply").read_bytes() == skin
-    monkeypatch.setattr("os.access", lambda *_: False)
+    # As on a disk that is read-only: permissions do not tell root.
+    monkeypatch.setattr("cmfsim.io.folders.tempfile.mkdtemp", refuse)
     code, _, err = run(*words, ellipsoids.parent / "closed")
     assert code == 1
     assert "cannot be written there" in err
@@ -512,12 +516,15 @@ def test_the_doctor_is_asked_once_or_not_at_all(ellipsoids, monkeypatch, small_m
     """His findings are in the model; with --no-doctor nobody asks him."""
     asked = []
 
-    def diagnose(case):
-        asked.append(case)
+    def diagnose(case, models=None):
+        asked.append((case, models))
         return (cmfsim.Finding("note", "said-once", "something"),)
 
+    def examine(case, models=None):
+        return cmfsim.doctor.Examination(diagnose(case, models), {})
+
     monkeypatch.setattr(case_model, "diagnose", diagnose)
-    monkeypatch.setattr("cmfsim.cli.case_commands.diagnose", diagnose)
+    monkeypatch.setattr("cmfsim.cli.case_commands.examine", examine)
     monkeypatch.setattr(case_model, "read_anatomy", lambda *_: (small_model.anatomy, ()))
     monkeypatch.setattr(case_model, "_draw", lambda *_: [])
     for words, times in (((), 1), (("--no-doctor",), 0)):
