@@ -124,7 +124,7 @@ def test_no_mutant_ends_in_a_traceback_or_a_wrong_report(name, originals, capsys
     path = originals / name
     data = path.read_bytes()
     content = json.loads(data)
-    rng = random.Random(0)  # noqa: S311 (a test's own)
+    rng = random.Random(0)
     refused = 0
     try:
         for number in range(MUTANTS):
