@@ -20,12 +20,13 @@ BUILD_STAMP := $(VENV)/.cmfsim-build
 DEVELOP_STAMP := $(VENV)/.cmfsim-develop
 DOCS_STAMP := $(VENV)/.cmfsim-docs
 DEVELOP := VIRTUAL_ENV="$(VENV_PATH)" "$(BIN)/maturin" develop --release $(CARGO_FLAGS)
-RUST_SOURCES := Cargo.toml Cargo.lock $(shell find crates -name '*.rs' -o -name 'Cargo.toml')
+RUST_SOURCES := Cargo.toml Cargo.lock \
+  $(shell find crates -name '*.rs' -o -name 'Cargo.toml' -o -name '*.[ch]')
 PYTHON_DIRS := python tests/python scripts examples benches fuzz
 CORE_FEATURES := --features mtm-core/metis
 
 .DEFAULT_GOAL := help
-.PHONY: help build test test-rust test-python lint format bench peers frontier fuzz demo docs clean
+.PHONY: help build test test-rust test-python lint format wheel notices bench peers frontier fuzz demo docs clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sort | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 16
@@ -59,7 +60,7 @@ test-rust: $(ENV_STAMP)
 test-python: $(DEVELOP_STAMP)
 	"$(PY)" -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
-lint: $(DEVELOP_STAMP) ## rustfmt, clippy, ruff, mypy, stubtest and the import rules
+lint: $(DEVELOP_STAMP) ## rustfmt, clippy, ruff, mypy, stubtest, the import rules and the licences
 	cargo fmt --all --check
 	cargo clippy --profile lint --workspace --all-targets $(CARGO_FLAGS) $(CORE_FEATURES) -- -D warnings
 	"$(BIN)/ruff" check $(PYTHON_DIRS)
@@ -67,11 +68,20 @@ lint: $(DEVELOP_STAMP) ## rustfmt, clippy, ruff, mypy, stubtest and the import r
 	"$(BIN)/mypy" --strict
 	cd python && "$(BIN)/stubtest" cmfsim._core
 	"$(PY)" scripts/check_imports.py
+	"$(PY)" scripts/third_party.py --check
 
 format: $(DEVELOP_STAMP) ## rewrite the sources in the project's format
 	cargo fmt --all
 	"$(BIN)/ruff" check --fix $(PYTHON_DIRS)
 	"$(BIN)/ruff" format $(PYTHON_DIRS)
+
+wheel: $(ENV_STAMP) ## build a wheel into dist/, install it into a new environment and run the demo there
+	rm -rf dist
+	VIRTUAL_ENV="$(VENV_PATH)" "$(BIN)/maturin" build --release $(CARGO_FLAGS) --out dist
+	"$(PY)" scripts/try_wheel.py dist
+
+notices: $(ENV_STAMP) ## write THIRD-PARTY-NOTICES.md again, after a change of Cargo.lock
+	"$(PY)" scripts/third_party.py
 
 bench: $(BUILD_STAMP) ## run the benches (minutes; close other programs first)
 	cargo bench --workspace $(CARGO_FLAGS) $(CORE_FEATURES)

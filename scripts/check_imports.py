@@ -157,7 +157,6 @@ CRATES: Mapping[str, str] = {
     "parry3d_f64": "mtm-core/src/surface.rs",
     "faer": "mtm-core/src/cholesky/",
     "pulp": "mtm-core/src/simd.rs",
-    "metis_sys": "mtm-core/src/ordering.rs",
     "libc": "mtm-core/src/memory.rs",
     "pyo3": "mtm-py/",
     "numpy": "mtm-py/",

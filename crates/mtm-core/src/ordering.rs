@@ -41,15 +41,79 @@ impl NodeGraph {
     }
 }
 
+/// The two functions of METIS that are called (`metis/libmetis/metis.h`), with 32-bit indices.
+#[cfg(feature = "metis")]
+mod metis {
+    use std::ffi::c_int;
+
+    /// Length of the options.
+    pub const N_OPTIONS: usize = 40;
+    /// Place of the seed of the random numbers among the options.
+    pub const SEED: usize = 9;
+    /// Place of the first index, 0 or 1.
+    pub const NUMBERING: usize = 18;
+    /// What a call without a fault returns.
+    pub const OK: c_int = 1;
+
+    #[allow(unsafe_code)]
+    unsafe extern "C" {
+        pub fn METIS_SetDefaultOptions(options: *mut i32) -> c_int;
+        pub fn METIS_NodeND(
+            count: *mut i32,
+            start: *mut i32,
+            neighbours: *mut i32,
+            weights: *mut i32,
+            options: *mut i32,
+            order: *mut i32,
+            position: *mut i32,
+        ) -> c_int;
+    }
+}
+
+/// The right to call METIS, which one thread of a process has at a time.
+///
+/// METIS draws from C's rand(), seeded at each call: two calls at once would share the sequence and the
+/// order would depend on timing. A process that was forked while another thread of its parent was at it
+/// takes the right over: that thread is not in this process.
+#[cfg(feature = "metis")]
+struct Turn;
+
+#[cfg(feature = "metis")]
+impl Turn {
+    /// The process that is at it; 0: none.
+    const NOBODY: u32 = 0;
+
+    fn holder() -> &'static std::sync::atomic::AtomicU32 {
+        static HOLDER: std::sync::atomic::AtomicU32 =
+            std::sync::atomic::AtomicU32::new(Turn::NOBODY);
+        &HOLDER
+    }
+
+    fn wait() -> Self {
+        use std::sync::atomic::Ordering::{Acquire, Relaxed};
+        let here = std::process::id();
+        loop {
+            let holder = Self::holder().load(Relaxed);
+            if holder != here
+                && Self::holder().compare_exchange(holder, here, Acquire, Relaxed).is_ok()
+            {
+                return Self;
+            }
+            std::thread::sleep(std::time::Duration::from_micros(200));
+        }
+    }
+}
+
+#[cfg(feature = "metis")]
+impl Drop for Turn {
+    fn drop(&mut self) {
+        Self::holder().store(Self::NOBODY, std::sync::atomic::Ordering::Release);
+    }
+}
+
 /// Nested-dissection order (position → node) by METIS (Karypis & Kumar 1998), the same on every call.
 #[cfg(feature = "metis")]
 pub fn nested_dissection(graph: &NodeGraph) -> Result<Option<Vec<u32>>> {
-    use std::sync::{Mutex, PoisonError};
-    // METIS draws from C's rand(), seeded at each call: two calls at once would share the sequence and
-    // the order would depend on timing.
-    static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
-    const OPTION_SEED: usize = metis_sys::moptions_et_METIS_OPTION_SEED as usize;
-    const OPTION_NUMBERING: usize = metis_sys::moptions_et_METIS_OPTION_NUMBERING as usize;
     const SEED: i32 = 1;
 
     let n = graph.n_nodes();
@@ -58,18 +122,18 @@ pub fn nested_dissection(graph: &NodeGraph) -> Result<Option<Vec<u32>>> {
     }
     let mut count = n as i32;
     let (mut start, mut neighbours) = (graph.start.clone(), graph.neighbours.clone());
-    let mut options = [0_i32; metis_sys::METIS_NOPTIONS as usize];
+    let mut options = [0_i32; metis::N_OPTIONS];
     let (mut order, mut position) = (vec![0_i32; n], vec![0_i32; n]);
-    let _guard = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
+    let _turn = Turn::wait();
     // SAFETY: every pointer is to a live, exclusively borrowed buffer of the length METIS documents:
     // start n+1, neighbours start[n], options METIS_NOPTIONS, order and position n; null vertex weights
     // are allowed. METIS keeps none of them.
     #[allow(unsafe_code)]
     let status = unsafe {
-        metis_sys::METIS_SetDefaultOptions(options.as_mut_ptr());
-        options[OPTION_SEED] = SEED;
-        options[OPTION_NUMBERING] = 0;
-        metis_sys::METIS_NodeND(
+        metis::METIS_SetDefaultOptions(options.as_mut_ptr());
+        options[metis::SEED] = SEED;
+        options[metis::NUMBERING] = 0;
+        metis::METIS_NodeND(
             &mut count,
             start.as_mut_ptr(),
             neighbours.as_mut_ptr(),
@@ -79,7 +143,7 @@ pub fn nested_dissection(graph: &NodeGraph) -> Result<Option<Vec<u32>>> {
             position.as_mut_ptr(),
         )
     };
-    if status != metis_sys::rstatus_et_METIS_OK {
+    if status != metis::OK {
         // The graph is well formed, so memory is all that can fail.
         return Err(MtmError::OutOfMemory {
             what: "nested dissection",
