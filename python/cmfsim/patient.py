@@ -113,6 +113,8 @@ class CaseImage:
     working_spacing : float or None, mm
     series : str or None
         UID or number of the DICOM series that is meant, where the folder holds several.
+    rescale : tuple of float or None
+        Slope and intercept from the image's values to HU, where they are not HU.
     """
 
     file: Path
@@ -121,6 +123,7 @@ class CaseImage:
     working_spacing: float | None = None
     metal_threshold: float | None = None
     series: str | None = None
+    rescale: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -131,3 +131,26 @@ def without_couch(image: ImageData, behind: float) -> ImageData:
     values = np.asarray(image.values).copy()
     values[:, (image.axes()[1] > behind).ravel()] = -1000
     return image.with_values(values)
+
+
+def saturated(image: ImageData, at: float) -> ImageData:
+    """Values cut off at a number of HU, as scanners and exports do."""
+    return image.with_values(np.minimum(image.values, at).astype(np.int16))
+
+
+def with_tube(
+    image: ImageData, skin: np.ndarray, hu: float = 250.0, radius: float = 5.0
+) -> ImageData:
+    """A tube taped to one cheek: a hollow cylinder of plastic that touches the skin.
+
+    `skin` holds the middle of the tube, (n, 3) mm, along the face.
+    """
+    values = np.asarray(image.values).copy()
+    x, y, z = image.axes()
+    nearest = np.full(values.shape, np.inf)
+    for a, b, c in skin:
+        nearest = np.minimum(nearest, np.sqrt((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2))
+    outside = values < -300
+    values[outside & (nearest < radius)] = hu
+    values[outside & (nearest < radius - 2.5)] = -1000
+    return image.with_values(values)

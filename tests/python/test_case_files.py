@@ -130,6 +130,29 @@ def test_an_image_may_stand_in_place_of_surfaces(tmp_path):
     assert case.surfaces is None
     assert case.image.file == tmp_path / "ct.nii.gz"
     assert (case.image.skin_threshold, case.image.bone_threshold) == (-250.0, None)
+    more = "metal_threshold = 1900\nseries = 3\nrescale = [1, -1024]\n"
+    case = load(tmp_path, HEAD + text + more)
+    assert case.image.metal_threshold == 1900.0
+    assert (case.image.series, case.image.rescale) == ("3", (1.0, -1024.0))
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("series = [3]", "number or UID"),
+        ("series = true", "number or UID"),
+        ('series = ""', "number or UID"),
+        ("rescale = 1", r"\[slope, intercept\]"),
+        ("rescale = [0, -1024]", "slope must be above 0"),
+        ("rescale = [1, 1e9]", "intercept within"),
+        ("metal_threshold = 5000", "metal_threshold"),
+        ("metal_threshold = 200\nbone_threshold = 250", "must be below"),
+    ],
+)
+def test_what_an_image_s_table_cannot_mean_is_refused(tmp_path, line, words):
+    """With the file, the line and the key."""
+    with pytest.raises(cmfsim.CaseError, match=words):
+        load(tmp_path, HEAD + f'[image]\nfile = "ct"\n{line}\n')
 
 
 WRONG = {

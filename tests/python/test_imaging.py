@@ -10,6 +10,7 @@ import pytest
 import cmfsim
 import ct_variants as variants
 from cmfsim import ImageData, ImageError, SegmentOptions, segment_head
+from cmfsim.imaging import intensity
 from synthetic_head import made_head
 
 pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
@@ -155,6 +156,10 @@ def test_an_mr_image_is_refused(head):
     with pytest.raises(ImageError) as caught:
         segment_head(head.image.with_values(mr.astype(np.int16)))
     assert isinstance(caught.value, ValueError)
+    # The same may befall a CT: what to do then.
+    assert "rescale = [1, 0] in [image]" in str(caught.value)
+    stated = intensity.calibration(head.image.values, (1.0, 0.0))
+    assert (stated.slope, stated.offset, stated.findings) == (1.0, 0.0, ())
 
 
 @pytest.mark.parametrize(
@@ -215,6 +220,87 @@ def test_metal_spikes_do_not_leave_the_skin(head):
     spikes = surface_points(found.bones["mandible"])
     assert np.abs(spikes[:, 0]).max() < 45.0
     assert spikes[:, 1].min() > -93.0
+
+
+def with_fillings(head, hu):
+    """Two fillings of a value in the tooth rows."""
+    x, y, z = head.image.axes()
+    values = head.image.values.astype(np.float64)
+    for side in (-1.0, 1.0):
+        ball = np.sqrt((x - side * 28.0) ** 2 + (y + 40.0) ** 2 + (z + 60.0) ** 2) < 5.0
+        values[ball] = hu
+    return head.image.with_values(values.astype(np.int16))
+
+
+def test_metal_is_found_where_the_image_is_cut_off_below_the_usual_threshold(head):
+    found = segment_head(with_fillings(head, 2000.0), landmarks=head.landmarks)
+    assert {"metal", "ct-saturated"} <= codes(found)
+    (metal,) = [f for f in found.findings if f.code == "metal"]
+    assert "2 pieces" in metal.what
+    assert "above 1940 HU" in metal.what
+    # What the case sets counts.
+    set_higher = segment_head(with_fillings(head, 2000.0), SegmentOptions(metal_threshold=2400.0))
+    assert not {"metal", "ct-saturated"} & codes(set_higher)
+
+
+def test_an_image_cut_off_too_low_to_tell_metal_is_reported(head):
+    found = segment_head(with_fillings(head, 1500.0), landmarks=head.landmarks)
+    assert "metal" not in codes(found)
+    (finding,) = [f for f in found.findings if f.code == "ct-saturated"]
+    assert finding.severity == "warning"
+    assert "metal_threshold" in finding.mend
+    lower = segment_head(with_fillings(head, 1500.0), SegmentOptions(metal_threshold=1400.0))
+    assert "metal" in codes(lower)
+
+
+def test_one_bright_voxel_is_no_saturation(head):
+    values = head.image.values.copy()
+    values[40, 20, 20] = 2000
+    assert "ct-saturated" not in {
+        f.code
+        for f in segment_head(head.image.with_values(values)).findings
+        if f.severity == "warning"
+    }
+
+
+@pytest.mark.parametrize(("hu", "kind"), [(250.0, "plastic"), (60.0, "other side")])
+def test_a_tube_on_the_cheek_is_reported_and_not_removed(head, anatomy, hu, kind):
+    level = anatomy.skin
+    x, _, z = (a.ravel() for a in level.axes())
+    column = int(np.argmin(np.abs(x - 40.0)))
+    rows = [k for k in range(len(z)) if -75.0 < z[k] < -20.0]
+    first = [int(np.argmax(level.values[column, :, k] > 0.0)) for k in rows]
+    middle = [level.lowest + [0, np.asarray(level.spacing)[1] * j - 4.0, 0] for j in first]
+    path = np.array([[x[column], m[1], z[k]] for m, k in zip(middle, rows, strict=True)])
+    found = segment_head(variants.with_tube(head.image, path, hu), landmarks=head.landmarks)
+    (finding,) = [f for f in found.findings if f.code == "skin-attachment"]
+    assert kind in finding.what
+    assert finding.severity == "warning"
+    place = [float(n) for n in finding.where.split("(")[1].split(")")[0].split(",")]
+    assert np.linalg.norm(np.array(place) - path.mean(axis=0)) < 15.0
+    # It is still skin.
+    assert found.skin.sample([path[len(path) // 2] - [0, 3.0, 0]])[0] > 0.0
+    assert "skin-attachment" not in codes(anatomy)
+
+
+def test_a_part_that_is_too_small_for_a_head_is_refused():
+    x, y, z = np.ogrid[-60:60:2.0, -60:60:2.0, -60:60:2.0]
+    values = np.full((60, 60, 60), -1000, dtype=np.int16)
+    values[(np.hypot(x, y) < 24.0) & (np.abs(z) < 40.0)] = 40
+    values[(np.hypot(x, y) < 9.0) & (np.abs(z) < 40.0)] = 900
+    with pytest.raises(ImageError, match=r"13\d cm³.*at least 250"):
+        segment_head(ImageData(values, (2.0, 2.0, 2.0)))
+
+
+def test_a_stated_scale_is_used_and_checked(head, anatomy):
+    stored = head.image.with_values(head.image.values + np.int16(1024))
+    found = segment_head(stored, SegmentOptions(rescale=(1.0, -1024.0)), landmarks=head.landmarks)
+    assert "ct-not-hu" not in codes(found)
+    np.testing.assert_array_equal(found.skin.values, anatomy.skin.values)
+    with pytest.raises(ImageError, match="correct rescale"):
+        segment_head(stored, SegmentOptions(rescale=(1.0, 0.0)))
+    with pytest.raises(ValueError, match="slope"):
+        SegmentOptions(rescale=(0.0, 0.0))
 
 
 # The real CT -----------------------------------------------------------------------------------
@@ -387,6 +473,11 @@ def test_a_hard_variant_of_the_real_ct_keeps_its_face(
     assert {"cranium", "mandible"} == set(anatomy.bones)
     if parted is not None:
         assert _parted(anatomy, reference) > parted
+
+
+@needs_phantom
+def test_the_real_face_has_nothing_attached(phantom_anatomy):
+    assert not {"skin-attachment", "ct-saturated", "metal"} & codes(phantom_anatomy)
 
 
 @needs_phantom

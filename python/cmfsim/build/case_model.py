@@ -13,6 +13,7 @@ import numpy as np
 
 from cmfsim._core import Surface, TetMesh, __version__
 from cmfsim.build.clefts import without_clefts
+from cmfsim.build.ends import end_findings
 from cmfsim.build.held import held_part
 from cmfsim.build.inputs import (
     case_key,
@@ -216,6 +217,15 @@ def build_model(
     findings += noticed
     if mesh.n_tets < whole:
         report = report_of_part(mesh, report)
+    findings += end_findings(
+        np.asarray(mesh.nodes),
+        np.asarray(mesh.boundary_triangles()),
+        kinds,
+        anatomy,
+        region,
+        segments=bones.segments,
+        moved=moved,
+    )
     findings += _untouched(case, mesh, kinds, bones)
     findings[:] = [*dict.fromkeys(findings)]
 

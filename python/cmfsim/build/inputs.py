@@ -110,7 +110,13 @@ def segment_options(case: Case) -> SegmentOptions:
         return SegmentOptions()
     given = {
         name: getattr(case.image, name)
-        for name in ("skin_threshold", "bone_threshold", "metal_threshold", "working_spacing")
+        for name in (
+            "skin_threshold",
+            "bone_threshold",
+            "metal_threshold",
+            "working_spacing",
+            "rescale",
+        )
         if getattr(case.image, name) is not None
     }
     return SegmentOptions(**given)

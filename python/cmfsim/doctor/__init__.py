@@ -15,6 +15,7 @@ from types import MappingProxyType
 from cmfsim.case import SEVERITIES, Finding
 from cmfsim.clinical_plan import ClinicalMotion
 from cmfsim.doctor.after import check_after
+from cmfsim.doctor.ends import check_ends
 from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.moved import check_moved
 from cmfsim.doctor.operation import check_cuts, check_plan, pieces_of
@@ -113,6 +114,7 @@ def examine(case: CaseOrPath, models: Sequence[str] | None = None) -> Examinatio
     if not any(finding.severity == "error" for finding in placement):
         findings += check_mesh_size(evidence)
         findings += check_plan(evidence, plan, pieces)
+        findings += check_ends(evidence)
         findings += check_moved(evidence)
         findings += check_after(evidence)
         if case.muscles is not None and (models is None or any("M" in name for name in models)):

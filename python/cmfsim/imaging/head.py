@@ -9,12 +9,14 @@ from numpy.typing import ArrayLike
 
 from cmfsim.case import Anatomy, Finding, ImageData
 from cmfsim.checks import Floats, as_rows
+from cmfsim.errors import ImageInputError
 from cmfsim.imaging.air import air_level
+from cmfsim.imaging.attached import attached_findings
 from cmfsim.imaging.bone import bone_level, find_bone, teeth_level
 from cmfsim.imaging.intensity import weak_bone
 from cmfsim.imaging.jaw import part_jaws
 from cmfsim.imaging.metal import find_metal, metal_within
-from cmfsim.imaging.morphology import Block, Volume
+from cmfsim.imaging.morphology import Block, Mask, Volume
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import find_skin
 from cmfsim.imaging.view import view_findings
@@ -23,6 +25,9 @@ from cmfsim.imaging.working import Working, without_noise, working_grid
 __all__ = ["segment_head"]
 
 _LOG = logging.getLogger(__name__)
+
+# A child's face in a narrow image is larger than this, cm³.
+LEAST_HEAD = 250.0
 
 
 def segment_head(
@@ -77,6 +82,7 @@ def segment_head(
     metal = find_metal(work, options)
     say("skin")
     skin = find_skin(work, metal, options)
+    _check_head(work, skin.mask)
     say("bone")
     # The couch and the air around the head need no more work.
     whole, work, metal = work, work.part(skin.box), metal_within(metal, skin.box)
@@ -88,6 +94,7 @@ def segment_head(
         *skin.findings,
         *bone.findings,
         *view_findings(work, skin, bone),
+        *attached_findings(work, skin, bone),
     ]
     # A smoothed rim may not carry bone past the skin.
     level = np.minimum(bone_level(bone, options), skin.level)
@@ -109,6 +116,16 @@ def segment_head(
     air = None if hollow is None else _image(whole, hollow, skin.box)
     outer = _image(whole, skin.level, skin.box)
     return Anatomy(outer, bones, air, teeth, tuple(all_findings))
+
+
+def _check_head(work: Working, inside: Mask) -> None:
+    """Refuses a part that is too small to be a head."""
+    volume = np.count_nonzero(inside) * float(np.prod(work.spacing)) / 1000.0
+    if volume < LEAST_HEAD:
+        raise ImageInputError(
+            f"the largest thing in the image that may be a head has {volume:.0f} cm³: a face has "
+            f"at least {LEAST_HEAD:g}; is the head cut off, empty (a phantom), or the scale wrong?"
+        )
 
 
 def _image(whole: Working, level: Volume, box: Block) -> ImageData:

@@ -10,7 +10,7 @@ from cmfsim.case import Finding
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.morphology import Volume
 
-__all__ = ["Calibration", "calibration", "noise_of", "weak_bone"]
+__all__ = ["Calibration", "calibration", "noise_of", "saturation_of", "weak_bone"]
 
 # Air by definition, and muscle and brain as scanners show them (25 to 60), HU.
 AIR = -1000.0
@@ -31,6 +31,18 @@ LEAST_SOFT_PART = 0.45
 # More of the tissue than this is bone in no head.
 MOST_BONE_PART = 0.45
 HISTOGRAM_BINS = 400
+# As many voxels and mm³ at the largest value, and more than in this range below it (HU), were cut
+# off there.
+LEAST_PLATEAU = 8
+LEAST_SATURATED = 15.0
+BELOW_SATURATED = 100.0
+# With a stated scale, air lies within this of −1000 HU.
+STATED_TOLERANCE = 250.0
+# What to do where the histogram misleads.
+STATE_IT = (
+    "If it is one, state how its values become HU, and nothing is guessed: rescale = [1, 0] in "
+    "[image] for HU, [1, -1024] for values that are 1024 too large"
+)
 # About as many voxels as a histogram needs.
 SAMPLE = 2_000_000
 
@@ -44,14 +56,14 @@ class Calibration:
     findings: tuple[Finding, ...] = ()
 
 
-def calibration(values: NDArray[Any]) -> Calibration:
-    """The calibration of an image, judged by its histogram.
+def calibration(values: NDArray[Any], stated: tuple[float, float] | None = None) -> Calibration:
+    """The calibration of an image: as stated, or judged by its histogram.
 
     Errors
     ------
     ImageError
         (also `ValueError`) One value throughout, no air and soft tissue to be told, or the spread
-        of an MR image.
+        of an MR image; no air where a stated scale puts it.
     """
     step = max(1, int(np.cbrt(values.size / SAMPLE)))
     sample = values[::step, ::step, ::step].astype(np.float64, copy=False).ravel(order="K")
@@ -60,6 +72,8 @@ def calibration(values: NDArray[Any]) -> Calibration:
         raise ImageInputError(
             f"the image is {low:g} nearly throughout: a CT has air, soft tissue and bone"
         )
+    if stated is not None:
+        return _stated(sample, *stated)
     if low < AIR - 400.0:
         # Padding outside a round field of view (−2000, −3024) is no air of its own.
         padded = sample < AIR - 400.0
@@ -83,6 +97,39 @@ def calibration(values: NDArray[Any]) -> Calibration:
     return result
 
 
+def _stated(sample: NDArray[np.float64], slope: float, intercept: float) -> Calibration:
+    """A scale that the case states, where it puts the darkest voxels near air."""
+    hu = slope * sample + intercept
+    # Padding outside a round field of view lies below air.
+    air = float(np.median(hu[hu <= np.percentile(hu, 10.0)]))
+    if air > AIR + STATED_TOLERANCE or float(hu.max()) < SOFT:
+        raise ImageInputError(
+            f"with the stated rescale ({slope:g}·value {intercept:+g}) the image has HU from "
+            f"{hu.min():.0f} to {hu.max():.0f}, and its darkest tenth lies at {air:.0f}: a CT of a "
+            "head has air at −1000 and bone above 250; correct rescale in [image]"
+        )
+    return Calibration(slope, intercept)
+
+
+def saturation_of(values: NDArray[Any], voxel: float, scale: Calibration) -> float:
+    """The value at which the brightest voxels were cut off, HU; infinite where they were not.
+
+    Parameters
+    ----------
+    values : array
+        Of the image as read: averages would hide a common value.
+    voxel : float, mm³
+    scale : Calibration
+    """
+    top = values.max()
+    count = int(np.count_nonzero(values == top))
+    if count < LEAST_PLATEAU or count * voxel < LEAST_SATURATED:
+        return np.inf
+    below = float(top) - BELOW_SATURATED / scale.slope
+    near = int(np.count_nonzero(values > below)) - count
+    return scale.slope * float(top) + scale.offset if count > near else np.inf
+
+
 def _peaks(sample: NDArray[np.float64], low: float, high: float) -> tuple[float, float]:
     """The values at the peaks of air and of soft tissue."""
     counts, edges = np.histogram(np.clip(sample, low, high), bins=HISTOGRAM_BINS)
@@ -96,15 +143,15 @@ def _peaks(sample: NDArray[np.float64], low: float, high: float) -> tuple[float,
     if len(tops) < 2:
         raise ImageInputError(
             "the image has no separate peaks of air and soft tissue in its histogram (values "
-            f"{low:g} to {high:g}): is it a CT of a head with air around it?"
+            f"{low:g} to {high:g}): a CT of a head with air around it is needed. {STATE_IT}"
         )
     air = tops[0]
     # Air's own peak may be double (padding beside air); soft tissue lies well above it.
     above = tops[centres[tops] > centres[air] + 0.08 * (high - low)]
     if not len(above):
         raise ImageInputError(
-            f"the image has one peak only, at {centres[air]:g}, in its histogram: is it a CT of a "
-            "head with air around it?"
+            f"the image has one peak only, at {centres[air]:g}, in its histogram: a CT of a "
+            f"head with air around it is needed. {STATE_IT}"
         )
     best = above[np.argmax(smooth[above])]
     # Fat has the larger peak in some heads; muscle and brain lie a tenth of the way above it.
@@ -121,7 +168,8 @@ def _not_hu(air: float, soft: float, slope: float, offset: float) -> Finding:
         f"{slope:.4g}·value {'+' if offset >= 0.0 else '−'} {abs(offset):.4g}",
         where="image",
         why="thresholds of skin and bone are in HU; a guessed scale moves the bone's surface",
-        mend="export the CT with its rescale slope and intercept, or check skin and bone by eye",
+        mend="state the scale in the case file (rescale = [slope, intercept] in [image]), or "
+        "export the CT with it; check skin and bone by eye",
     )
 
 
@@ -134,7 +182,8 @@ def _check_spread(hu: NDArray[np.float64], air: float, soft: float) -> None:
             f"the image is not like a CT: with air at {air:.4g} and soft tissue at {soft:.4g}, "
             f"{100 * near:.0f} % of the tissue is within {SOFT_SPREAD:g} HU of soft tissue (at "
             f"least {100 * LEAST_SOFT_PART:.0f} % expected) and {100 * bright:.0f} % as bright as "
-            f"bone (at most {100 * MOST_BONE_PART:.0f} %). MR images cannot be segmented so"
+            f"bone (at most {100 * MOST_BONE_PART:.0f} %). An MR image cannot be used: give the CT "
+            f"series. {STATE_IT}"
         )
 
 

@@ -19,11 +19,17 @@ from cmfsim.imaging.morphology import (
     simpleitk,
     sizes_of,
 )
-from cmfsim.imaging.options import SegmentOptions
+from cmfsim.imaging.options import METAL, SegmentOptions
 from cmfsim.imaging.working import Working
 
 __all__ = ["Metal", "find_metal", "metal_within", "without_streaks"]
 
+# Averaging leaves this part of a cut-off value in voxels that hold nothing else.
+SATURATED_PART = 0.97
+# Images cut off below this show dense bone as bright as metal, HU.
+LEAST_SATURATION = 1700.0
+# Cut off below this an image shows no teeth either, as synthetic heads do, HU.
+LEAST_WINDOW = 1000.0
 # Metal of less than this is a point of noise or dense enamel, mm³.
 LEAST_METAL = 15.0
 # Farther from metal than this, streaks are weaker than bone, and thin bone (the vault) is kept, mm.
@@ -73,9 +79,10 @@ def metal_within(metal: Metal, box: Block) -> Metal:
 
 def find_metal(work: Working, options: SegmentOptions) -> Metal:
     """The metal of a head, and the image without its streaks."""
-    bright = work.hu > options.metal_threshold
+    threshold, noticed = _threshold(work, options)
+    bright = work.hu > threshold
     volume = float(np.prod(work.spacing))
-    nothing = Metal(None, slice(0, 0), work.hu, ())
+    nothing = Metal(None, slice(0, 0), work.hu, noticed)
     if np.count_nonzero(bright) * volume < LEAST_METAL:
         return nothing
     labels, count = label(bright, corners=True)
@@ -94,13 +101,34 @@ def find_metal(work: Working, options: SegmentOptions) -> Metal:
         "warning",
         "metal",
         f"{int(np.count_nonzero(large))} pieces of metal, "
-        f"{np.count_nonzero(mask) * volume / 1000.0:.1f} cm³, between z = {low:.0f} and "
-        f"{high:.0f} mm",
+        f"{np.count_nonzero(mask) * volume / 1000.0:.1f} cm³ above {threshold:.0f} HU, between "
+        f"z = {low:.0f} and {high:.0f} mm",
         where="image",
         why="streaks hide skin and bone at that height; they were smoothed and spikes removed",
         mend="check lips, cheeks and tooth rows by eye",
     )
-    return Metal(mask, zone, hu, (finding,))
+    return Metal(mask, zone, hu, (*noticed, finding))
+
+
+def _threshold(work: Working, options: SegmentOptions) -> tuple[float, tuple[Finding, ...]]:
+    """The value above which is metal, and a finding where the image is cut off below the usual."""
+    if options.metal_threshold is not None:
+        return options.metal_threshold, ()
+    cut = SATURATED_PART * work.saturation
+    if cut >= METAL:
+        return METAL, ()
+    sees = cut >= LEAST_SATURATION
+    finding = Finding(
+        "warning" if cut >= LEAST_WINDOW else "note",
+        "ct-saturated",
+        f"the image is cut off at {work.saturation:.0f} HU, and metal is told by {METAL:g} HU"
+        + (f"; what reaches {cut:.0f} HU was taken for metal" if sees else ": none was looked for"),
+        where="image",
+        why="metal, enamel and dense bone have one value there"
+        + ("" if sees else ", so that streaks of metal may stay in skin and bone"),
+        mend="export the CT with its whole range of values, or set metal_threshold in [image]",
+    )
+    return (cut if sees else np.inf), (finding,)
 
 
 def _median(part: Volume, spacing: NDArray[np.float64]) -> Volume:

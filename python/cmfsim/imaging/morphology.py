@@ -4,6 +4,7 @@ Arrays have axes x, y, z and Fortran order, which is the order of ITK's memory: 
 the same bytes, and element-wise work runs straight through memory.
 """
 
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -34,6 +35,7 @@ __all__ = [
     "resampled_to",
     "shrunk",
     "simpleitk",
+    "simplex",
     "sizes_of",
     "smoothed",
     "watershed",
@@ -68,6 +70,19 @@ def watershed(height: Volume, seeds: NDArray[Any], mask: Mask) -> NDArray[Any]:
     flood = _package("skimage.segmentation").watershed
     basins: NDArray[Any] = flood(height.T, seeds.T, mask=mask.T).T
     return basins
+
+
+def simplex(
+    cost: Callable[[NDArray[np.float64]], float],
+    start: NDArray[np.float64],
+    steps: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Where a function of few numbers is least, by Nelder and Mead's simplex (1965)."""
+    corners = np.vstack([start, start + np.diag(steps)])
+    options = {"initial_simplex": corners, "maxiter": 200, "xatol": 1e-3, "fatol": 1e-4}
+    minimize = _package("scipy.optimize").minimize
+    least: NDArray[np.float64] = minimize(cost, start, method="Nelder-Mead", options=options).x
+    return least
 
 
 def as_itk(array: NDArray[Any], spacing: NDArray[np.float64]) -> Any:

@@ -2,10 +2,15 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from cmfsim.checks import as_number, as_positive
 from cmfsim.errors import ImageInputError
 
-__all__ = ["SegmentOptions"]
+__all__ = ["METAL", "SegmentOptions"]
+
+# Enamel reaches 2200 HU; fillings, crowns and plates lie above this.
+METAL = 2500.0
 
 
 @dataclass(frozen=True)
@@ -18,8 +23,9 @@ class SegmentOptions:
         Between air (−1000) and fat (−100); −300 lies near half way to muscle.
     bone_threshold : float, HU
         Between soft tissue (up to 100) and compact bone (700 and more).
-    metal_threshold : float, HU
-        Above enamel (up to 2200): fillings, crowns, plates.
+    metal_threshold : float or None, HU
+        Above enamel (up to 2200): fillings, crowns, plates. None: 2500, or just below the value at
+        which the image saturates where that is lower.
     working_spacing : float, mm
         Finer voxels are averaged until they would be larger than this; coarser ones are kept.
     most_voxels : int
@@ -32,6 +38,9 @@ class SegmentOptions:
         Pieces of bone below this volume are dropped.
     part_jaws : bool
         Whether to look for the mandible; else the bone is one "skull".
+    rescale : tuple of float or None
+        Slope and intercept from the image's values to HU. None: the values are HU, or a scale that
+        the histogram gives away, with a finding.
 
     Raises
     ------
@@ -41,21 +50,31 @@ class SegmentOptions:
 
     skin_threshold: float = -300.0
     bone_threshold: float = 250.0
-    metal_threshold: float = 2500.0
+    metal_threshold: float | None = None
     working_spacing: float = 1.0
     most_voxels: int = 40_000_000
     closing: float = 2.5
     least_skin: float = 1.0
     island: float = 1500.0
     part_jaws: bool = True
+    rescale: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("skin_threshold", "bone_threshold", "metal_threshold"):
+        metal = METAL if self.metal_threshold is None else self.metal_threshold
+        if self.metal_threshold is None and self.bone_threshold >= METAL:
+            metal = np.inf
+        for name in ("skin_threshold", "bone_threshold"):
             as_number(name, getattr(self, name))
+        if self.metal_threshold is not None:
+            as_number("metal_threshold", self.metal_threshold)
         for name in ("working_spacing", "most_voxels", "closing", "least_skin", "island"):
             as_positive(name, getattr(self, name))
-        if not -1000.0 < self.skin_threshold < self.bone_threshold < self.metal_threshold:
+        if not -1000.0 < self.skin_threshold < self.bone_threshold < metal:
             raise ImageInputError(
                 f"thresholds are skin {self.skin_threshold:g}, bone {self.bone_threshold:g}, metal "
-                f"{self.metal_threshold:g} HU: they must ascend and lie above −1000"
+                f"{metal:g} HU: they must ascend and lie above −1000"
             )
+        if self.rescale is not None:
+            slope, intercept = self.rescale
+            as_positive("slope of rescale", slope)
+            as_number("intercept of rescale", intercept)

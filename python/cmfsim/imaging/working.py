@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cmfsim.case import Finding, ImageData
 from cmfsim.errors import ImageInputError
-from cmfsim.imaging.intensity import Calibration, calibration, noise_of
+from cmfsim.imaging.intensity import Calibration, calibration, noise_of, saturation_of
 from cmfsim.imaging.morphology import (
     Block,
     Mask,
@@ -59,6 +59,8 @@ class Working:
         Whether the first and the last layer along each axis is the image's own border.
     native : (3,) float64, mm
         Voxel size of the image.
+    saturation : float, HU
+        The value at which the image's brightest voxels were cut off; infinite where they were not.
     """
 
     hu: Volume
@@ -66,6 +68,7 @@ class Working:
     origin: NDArray[np.float64]
     border: NDArray[np.bool_]
     native: NDArray[np.float64]
+    saturation: float = np.inf
 
     def part(self, box: Block) -> "Working":
         """A block of this grid."""
@@ -77,6 +80,7 @@ class Working:
             self.origin + self.spacing * starts,
             self.border & np.array([starts == 0, ends]),
             self.native,
+            self.saturation,
         )
 
     def image(self, values: NDArray[np.float32]) -> ImageData:
@@ -94,7 +98,7 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     """
     spacing = np.asarray(image.spacing, dtype=np.float64)
     _check_size(image, spacing)
-    scale = calibration(image.values)
+    scale = calibration(image.values, options.rescale)
     findings = [*scale.findings, *_spacing_findings(spacing)]
     factors = _factors(spacing, options.working_spacing)
     values = image.values
@@ -116,7 +120,8 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
         shape = tuple(int(n) + 1 for n in steps)
         hu = resampled_to(hu, bins, np.zeros(3), shape, target)
     np.clip(hu, -1024.0, 4000.0, out=hu)
-    return Working(hu, target, origin, border, spacing), tuple(findings)
+    saturation = saturation_of(image.values, float(np.prod(spacing)), scale)
+    return Working(hu, target, origin, border, spacing, saturation), tuple(findings)
 
 
 def without_noise(hu: Volume) -> Volume:

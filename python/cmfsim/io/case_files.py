@@ -76,6 +76,9 @@ EDGE_LENGTHS = (0.3, 30.0)
 MOST_CLEFT = 20.0
 # CT values above this are clipped, HU.
 MOST_HU = 4000.0
+# What takes the values of an image to HU: images from 0 to 1 have a slope of some 4000.
+MOST_SLOPE = 1e5
+MOST_INTERCEPT = 1e5
 # Grid spacings that a head can be worked on at, mm.
 WORKING_SPACINGS = (0.2, 5.0)
 
@@ -287,7 +290,13 @@ def _output(table: Table, folder: Path) -> Path:
 
 def _image(table: Table, folder: Path) -> CaseImage:
     table.only(
-        "file", "skin_threshold", "bone_threshold", "metal_threshold", "working_spacing", "series"
+        "file",
+        "skin_threshold",
+        "bone_threshold",
+        "metal_threshold",
+        "working_spacing",
+        "series",
+        "rescale",
     )
     skin = table.number("skin_threshold", "HU", low=-1024.0, high=3071.0)
     bone = table.number("bone_threshold", "HU", low=-1024.0, high=3071.0)
@@ -299,7 +308,24 @@ def _image(table: Table, folder: Path) -> CaseImage:
     low, high = WORKING_SPACINGS
     spacing = table.number("working_spacing", "mm", low=low, high=high)
     path = _file(table, "file", folder)
-    return CaseImage(path, skin, bone, spacing, metal, _dicom_series(table))
+    return CaseImage(path, skin, bone, spacing, metal, _dicom_series(table), _rescale(table))
+
+
+def _rescale(table: Table) -> tuple[float, float] | None:
+    """Slope and intercept from the values of an image to HU."""
+    if "rescale" not in table:
+        return None
+    given = table.plain("rescale")
+    if not isinstance(given, list) or len(given) != 2 or any(isinstance(n, str) for n in given):
+        table.fail("rescale", f"is {given!r}: [slope, intercept] is needed, such as [1, -1024]")
+    slope, intercept = (float(n) for n in given)
+    if not 0.0 < slope <= MOST_SLOPE or abs(intercept) > MOST_INTERCEPT:
+        table.fail(
+            "rescale",
+            f"is [{slope:g}, {intercept:g}]: the slope must be above 0 and at most {MOST_SLOPE:g}, "
+            f"the intercept within ±{MOST_INTERCEPT:g}",
+        )
+    return slope, intercept
 
 
 def _dicom_series(table: Table) -> str | None:

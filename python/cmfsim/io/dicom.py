@@ -648,8 +648,8 @@ def _tilt_findings(
                 f"({np.linalg.norm(along[-1]):.1f} mm from first to last slice)",
                 where=name,
                 why="stacked at right angles the head would be sheared; outside the slices there "
-                "is air, so that the head ends on the oblique first and last slice",
-                mend="check the skin by eye against the scan",
+                "is air, so that the neck may end on an oblique plane, where nothing is fixed",
+                mend=f"check the skin by eye; {_whole_heights(stack)}",
             )
         )
     if abs(abs(tilt) - angle) > TILTS_AGREE:
@@ -666,6 +666,21 @@ def _tilt_findings(
             )
         )
     return findings
+
+
+def _whole_heights(stack: _Stack) -> str:
+    """Between which heights every slice position was scanned, as the region of a case has them."""
+    columns, rows = (int(stack.slices[0].text(k)) for k in ("columns", "rows"))
+    across = np.array([0.0, (columns - 1) * stack.spacing[0] * stack.axes[0, 2]])
+    down = np.array([0.0, (rows - 1) * stack.spacing[1] * stack.axes[1, 2]])
+    corners = np.add.outer(across, down).ravel()
+    first, last = stack.positions[0, 2] + corners, stack.positions[-1, 2] + corners
+    low, high = (first, last) if first.mean() < last.mean() else (last, first)
+    return (
+        f"the head is scanned from front to back between z = {low.max():.1f} and "
+        f"{high.min():.1f} mm: lower = {low.max():.1f} in [region] ends the tissue on a plane that "
+        "fixes it, where the face allows that"
+    )
 
 
 def _uneven(name: str, stack: _Stack, uneven: list[int]) -> Finding:

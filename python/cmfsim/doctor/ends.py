@@ -1,0 +1,62 @@
+"""Whether a jaw that moves lies far enough from where the image, and with it the tissue, ends."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from cmfsim.case import Finding
+from cmfsim.doctor.evidence import Evidence
+
+__all__ = ["check_ends"]
+
+# What moves the chin, and the landmarks at its lower and upper border.
+LOWER_JAW = frozenset({"mandible", "mandible_body", "chin"})
+LOWEST, HIGHEST = "menton", "infradentale"
+# Soft tissue follows a bone that moves over about its own thickness, mm.
+NEAR_END = 20.0
+
+
+def check_ends(evidence: Evidence) -> Iterator[Finding]:
+    """A finding where the chin moves and the tissue below it is fixed close by."""
+    case = evidence.case
+    moving = {*case.plan, *(n for cut in case.osteotomies for n in cut.segments)} & LOWER_JAW
+    if not moving:
+        return
+    if (found := _chin(evidence)) is None:
+        return
+    place, top, where = found
+    ends = []
+    if case.region.lower is not None:
+        ends.append((case.region.lower, case.where("region.lower"), "lower lies further down"))
+    if evidence.image is not None:
+        key = case.where("image.file")
+        ends.append((float(evidence.image.lowest[2]), key, "the image goes further down"))
+    if not ends:
+        return
+    end, key, how = max(ends)
+    room = place - end
+    # A jaw that lies beyond the end altogether is another finding's.
+    if room >= NEAR_END or top < end:
+        return
+    yield Finding(
+        "warning",
+        "segment-near-end",
+        f"{', '.join(sorted(moving))} moves, and the tissue ends, fixed, {max(room, 0.0):.1f} mm "
+        f"below {where} (z = {place:.1f} mm, end at {end:.1f} mm; at least {NEAR_END:g} mm is "
+        "needed)",
+        key,
+        "tissue below the chin cannot follow: the face there moves too little, or not at all",
+        f"use data where {how}, or leave chin and throat out of the evaluation",
+    )
+
+
+def _chin(evidence: Evidence) -> tuple[float, float, str] | None:
+    """The heights of the lower border of the chin and of the jaw's top, and their source."""
+    points = evidence.skull_landmarks
+    if LOWEST in points:
+        heights = [float(points[n][2]) for n in (LOWEST, HIGHEST) if n in points]
+        return heights[0], max(heights), f"the landmark {LOWEST}"
+    if "mandible" in evidence.bones:
+        heights = np.asarray(evidence.bones["mandible"].surface.vertices)[:, 2].tolist()
+        return min(heights), max(heights), "the mandible"
+    return None

@@ -1,0 +1,117 @@
+"""Things on the face that are no part of it: tubes, holders, tape. They are reported, not removed.
+
+What stands out from the head as thin as a tube is looked at: it belongs to a face if it has its
+mirror image on the other side, as ears, nose and lips have, and is not as dense as plastic.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.case import Finding
+from cmfsim.imaging.bone import Bone
+from cmfsim.imaging.morphology import Mask, Volume, box_of, depth, label, opened, reached, simplex
+from cmfsim.imaging.skin import Skin
+from cmfsim.imaging.working import Working, coarse_of
+
+__all__ = ["attached_findings"]
+
+# Voxels that things on the face are told apart on, mm.
+STEP = 2.0
+# What a ball of this radius does not fit into stands out from the head, mm: tubes for the airway
+# measure up to 15 mm across.
+WIDEST = 8.0
+# A part without its mirror image within the first is one-sided, with all that joins it and has none
+# within the second, mm: noses and lips deviate less.
+ONE_SIDED = 5.0
+NEARLY_ONE_SIDED = 3.0
+# Plastic is denser than this, skin and cartilage are not, HU; bone this near is the head's own, mm.
+PLASTIC = 130.0
+OWN_BONE = 4.0
+# Smaller and shorter things are folds, swellings and noise, mm³ and mm.
+LEAST_VOLUME = 600.0
+LEAST_LENGTH = 18.0
+# The face lies in front of this part of the head's depth: ears, folded or not, lie behind.
+FACE_PART = 0.45
+# Points of the face that its plane of symmetry is fitted to.
+SAMPLES = 4000
+
+
+def attached_findings(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
+    """A finding for each thing on the face that is one-sided or as dense as plastic."""
+    inside, spacing, shift = coarse_of(skin.mask.astype(np.float32), work.spacing, STEP)
+    mask: Mask = np.asfortranarray(inside > 0.5)
+    hu = coarse_of(work.hu, work.spacing, STEP)[0]
+    own = coarse_of(bone.solid.astype(np.float32), work.spacing, STEP)[0] > 0.25
+    box = box_of(mask)
+    rows = box[1]
+    behind = rows.start + int(FACE_PART * (rows.stop - rows.start))
+    around = depth(mask, spacing)
+    out = mask & ~opened(mask, WIDEST, spacing)
+    out[:, behind:] = False
+    dense = out & (hu > PLASTIC) & (around < WIDEST)
+    dense &= depth(np.asfortranarray(own), spacing) < -OWN_BONE
+    mirrored = _mirrored(around, spacing, behind, out)
+    alone = reached(out & (mirrored < -NEARLY_ONE_SIDED), mirrored < -ONE_SIDED)
+    found: Mask = dense | alone
+    labels, count = label(found, corners=True)
+    findings = []
+    for piece in range(1, count + 1):
+        voxels = np.argwhere(labels == piece)
+        volume = len(voxels) * float(np.prod(spacing))
+        size = (np.ptp(voxels, axis=0) + 1) * spacing
+        if volume < LEAST_VOLUME or float(np.linalg.norm(size)) < LEAST_LENGTH:
+            continue
+        middle = work.origin + shift + voxels.mean(axis=0) * spacing
+        findings.append(_finding(middle, size, volume, float(dense[labels == piece].mean())))
+    return findings
+
+
+def _finding(
+    middle: NDArray[np.float64], size: NDArray[np.float64], volume: float, dense: float
+) -> Finding:
+    kind = "as dense as plastic" if dense > 0.5 else "without its like on the other side"
+    return Finding(
+        "warning",
+        "skin-attachment",
+        f"something stands out from the face {kind}: {size[0]:.0f} × {size[1]:.0f} × "
+        f"{size[2]:.0f} mm, {volume / 1000.0:.1f} cm³",
+        where=f"skin at ({middle[0]:.0f}, {middle[1]:.0f}, {middle[2]:.0f}) mm",
+        why="a tube, a holder or tape on the face becomes skin, and moves and is compared as such",
+        mend="look at it in the image; erase it there (air, −1000 HU), or leave that part of the "
+        "face out of the evaluation",
+    )
+
+
+def _mirrored(around: Volume, spacing: NDArray[np.float64], behind: int, out: Mask) -> Volume:
+    """The depth inside the head of each voxel's mirror image, mm; infinite where not asked for."""
+    face = np.argwhere(np.abs(around[:, :behind]) < float(spacing.max())) * spacing
+    if not len(face) or not out.any():
+        return np.full(around.shape, np.float32(np.inf))
+    face = face[:: max(1, len(face) // SAMPLES)]
+    middle = face.mean(axis=0)
+
+    def reflected(points: Any, plane: Any) -> Any:
+        offset, yaw, roll = plane
+        normal = np.array([1.0, yaw, roll])
+        normal /= np.linalg.norm(normal)
+        away = (points - middle) @ normal - offset
+        return points - 2.0 * away[:, None] * normal
+
+    def at(points: Any) -> Any:
+        index = np.rint(points / spacing).astype(np.intp)
+        last = np.array(around.shape) - 1
+        index = np.clip(index, 0, last)
+        return around[tuple(index.T)]
+
+    def cost(plane: Any) -> float:
+        # What is far off counts no more than this: a tube may not turn the plane.
+        return float(np.minimum(np.abs(at(reflected(face, plane))), 3.0 * ONE_SIDED).mean())
+
+    steps = np.array([8.0, 0.1, 0.1])
+    plane = simplex(cost, np.zeros(3), steps)
+    deep = np.full(around.shape, np.float32(np.inf))
+    voxels = np.argwhere(out)
+    deep[tuple(voxels.T)] = at(reflected(voxels * spacing, plane))
+    return deep
