@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import threading
 import time
+import types
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -11,7 +12,8 @@ import pytest
 
 import cmfsim
 import phantom_case
-from cmfsim.build import build_model
+from cmfsim.build import build_model, case_model
+from cmfsim.build.motions import PlannedBones
 from cmfsim.io import Case
 from cmfsim.osteotomy import CutOptions, check_segments, surfaces
 from head_case import HeadCase
@@ -197,3 +199,45 @@ def test_a_given_bone_with_an_inner_wall_is_taken_as_it_is(inwards):
     anatomy = cmfsim.anatomy_from_surfaces(skin, {"cranium": hollow}, spacing=1.0)
     (segment,) = cmfsim.segments_from_surfaces(anatomy.bones, anatomy.surfaces)
     assert segment.surface is anatomy.surfaces["cranium"]
+
+
+def moved_without_nodes(segments, motions, *, plan):
+    """What the build does with moved segments that hold no node of a mesh in front of the face."""
+    nodes = np.array([[0, -90, -80], [5, -90, -80], [0, -85, -80], [0, -90, -75.0]])
+    mesh = cmfsim.TetMesh(nodes, [[0, 1, 2, 3]])
+    none = cmfsim.NodeKinds(
+        np.zeros(4, np.uint8), np.full(4, -1, np.int16), tuple(s.name for s in segments)
+    )
+    case = types.SimpleNamespace(where=lambda key: key, plan=plan, osteotomies=())
+    return case_model._untouched(case, mesh, none, PlannedBones(tuple(segments), motions))
+
+
+def test_a_piece_beyond_the_mesh_that_nobody_named_is_a_warning(cut):
+    """Vertebrae that moved between two scans are no part of the plan; a bone of the plan is."""
+    forwards = cmfsim.rigid_motion((0, -3, 0))
+    vertices = np.asarray(cut[0].surface.vertices) + [0, 500, 0]
+    behind = dataclasses.replace(
+        cut[0], surface=dataclasses.replace(cut[0].surface, vertices=vertices)
+    )
+    name = behind.name
+    (finding,) = moved_without_nodes([behind], {name: forwards}, plan={})
+    assert (finding.severity, finding.code) == ("warning", "segment-touches-no-tissue")
+    with pytest.raises(cmfsim.CaseError, match=f"'{name}' moves, but no node"):
+        moved_without_nodes([behind], {name: forwards}, plan={name: None})
+    assert moved_without_nodes([behind], {name: np.eye(4)}, plan={name: None}) == ()
+
+
+def test_a_build_compares_landmarks_with_the_bones_that_it_made(head, truth, cut):
+    """Correct ones give no word; all 5 mm up are found on bones and skin, and end no build."""
+    case = types.SimpleNamespace(where=lambda key: key)
+    marks = {"skull": head.skull_landmarks, "skin": head.skin_landmarks}
+    assert case_model._misplaced(case, marks, truth, cut) == []
+    for shift, words in ((5.0, "5.0 mm too high"), (12.0, "12.0 mm too high")):
+        moved = {
+            key: {name: place + [0, 0, shift] for name, place in places.items()}
+            for key, places in marks.items()
+        }
+        told = case_model._misplaced(case, moved, truth, cut)
+        assert {f.severity for f in told} == {"warning"}
+        assert any(words in f.what for f in told if f.where == "landmarks.skull")
+        assert any(f.where == "landmarks.skin" for f in told)
