@@ -228,7 +228,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "surface_checks": "checks crossings scene topology",
         "surface_repair": "capping case checks errors scene surface_checks topology _core",
         "doctor": (
-            "bone_motion case checks clinical_plan errors io osteotomy patient planning "
+            "bone_motion case checks clinical_plan errors imaging io osteotomy patient planning "
             "registration scene surface_checks surface_repair template topology _core"
         ),
         "cli": (

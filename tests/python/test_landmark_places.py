@@ -249,7 +249,19 @@ procedure = "le_fort_1"
     path = tmp_path / "case.toml"
     path.write_text(text, encoding="utf-8")
     markup = json.loads((folder / "skull_landmarks.mrk.json").read_text(encoding="utf-8"))
-    for shift, expected in ((0.0, []), (5.0, ["landmarks-shifted"])):
+    # Stored without its offset, as scanners do, the same CT has bone elsewhere in its numbers.
+    ct = cmfsim.read_image(folder / "ct.nii.gz")
+    raw = ct.values[::2, ::2].astype(np.int32) + 1024
+    coarse = cmfsim.ImageData(raw, np.asarray(ct.spacing) * [2, 2, 1], ct.lowest)
+    cmfsim.write_image(coarse, tmp_path / "raw.nrrd")
+    whole = str(folder / "ct.nii.gz")
+    for image, shift, expected in (
+        (whole, 0.0, []),
+        ("raw.nrrd", 0.0, []),
+        (whole, 5.0, ["landmarks-shifted"]),
+        ("raw.nrrd", 0.0, ["landmarks-shifted"]),
+    ):
+        path.write_text(text.replace(whole, image), encoding="utf-8")
         for point in markup["markups"][0]["controlPoints"]:
             point["position"][2] += shift
         (tmp_path / "skull.mrk.json").write_text(json.dumps(markup), encoding="utf-8")

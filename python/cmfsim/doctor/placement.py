@@ -15,6 +15,7 @@ from cmfsim.doctor.landmarks import (
     nearest_of_surfaces,
 )
 from cmfsim.doctor.places import place_text
+from cmfsim.errors import ImageError
 from cmfsim.patient import UNITS
 from cmfsim.registration import side_vectors, wrong_sides
 
@@ -383,7 +384,16 @@ def _nearest_point(evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
     if given is None or image is None:
         return None
     stated = given.bone_threshold if key == "skull" else given.skin_threshold
-    return nearest_of_level(image, THRESHOLDS[key] if stated is None else stated, landmarks)
+    # A case of surfaces loads nothing of imaging.
+    from cmfsim.imaging.intensity import calibration  # noqa: PLC0415
+
+    try:
+        to_hu = calibration(np.asarray(image.values))
+    except ImageError:
+        # No CT: reported where the image is segmented.
+        return None
+    threshold = THRESHOLDS[key] if stated is None else stated
+    return nearest_of_level(image, (threshold - to_hu.offset) / to_hu.slope, landmarks)
 
 
 def _is_part(bodies: Sequence[Body], points: Floats) -> bool:
