@@ -225,7 +225,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "topology": "",
         "crossings": "checks",
         "capping": "checks",
-        "surface_checks": "checks crossings scene topology",
+        "surface_checks": "checks crossings errors scene topology",
         "surface_repair": "capping case checks errors scene surface_checks topology _core",
         "doctor": (
             "bone_motion case checks clinical_plan errors imaging io osteotomy patient planning "

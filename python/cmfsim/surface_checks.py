@@ -11,10 +11,21 @@ from numpy.typing import NDArray
 
 from cmfsim.checks import Floats
 from cmfsim.crossings import crossing_pairs
+from cmfsim.errors import CaseInputError
 from cmfsim.scene import SurfaceData
 from cmfsim.topology import Edges, component_labels, edges_of, orientation_flips
 
-__all__ = ["BorderLoop", "Component", "SurfaceReport", "border_loops", "check_surface"]
+__all__ = [
+    "BorderLoop",
+    "Component",
+    "SurfaceReport",
+    "border_loops",
+    "check_extent",
+    "check_surface",
+]
+
+# Largest coordinate of which areas and volumes are still numbers, mm.
+MAX_COORDINATE = 1e90
 
 # A triangle whose height is below this share of its longest edge is a line, not a triangle: its
 # normal is rounding error for coordinates of some 1000 mm at double precision.
@@ -118,6 +129,23 @@ class SurfaceReport:
         return not self.borders
 
 
+def check_extent(vertices: Floats) -> None:
+    """Refuses coordinates so large that areas and volumes would not be numbers.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) With the vertex.
+    """
+    far = np.argwhere(np.abs(vertices) > MAX_COORDINATE)
+    if len(far):
+        vertex, axis = far[0]
+        raise CaseInputError(
+            f"surface vertex {vertex} has the coordinate {vertices[vertex, axis]:g} mm: at most "
+            f"{MAX_COORDINATE:g} is worked with"
+        )
+
+
 def check_surface(surface: SurfaceData, *, crossings: bool = True) -> SurfaceReport:
     """The state of a surface.
 
@@ -133,6 +161,11 @@ def check_surface(surface: SurfaceData, *, crossings: bool = True) -> SurfaceRep
     -------
     SurfaceReport
 
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A coordinate above 1e90 mm.
+
     Examples
     --------
     >>> import cmfsim
@@ -143,6 +176,7 @@ def check_surface(surface: SurfaceData, *, crossings: bool = True) -> SurfaceRep
     """
     vertices = np.asarray(surface.vertices, dtype=np.float64)
     triangles = np.asarray(surface.triangles).astype(np.int64)
+    check_extent(vertices)
     degenerate, slivers = thin_triangles(vertices, triangles)
     duplicate = duplicate_triangles(triangles)
     # Repetitions would look like forks. A triangle without area still joins its neighbours, unless

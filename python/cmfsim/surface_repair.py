@@ -13,6 +13,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.scene import SurfaceData
 from cmfsim.surface_checks import (
     border_loops,
+    check_extent,
     duplicate_triangles,
     has_three_corners,
     thin_triangles,
@@ -95,7 +96,7 @@ def repair_surface(
     Raises
     ------
     CaseError
-        (also `ValueError`) No triangle with an area is left.
+        (also `ValueError`) No triangle with an area is left; a coordinate above 1e90 mm.
 
     Examples
     --------
@@ -114,6 +115,7 @@ def repair_surface(
 
     vertices = np.asarray(surface.vertices)
     triangles = np.asarray(surface.triangles).astype(np.int64)
+    check_extent(vertices)
     vertices, triangles, n_welded = _welded(vertices, triangles, options.weld_distance)
     if n_welded:
         note("surface-welded", f"{n_welded} vertices became one with others", "they hid edges")

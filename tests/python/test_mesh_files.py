@@ -72,6 +72,8 @@ BAD_OBJ = {
     "v 0 0\nf 1 2 3": "line 5: a vertex has 2 numbers",
     "v 0 0 nan\nf 1 2 3": "line 5: 'nan' is not finite",
     "v 0 0 1e999\nf 1 2 3": "line 5: '1e999' is not finite",
+    "v 0 0 1e30\nf 1 2 3": "point 4 has the coordinate 1e.30: at most 1e.09 is read, in any unit",
+    "f 1//1 2 //3 3": "line 5: '//3' is no texture",
     "v 0 0 1 2\nf 1 2 3": "line 5: a vertex has 4 numbers",
     "fo 1 2 3": "line 5: 'fo' is not known in OBJ",
     "f 1 2 3\n# 5 vertices": "a comment states 5 vertices, the file holds 4",
@@ -223,6 +225,7 @@ def test_stl_of_another_length_than_its_count_is_refused(ball, tmp_path):
         (binary[:80] + struct.pack("<I", 2**32 - 1) + binary[84:], "states 4294967295"),
         (binary[:83], "83 bytes, a header has 84"),
         (stl_text(corners).replace(b"endsolid it\n", b""), "1 solids begin and 0 end"),
+        (stl_text(corners).replace(b"endsolid it", b"endsolid= it"), "1 solids begin and 0 end"),
         (stl_text(corners).replace(b"endfacet", b"", 1), "words are not 21 for each facet"),
         (stl_text(corners).replace(b"vertex", b"vortex", 1), "facet 0 has 'vortex'"),
         (stl_text(corners).replace(b"loop\n  vertex", b"loop\n  vertex 1e999", 1), "words"),
@@ -292,6 +295,20 @@ def test_xml_in_another_encoding_hides_nothing(encoding, tmp_path):
     content = vtp(head=f'<?xml version="1.0" encoding="{encoding}"?>{ENTITIES}').encode(encoding)
     refused(saved(tmp_path, "it.vtp", content), "not XML in UTF-8")
     refused(saved(tmp_path, "it.vtp", content.replace(ENTITIES.encode(encoding), b"")), "UTF-8")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        ("Polys>", "Polyt>", "Piece has the element 'Polyt': PointData"),
+        ("Piece", "Pieze", "PolyData has the element 'Pieze'"),
+        (' NumberOfPolys="4"', "", "array 'connectivity': states 96 bytes, 0 are needed"),
+        ("<Points>", "<a:Points>", "not XML in UTF-8"),
+        ('"Int64"', '"Float64"', "whole numbers are needed"),
+    ],
+)
+def test_names_that_vtk_does_not_know_are_not_passed_over(old, new, match, tmp_path):
+    refused(saved(tmp_path, "it.vtp", vtp().replace(old, new)), match)
 
 
 def test_deep_xml_is_refused(tmp_path):

@@ -132,6 +132,16 @@ def test_a_file_cut_short_is_refused_in_time(ending, share, tmp_path):
 # Checks.
 
 
+@pytest.mark.parametrize("far", [1e100, -1e300])
+def test_coordinates_that_overflow_are_refused(far):
+    """Areas and volumes were inf and NaN, and repairing failed in numpy's words."""
+    vertices, triangles = sphere(1)
+    vertices[5, 2] = far
+    for call in (check, repair):
+        with pytest.raises(cmfsim.CaseError, match=r"surface vertex 5 has the coordinate .*e\+"):
+            call(vertices, triangles)
+
+
 def test_a_sphere_is_sound():
     """Closed, outward, one piece; area and volume of the inscribed polyhedron."""
     vertices, triangles = sphere(4)

@@ -12,6 +12,10 @@ from cmfsim.errors import CaseInputError
 
 __all__ = ["CELL_CORNERS", "Cells", "PlainMesh"]
 
+# Largest coordinate, whatever its unit: a head in µm has 1e6. Far larger ones overflow in areas and
+# volumes.
+MAX_COORDINATE = 1e9
+
 # Corners of a cell of each type that has straight edges.
 CELL_CORNERS = {
     "vertex": 1,
@@ -70,8 +74,14 @@ class PlainMesh:
         if points.ndim != 2 or points.shape[1] != 3:
             raise CaseInputError(f"has points of shape {points.shape}: (n, 3) is needed")
         if not np.isfinite(points).all():
-            bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-            raise CaseInputError(f"point {bad} is not finite: every coordinate must be")
+            row = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+            raise CaseInputError(f"point {row} is not finite: every coordinate must be")
+        if points.size and float(np.abs(points).max()) > MAX_COORDINATE:
+            bad, axis = np.argwhere(np.abs(points) > MAX_COORDINATE)[0]
+            raise CaseInputError(
+                f"point {bad} has the coordinate {points[bad, axis]:g}: at most {MAX_COORDINATE:g} "
+                "is read, in any unit; is the file damaged?"
+            )
         for block in self.cells:
             _check_block(block, len(points))
         for name, array in self.point_data.items():

@@ -15,7 +15,9 @@ __all__ = ["read_stl", "write_stl"]
 HEADER = 80
 ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 # Lines that open and close a solid; their names may hold anything.
-SOLID = re.compile(rb"^[ \t]*(solid|endsolid)\b[^\r\n]*", re.IGNORECASE | re.MULTILINE)
+SOLID = re.compile(
+    rb"^[ \t]*(solid|endsolid)(?=[ \t\r\n]|\Z)[^\r\n]*", re.IGNORECASE | re.MULTILINE
+)
 # The words of a facet in text; empty where a number stands.
 FACET = (
     *(b"facet", b"normal", b"", b"", b"", b"outer", b"loop"),
