@@ -29,7 +29,7 @@ __all__ = ["read_mesh", "read_tet_mesh", "read_tets"]
 # Formats of meshio whose files name other files, which may lie anywhere, or hold no mesh.
 NAME_OTHERS = frozenset({".xdmf", ".xmf", ".hmf", ".node", ".ele", ".svg"})
 # Processor time, s, and memory, bytes, that meshio may take for a small file.
-SECONDS, MEMORY = 3.0, 2**30
+SECONDS, MEMORY = 2.0, 2**30
 # Cells that lie on or in the tets of a file without being part of the tissue.
 PASSED_OVER = frozenset({"vertex", "line", "triangle", "quad", "tetra"})
 

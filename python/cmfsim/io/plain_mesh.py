@@ -75,7 +75,7 @@ class PlainMesh:
             raise CaseInputError(f"has points of shape {points.shape}: (n, 3) is needed")
         if not np.isfinite(points).all():
             row = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-            raise CaseInputError(f"point {row} is not finite: every coordinate must be")
+            raise CaseInputError(f"point {row} is not finite: every coordinate must be finite")
         if points.size and float(np.abs(points).max()) > MAX_COORDINATE:
             bad, axis = np.argwhere(np.abs(points) > MAX_COORDINATE)[0]
             raise CaseInputError(

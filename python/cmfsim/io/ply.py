@@ -91,7 +91,7 @@ def read_ply(data: bytes) -> tuple[Floats, Integers]:
     points = np.stack([np.asarray(column, dtype=np.float64) for column, _ in axes], axis=1)
     if not np.isfinite(points).all():
         bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise CaseInputError(f"vertex {bad} is not finite: every coordinate must be")
+        raise CaseInputError(f"vertex {bad} is not finite: every coordinate must be finite")
     corners, lengths = _column(face, rows["face"], CORNERS)
     if lengths is None or corners.dtype.kind == "f":
         raise CaseInputError(

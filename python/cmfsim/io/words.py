@@ -48,7 +48,7 @@ def real_numbers(words: Sequence[bytes], where: Callable[[int], str], kind: str 
     if not np.isfinite(values).all():
         bad = int(np.flatnonzero(~np.isfinite(values))[0])
         raise CaseInputError(
-            f"{where(bad)}: {shown(words[bad])} is not finite: every coordinate must be"
+            f"{where(bad)}: {shown(words[bad])} is not finite: every coordinate must be finite"
         )
     return values
 
