@@ -1,16 +1,19 @@
 """Headers of image files: what they state is checked, and nothing in them ends the process."""
 
+import bz2
 import gzip
 import os
 import struct
 import time
+import tracemalloc
+import zlib
 
 import numpy as np
 import pytest
 
 from cmfsim import ImageData, ImageError
 from cmfsim.io import images
-from cmfsim.io.image_headers import ImageHeader
+from cmfsim.io.image_headers import ImageHeader, check_length
 from cmfsim.io.images import read_image, read_image_file, write_image
 from cmfsim.io.metaimage import meta_header
 from cmfsim.io.nifti import read_nifti
@@ -204,7 +207,32 @@ def test_a_packed_file_is_unpacked_no_further_than_its_header_states(tmp_path):
         file.write(data)
         for _ in range(64):
             file.write(bytes(2**22))
-    np.testing.assert_array_equal(read_image(path).values[::-1, ::-1], VALUES)
+    tracemalloc.start()
+    refused(path, "longer than its header states")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**24
+
+
+@pytest.mark.parametrize("change", ["tail", "checksum", "short", "long"])
+@pytest.mark.parametrize("kind", ["gzip", "zlib", "bzip2"])
+def test_packed_voxels_are_held_against_their_checksum_and_length(tmp_path, kind, change):
+    """ITK pads, drops and takes damaged voxels without a word."""
+    voxels = VALUES.T.tobytes()
+    voxels = {"short": voxels[:-2], "long": voxels + b"ab"}.get(change, voxels)
+    pack = {"gzip": gzip.compress, "zlib": zlib.compress, "bzip2": bz2.compress}[kind]
+    packed = pack(voxels)
+    if change == "tail":
+        packed += b"more"
+    elif change == "checksum":
+        middle = len(packed) // 2
+        packed = packed[:middle] + bytes([packed[middle] ^ 4]) + packed[middle + 1 :]
+    path = tmp_path / "voxels"
+    path.write_bytes(b"head" + packed)
+    with pytest.raises(ImageError, match="voxels"):
+        check_length("voxels", path, 4, VALUES.nbytes, kind)
+    path.write_bytes(b"head" + pack(VALUES.T.tobytes()))
+    check_length("voxels", path, 4, VALUES.nbytes, kind)
 
 
 # Files elsewhere -------------------------------------------------------------------------------

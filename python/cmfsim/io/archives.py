@@ -188,7 +188,7 @@ def read_archive(
         raise CaseInputError(f"format is {header.get('format')!r}: {format_name!r} is needed")
     check_version(header.get("version"))
     check_units(header.get("units"))
-    check_numbers(header)
+    check_numbers(header, finite=True)
     return header, members
 
 

@@ -197,8 +197,14 @@ def check_plain_toml(text: str) -> None:
         raise CaseInputError(f"line {line}: a key has more than {MAX_KEY_PARTS} parts")
 
 
-def check_numbers(value: object) -> None:
+def check_numbers(value: object, *, finite: bool = False) -> None:
     """Refuses whole numbers beyond a float's range anywhere in plain values of a text.
+
+    Parameters
+    ----------
+    value : plain values
+    finite : bool
+        Whether other numbers must be finite as well: JSON reads 1e400 as infinity.
 
     Raises
     ------
@@ -217,6 +223,8 @@ def check_numbers(value: object) -> None:
             raise CaseInputError(
                 f"holds a whole number of about {digits} digits: at most {MAX_DIGITS} are read"
             )
+        elif finite and isinstance(entry, float) and not math.isfinite(entry):
+            raise CaseInputError("holds a number that is not finite, such as 1e400")
 
 
 def toml_module() -> Any:

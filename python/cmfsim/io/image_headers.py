@@ -5,11 +5,14 @@ any memory, data files in other folders, sheared axes that are silently made ort
 has its own file beside this one.
 """
 
+import bz2
 import math
 import re
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +30,7 @@ __all__ = [
     "ImageHeader",
     "apart",
     "check_affine",
+    "check_length",
     "check_shape",
     "data_file",
     "number",
@@ -45,6 +49,8 @@ MOST_ALONG = 100_000
 FARTHEST = 1e6
 # Deflate cannot pack more tightly than this.
 MOST_PACKED = 1032
+# Bytes that are read or unpacked at once.
+CHUNK = 1 << 20
 LENGTHS: Mapping[str, float] = {
     "mm": 1.0, "millimeter": 1.0, "millimetre": 1.0, "millimeters": 1.0, "cm": 10.0, "m": 1000.0,
     "um": 0.001, "µm": 0.001, "micron": 0.001,
@@ -109,6 +115,78 @@ def check_shape(name: str, size: list[int], components: int = 1) -> None:
             f"{name}: has {text} voxels: at most {MOST_VOXELS} are read, and {MOST_ALONG} along "
             "an axis"
         )
+
+
+def check_length(name: str, data: Path, start: int, needed: int, packing: str = "") -> None:
+    """Refuses voxels that are fewer or more than their header states, or damaged where packed.
+
+    ITK pads what is short, drops what is long, and does not compare checksums.
+
+    Parameters
+    ----------
+    name : str
+        What errors call the file.
+    data : Path
+    start : int
+        Where the voxels begin.
+    needed : int
+        Bytes of the voxels, unpacked.
+    packing : str
+        "gzip", "zlib" or "bzip2"; empty where they are not packed.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) With both lengths.
+    """
+    if not packing:
+        found = data.stat().st_size - start
+    else:
+        found = _unpacked_length(name, data, start, needed, packing)
+    if found == needed:
+        return
+    what = "is cut short" if found < needed else "is longer than its header states"
+    raise ImageInputError(f"{name}: {what}: {found} of {needed} bytes of voxels; copy it again")
+
+
+def _unpacked_length(name: str, data: Path, start: int, needed: int, packing: str) -> int:
+    """The bytes of voxels in a packed file, or a few more than needed where there are more."""
+    if packing == "bzip2":
+        reader: Any = bz2.BZ2Decompressor()
+    else:
+        reader = zlib.decompressobj(zlib.MAX_WBITS + 16 if packing == "gzip" else zlib.MAX_WBITS)
+    found = 0
+    try:
+        with data.open("rb") as file:
+            file.seek(start)
+            while not reader.eof and found <= needed and (block := file.read(CHUNK)):
+                # Unpacked by pieces: a block of zeros alone would take a thousand times its size.
+                found += len(reader.decompress(block, CHUNK))
+                while not reader.eof and found <= needed and (more := _rest(reader)):
+                    found += len(more)
+            left = len(reader.unused_data) + len(file.read(CHUNK))
+    except (OSError, zlib.error) as error:
+        raise ImageInputError(
+            f"{name}: its voxels are damaged ({error}); copy the file again"
+        ) from error
+    if reader.eof and left:
+        raise ImageInputError(
+            f"{name}: holds {left} bytes or more behind the end of its voxels: copy it again"
+        )
+    if found <= needed and not reader.eof:
+        raise ImageInputError(
+            f"{name}: is cut short: its voxels are packed, and their end is not in the file; copy "
+            "it again"
+        )
+    return found
+
+
+def _rest(reader: Any) -> bytes:
+    """More of what is unpacked of the block that was given last; nothing once it is used up."""
+    if isinstance(reader, bz2.BZ2Decompressor):
+        return b"" if reader.needs_input else reader.decompress(b"", CHUNK)
+    tail = reader.unconsumed_tail
+    return bytes(reader.decompress(tail, CHUNK)) if tail else b""
 
 
 def data_file(path: Path, name: str) -> Path:

@@ -15,6 +15,7 @@ from cmfsim.io.image_headers import (
     MOST_PACKED,
     ImageHeader,
     check_affine,
+    check_length,
     check_shape,
     data_file,
     number,
@@ -62,9 +63,10 @@ def meta_header(path: Path) -> ImageHeader:
     data, start = path, begin
     if name.upper() != "LOCAL":
         data, start = data_file(path, name), 0
-    found = data.stat().st_size - start
     packed = fields.get("CompressedData", "False").lower() in {"true", "1"}
-    if found * (MOST_PACKED if packed else 1) < needed:
+    if fields.get("HeaderSize", "0") == "0":
+        check_length(data.name, data, start, needed, "zlib" if packed else "")
+    elif (found := data.stat().st_size - start) * (MOST_PACKED if packed else 1) < needed:
         raise ImageInputError(
             f"{data.name}: is cut short: {found} of {needed} bytes; copy it again"
         )

@@ -210,8 +210,12 @@ def _voxels(path: Path, stream: Any, header: _Header, *, packed: bool) -> NDArra
         raise ImageInputError(
             f"{path.name}: is cut short: {found} of {needed} bytes of voxels; copy it again"
         )
-    # The end of a packed file holds its checksum.
-    stream.read(CHUNK)
+    # The end of a packed file holds its checksum, which is compared by reading past it.
+    if stream.read(1):
+        raise ImageInputError(
+            f"{path.name}: is longer than its header states, which are {needed} bytes of voxels: "
+            "the header belongs to another image, or the file is damaged; copy it again"
+        )
     values = values.astype(header.dtype.newbyteorder("="), copy=False)
     slope, intercept = header.scale
     if slope == 0.0 or (slope, intercept) == (1.0, 0.0):

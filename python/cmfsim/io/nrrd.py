@@ -16,6 +16,7 @@ from cmfsim.io.image_headers import (
     MOST_HEADER,
     ImageHeader,
     check_affine,
+    check_length,
     check_shape,
     data_file,
     number,
@@ -25,6 +26,10 @@ from cmfsim.io.image_headers import (
 
 __all__ = ["nrrd_header"]
 
+# NRRD's encodings whose length is known beforehand; text and hexadecimal are ITK's to read.
+PACKINGS: Mapping[str, str] = {
+    "raw": "", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2",
+}  # fmt: skip
 # NRRD's anatomical spaces: what takes each axis to L, P and S.
 SPACES: Mapping[str, tuple[float, float, float]] = {
     "right-anterior-superior": (-1.0, -1.0, 1.0),
@@ -109,13 +114,19 @@ def _fields(path: Path) -> tuple[dict[str, str], int]:
 
 
 def _check_data(path: Path, fields: Mapping[str, str], begin: int, needed: int) -> None:
+    skips = False
     for key in ("byte skip", "byteskip", "line skip", "lineskip"):
-        if fields.get(key, "0") not in {"0", "-1"}:
-            whole(path, key, fields[key])
+        if fields.get(key, "0") != "0":
+            skips = True
+            if fields[key] != "-1":
+                whole(path, key, fields[key])
     data, start = path, begin
     if "data file" in fields:
         data, start = data_file(path, fields["data file"]), 0
-    if fields.get("encoding", "raw").lower() == "raw" and data.stat().st_size - start < needed:
+    packing = PACKINGS.get(fields.get("encoding", "raw").lower())
+    if packing is not None and not skips:
+        check_length(data.name, data, start, needed, packing)
+    elif packing == "" and data.stat().st_size - start < needed:
         raise ImageInputError(
             f"{data.name}: is cut short: {data.stat().st_size - start} of {needed} bytes; copy it "
             "again"

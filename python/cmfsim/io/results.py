@@ -1,6 +1,7 @@
 """Results of a solve as `.npz`, `.vtu` and `.vtp`: each reader beside its writer."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -45,7 +46,47 @@ def read_result(path: str | os.PathLike[str]) -> SceneResult:
     with named(path):
         summary, members = read_archive(path, RESULT_FORMAT, "result")
         names = [f for f in SceneResult.__dataclass_fields__ if f != "summary"]
-        return SceneResult(**{n: member_of(members, n) for n in names}, summary=summary)
+        arrays = {name: member_of(members, name) for name in names}
+        _check(arrays)
+        return SceneResult(**arrays, summary=summary)
+
+
+def _check(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Refuses arrays that no solve writes: other shapes, not finite, or of unknown nodes."""
+    n, s = len(arrays["nodes"]), len(arrays["contact_nodes"])
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "nodes": (n, 3),
+        "tets": (None, 4),
+        "skin_triangles": (None, 3),
+        "displacements": (n, 3),
+        "forces": (n, 3),
+        "residual_history": (None,),
+        "contact_nodes": (s,),
+        "contact_points": (s, 3),
+        "contact_normals": (s, 3),
+        "contact_forces": (s,),
+        "contact_gaps": (s,),
+    }
+    for name, shape in shapes.items():
+        array = arrays[name]
+        kinds = "iu" if name in {"tets", "skin_triangles", "contact_nodes"} else "f"
+        fits = array.ndim == len(shape) and all(
+            wanted in (None, found) for wanted, found in zip(shape, array.shape, strict=True)
+        )
+        if array.dtype.kind not in kinds or not fits:
+            wanted = " × ".join("any" if w is None else str(w) for w in shape)
+            raise CaseInputError(
+                f"array {name!r} is {array.dtype} of shape {array.shape}: {wanted} of "
+                f"{'whole' if kinds == 'iu' else 'real'} numbers is needed"
+            )
+        if kinds == "f" and not np.isfinite(array).all():
+            at = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+            raise CaseInputError(f"array {name!r} holds a number that is not finite at {at}")
+    # Contact nodes of quadratic tets lie in the middle of edges, beyond the nodes of the mesh.
+    for name in ("tets", "skin_triangles"):
+        array = arrays[name]
+        if array.size and not 0 <= int(array.min()) <= int(array.max()) < n:
+            raise CaseInputError(f"array {name!r} names a node that is not among {n}")
 
 
 def write_result(path: str | os.PathLike[str], result: SceneResult) -> None:
