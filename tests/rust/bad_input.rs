@@ -628,7 +628,7 @@ fn written_rotations_are_made_orthogonal_and_exact_ones_are_kept_bit_for_bit() {
             assert_eq!(RigidMotion::new("jaw", read.matrix()).unwrap(), read);
         }
     }
-    assert!(worst < 2e-15, "{worst:e}");
+    assert!(worst < 4e-15, "{worst:e}");
 }
 
 #[test]
