@@ -121,7 +121,7 @@ fn measure(n_tets: usize, line: usize) {
     let Some((solver, found)) = last else { return };
     println!("unknowns {}", solver.n_unknowns());
     println!("sliding {}", found.contact.nodes.len());
-    println!("error_bound {:e}", found.error_bound);
+    println!("error_estimate {:e}", found.error_estimate);
     let skin: f64 = shell
         .skin
         .iter()
@@ -209,7 +209,7 @@ fn report() {
     println!(
         "| tets | unknowns | sliding nodes | method | arrays to displacements | next plan | \
          contact iterations | operator set-up | operator per plan (skin) | peak MB (arrays alone) | \
-         error bound, mm |"
+         estimated error, mm |"
     );
     println!("|---|---|---|---|---|---|---|---|---|---|---|");
     let mut whole: Vec<Vec<(f64, f64)>> = vec![Vec::new(); LINES.len()];
@@ -235,7 +235,7 @@ fn report() {
                 time("operator"),
                 text("peak_mb"),
                 text("arrays_mb"),
-                number(&f, "error_bound").unwrap_or(f64::NAN)
+                number(&f, "error_estimate").unwrap_or(f64::NAN)
             );
             if let (Some(n), Some(t)) = (number(&f, "tets"), times(&f, "whole")) {
                 whole[line].push((n, t.median));

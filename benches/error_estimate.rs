@@ -10,10 +10,12 @@
 mod meshes;
 mod random_scenes;
 
+use std::collections::BTreeMap;
 use std::process::ExitCode;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use mtm_core::error::MtmError;
 use mtm_core::method::Method;
 use rayon::prelude::*;
 
@@ -37,12 +39,20 @@ struct Options {
     only: Option<u64>,
 }
 
+/// Why a method refused, in a few words.
+type Reason = &'static str;
+
 /// What became of one scene with one method.
 #[derive(Clone, Copy)]
 enum Outcome {
-    Refused,
+    Refused(Reason),
     /// True and reported error, mm, and the iterations.
-    Solved { error: f64, reported: f64, iterations: usize, allowed: f64 },
+    Solved {
+        error: f64,
+        reported: f64,
+        iterations: usize,
+        allowed: f64,
+    },
 }
 
 /// What became of one scene.
@@ -58,7 +68,7 @@ enum Verdict {
     /// The mesh or the boundary of the drawn scene was refused.
     Unbuilt,
     /// No reference, and every method refused as well.
-    AllRefused(usize),
+    AllRefused(usize, [Reason; 2]),
     /// No reference, but an answer.
     Unverified(u64, String),
 }
@@ -72,6 +82,7 @@ struct Count {
     /// Reported over true error where it holds and the error is above rounding.
     margins: Vec<f64>,
     iterations: usize,
+    reasons: BTreeMap<Reason, usize>,
 }
 
 fn main() -> ExitCode {
@@ -120,6 +131,13 @@ fn arguments() -> Result<Options, String> {
     Ok(options)
 }
 
+fn reason(error: &MtmError) -> Reason {
+    match error {
+        MtmError::NotConverged { shortfall, .. } => shortfall.quantity,
+        _ => "the matrix is not positive definite to working precision",
+    }
+}
+
 fn judge(options: &Options, index: u64, checked: &AtomicUsize, apart: &Mutex<f64>) -> Verdict {
     let Ok(scene) = Scene::random(options.seed, index, options.nodes) else {
         return Verdict::Unbuilt;
@@ -140,7 +158,7 @@ fn judge(options: &Options, index: u64, checked: &AtomicUsize, apart: &Mutex<f64
         }
     }
     if solved.iter().all(Result::is_err) {
-        return Verdict::AllRefused(decade);
+        return Verdict::AllRefused(decade, solved.map(|s| s.err().as_ref().map_or("", reason)));
     }
     let Some(exact) = scene.reference() else {
         return Verdict::Unverified(index, scene.description);
@@ -156,10 +174,10 @@ fn judge(options: &Options, index: u64, checked: &AtomicUsize, apart: &Mutex<f64
         }
     }
     let outcomes = solved.map(|solved| match solved {
-        Err(_) => Outcome::Refused,
+        Err(error) => Outcome::Refused(reason(&error)),
         Ok(found) => Outcome::Solved {
             error: farthest(&found.displacements, &exact),
-            reported: found.error_bound,
+            reported: found.error_estimate,
             iterations: found.iterations,
             allowed: ROUNDINGS * f64::EPSILON * size,
         },
@@ -187,10 +205,9 @@ fn report(verdicts: &[Verdict]) -> usize {
         match verdict {
             Verdict::Unbuilt => unbuilt += 1,
             Verdict::Unverified(index, description) => unverified.push((index, description)),
-            Verdict::AllRefused(decade) => {
-                for counts in &mut counts {
-                    counts[*decade].scenes += 1;
-                    counts[*decade].refused += 1;
+            Verdict::AllRefused(decade, reasons) => {
+                for (counts, reason) in counts.iter_mut().zip(reasons) {
+                    counts[*decade].add(Outcome::Refused(reason));
                 }
             }
             Verdict::Judged(judged) => {
@@ -220,8 +237,15 @@ fn report(verdicts: &[Verdict]) -> usize {
             all.worst = all.worst.max(count.worst);
             all.iterations += count.iterations;
             all.margins.extend(&count.margins);
+            for (reason, count) in &count.reasons {
+                *all.reasons.entry(reason).or_default() += count;
+            }
         }
         all.print("all");
+        println!();
+        for (reason, count) in &all.reasons {
+            println!("- refused {count} times: {reason}");
+        }
         println!();
     }
     println!("{unbuilt} drawn scenes could not be built; {} had no reference", unverified.len());
@@ -244,9 +268,15 @@ impl Count {
     /// Counts an outcome; how many times too small its estimate was, if it was.
     fn add(&mut self, outcome: Outcome) -> Option<f64> {
         self.scenes += 1;
-        let Outcome::Solved { error, reported, iterations, allowed } = outcome else {
-            self.refused += 1;
-            return None;
+        let (error, reported, iterations, allowed) = match outcome {
+            Outcome::Solved { error, reported, iterations, allowed } => {
+                (error, reported, iterations, allowed)
+            }
+            Outcome::Refused(reason) => {
+                self.refused += 1;
+                *self.reasons.entry(reason).or_default() += 1;
+                return None;
+            }
         };
         self.iterations += iterations;
         let ratio = error / reported.max(f64::MIN_POSITIVE);

@@ -105,8 +105,10 @@ impl Scene {
 
     /// What `method` makes of the scene.
     pub fn solve(&self, method: Method) -> Result<mtm_core::solution::Solution> {
-        let options = StaticOptions { method, tolerance: self.tolerance, ..StaticOptions::default() };
-        let solver = StaticSolver::new(self.tensors.clone(), self.boundary.clone(), options, GO_ON)?;
+        let options =
+            StaticOptions { method, tolerance: self.tolerance, ..StaticOptions::default() };
+        let solver =
+            StaticSolver::new(self.tensors.clone(), self.boundary.clone(), options, GO_ON)?;
         solver.solve(&self.plan, self.loads.as_deref(), GO_ON)
     }
 
@@ -180,9 +182,8 @@ impl Scene {
 
 /// Largest distance of a node between two fields, mm.
 pub fn farthest(a: &[[f64; 3]], b: &[[f64; 3]]) -> f64 {
-    let distance = |(a, b): (&[f64; 3], &[f64; 3])| {
-        (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f64>().sqrt()
-    };
+    let distance =
+        |(a, b): (&[f64; 3], &[f64; 3])| (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f64>().sqrt();
     a.iter().zip(b).map(distance).fold(0.0, |m, d| if d > m || d.is_nan() { d } else { m })
 }
 
@@ -490,7 +491,8 @@ impl<'a> Equations<'a> {
         let matrix = self.scene.tensors.matrix();
         (0..u.len())
             .map(|j| {
-                let mut r = self.scene.loads.as_ref().map_or([ZERO; 3], |f| f[j].map(|v| Pair(v, 0.0)));
+                let mut r =
+                    self.scene.loads.as_ref().map_or([ZERO; 3], |f| f[j].map(|v| Pair(v, 0.0)));
                 let (columns, blocks) = matrix.row(j);
                 for (&k, block) in columns.iter().zip(blocks) {
                     for i in 0..3 {

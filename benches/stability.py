@@ -38,7 +38,7 @@ FIGURES = {
     "residual": "residual",
     "true residual": "true_residual",
     "error": "error",
-    "bound": "error_bound",
+    "estimate": "error_estimate",
     "distance, mm": "distance",
     "tangential": "tangential",
     "least J": "least_volume",
@@ -68,17 +68,17 @@ machine.
   It is checked against the residual in 32 digits. It says little about the error where κ is large.
 - **error** is the largest distance of a node from its reference position over the largest
   displacement.
-- **bound** is `result.error_bound` over the largest displacement; for Cholesky an estimate, ten
-  times the error with which the factor recovered a known solution.
+- **estimate** is `result.error_estimate` over the largest displacement: no bound (*Error estimates*
+  below).
 - **verdict**: *ok*, *refused* with the error raised, or **WRONG**.
 
 What is *ok*, with ε = 2.2e-16: Cholesky's error is within the larger of {ERROR_LIMIT:.0e} and
 {CONDITION_FACTOR:g} ε κ. The error of `pcg` and `relaxation` is within {BOUND_FACTOR:g} × their
-bound plus {CONDITION_FACTOR:g} ε κ: the bounds are of the equations in float64, whose own rounding
-is of the order ε κ. No such allowance is ever more than {WORTHLESS:.0e}. A solvable case may be
-refused (`SolverError`) by Cholesky where {CONDITION_FACTOR:g} ε κ > {WORTHLESS:.0e}, by `pcg` where
-{CONDITION_FACTOR:g} ε κ exceeds the tolerance asked for (1e-9 unless stated), by `relaxation` there
-or where κ exceeds the {SWEEPS} sweeps that it gets here.
+estimate plus {CONDITION_FACTOR:g} ε κ: the estimates are of the equations in float64, whose own
+rounding is of the order ε κ. No such allowance is ever more than {WORTHLESS:.0e}. A solvable case
+may be refused (`SolverError`) by Cholesky where {CONDITION_FACTOR:g} ε κ > {WORTHLESS:.0e}, by
+`pcg` where {CONDITION_FACTOR:g} ε κ exceeds the tolerance asked for (1e-9 unless stated), by
+`relaxation` there or where κ exceeds the {SWEEPS} sweeps that it gets here.
 
 *Contact*, *lift-off*, *contact tolerance*, *held by contact*: **distance** is the largest from
 where a held node belongs, over the triangles of the moved surface, one by one; **tangential** the
@@ -103,7 +103,7 @@ rest.
 ## Where a method must not be used
 
 - **cholesky**: it loses log10 κ of its 16 digits, so an answer at κ of 1e12 (a bar 1000 times as
-  long as thick) has four; `result.error_bound` says so. Not far above, it is refused.
+  long as thick) has four; `result.error_estimate` says so. Not far above, it is refused.
 - **pcg**: where κ is above about 1e7: stiff tissue that soft tissue holds with a contrast above
   1e6, slender bodies. Rounding then keeps it from its tolerance, and it raises `SolverError`.
 - **relaxation**: stiff bodies in soft tissue with a contrast above 1e2, ν above 0.49, slivers: it
@@ -150,8 +150,8 @@ def table(suite: ModuleType, rows: list[Row]) -> str:
 
 
 def _figure(row: Row, heading: str) -> str:
-    # The bound of a direct solve is rounding, and differs from machine to machine.
-    if heading == "bound" and row.method == "cholesky":
+    # The estimate of a direct solve is rounding, and differs from machine to machine.
+    if heading == "estimate" and row.method == "cholesky":
         return "–"
     value = getattr(row, FIGURES[heading])
     if heading in ("least J", "deflection") and value is not None:

@@ -392,7 +392,7 @@ fn run_plans(bytes: &mut Bytes<'_>) -> Result<usize, MtmError> {
                 finite("forces", found.forces.as_flattened());
                 finite("contact forces", &found.contact.forces);
                 finite("gaps", &found.contact.gaps);
-                finite("residual", &[found.residual, found.error_bound, found.contact_gap()]);
+                finite("residual", &[found.residual, found.error_estimate, found.contact_gap()]);
                 for &j in boundary.fixed() {
                     assert_eq!(found.displacements[j as usize], [0.0; 3], "fixed node {j} moved");
                 }

@@ -96,13 +96,13 @@ CORE: Mapping[str, frozenset[str]] = {
             "cholesky/structure cholesky/sweep cholesky/symmetric cholesky/workspace"
         ),
         "row_sums": "blocks",
-        "error_bound": "",
-        "krylov": "blocks error_bound row_sums",
+        "error_estimate": "",
+        "krylov": "blocks error_estimate row_sums",
         "multigrid/block_rows": "blocks",
         "multigrid/small_blocks": "simd",
         "multigrid/scaling": "multigrid/block_rows multigrid/small_blocks",
         "multigrid/scaled_matrix": (
-            "error_bound row_sums simd multigrid/block_rows multigrid/scaling "
+            "error_estimate row_sums simd multigrid/block_rows multigrid/scaling "
             "multigrid/small_blocks"
         ),
         "multigrid/smoother": "simd multigrid/scaled_matrix",

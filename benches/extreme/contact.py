@@ -322,7 +322,7 @@ def _compared(case: Case, row: Row, result: cmfsim.Solution) -> Row:
         residual=result.residual,
         true_residual=residual,
         error=error,
-        error_bound=result.error_bound / size,
+        error_estimate=result.error_estimate / size,
         allowed=allowed,
         distance=lost,
         tangential=tangential,

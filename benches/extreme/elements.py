@@ -222,7 +222,7 @@ def judge(case: Case, method: str) -> Row:
     u = result.all_displacements
     size = float(np.linalg.norm(known.displacements, axis=1).max())
     error = float(np.linalg.norm(u - known.displacements, axis=1).max()) / size
-    bound = 0.0 if solver_name == "cholesky" else result.error_bound / size
+    bound = 0.0 if solver_name == "cholesky" else result.error_estimate / size
     allowed = max(ERROR_LIMIT, min(round_off, WORTHLESS)) + bound
     outside = np.zeros(u.size) if loads is None else loads.ravel()
     rest = (known.matrix @ u.ravel() - outside)[known.free]
@@ -246,7 +246,7 @@ def judge(case: Case, method: str) -> Row:
         condition=known.condition,
         residual=residual,
         error=error,
-        error_bound=bound,
+        error_estimate=bound,
         allowed=allowed,
         deflection=deflection,
         iterations=result.iterations,

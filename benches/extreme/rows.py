@@ -17,7 +17,7 @@ EPS = float(np.finfo(np.float64).eps)
 ERROR_LIMIT = 1e-9
 # Allowed error over ε κ, where that is more than `ERROR_LIMIT`: κ of the equilibrated matrix.
 CONDITION_FACTOR = 10.0
-# The true error of an iterative method may be this many times the bound that it reports, beside
+# The true error of an iterative method may be this many times what it reports, beside
 # the round-off that every method has.
 BOUND_FACTOR = 1.0
 # Residual of a direct solve over its round-off, ε ‖|K| |u|‖ / ‖b‖ (times E_t/E_l for soft fibres,
@@ -82,7 +82,7 @@ class Row:
         As reported, and with 32 digits.
     error : float or None
         Largest nodal error over the largest displacement.
-    error_bound : float or None
+    error_estimate : float or None
         As reported, over the largest displacement.
     distance : float or None, mm
         How far a held node is from its place on the moved surface.
@@ -109,7 +109,7 @@ class Row:
     residual: float | None = None
     true_residual: float | None = None
     error: float | None = None
-    error_bound: float | None = None
+    error_estimate: float | None = None
     allowed: float | None = None
     iterations: int | None = None
     distance: float | None = None

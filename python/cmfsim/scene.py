@@ -268,7 +268,7 @@ class SolverOptions:
     contact : str
         "bilateral" or "unilateral".
     tolerance : float
-        Relative error bound of the iterative methods.
+        Estimated error of the iterative methods, over the length of the motion.
     max_iterations : int or None
     contact_tolerance : float
         Largest gap over the diagonal of the mesh, and largest tangential share of contact forces.
@@ -536,9 +536,9 @@ class SceneResult(Frozen):
     contact_forces : (s,) float64, N
     contact_gaps : (s,) float64, mm
     summary : dict
-        Method, residual, error bound, iterations, largest contact gap, tets that large deformation
-        leaves inverted (None in linear kinematics, where the count means nothing), findings of the
-        solution, timings, versions and the SHA-256 of the scene's content.
+        Method, residual, estimated error, iterations, largest contact gap, tets that large
+        deformation leaves inverted (None in linear kinematics, where the count means nothing),
+        findings of the solution, timings, versions and the SHA-256 of the scene's content.
     """
 
     nodes: Floats

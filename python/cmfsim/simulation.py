@@ -138,7 +138,11 @@ def solve_scene(scene: Scene) -> SceneResult:
     """
     solver = scene_solver(scene)
     solution = solver.solve(scene_plan(scene), loads=scene.loads)
-    _log.info("solved: residual %.2e, error bound %.2e mm", solution.residual, solution.error_bound)
+    _log.info(
+        "solved: residual %.2e, error %.2e mm (estimated)",
+        solution.residual,
+        solution.error_estimate,
+    )
     inverted, findings = _inverted(solver, solution)
     summary: dict[str, Any] = {
         "scene_sha256": scene.sha256(),
@@ -151,7 +155,7 @@ def solve_scene(scene: Scene) -> SceneResult:
         "contact": scene.options.contact,
         "conflicts": solver.boundary.conflicts,
         "residual": _finite(solution.residual),
-        "error_bound": _finite(solution.error_bound),
+        "error_estimate": _finite(solution.error_estimate),
         "iterations": solution.iterations,
         "contact_gap": _finite(solution.contact_gap),
         "contact_iterations": solution.contact_iterations,
@@ -199,7 +203,7 @@ def _inverted(solver: StaticSolver, solution: Solution) -> tuple[int | None, lis
 
 
 def _finite(value: float) -> float | None:
-    """A figure as JSON can hold it: null stands for an unknown bound."""
+    """A figure as JSON can hold it: null stands for one that is not known."""
     return value if math.isfinite(value) else None
 
 

@@ -64,7 +64,7 @@ fn methods_agree_to_a_nanometre() {
         for (method, other) in METHODS.iter().zip(&found).skip(1) {
             let e = largest_difference(&found[0].displacements, &other.displacements);
             assert!(e <= 1e-6, "{name}, {method:?}: {e:e} mm");
-            assert!(e <= 10.0 * other.error_bound, "{name}, {method:?}: {e:e} beyond its bound");
+            assert!(e <= 10.0 * other.error_estimate, "{name}, {method:?}: {e:e} beyond its bound");
         }
     }
 }
@@ -102,7 +102,7 @@ fn contact_costs_conjugate_gradients_two_plain_plans_at_most() {
     let moved = |motion| plan([("lid", Motion::Rigid(press)), ("floor", motion)]);
     let found = solve(&tensors, &bounds, pcg(), &moved(Motion::Rigid(tilt)), None).unwrap();
     assert!(found.contact_iterations >= 3, "{}", found.contact_iterations);
-    assert!(found.error_bound <= 1e-7, "{:e}", found.error_bound);
+    assert!(found.error_estimate <= 1e-7, "{:e}", found.error_estimate);
 
     let held = vec![joined("lid", shape.side(2, true))];
     let floor_fixed = boundary(shape.side(2, false), held);
@@ -220,7 +220,7 @@ fn solution_bits(
     out.extend(bits(&found.contact.normals));
     out.extend(found.contact.forces.iter().map(|f| f.to_bits()));
     out.push(found.residual.to_bits());
-    out.push(found.error_bound.to_bits());
+    out.push(found.error_estimate.to_bits());
     out
 }
 

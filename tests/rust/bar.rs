@@ -105,7 +105,7 @@ fn bar_along_the_fibre_stretches_by_stress_over_young_along() {
     let e = TRACTION / MODULI.young_along;
     let exact = Matrix3::from_diagonal(&Vec3::new(e, -nu_lt * e, -nu_lt * e));
     assert_stretch("along", &along_fibre(MODULI, [1.0, 0.0, 0.0]), exact);
-    assert!((strain(MODULI, Vec3::x(), Vec3::x(), TRACTION) - exact).amax() <= 1e-16);
+    assert!((strain(MODULI, Vec3::x(), Vec3::x(), TRACTION) - exact).amax() <= 1e-12 * e);
 }
 
 /// Pulled across the fibre (along y): ε_xx = σ/E_t, ε_yy = −ν_lt σ/E_l, ε_zz = −ν_tt σ/E_t.
@@ -125,7 +125,7 @@ fn bar_at_45_degrees_stretches_by_the_mean_compliance() {
     let fibre = Vec3::new(1.0, 1.0, 0.0).normalize();
     let exact = strain(MODULI, fibre, Vec3::x(), TRACTION);
     let mean = 0.5 * (1.0 / MODULI.young_along + 1.0 / MODULI.young_across);
-    assert!((exact[(0, 0)] - TRACTION * mean).abs() <= 1e-15, "{exact}");
+    assert!((exact[(0, 0)] - TRACTION * mean).abs() <= 1e-12 * TRACTION * mean, "{exact}");
     assert!(exact[(0, 1)].abs() > 0.1 * exact[(0, 0)].abs(), "shear couples: {exact}");
     assert_stretch("45°", &along_fibre(MODULI, fibre.into()), exact);
 }

@@ -103,7 +103,7 @@ fn stiffness_is_symmetric_with_six_zero_modes_and_no_negative_one() {
         for element in [Element::NodalPressure, Element::Quadratic] {
             let tensors = of_element(&mesh, &tissue, element);
             let k = dense(tensors.matrix());
-            assert!((&k - k.transpose()).amax() < 1e-15 * k.amax(), "{name} {element:?}");
+            assert!((&k - k.transpose()).amax() < 1e-13 * k.amax(), "{name} {element:?}");
             let mut values = SymmetricEigen::new(k).eigenvalues.as_slice().to_vec();
             values.sort_by(f64::total_cmp);
             let largest = values[values.len() - 1];
@@ -381,7 +381,7 @@ fn large_deformation_over_a_dome_settles_alike_by_every_method() {
             let early = run(Method::Pcg, 0.1);
             let apart = largest_difference(&by_factor.displacements, &early.displacements);
             assert!(apart < 0.1 * moved, "{name}: stopped early {apart} of {moved}");
-            assert!(apart <= early.error_bound, "{name}: {apart} over {}", early.error_bound);
+            assert!(apart <= early.error_estimate, "{name}: {apart} over {}", early.error_estimate);
             assert!(early.iterations < by_cg.iterations, "{name}: stopped no earlier");
         }
     }

@@ -5,6 +5,7 @@ use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use mtm_core::fibre::{MuscleFibres, MuscleKind, NearFibres, OrientedBox};
 use mtm_core::{ErrorKind, MtmError, Surface};
+use nalgebra::Vector3;
 
 type Point = [f64; 3];
 
@@ -32,8 +33,9 @@ fn plate(map: impl Fn(f64, f64) -> [f64; 2], steps: [usize; 2], thickness: f64) 
 }
 
 fn angle(a: Point, b: Point) -> f64 {
-    let dot: f64 = (0..3).map(|i| a[i] * b[i]).sum();
-    dot.abs().min(1.0).acos().to_degrees()
+    let (a, b) = (Vector3::from(a), Vector3::from(b));
+    // Not by the arc cosine: near 0 rounding alone makes 1e-6 degrees of it.
+    a.cross(&b).norm().atan2(a.dot(&b).abs()).to_degrees()
 }
 
 fn arc_map(s: f64, v: f64) -> [f64; 2] {

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
+use crate::error::{ErrorKind, LARGEST_COORDINATE, MtmError, Result, check_coordinates};
 use crate::mesh::{add, scaled};
 use crate::motion::{RigidMotion, SurfaceMotion};
 use crate::surface::Surface;
@@ -210,8 +210,10 @@ impl Boundary {
                 ));
             }
             match &segment.gap {
-                Gap::Uniform(value) if !value.is_finite() => {
-                    return fail(format!("has a gap of {value}: it must be finite (mm)"));
+                Gap::Uniform(value) if !is_gap(*value) => {
+                    return fail(format!(
+                        "has a gap of {value}: it must be finite, -1e6 to 1e6 mm"
+                    ));
                 }
                 Gap::PerNode(values) if values.len() != segment.sliding.len() => {
                     return fail(format!(
@@ -221,9 +223,9 @@ impl Boundary {
                     ));
                 }
                 Gap::PerNode(values) => {
-                    if let Some(index) = values.iter().position(|v| !v.is_finite()) {
+                    if let Some(index) = values.iter().position(|&v| !is_gap(v)) {
                         return fail(format!(
-                            "has gap[{index}] = {}: it must be finite",
+                            "has gap[{index}] = {}: it must be finite, -1e6 to 1e6 mm",
                             values[index]
                         ));
                     }
@@ -311,7 +313,7 @@ impl Boundary {
                         return Err(fail(&segment.name, problem));
                     }
                     let what = format!("plan[\"{}\"]", segment.name);
-                    check_finite_rows(&what, rows, ErrorKind::Boundary)?;
+                    check_coordinates(&what, rows, ErrorKind::Boundary)?;
                     if !segment.sliding.is_empty() {
                         return Err(fail(
                             &segment.name,
@@ -398,6 +400,14 @@ pub(crate) fn matched<'a>(plan: &'a Plan, segments: &[&str]) -> Result<Vec<&'a M
     segments
         .iter()
         .map(|&segment| match plan.iter().find(|(name, _)| name == segment) {
+            Some((_, Motion::Rigid(rigid))) if is_far(rigid) => Err(fail(
+                segment,
+                format!(
+                    "its translation {:?} mm is out of range: allowed is -1e7 to 1e7 mm; check the \
+                     units",
+                    [0, 1, 2].map(|i| rigid.matrix()[i][3])
+                ),
+            )),
             Some((_, motion)) => Ok(motion),
             None => Err(fail(
                 segment,
@@ -405,6 +415,16 @@ pub(crate) fn matched<'a>(plan: &'a Plan, segments: &[&str]) -> Result<Vec<&'a M
             )),
         })
         .collect()
+}
+
+/// Whether a gap, mm, is one that contact can keep.
+fn is_gap(value: f64) -> bool {
+    value.abs() <= LARGEST_COORDINATE
+}
+
+/// Whether a motion leads out of all that coordinates may be, whatever centre it turns about.
+fn is_far(rigid: &RigidMotion) -> bool {
+    rigid.matrix().iter().any(|row| row[3].abs() > 10.0 * LARGEST_COORDINATE)
 }
 
 /// `nodes` without repetitions, first occurrences kept in order.

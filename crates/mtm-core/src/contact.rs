@@ -105,6 +105,14 @@ pub struct ContactState {
     pub iterations: usize,
 }
 
+impl ContactState {
+    /// Largest distance of a held node from its surface, mm.
+    pub(crate) fn largest_gap(&self) -> f64 {
+        let held = self.gaps.iter().zip(&self.active).filter(|(_, active)| **active);
+        held.fold(0.0, |m, (gap, _)| m.max(gap.abs()))
+    }
+}
+
 /// Constraints n_r·u_i = offset_r on the sliding nodes that are held.
 pub struct Constraints<'a> {
     /// Node and normal of each constraint, nodes ascending.

@@ -44,7 +44,7 @@ pub enum MtmError {
         kind: ErrorKind,
     },
     /// A value lies outside the allowed range.
-    #[error("{what}[{index}] is {value}: allowed is {allowed}")]
+    #[error("{what}[{index}] is {}: allowed is {allowed}", shown(*.value))]
     OutOfRange {
         /// The array or parameter.
         what: String,
@@ -259,19 +259,15 @@ pub enum MtmError {
         /// What was seen.
         detail: String,
     },
-    /// An iterative method stopped before its error bound was met.
-    #[error(
-        "{method} did not converge: {iterations} iterations, error bound {error:.3e} mm where {tolerance:.3e} mm was asked for; {advice}"
-    )]
+    /// An iterative method stopped before what it estimates of its error was small enough.
+    #[error("{method} did not converge: after {iterations} iterations {shortfall}; {advice}")]
     NotConverged {
         /// The method.
         method: &'static str,
         /// Iterations done.
         iterations: usize,
-        /// Error bound reached, mm.
-        error: f64,
-        /// Error bound asked for, mm.
-        tolerance: f64,
+        /// What was not reached.
+        shortfall: Shortfall,
         /// What to try.
         advice: &'static str,
     },
@@ -386,6 +382,40 @@ pub enum MtmError {
     },
 }
 
+/// A value as an error shows it: without hundreds of digits.
+fn shown(value: f64) -> String {
+    let size = value.abs();
+    if value.is_finite() && size != 0.0 && !(1e-5..1e9).contains(&size) {
+        format!("{value:e}")
+    } else {
+        value.to_string()
+    }
+}
+
+/// A quantity that an iteration did not bring down to where it was asked to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Shortfall {
+    /// The quantity, in words.
+    pub quantity: &'static str,
+    /// What it was at the end; infinite where it could not be computed.
+    pub value: f64,
+    /// What was asked for.
+    pub limit: f64,
+    /// Its unit with a space before it; empty if it has none.
+    pub unit: &'static str,
+}
+
+impl std::fmt::Display for Shortfall {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { quantity, value, limit, unit } = self;
+        if value.is_finite() {
+            write!(f, "{quantity} is {value:.3e}{unit} where {limit:.3e}{unit} was asked for")
+        } else {
+            write!(f, "{quantity} could not be computed, and {limit:.3e}{unit} was asked for")
+        }
+    }
+}
+
 /// The family an error belongs to; the Python exceptions carry the same names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
@@ -467,6 +497,49 @@ pub(crate) fn check_finite_rows(what: &str, rows: &[[f64; 3]], kind: ErrorKind) 
     for (index, row) in rows.iter().enumerate() {
         if let Some(&value) = row.iter().find(|v| !v.is_finite()) {
             return Err(MtmError::NotFinite { what: what.to_owned(), index, value, kind });
+        }
+    }
+    Ok(())
+}
+
+/// Largest coordinate and displacement, mm (1 km): squares and sums of them stay far from overflow.
+pub const LARGEST_COORDINATE: f64 = 1e6;
+/// Largest force on a node, N.
+pub const LARGEST_FORCE: f64 = 1e12;
+
+/// Refuses NaN, infinity and coordinates or displacements beyond [`LARGEST_COORDINATE`], naming the row.
+pub(crate) fn check_coordinates(what: &str, rows: &[[f64; 3]], kind: ErrorKind) -> Result<()> {
+    check_rows_within(what, rows, LARGEST_COORDINATE, "-1e6 to 1e6 mm; check the units", kind)
+}
+
+/// Refuses NaN, infinity and displacements that no body has, naming the row: those of a solution under
+/// absurd loads may be beyond [`LARGEST_COORDINATE`].
+pub(crate) fn check_displacements(what: &str, rows: &[[f64; 3]], kind: ErrorKind) -> Result<()> {
+    check_rows_within(what, rows, 1e30, "-1e30 to 1e30 mm", kind)
+}
+
+/// Refuses NaN, infinity and forces beyond [`LARGEST_FORCE`], naming the row.
+pub(crate) fn check_forces(what: &str, rows: &[[f64; 3]], kind: ErrorKind) -> Result<()> {
+    check_rows_within(what, rows, LARGEST_FORCE, "-1e12 to 1e12 N; check the units", kind)
+}
+
+fn check_rows_within(
+    what: &str,
+    rows: &[[f64; 3]],
+    largest: f64,
+    allowed: &'static str,
+    kind: ErrorKind,
+) -> Result<()> {
+    check_finite_rows(what, rows, kind)?;
+    for (index, row) in rows.iter().enumerate() {
+        if let Some(&value) = row.iter().find(|v| v.abs() > largest) {
+            return Err(MtmError::OutOfRange {
+                what: what.to_owned(),
+                index,
+                value,
+                allowed,
+                kind,
+            });
         }
     }
     Ok(())

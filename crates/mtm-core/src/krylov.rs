@@ -1,19 +1,29 @@
-//! Preconditioned conjugate gradients that stop on a bound of the error, not on the residual.
+//! Preconditioned conjugate gradients that stop on an estimate of the error, not on the residual.
 //!
 //! At a material contrast of 1e6 a relative residual of 1e-6 can leave centimetres of error: a stiff
 //! muscle dominates the norm while the fat beside it is still wrong. The iteration here ends when
-//! both the error in millimetres and the error in energy are bounded, and both are checked once more
-//! with the true residual `b − A x` before a solution is handed out.
+//! both the estimated error in millimetres and that in energy are small enough, and both are checked once
+//! more with the true residual `b − A x` before a solution is handed out. Where the estimates have reason
+//! to miss a slow motion, [`trial`] measures them on a known solution first.
 
 use rayon::prelude::*;
 
 use crate::blocks::{Block, BlockMatrix};
-use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
-use crate::error_bound::{StoppingRule, Verdict};
-use crate::row_sums::{ROWS_PER_SUM, advance, dot, dot_and_largest, in_pool, multiply_and_dot};
+use crate::error::{ErrorKind, MtmError, Result, Shortfall, check_finite_rows};
+use crate::error_estimate::{Due, FLOOR_PROGRESS, STAGNATION_ITERATIONS, StoppingRule, Verdict};
+use crate::row_sums::{
+    ROWS_PER_SUM, advance, dot, dot_and_largest, farthest, in_pool, multiply_and_dot,
+};
 
-pub use crate::error_bound::PcgOptions;
-pub(crate) use crate::error_bound::Spectrum;
+pub use crate::error_estimate::PcgOptions;
+pub(crate) use crate::error_estimate::Spectrum;
+
+/// Fall of the error of a trial after which its true residual is looked at again.
+const TRIAL_FALL: f64 = 0.1;
+/// Growth of the iterations of a trial after which it is looked at at the latest.
+const TRIAL_PAUSE: f64 = 1.3;
+/// True rᵀz over that of the recurrence above which the recurrence has drifted: the round-off floor.
+const DRIFT: f64 = 4.0;
 
 /// A symmetric positive definite matrix, as conjugate gradients see it.
 ///
@@ -109,10 +119,10 @@ pub struct PcgOutcome {
     pub solution: Vec<[f64; 3]>,
     /// Iterations done, over all restarts.
     pub iterations: usize,
-    /// Estimated bound of the largest nodal error, mm: `max_j |z_j| / θ_min` with the true residual,
-    /// `θ_min` half the smallest Ritz value of `M⁻¹ A`.
-    pub error_bound_mm: f64,
-    /// Upper bound of the error in the energy norm, relative to the energy norm of the solution.
+    /// Estimate of the largest nodal error, mm: `max_j |z_j| / θ_min` with the true residual, `θ_min` half
+    /// the smallest Ritz value of `M⁻¹ A`. No bound: Ritz values lie above the spectrum.
+    pub error_estimate_mm: f64,
+    /// Estimate of the error in the energy norm, relative to the energy norm of the solution.
     pub energy_error: f64,
     /// `‖b − A x‖ / ‖b‖`, computed afresh. Says little at high contrast.
     pub residual: f64,
@@ -128,7 +138,7 @@ pub struct PcgOutcome {
 /// `b`, `x0`: one row of three per block row, N and mm. `interrupted` is asked once per iteration, on
 /// the calling thread. The bits of the result do not depend on the number of threads.
 ///
-/// Stops when `max_j |z_j| / θ_min ≤ tolerance` and when the Gauss–Radau bound of the energy error
+/// Stops when `max_j |z_j| / θ_min ≤ tolerance` and when the Gauss–Radau estimate of the energy error
 /// (Meurant & Tichý 2013, with the smallest Ritz value less a safety margin as lower end of the
 /// spectrum) is within `energy_tolerance`; both must then hold for the true residual as well.
 ///
@@ -145,24 +155,39 @@ pub fn pcg(
     interrupted: &(dyn Fn() -> bool + Sync),
 ) -> Result<PcgOutcome> {
     let mut seen = Spectrum::default();
-    match pcg_near(a, b, x0, preconditioner, options, None, &mut seen, interrupted)? {
-        Reached::Solution(outcome) | Reached::Step(outcome) => Ok(outcome),
-    }
+    let reached = pcg_near(a, b, x0, preconditioner, options, None, &mut seen, interrupted)?;
+    Ok(reached.into_outcome())
 }
 
 /// Where [`pcg_near`] ended.
 pub(crate) enum Reached {
     /// Within the tolerances, checked with the true residual.
     Solution(PcgOutcome),
-    /// Near enough for a step; its bound is that of the recurrence.
+    /// Near enough for a step; its estimate is that of the recurrence.
     Step(PcgOutcome),
+}
+
+impl Reached {
+    /// What was reached.
+    pub(crate) fn outcome(&self) -> &PcgOutcome {
+        match self {
+            Self::Solution(outcome) | Self::Step(outcome) => outcome,
+        }
+    }
+
+    /// What was reached.
+    pub(crate) fn into_outcome(self) -> PcgOutcome {
+        match self {
+            Self::Solution(outcome) | Self::Step(outcome) => outcome,
+        }
+    }
 }
 
 /// [`pcg`] for one of several systems that differ little, with the same preconditioner.
 ///
 /// `seen`: what earlier systems showed of the spectrum. With `share`, the solution is only a step on the
-/// way to another system: the iteration ends as soon as the bound has fallen to that share of the one at
-/// `x0` (the bound of the step is then as good as what was seen), unless that lies within the tolerances.
+/// way to another system: the iteration ends as soon as the estimate has fallen to that share of the one at
+/// `x0` (the estimate of the step is then as good as what was seen), unless that lies within the tolerances.
 pub(crate) fn pcg_near(
     a: &dyn Operator,
     b: &[[f64; 3]],
@@ -191,7 +216,7 @@ pub(crate) fn pcg_near(
         return Ok(Reached::Solution(PcgOutcome {
             solution: vec![[0.0; 3]; n],
             iterations: 0,
-            error_bound_mm: 0.0,
+            error_estimate_mm: 0.0,
             energy_error: 0.0,
             residual: 0.0,
             residual_history: Vec::new(),
@@ -231,17 +256,92 @@ pub(crate) fn pcg_near(
                 return Ok(Reached::Solution(state.outcome(doubt, b_norm, iterations, history)));
             }
             Verdict::GiveUp => {
-                return Err(MtmError::NotConverged {
-                    method: "pcg",
-                    iterations,
-                    error: state.error_mm(),
-                    tolerance: options.tolerance,
-                    advice: "use the Cholesky method, or allow a larger tolerance",
-                });
+                return Err(state.not_converged(due, options, iterations));
             }
             Verdict::Restart => state.restart(),
         }
     }
+}
+
+/// What conjugate gradients made of a system whose solution is known.
+#[derive(Debug, Clone)]
+pub(crate) struct Trial {
+    /// The spectrum, and how errors follow from residuals.
+    pub seen: Spectrum,
+    /// Largest nodal error that was reached, over the largest displacement.
+    pub error: f64,
+    pub iterations: usize,
+}
+
+/// How well conjugate gradients can solve with `a`: a system with a known solution, on which errors are
+/// measured, not estimated.
+///
+/// In the known field every node goes its own way, so that each slow motion has its share of it and none
+/// of the residual. `goal`: error over the largest displacement at which the trial ends; it ends as well
+/// where rounding lets the error fall no further, and after `max_iterations`.
+pub(crate) fn trial(
+    a: &dyn Operator,
+    preconditioner: &dyn Preconditioner,
+    goal: f64,
+    max_iterations: usize,
+    interrupted: &(dyn Fn() -> bool + Sync),
+) -> Result<Trial> {
+    let n = a.n_rows();
+    let zeros = vec![[0.0; 3]; n];
+    let mut known: Vec<[f64; 3]> =
+        (0..n).map(|j| [0, 1, 2].map(|i| 1.0 + 0.5 * ((3 * j + i) as f64 * 0.7).sin())).collect();
+    a.project(&mut known);
+    let size = farthest(&known, &zeros);
+    let mut seen = Spectrum::default();
+    if size == 0.0 {
+        return Ok(Trial { seen, error: 0.0, iterations: 0 });
+    }
+    let mut b = zeros.clone();
+    a.multiply_into(&known, &mut b);
+    let mut state = State::new(a, &b, &zeros, preconditioner, &mut seen);
+    in_pool(|| state.replace_residual());
+    state.restart();
+    let (mut best, mut best_at) = (1.0_f64, 0);
+    let (mut looked, mut looked_at, mut restarted) = (1.0_f64, 0_usize, f64::INFINITY);
+    let mut iterations = 0;
+    for iteration in 1..=max_iterations {
+        if interrupted() {
+            return Err(MtmError::Interrupted);
+        }
+        if state.rz == 0.0 {
+            break;
+        }
+        in_pool(|| state.step())?;
+        iterations = iteration;
+        let error = farthest(&state.x, &known) / size;
+        if error < best {
+            (best, best_at) = (error, iteration);
+        }
+        let stagnant = iteration - best_at >= STAGNATION_ITERATIONS.max(iteration / 2);
+        let last = error <= goal || stagnant || iteration == max_iterations;
+        let due =
+            error <= TRIAL_FALL * looked || iteration as f64 >= TRIAL_PAUSE * looked_at as f64;
+        if !(last || due) {
+            continue;
+        }
+        (looked, looked_at) = (error.min(looked), iteration);
+        let (rz, largest_z) = in_pool(|| state.true_residual());
+        if largest_z > 0.0 {
+            state.spectrum.amplified(error * size / largest_z);
+        }
+        if last {
+            break;
+        }
+        if rz > DRIFT * state.rz {
+            if error > FLOOR_PROGRESS * restarted {
+                break;
+            }
+            restarted = error;
+            in_pool(|| state.replace_residual());
+            state.restart();
+        }
+    }
+    Ok(Trial { seen, error: best, iterations })
 }
 
 /// The vectors and coefficients of the iteration.
@@ -301,6 +401,17 @@ impl<'a> State<'a> {
         (self.rz, self.largest_z) = dot_and_largest(&self.r, &self.z);
     }
 
+    /// rᵀz and the largest row of z for the true residual, without a change of the iteration.
+    fn true_residual(&mut self) -> (f64, f64) {
+        let (r, z) = (self.r.clone(), self.z.clone());
+        let (rz, r_norm, largest_z) = (self.rz, self.r_norm, self.largest_z);
+        self.replace_residual();
+        let found = (self.rz, self.largest_z);
+        (self.r, self.z) = (r, z);
+        (self.rz, self.r_norm, self.largest_z) = (rz, r_norm, largest_z);
+        found
+    }
+
     /// z = P M⁻¹ P r, P the projection of the operator: what rounding leaves outside the subspace may be
     /// all of a small residual, and there the operator says nothing.
     fn precondition(&mut self) {
@@ -318,7 +429,7 @@ impl<'a> State<'a> {
         residual_history: Vec<f64>,
     ) -> PcgOutcome {
         PcgOutcome {
-            error_bound_mm: doubt * self.error_mm(),
+            error_estimate_mm: doubt * self.error_mm(),
             energy_error: doubt * self.energy_error(),
             residual: self.r_norm / b_norm,
             ritz: [self.spectrum.smallest, self.spectrum.largest],
@@ -371,6 +482,34 @@ impl<'a> State<'a> {
                 self.rz
             ),
         }
+    }
+
+    /// What kept the iteration from converging, of the three that must be met: the one that is furthest
+    /// from it.
+    fn not_converged(&self, due: Due, options: &PcgOptions, iterations: usize) -> MtmError {
+        let (error, energy) = (due.doubt * self.error_mm(), due.doubt * self.energy_error());
+        let by_energy = energy / options.energy_tolerance > error / options.tolerance;
+        let shortfall = if by_energy {
+            Shortfall {
+                quantity: "the estimated error of the energy",
+                value: energy,
+                limit: options.energy_tolerance,
+                unit: " of the whole",
+            }
+        } else {
+            Shortfall {
+                quantity: "the estimated error of a node",
+                value: error,
+                limit: options.tolerance,
+                unit: " mm",
+            }
+        };
+        let advice = if due.exhausted {
+            "allow more iterations (max_iterations) or a larger tolerance, or use method=\"cholesky\""
+        } else {
+            "rounding lets it fall no further: use method=\"cholesky\", or allow a larger tolerance"
+        };
+        MtmError::NotConverged { method: "pcg", iterations, shortfall, advice }
     }
 
     /// See [`Spectrum::error_mm`].

@@ -14,6 +14,10 @@ pub const DEFINITE_RATIO: f64 = 1e-12;
 pub const FIBRE_TOLERANCE: f64 = 1e-6;
 /// Allowed asymmetry of a user-given stiffness over its largest entry.
 const SYMMETRY_TOLERANCE: f64 = 1e-9;
+/// Smallest and largest modulus, MPa: far beyond any tissue (fat 0.003, enamel 1e5) and any unit of it, and
+/// far from where products overflow or vanish.
+const SOFTEST: f64 = 1e-15;
+const STIFFEST: f64 = 1e12;
 
 /// Stiffness in Voigt order xx, yy, zz, yz, xz, xy with engineering shears, MPa, row by row.
 pub type Voigt = [[f64; 6]; 6];
@@ -439,6 +443,20 @@ impl Tissue {
         (0..self.n_rows()).map(ratio).fold(0.0, f64::max)
     }
 
+    /// Stiffest over softest tet, by the mean resistance to shear; 1 where it is uniform.
+    pub fn contrast(&self) -> f64 {
+        let shear = |t: usize| match self.of_tet(t) {
+            TetMaterial::Isotropic(l) => l.mu,
+            // Two planes of shear hold the fibre, one lies across it.
+            TetMaterial::Spencer(c, _) => c.mu_across + c.mu_difference * 2.0 / 3.0,
+            TetMaterial::General(c) => (c[3][3] + c[4][4] + c[5][5]) / 3.0,
+        };
+        let (least, most) = (0..self.n_rows())
+            .map(shear)
+            .fold((f64::INFINITY, 0.0_f64), |(least, most), v| (least.min(v), most.max(v)));
+        most / least
+    }
+
     /// Constants of tet `t`.
     pub fn of_tet(&self, t: usize) -> TetMaterial<'_> {
         fn row<T>(rows: &[T], t: usize) -> &T {
@@ -511,7 +529,7 @@ fn check_matching(constants: usize, fibres: usize) -> Result<()> {
 }
 
 fn check_young(what: &'static str, index: usize, value: f64) -> Result<()> {
-    if value.is_finite() && value > 0.0 {
+    if (SOFTEST..=STIFFEST).contains(&value) {
         return Ok(());
     }
     let kind = ErrorKind::Material;
@@ -519,7 +537,7 @@ fn check_young(what: &'static str, index: usize, value: f64) -> Result<()> {
         what: what.into(),
         index,
         value,
-        allowed: "positive and finite (MPa)",
+        allowed: "positive, 1e-15 to 1e12 MPa; check the units",
         kind,
     })
 }
@@ -595,6 +613,15 @@ fn check_voigt(tet: usize, c: &Voigt) -> Result<()> {
                     what: "stiffness".into(),
                     index: tet,
                     value,
+                    kind,
+                });
+            }
+            if value.abs() > STIFFEST || (row == column && value > 0.0 && value < SOFTEST) {
+                return Err(MtmError::OutOfRange {
+                    what: "stiffness".into(),
+                    index: tet,
+                    value,
+                    allowed: "1e-15 to 1e12 MPa on the diagonal, at most 1e12 MPa next to it",
                     kind,
                 });
             }

@@ -2,11 +2,15 @@
 
 use rayon::prelude::*;
 
-use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
+use crate::error::{ErrorKind, MtmError, Result, check_coordinates};
 
 /// Volume over longest edge cubed below which a tet counts as degenerate. A sliver with a smallest
 /// dihedral angle of 0.1° is near 2e-4; f64 geometry keeps about three digits at this limit.
 pub const DEGENERATE_RELATIVE_VOLUME: f64 = 1e-12;
+
+/// Length that the longest edge of a tet has at least, mm: the products of shorter ones leave the range of
+/// normal numbers.
+const SHORTEST_EDGE: f64 = 1e-9;
 
 /// The four faces of a tet, outward when the tet is positively oriented.
 const FACES: [[usize; 3]; 4] = [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]];
@@ -54,7 +58,7 @@ impl TetMesh {
     /// The mesh of positively oriented tets on `nodes` (mm).
     ///
     /// # Errors
-    /// Empty arrays, values that are not finite, node indices out of range, tets that repeat a node,
+    /// Empty arrays, values that are not finite or beyond 1e6 mm, node indices out of range, tets that repeat a node,
     /// are inverted or degenerate, two tets on the same nodes, nodes that no tet uses.
     pub fn new(nodes: Vec<[f64; 3]>, tets: Vec<[u32; 4]>) -> Result<Self> {
         if nodes.is_empty() {
@@ -63,7 +67,7 @@ impl TetMesh {
         if tets.is_empty() {
             return Err(MtmError::Empty { what: "tets", kind: ErrorKind::Mesh });
         }
-        check_finite_rows("nodes", &nodes, ErrorKind::Mesh)?;
+        check_coordinates("nodes", &nodes, ErrorKind::Mesh)?;
         for (row, tet) in tets.iter().enumerate() {
             if let Some(&node) = tet.iter().find(|&&v| v as usize >= nodes.len()) {
                 return Err(MtmError::IndexOutOfRange {
@@ -242,9 +246,19 @@ fn check_volumes(nodes: &[[f64; 3]], tets: &[[u32; 4]], volumes: &[f64]) -> Resu
     let worst = (0..tets.len()).into_par_iter().find_map_first(|t| {
         let edge = longest(t);
         let limit = DEGENERATE_RELATIVE_VOLUME * edge * edge * edge;
-        (volumes[t].is_nan() || volumes[t] <= limit).then_some((t, edge, limit))
+        let bad = volumes[t].is_nan() || volumes[t] <= limit || edge < SHORTEST_EDGE;
+        bad.then_some((t, edge, limit))
     });
     let Some((tet, edge, limit)) = worst else { return Ok(()) };
+    if edge < SHORTEST_EDGE {
+        return Err(MtmError::OutOfRange {
+            what: "longest edge of tets".into(),
+            index: tet,
+            value: edge,
+            allowed: "1e-9 mm or more; check the units",
+            kind: ErrorKind::Mesh,
+        });
+    }
     if volumes[tet] < -limit {
         let count = volumes.iter().filter(|&&v| v < 0.0).count();
         return Err(MtmError::InvertedTet { tet, volume: volumes[tet], nodes: tets[tet], count });

@@ -16,7 +16,7 @@ pub enum Method {
     Auto,
     /// Sparse Cholesky factor, kept for new plans.
     Cholesky,
-    /// Conjugate gradients with multigrid, stopped by an error bound.
+    /// Conjugate gradients with multigrid, stopped by an estimate of the error.
     Pcg,
     /// The node-wise iteration of the literature.
     Relaxation,
@@ -37,7 +37,7 @@ pub const METHODS: &str = "auto, cholesky, pcg, relaxation";
 pub struct StaticOptions {
     /// How the linear system is solved.
     pub method: Method,
-    /// Error bound of the iterative methods over the largest prescribed displacement.
+    /// Estimated error of the iterative methods over the largest prescribed displacement.
     pub tolerance: f64,
     /// Most iterations of the iterative methods; their own default if `None`.
     pub max_iterations: Option<usize>,

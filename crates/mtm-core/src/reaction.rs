@@ -16,7 +16,7 @@ use crate::cholesky::{
 };
 use crate::contact::{Constraints, Response, Sliding};
 use crate::crease::ContactRow;
-use crate::error::{MtmError, Result};
+use crate::error::{MtmError, Result, Shortfall};
 use crate::mesh::{add, dot, scaled, sub};
 
 /// Steps of sweeps after which contact gives up: ten on smooth bone, a hundred on teeth.
@@ -271,8 +271,12 @@ impl Answers<'_> {
                     .map_err(|error| MtmError::NotConverged {
                         method: "contact by sweeps",
                         iterations: MOST_SWEEPS,
-                        error,
-                        tolerance: exact,
+                        shortfall: Shortfall {
+                            quantity: "the error of the contact nodes",
+                            value: error,
+                            limit: exact,
+                            unit: " mm",
+                        },
                         advice: "use method=\"pcg\"; contact normals or walls may be degenerate",
                     })?
             }

@@ -7,7 +7,7 @@
 use nalgebra::Matrix3;
 
 use crate::blocks::{Block, BlockMatrix};
-use crate::error::{MtmError, Result};
+use crate::error::{MtmError, Result, Shortfall};
 
 /// Sweeps over which the contraction of the steps is measured.
 const WINDOW: usize = 20;
@@ -34,7 +34,7 @@ pub struct RelaxationOutcome {
     pub sweeps: usize,
     /// Estimate of the error, mm: ρ/(1−ρ) times the last step, with ρ the measured contraction. Not a
     /// bound: a slow mode that has hardly moved yet does not show in the steps.
-    pub error_bound: f64,
+    pub error_estimate: f64,
     /// Largest step of each sweep, mm.
     pub steps: Vec<f64>,
 }
@@ -101,14 +101,23 @@ pub fn relax(
             bound = options.factor * step * contraction / (1.0 - contraction);
         }
         if bound <= options.tolerance {
-            return Ok(RelaxationOutcome { solution: x, sweeps: sweep, error_bound: bound, steps });
+            return Ok(RelaxationOutcome {
+                solution: x,
+                sweeps: sweep,
+                error_estimate: bound,
+                steps,
+            });
         }
     }
     Err(MtmError::NotConverged {
         method: "relaxation",
         iterations: options.max_sweeps,
-        error: bound,
-        tolerance: options.tolerance,
+        shortfall: Shortfall {
+            quantity: "the estimated error of a node",
+            value: bound,
+            limit: options.tolerance,
+            unit: " mm",
+        },
         advice: "use method=\"cholesky\" or \"pcg\"; node-wise relaxation is kept for comparison",
     })
 }

@@ -51,6 +51,21 @@ pub(crate) fn dot_and_largest(r: &[[f64; 3]], z: &[[f64; 3]]) -> (f64, f64) {
     (sum, largest.sqrt())
 }
 
+/// Largest Euclidean distance between the rows of `x` and `y`; not a number where one is not.
+pub(crate) fn farthest(x: &[[f64; 3]], y: &[[f64; 3]]) -> f64 {
+    let most = |m: f64, d: f64| if d > m || d.is_nan() { d } else { m };
+    let partial: Vec<f64> = x
+        .par_chunks(ROWS_PER_SUM)
+        .zip(y.par_chunks(ROWS_PER_SUM))
+        .map(|(x, y)| {
+            x.iter().zip(y).fold(0.0, |m, (x, y)| {
+                most(m, (0..3).map(|i| (x[i] - y[i]) * (x[i] - y[i])).sum::<f64>())
+            })
+        })
+        .collect();
+    partial.into_iter().fold(0.0, most).sqrt()
+}
+
 /// `q = A p` and `pᵀq` in one sweep.
 pub(crate) fn multiply_and_dot(a: &BlockMatrix, p: &[[f64; 3]], q: &mut [[f64; 3]]) -> f64 {
     let partial: Vec<f64> = q

@@ -7,16 +7,19 @@ use crate::blocks::{Block, BlockMatrix};
 use crate::boundary::{Boundary, Motion, NodeKind, Plan};
 use crate::contact::{ContactState, Sliding};
 use crate::equilibrium::{Equilibrium, Slide};
-use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
-use crate::iterative::Effort;
+use crate::error::{ErrorKind, MtmError, Result, check_forces};
+use crate::iterative::{Effort, Extremes, is_doubtful};
 use crate::kinematics::Kinematics;
-use crate::mesh::{dot, norm, scaled, sub};
+use crate::mesh::{add, dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
 use crate::reduction::{NO_ROW, Reduction};
 use crate::restraint::{self, Held};
 use crate::solution::{Clock, ContactResult, Solution, Timings};
 use crate::system::{Frozen, System};
 use crate::tensors::MassTensors;
+
+/// Multiple of the correction of a solution by factor that stands for the error of the corrected one.
+const CORRECTION_SAFETY: f64 = 2.0;
 
 /// A patient's tensors and node kinds, ready for any plan.
 pub struct StaticSolver {
@@ -26,6 +29,8 @@ pub struct StaticSolver {
     pub(crate) node_kinds: Arc<Boundary>,
     options: StaticOptions,
     method: Method,
+    /// Whether solutions by factor are corrected once.
+    refines: bool,
     pub(crate) reduction: Reduction,
     pub(crate) sliding: Option<Sliding>,
     mechanics: Mechanics,
@@ -95,7 +100,10 @@ impl StaticSolver {
                 &reduction.rows(places),
                 sliding.as_ref(),
                 held,
-                tensors.tissue().largest_lame_ratio(),
+                Extremes {
+                    lame_ratio: tensors.tissue().largest_lame_ratio(),
+                    contrast: tensors.tissue().contrast(),
+                },
                 &options,
                 &mut clock,
                 interrupted,
@@ -106,12 +114,16 @@ impl StaticSolver {
                 .map(|(body, method)| (Mechanics::LargeRotation(Box::new(body)), method))
         };
         let (mechanics, method) = made.map_err(|e| by_node(e, &reduction.unknowns))?;
+        let refines = method == Method::Cholesky
+            && options.kinematics == Kinematics::Linear
+            && is_doubtful(tensors.tissue().contrast());
         Ok(Self {
             tensors,
             boundary,
             node_kinds,
             options,
             method,
+            refines,
             reduction,
             sliding,
             mechanics,
@@ -194,12 +206,13 @@ impl StaticSolver {
         for (&j, v) in self.reduction.unknowns.iter().zip(&rows) {
             u[j as usize] = *v;
         }
-        let forces = match &self.mechanics {
-            Mechanics::Linear(_) => self.tensors.matrix().multiply(&u),
-            Mechanics::LargeRotation(body) => body.forces(&u)?,
-        };
+        let mut forces = self.forces(&u)?;
+        if self.refines && contact.is_none() {
+            self.refine(&mut u, &forces, loads, &mut effort, interrupted)?;
+            forces = self.forces(&u)?;
+        }
         let residual = self.residual(&forces, loads, contact.as_ref(), &b);
-        if !(residual.is_finite() && effort.error_bound.is_finite()) {
+        if !(residual.is_finite() && effort.error_estimate.is_finite()) {
             return Err(MtmError::NotPositiveDefinite {
                 node: 0,
                 detail: "the solution is not finite; the plan or the moduli overflow f64".into(),
@@ -218,13 +231,47 @@ impl StaticSolver {
             displacements: u,
             forces,
             residual,
-            error_bound: effort.error_bound,
+            error_estimate: effort.error_estimate,
             iterations: effort.iterations,
             residual_history: effort.history,
             contact: self.contact_result(contact),
             contact_iterations,
             timings,
         })
+    }
+
+    /// Internal forces under displacements of all nodes, N.
+    fn forces(&self, u: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
+        match &self.mechanics {
+            Mechanics::Linear(_) => Ok(self.tensors.matrix().multiply(u)),
+            Mechanics::LargeRotation(body) => body.forces(u),
+        }
+    }
+
+    /// Adds to `u` what its own forces out of balance still bring, and counts it as error: where stiff and
+    /// soft tissue are mixed, a solution may lose digits that the known one of the factor kept.
+    fn refine(
+        &self,
+        u: &mut [[f64; 3]],
+        forces: &[[f64; 3]],
+        loads: Option<&[[f64; 3]]>,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<()> {
+        let Mechanics::Linear(system) = &self.mechanics else { return Ok(()) };
+        let out_of_balance = |&j: &u32| {
+            let f = scaled(forces[j as usize], -1.0);
+            loads.map_or(f, |rows| add(rows[j as usize], f))
+        };
+        let b: Vec<[f64; 3]> = self.reduction.unknowns.iter().map(out_of_balance).collect();
+        let correction = system.solve(&b, 0.0, &mut Effort::default(), interrupted)?;
+        let mut largest = 0.0_f64;
+        for (&j, d) in self.reduction.unknowns.iter().zip(&correction) {
+            u[j as usize] = add(u[j as usize], *d);
+            largest = largest.max(norm(*d));
+        }
+        effort.error_estimate = effort.error_estimate.max(CORRECTION_SAFETY * largest);
+        Ok(())
     }
 
     /// Displacements of all nodes with the prescribed ones filled in, mm.
@@ -265,7 +312,7 @@ impl StaticSolver {
                 kind: ErrorKind::Boundary,
             });
         }
-        check_finite_rows("loads", loads, ErrorKind::Boundary)?;
+        check_forces("loads", loads, ErrorKind::Boundary)?;
         let mut out = loads.to_vec();
         out.resize(n, [0.0; 3]);
         Ok(out)

@@ -13,7 +13,7 @@ use parry3d_f64::math::Vector;
 use parry3d_f64::partitioning::{Bvh, BvhBuildStrategy, BvhNode};
 use rayon::prelude::*;
 
-use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
+use crate::error::{ErrorKind, MtmError, Result, check_coordinates};
 use crate::topology::{NO_TRIANGLE, Topology};
 use crate::triangle::{self, Facet, TrianglePoint, Vec3};
 pub use crate::triangle::{DEGENERATE_AREA, Feature};
@@ -135,7 +135,7 @@ impl Surface {
         if triangles.is_empty() {
             return Err(MtmError::Empty { what: "surface triangles", kind });
         }
-        check_finite_rows("surface vertices", &vertices, kind)?;
+        check_coordinates("surface vertices", &vertices, kind)?;
         for (row, vertex) in triangles.iter().enumerate() {
             if let Some(&index) = vertex.iter().find(|&&v| v as usize >= vertices.len()) {
                 return Err(MtmError::IndexOutOfRange {
@@ -174,7 +174,7 @@ impl Surface {
                 kind: ErrorKind::Boundary,
             });
         }
-        check_finite_rows("moved vertices", &vertices, ErrorKind::Boundary)?;
+        check_coordinates("moved vertices", &vertices, ErrorKind::Boundary)?;
         let facets = facets(&vertices, &self.topology.triangles)?;
         // The tree of the rest shape with new boxes: neighbours stay neighbours.
         let mut bvh = self.shape.bvh.clone();

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use crate::blocks::{Block, BlockMatrix};
 use crate::element::{Element, ElementNodes};
-use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
+use crate::error::{ErrorKind, MtmError, Result, check_displacements};
 use crate::material::{Lame, Spencer, TetMaterial, Tissue, Voigt};
 use crate::mesh::{TetGeometry, TetMesh, dot};
 use crate::nodal_pressure::{Patches, split};
@@ -217,7 +217,7 @@ impl MassTensors {
                 kind,
             });
         }
-        check_finite_rows("displacements", displacements, kind)
+        check_displacements("displacements", displacements, kind)
     }
 }
 

@@ -224,7 +224,7 @@ def _add_scene_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     )
     solve.add_argument("--method", choices=METHODS, help="instead of the scene's own")
     solve.add_argument("--contact", choices=CONTACTS, help="instead of the scene's own")
-    solve.add_argument("--tolerance", type=float, help="relative error bound, iterative methods")
+    solve.add_argument("--tolerance", type=float, help="relative error, iterative methods")
     solve.add_argument(
         "--plan", metavar="PLAN", type=Path, help="plan.toml or plan.json instead of the scene's"
     )

@@ -41,7 +41,8 @@ def solve(options: argparse.Namespace) -> int:
     print(f"solved        {summary['n_tets']} tets, {summary['n_unknowns']} unknowns")
     print(f"method        {summary['method']}, {summary['iterations']} iterations")
     print(
-        f"residual      {summary['residual']:.2e} (error at most {summary['error_bound']:.2e} mm)"
+        f"residual      {summary['residual']:.2e} "
+        f"(error {summary['error_estimate']:.2e} mm, estimated)"
     )
     if len(result.contact_nodes):
         print(

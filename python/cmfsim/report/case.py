@@ -351,12 +351,20 @@ def _model_section(
                 solved["method"],
                 number(solved["n_unknowns"]),
                 number(solved["residual"]),
-                number(solved.get("error_estimate", solved.get("error_bound"))),
+                number(solved["error_estimate"]),
                 number(solved["contact_iterations"]),
                 number(solved["contact_gap"]),
             )
         )
-    columns = ("model", "method", "unknowns", "residual", "error ≤ mm", "contact its.", "gap, mm")
+    columns = (
+        "model",
+        "method",
+        "unknowns",
+        "residual",
+        "error, mm (estimated)",
+        "contact its.",
+        "gap, mm",
+    )
     solved_table = Table(columns, tuple(rows), "How the equations were solved.")
     segments = tuple(
         (name, number(held["joined"]), number(held["sliding"]))

@@ -6,7 +6,7 @@
 
 mod sliding;
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use crate::blocks::BlockMatrix;
 use crate::cholesky::Symbolic;
@@ -14,9 +14,9 @@ use crate::constraints::{
     Constraint, add_offsets, along_normals, orthonormal, projected, projected_rhs,
 };
 use crate::contact::{Constraints, ContactState, Response, Sliding};
-use crate::error::{ErrorKind, MtmError, Result};
-use crate::iterative::Effort;
-use crate::krylov::{PcgOptions, Preconditioner, pcg};
+use crate::error::{ErrorKind, MtmError, Result, Shortfall};
+use crate::iterative::{Confirmed, Effort, Extremes, is_doubtful};
+use crate::krylov::{PcgOptions, Preconditioner, Spectrum};
 use crate::mesh::{add, dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
 use crate::multigrid::{Multigrid, MultigridOptions};
@@ -65,6 +65,7 @@ pub(crate) struct Equilibrium {
     tensors: Arc<MassTensors>,
     solver: TangentSolver,
     options: StaticOptions,
+    tissue: Extremes,
 }
 
 /// What the boundary asks for.
@@ -154,7 +155,11 @@ impl Equilibrium {
         };
         clock.lap("ordering", method == Method::Cholesky);
         let energy = StrainEnergy::new(tensors.clone(), options.kinematics);
-        Ok((Self { energy, tensors, solver, options: *options }, method))
+        let tissue = Extremes {
+            lame_ratio: tensors.tissue().largest_lame_ratio(),
+            contrast: tensors.tissue().contrast(),
+        };
+        Ok((Self { energy, tensors, solver, options: *options, tissue }, method))
     }
 
     /// Bytes of a factor; 0 for conjugate gradients, which keep nothing from one tangent to the next.
@@ -339,12 +344,13 @@ impl Equilibrium {
             let bound = ending.filter(|_| length <= goal).unwrap_or(bound);
             ending = (bound <= goal).then_some(bound);
             if ending.is_some() && allowed <= finest {
-                effort.error_bound = bound;
+                effort.error_estimate = bound;
                 return Ok(moved_by(reduction, &pose.u, &step.rows, 1.0));
             }
             pose = self.search(reduction, pose, target, &step, kind, on_walls)?;
         }
-        Err(self.lost(length, target.scale))
+        let limit = self.options.tolerance * reach(&pose, target);
+        Err(lost("the estimated error of a node", length, limit, " mm"))
     }
 
     /// The state at the end of `step`, shortened until it lies downhill but for its slack.
@@ -388,7 +394,7 @@ impl Equilibrium {
             }
             share *= 0.5;
         }
-        Err(self.lost(step.length(), target.scale))
+        Err(lost("the share of the last step that lowers the energy", share, SHORTEST, ""))
     }
 
     /// Error that the next step from `pose` may have, mm, after one of `length`; 0 by a factor.
@@ -399,16 +405,6 @@ impl Equilibrium {
         let reach = reach(pose, target);
         let least = STEP_TOLERANCE * self.options.tolerance * reach;
         (STEP_SHARE * length.min(reach)).max(least)
-    }
-
-    fn lost(&self, length: f64, scale: f64) -> MtmError {
-        MtmError::NotConverged {
-            method: "newton",
-            iterations: MAX_STEPS,
-            error: length,
-            tolerance: self.options.tolerance * scale,
-            advice: "divide the plan into smaller moves, mend flat tets, or use kinematics=\"linear\"",
-        }
     }
 
     /// Merit and slope at displacements `u`.
@@ -432,7 +428,8 @@ impl Equilibrium {
             merit += 0.5 * spring.stiffness * stretch * stretch;
         }
         if !merit.is_finite() {
-            return Err(self.lost(f64::INFINITY, target.scale));
+            let limit = self.options.tolerance * target.scale;
+            return Err(lost("the estimated error of a node", f64::INFINITY, limit, " mm"));
         }
         Ok(Pose { u, merit, size, slope })
     }
@@ -513,7 +510,26 @@ impl Equilibrium {
             ..defaults
         };
         let start = vec![[0.0; 3]; rhs.len()];
-        Ok(pcg(matrix, rhs, &start, &multigrid, &options, interrupted)?.solution)
+        let confirmed = Confirmed {
+            a: matrix,
+            preconditioner: &multigrid,
+            trial: &OnceLock::new(),
+            doubtful: is_doubtful(self.tissue.contrast),
+            relative: options.tolerance / far,
+        };
+        let seen = &mut Spectrum::default();
+        let reached = confirmed.solve(rhs, &start, &options, None, seen, interrupted)?;
+        Ok(reached.into_outcome().solution)
+    }
+}
+
+/// That Newton's method did not bring `quantity` to `limit`.
+fn lost(quantity: &'static str, value: f64, limit: f64, unit: &'static str) -> MtmError {
+    MtmError::NotConverged {
+        method: "newton",
+        iterations: MAX_STEPS,
+        shortfall: Shortfall { quantity, value, limit, unit },
+        advice: "divide the plan into smaller moves, fix flat tets, or use kinematics=\"linear\"",
     }
 }
 

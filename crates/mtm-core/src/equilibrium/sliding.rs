@@ -106,7 +106,7 @@ impl Equilibrium {
             &reduction.rows(self.tensors.element_nodes().positions()),
             Some(slide.sliding),
             slide.held,
-            self.tensors.tissue().largest_lame_ratio(),
+            self.tissue,
             &options,
             &mut Clock::new(),
             interrupted,

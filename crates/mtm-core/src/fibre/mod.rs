@@ -380,6 +380,7 @@ fn principal_direction(a: &Matrix3<f64>, otherwise: Vec3) -> Vec3 {
     if size <= f64::EPSILON * mean.abs() {
         return otherwise;
     }
+    // A rounding of the angle near 0 is lost in its cosine.
     let half_determinant = (0.5 * deviator.determinant() / size.powi(3)).clamp(-1.0, 1.0);
     let largest = 2.0 * size * (half_determinant.acos() / 3.0).cos();
     let m = deviator - Matrix3::identity() * largest;

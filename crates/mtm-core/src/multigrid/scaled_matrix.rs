@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::error_bound::tridiagonal_extremes;
+use crate::error_estimate::tridiagonal_extremes;
 use crate::row_sums::dot;
 use crate::simd::{Kernel, widest};
 

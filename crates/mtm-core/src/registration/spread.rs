@@ -2,33 +2,17 @@
 
 use nalgebra::Matrix3;
 
-use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
+use crate::error::{self, ErrorKind, MtmError, Result};
 use crate::triangle::Vec3;
-
-/// Largest coordinate, mm (1 km): squares and sums of it stay far from overflow.
-pub const LARGEST_COORDINATE: f64 = 1e6;
 
 /// Thickness of points over their longest extent below which they count as lying in a plane or line.
 ///
 /// At this limit, 0.015 mm in a head, no operator places points well enough to tell the direction.
 pub const FLAT_THICKNESS: f64 = 1e-4;
 
-/// Refuses NaN, infinity and coordinates beyond [`LARGEST_COORDINATE`], naming the row.
+/// Refuses NaN, infinity and coordinates that are too large, naming the row.
 pub(crate) fn check_coordinates(what: &str, points: &[[f64; 3]]) -> Result<()> {
-    let kind = ErrorKind::Registration;
-    check_finite_rows(what, points, kind)?;
-    for (index, point) in points.iter().enumerate() {
-        if let Some(&value) = point.iter().find(|x| x.abs() > LARGEST_COORDINATE) {
-            return Err(MtmError::OutOfRange {
-                what: what.to_owned(),
-                index,
-                value,
-                allowed: "-1e6 to 1e6 mm; check the units",
-                kind,
-            });
-        }
-    }
-    Ok(())
+    error::check_coordinates(what, points, ErrorKind::Registration)
 }
 
 /// Extents of points along their principal axes, ascending, mm: thickness, width, length.

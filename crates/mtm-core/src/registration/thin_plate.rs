@@ -80,7 +80,7 @@ impl ThinPlateSpline {
     ///
     /// # Errors
     /// [`MtmError::Length`] for sets of different size, [`MtmError::TooFewPoints`] and
-    /// [`MtmError::OutOfRange`] for their number, coordinates beyond [`LARGEST_COORDINATE`](super::spread::LARGEST_COORDINATE) and a
+    /// [`MtmError::OutOfRange`] for their number, coordinates beyond [`LARGEST_COORDINATE`](crate::error::LARGEST_COORDINATE) and a
     /// negative smoothing, [`MtmError::NotFinite`], [`MtmError::CoincidentPoints`] and
     /// [`MtmError::FlatPoints`] for the source.
     pub fn new(source: Vec<[f64; 3]>, target: Vec<[f64; 3]>, smoothing: f64) -> Result<Self> {
@@ -131,7 +131,7 @@ impl ThinPlateSpline {
     ///
     /// # Errors
     /// [`MtmError::NotFinite`] and, for a coordinate beyond
-    /// [`LARGEST_COORDINATE`](super::spread::LARGEST_COORDINATE),
+    /// [`LARGEST_COORDINATE`](crate::error::LARGEST_COORDINATE),
     /// [`MtmError::OutOfRange`] with the row.
     pub fn warp(&self, points: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
         check_coordinates("points", points)?;

@@ -317,5 +317,7 @@ pub fn shape(x: [[f64; 3]; 4]) -> f64 {
         .map(|n| scaled(n, 1.0 / norm(n)));
     let largest_cosine =
         pairs().map(|[f, g]| -dot(normals[f], normals[g])).fold(f64::NEG_INFINITY, f64::max);
+    // The arc cosine is coarse near 0 (1e-8 rad), where a tet is worthless however flat; better shapes are far
+    // from there, and equal ones stay equal.
     largest_cosine.clamp(-1.0, 1.0).acos()
 }

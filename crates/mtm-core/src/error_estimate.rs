@@ -1,15 +1,24 @@
 //! How far an iterate of conjugate gradients is from the solution, and when that is near enough.
 //!
 //! The coefficients of the iteration spell out a Lanczos matrix of the preconditioned system: its
-//! smallest eigenvalue (Ritz value) turns a residual into a bound of the error.
+//! smallest eigenvalue (Ritz value) turns a residual into an estimate of the error. It is no bound: Ritz
+//! values lie above the spectrum, and a slow motion that the residual hardly holds shows in them late.
 
-/// Fraction of the smallest Ritz value taken as a lower bound of the spectrum (Ritz values approach
-/// it from above).
+/// Fraction of the smallest Ritz value taken as the lower end of the spectrum (Ritz values approach it from
+/// above).
 const RITZ_SAFETY: f64 = 0.5;
+/// Ratio of the extreme Ritz values up to which that fraction serves; beyond, it falls with the root. Soft
+/// tissue with muscles has 6 to 8.
+const RITZ_SPREAD: f64 = 10.0;
+/// Ratio of the extreme Ritz values above which an estimate is not believed without a trial.
+const DOUBTFUL_SPREAD: f64 = 40.0;
+/// Multiple of the largest error over preconditioned residual of a trial that stands for that of any
+/// solution.
+const TRIAL_AMPLIFICATION: f64 = 4.0;
 /// Relative change of the smallest Ritz value, over the last [`RITZ_WINDOW`] of all iterations, below
 /// which it counts as resolved.
 const RITZ_SETTLED: f64 = 0.1;
-/// Power of the fall of the smallest Ritz value over that window by which the bounds count as larger
+/// Power of the fall of the smallest Ritz value over that window by which the estimates count as larger
 /// where it is not resolved: it may go on to fall as much several times more.
 const RITZ_DOUBT: i32 = 4;
 /// Share of all iterations over which the smallest Ritz value must stay put. A share, not a number: a
@@ -17,30 +26,33 @@ const RITZ_DOUBT: i32 = 4;
 const RITZ_WINDOW: f64 = 0.3;
 /// Fewest iterations over which it must.
 const RITZ_WINDOW_MIN: usize = 3;
-/// Fewest iterations without any decrease of the error bound that count as stagnation; the block-Jacobi
-/// method may need hundreds before the bound first falls.
-const STAGNATION_ITERATIONS: usize = 500;
+/// Fewest iterations without any decrease of the estimated error that count as stagnation; the
+/// block-Jacobi method may need hundreds before it first falls.
+pub(crate) const STAGNATION_ITERATIONS: usize = 500;
 /// How often the iteration may restart from the true residual.
 const MAX_RESTARTS: usize = 5;
-/// Share of the last true bound that a restart must get below, or the round-off floor is reached.
-const FLOOR_PROGRESS: f64 = 0.5;
+/// Share of the error at the last restart that the next must get below, or the round-off floor is
+/// reached.
+pub(crate) const FLOOR_PROGRESS: f64 = 0.5;
 /// Relative energy `√(rᵀz / r₀ᵀz₀)` at which nothing but round-off is left.
 const ROUND_OFF: f64 = 1e-15;
 /// Bisection steps for an extreme eigenvalue of a tridiagonal matrix.
 const BISECTIONS: usize = 40;
+/// Relative change of an extreme eigenvalue that is not looked for.
+const EXTREME_CHANGE: f64 = 1e-6;
 /// Smallest ratio of extreme eigenvalues that the bisection looks for.
 const SPECTRUM_RANGE: f64 = 1e-14;
 
 /// When [`pcg`](crate::krylov::pcg) stops.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PcgOptions {
-    /// Largest error of a node, mm; for example 1e-9 of the largest prescribed displacement.
+    /// Largest estimated error of a node, mm; for example 1e-9 of the largest prescribed displacement.
     pub tolerance: f64,
-    /// Error in the energy norm, relative to the energy norm of the solution.
+    /// Estimated error in the energy norm, relative to the energy norm of the solution.
     pub energy_tolerance: f64,
     /// Iterations after which the method gives up.
     pub max_iterations: usize,
-    /// Iterations before which no bound is believed: the smallest Ritz value must be resolved first.
+    /// Iterations before which no estimate is believed: the smallest Ritz value must be resolved first.
     pub min_iterations: usize,
     /// Multiple of both tolerances still accepted once round-off stops all further progress.
     pub slack: f64,
@@ -59,7 +71,7 @@ impl Default for PcgOptions {
 }
 
 impl PcgOptions {
-    /// Both bounds over their tolerances, the larger of the two; infinite if not a number.
+    /// Both estimates over their tolerances, the larger of the two; infinite if not a number.
     pub(crate) fn excess(&self, error_mm: f64, energy_error: f64) -> f64 {
         let excess = (error_mm / self.tolerance).max(energy_error / self.energy_tolerance);
         if excess.is_nan() { f64::INFINITY } else { excess }
@@ -72,7 +84,7 @@ pub(crate) struct StoppingRule<'a> {
     options: &'a PcgOptions,
     /// rᵀz at the start.
     first_rz: f64,
-    /// The lowest bound since the last restart, mm, and its iteration.
+    /// The lowest estimate since the last restart, mm, and its iteration.
     best: (f64, usize),
     /// Excess of the true residual at the last restart.
     verified: f64,
@@ -82,11 +94,11 @@ pub(crate) struct StoppingRule<'a> {
 /// Why the true residual is due.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Due {
-    /// Factor by which the bounds count as larger: one where the spectrum is resolved, see
+    /// Factor by which the estimates count as larger: one where the spectrum is resolved, see
     /// [`Spectrum::doubt`].
     pub(crate) doubt: f64,
     /// Whether no iteration is left.
-    exhausted: bool,
+    pub(crate) exhausted: bool,
 }
 
 /// What the true residual leads to.
@@ -107,7 +119,7 @@ impl<'a> StoppingRule<'a> {
 
     /// The reason, if there is one, to look at the true residual after so many iterations.
     ///
-    /// `error_mm`: bound as the recurrence carries it. `excess`: see [`PcgOptions::excess`]; asked
+    /// `error_mm`: estimate as the recurrence carries it. `excess`: see [`PcgOptions::excess`]; asked
     /// only if all else is met.
     pub(crate) fn due(
         &mut self,
@@ -133,7 +145,7 @@ impl<'a> StoppingRule<'a> {
         (met || floor || stagnant || exhausted).then_some(Due { doubt, exhausted })
     }
 
-    /// What follows from the bounds of the true residual.
+    /// What follows from the estimates by the true residual.
     pub(crate) fn verdict(
         &mut self,
         due: Due,
@@ -160,7 +172,7 @@ impl<'a> StoppingRule<'a> {
 /// The Lanczos matrix of `M⁻¹ A` that the coefficients of the iteration spell out.
 ///
 /// It may outlive a solution, for the next of a system that differs little.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, Clone)]
 pub(crate) struct Spectrum {
     alphas: Vec<f64>,
     betas: Vec<f64>,
@@ -170,7 +182,12 @@ pub(crate) struct Spectrum {
     pub(crate) smallest: f64,
     /// Largest Ritz value over all restarts.
     pub(crate) largest: f64,
+    /// Extreme Ritz values since the last restart.
+    extremes: Option<[f64; 2]>,
     recent: Vec<f64>,
+    /// Largest error over preconditioned residual that a trial showed, both in the largest norm of a node;
+    /// 0 without one.
+    amplification: f64,
 }
 
 impl Spectrum {
@@ -180,6 +197,38 @@ impl Spectrum {
         self.betas.clear();
         self.diagonal.clear();
         self.off_squared.clear();
+        self.extremes = None;
+    }
+
+    /// Notes that an error of a known solution was `ratio` times its preconditioned residual.
+    pub(crate) fn amplified(&mut self, ratio: f64) {
+        self.amplification = self.amplification.max(ratio);
+    }
+
+    /// Takes over what a trial with the same operator showed.
+    pub(crate) fn learn(&mut self, trial: &Self) {
+        if self.amplification >= trial.amplification && self.smallest <= trial.smallest {
+            return;
+        }
+        if self.recent.len() < trial.recent.len() {
+            self.recent.clone_from(&trial.recent);
+        }
+        self.amplified(trial.amplification);
+        if trial.smallest > 0.0 {
+            let own = if self.smallest > 0.0 { self.smallest } else { f64::INFINITY };
+            self.smallest = own.min(trial.smallest);
+        }
+        self.largest = self.largest.max(trial.largest);
+    }
+
+    /// Whether the spectrum is so wide that a slow motion may hide in it.
+    pub(crate) fn is_wide(&self) -> bool {
+        self.spread() > DOUBTFUL_SPREAD
+    }
+
+    /// Largest Ritz value over the smallest; 1 before the first iteration.
+    fn spread(&self) -> f64 {
+        if self.smallest > 0.0 { self.largest / self.smallest } else { 1.0 }
     }
 
     /// T has 1/α_k + β_{k−1}/α_{k−1} on the diagonal and √β_k/α_k beside it.
@@ -194,13 +243,15 @@ impl Spectrum {
         }
         self.alphas.push(alpha);
         self.betas.push(beta);
-        let [low, high] = tridiagonal_extremes(&self.diagonal, &self.off_squared);
+        let [low, high] =
+            extremes_after(self.extremes, &self.diagonal, &self.off_squared, EXTREME_CHANGE);
+        self.extremes = Some([low, high]);
         self.smallest = if self.smallest > 0.0 { self.smallest.min(low) } else { low };
         self.largest = self.largest.max(high);
         self.recent.push(self.smallest);
     }
 
-    /// Factor of doubt in the bounds: one where the smallest Ritz value has come to rest, a power of its
+    /// Factor of doubt in the estimates: one where the smallest Ritz value has come to rest, a power of its
     /// recent fall where it has not, infinite where too little is known.
     pub(crate) fn doubt(&self) -> f64 {
         let window = RITZ_WINDOW_MIN.max((RITZ_WINDOW * self.recent.len() as f64) as usize);
@@ -213,17 +264,19 @@ impl Spectrum {
 
     /// A lower end of the spectrum, as far as it has shown.
     fn lower_end(&self) -> f64 {
-        if self.smallest > 0.0 { RITZ_SAFETY * self.smallest } else { RITZ_SAFETY }
+        let safety =
+            RITZ_SAFETY * (RITZ_SPREAD / self.spread().min(DOUBTFUL_SPREAD)).sqrt().min(1.0);
+        if self.smallest > 0.0 { safety * self.smallest } else { RITZ_SAFETY }
     }
 
     /// Estimated largest error of a node: e = A⁻¹ r = (M⁻¹A)⁻¹ z.
     ///
     /// `largest_z`: largest row norm of z, mm.
     pub(crate) fn error_mm(&self, largest_z: f64) -> f64 {
-        largest_z / self.lower_end()
+        largest_z * (1.0 / self.lower_end()).max(TRIAL_AMPLIFICATION * self.amplification)
     }
 
-    /// Bound of the error in the energy norm, relative to that of the solution.
+    /// Estimate of the error in the energy norm, relative to that of the solution.
     ///
     /// `rz`: rᵀz. `energy`: ‖x‖_A² of the solution, N mm.
     pub(crate) fn energy_error(&self, rz: f64, energy: f64) -> f64 {
@@ -251,6 +304,17 @@ impl Spectrum {
 ///
 /// `off_squared`: squares of the entries beside the diagonal, one fewer than `diagonal`.
 pub(crate) fn tridiagonal_extremes(diagonal: &[f64], off_squared: &[f64]) -> [f64; 2] {
+    extremes_after(None, diagonal, off_squared, 0.0)
+}
+
+/// [`tridiagonal_extremes`] of a matrix that grew by one row since its extremes were `before`: they have
+/// moved apart (Cauchy's interlacing), mostly by less than the relative `change` that is not looked for.
+fn extremes_after(
+    before: Option<[f64; 2]>,
+    diagonal: &[f64],
+    off_squared: &[f64],
+    change: f64,
+) -> [f64; 2] {
     let n = diagonal.len();
     let mut bounds = [f64::INFINITY, f64::NEG_INFINITY];
     for i in 0..n {
@@ -284,7 +348,10 @@ pub(crate) fn tridiagonal_extremes(diagonal: &[f64], off_squared: &[f64]) -> [f6
         }
         0.5 * (low + high)
     };
-    [bisect(1), bisect(n)]
+    let Some([low, high]) = before else { return [bisect(1), bisect(n)] };
+    let same_low = below(low * (1.0 - change)) == 0;
+    let same_high = below(high * (1.0 + change)) == n;
+    [if same_low { low } else { bisect(1) }, if same_high { high } else { bisect(n) }]
 }
 
 #[cfg(test)]
