@@ -68,8 +68,8 @@ machine.
   It is checked against the residual in 32 digits. It says little about the error where κ is large.
 - **error** is the largest distance of a node from its reference position over the largest
   displacement.
-- **estimate** is `result.error_estimate` over the largest displacement: no bound (*Error estimates*
-  below).
+- **estimate** is `result.error_estimate` over the largest displacement: no bound
+  ([error estimates](error_estimates.md)).
 - **verdict**: *ok*, *refused* with the error raised, or **WRONG**.
 
 What is *ok*, with ε = 2.2e-16: Cholesky's error is within the larger of {ERROR_LIMIT:.0e} and

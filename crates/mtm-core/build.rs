@@ -90,7 +90,11 @@ mod metis {
         let found = manifest(&["--offline"]).or_else(|_| manifest(&[]));
         let manifest = found.unwrap_or_else(|error| panic!("the sources of METIS: {error}"));
         let vendor = manifest.with_file_name(VENDOR);
-        assert!(vendor.is_dir(), "{}: no such folder, so METIS cannot be compiled", vendor.display());
+        assert!(
+            vendor.is_dir(),
+            "{}: no such folder, so METIS cannot be compiled",
+            vendor.display()
+        );
         vendor
     }
 
