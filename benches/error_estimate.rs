@@ -7,6 +7,7 @@
 //! status is 1 if any estimate failed.
 
 #[path = "../tests/rust/meshes/mod.rs"]
+#[allow(clippy::unwrap_used)] // as in the tests, which share them
 mod meshes;
 mod random_scenes;
 
@@ -164,7 +165,7 @@ fn judge(options: &Options, index: u64, checked: &AtomicUsize, apart: &Mutex<f64
         return Verdict::Unverified(index, scene.description);
     };
     let size = largest(&exact);
-    if index % CHECKED == 0
+    if index.is_multiple_of(CHECKED)
         && exact.len() <= CHECKED_NODES
         && let Some(other) = scene.factored_in_pairs()
     {

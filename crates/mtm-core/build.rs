@@ -1,9 +1,10 @@
 //! Compiles METIS (`metis/README.md`) where the feature `metis` is on.
 
-fn main() {
+fn main() -> Result<(), String> {
     println!("cargo:rerun-if-changed=build.rs");
     #[cfg(feature = "metis")]
-    metis::compile();
+    metis::compile()?;
+    Ok(())
 }
 
 #[cfg(feature = "metis")]
@@ -44,10 +45,10 @@ mod metis {
     ];
     const GKLIB: [&str; 5] = ["error.c", "mcore.c", "memory.c", "random.c", "timers.c"];
 
-    pub fn compile() {
+    pub fn compile() -> Result<(), String> {
         let own = Path::new(env!("CARGO_MANIFEST_DIR")).join("metis");
         println!("cargo:rerun-if-changed={}", own.display());
-        let vendor = vendored_sources();
+        let vendor = vendored_sources()?;
         let (libmetis, gklib) = (vendor.join("metis/libmetis"), vendor.join("GKlib"));
         let mut build = cc::Build::new();
         build.files(LIBMETIS.iter().map(|name| libmetis.join(name)));
@@ -80,22 +81,22 @@ mod metis {
             _ => {}
         }
         // Debug builds solve real meshes in tests, too.
-        build.opt_level(3).warnings(false).compile("cmfsim_metis");
+        build.opt_level(3).warnings(false);
+        build.try_compile("cmfsim_metis").map_err(|error| format!("METIS: {error}"))
     }
 
     /// The folder of the sources inside the crate that cargo fetched for this build.
-    fn vendored_sources() -> PathBuf {
+    fn vendored_sources() -> Result<PathBuf, String> {
         // Without the network first: cargo has what the build needs, but for crates of tests, which it
         // may have to fetch to answer.
         let found = manifest(&["--offline"]).or_else(|_| manifest(&[]));
-        let manifest = found.unwrap_or_else(|error| panic!("the sources of METIS: {error}"));
+        let manifest = found.map_err(|error| format!("the sources of METIS: {error}"))?;
         let vendor = manifest.with_file_name(VENDOR);
-        assert!(
-            vendor.is_dir(),
-            "{}: no such folder, so METIS cannot be compiled",
-            vendor.display()
-        );
-        vendor
+        if vendor.is_dir() {
+            Ok(vendor)
+        } else {
+            Err(format!("{}: no such folder, so METIS cannot be compiled", vendor.display()))
+        }
     }
 
     /// The manifest of the crate, as `cargo metadata` states it.

@@ -778,7 +778,7 @@ fn absurd_values_are_named() {
         let tissue = Tissue::isotropic(&[Elastic { young: value, poisson: 0.3 }]);
         assert_refused!(tissue, OutOfRange { .. }, Material, "young", "1e-15 to 1e12 MPa");
         let mut c = isotropic(1.0, 0.3).stiffness()[0];
-        c.iter_mut().flatten().for_each(|v| *v *= value);
+        c.iter_mut().flatten().for_each(|v| *v *= value.min(1e300));
         assert_refused!(Tissue::from_stiffness(vec![c]), OutOfRange { .. }, Material, "stiffness");
     }
     for value in [1e13, 1e160, 1e300, f64::MAX] {

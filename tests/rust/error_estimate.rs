@@ -3,6 +3,7 @@
 
 mod meshes;
 #[path = "../../benches/random_scenes.rs"]
+#[allow(dead_code)] // the bench sorts scenes by more than the test
 mod random_scenes;
 
 use mtm_core::error::MtmError;

@@ -91,6 +91,7 @@ mod tests {
     }
 
     #[test]
+    #[allow(clippy::unwrap_used)]
     fn each_process_of_a_line_has_one_pool_of_its_own() {
         let sums: Vec<_> = [11, 12, 13, 12, 11]
             .map(|process| pool_of(process).unwrap())
