@@ -20,7 +20,6 @@ def test_the_project_keeps_its_import_rules(capsys: pytest.CaptureFixture[str]) 
         ("crates/mtm-core/src/mesh.rs", "use crate::surface::Surface;", "mesh may not import"),
         ("crates/mtm-core/src/mesh.rs", "\nuse faer::Mat;", "mesh.rs:2: faer belongs in"),
         ("crates/mtm-core/src/contact.rs", "let t = parry3d_f64::shape();", "parry3d_f64 belongs"),
-        ("crates/mtm-core/src/cholesky.rs", "metis_sys::METIS_NodeND();", "metis_sys belongs"),
         ("crates/mtm-core/src/mesh.rs", "use pyo3::prelude::*;", "pyo3 belongs in crates/mtm-py"),
         ("crates/mtm-core/src/mesh.rs", "use crate::{error, blocks};", "one `use crate::"),
         ("crates/mtm-core/src/new.rs", "", "add it to CORE"),
