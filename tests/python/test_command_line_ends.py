@@ -267,7 +267,10 @@ def test_a_closed_pipe_ends_quietly(case, closing):
     """`cmfsim doctor case.toml | head -1` ended in a traceback."""
     word = f"'{sys.executable}' -m cmfsim doctor '{case}' -q; echo $? >&2"
     done = subprocess.run(
-        ["/bin/bash", "-c", f"({word}) | {closing}"], capture_output=True, check=False, text=True
+        ["/bin/bash", "-c", f"({word}) | {closing}"],
+        capture_output=True,
+        check=False,
+        encoding="utf-8",
     )
     assert "Traceback" not in done.stderr
     assert "Exception" not in done.stderr
@@ -283,7 +286,7 @@ def test_a_closed_or_full_standard_output_is_no_traceback(case):
             continue
         word = f"'{sys.executable}' -m cmfsim doctor '{case}' -q {line}"
         done = subprocess.run(
-            ["/bin/bash", "-c", word], capture_output=True, check=False, text=True
+            ["/bin/bash", "-c", word], capture_output=True, check=False, encoding="utf-8"
         )
         assert done.returncode == code, done.stderr
         assert "Traceback" not in done.stderr

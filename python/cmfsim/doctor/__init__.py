@@ -46,7 +46,7 @@ class Examination:
         Errors first, then warnings and notes.
     plan : mapping of str to ClinicalMotion
         How each segment moves that the plan names, as far as it can be read. Empty for a plan that
-        is read off the bones after the operation.
+        is read off the bones after the operation, and where the files do not lie in one frame.
     """
 
     findings: tuple[Finding, ...]
@@ -108,10 +108,11 @@ def examine(case: CaseOrPath, models: Sequence[str] | None = None) -> Examinatio
     placement = check_placement(evidence)
     findings += placement
     findings += [*check_image(evidence), *check_surfaces(evidence)]
-    pieces = pieces_of(evidence)
-    plan = state_plan(evidence, pieces)
+    plan: dict[str, ClinicalMotion] = {}
     # Distances between things in different frames say nothing.
     if not any(finding.severity == "error" for finding in placement):
+        pieces = pieces_of(evidence)
+        plan = state_plan(evidence, pieces)
         findings += check_mesh_size(evidence)
         findings += check_plan(evidence, plan, pieces)
         findings += check_ends(evidence)

@@ -25,6 +25,8 @@ __all__ = ["Body", "Evidence", "gather"]
 
 # Points of a surface that distances are measured at; a few thousand describe a skull.
 MAX_SAMPLES = 20_000
+# No head or bone is longer, mm: ten times what the check of sizes lets pass.
+FAR_TOO_LONG = 4200.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +150,9 @@ def gather(case: Case) -> Evidence:
         files = {"skin": case.surfaces.skin}
         files |= {f"bones.{name}": path for name, path in case.surfaces.bones.items()}
         for key, path in files.items():
-            body = _body(case, case.surfaces, key, path, findings)
+            # A bone's size is checked against the skin's.
+            is_sized = key == "skin" or skin is not None
+            body = _body(case, case.surfaces, key, path, findings, is_sized=is_sized)
             if body is None:
                 continue
             if key == "skin":
@@ -211,7 +215,13 @@ def gather(case: Case) -> Evidence:
 
 
 def _body(
-    case: Case, given: CaseSurfaces, key: str, path: Path, findings: list[Finding]
+    case: Case,
+    given: CaseSurfaces,
+    key: str,
+    path: Path,
+    findings: list[Finding],
+    *,
+    is_sized: bool,
 ) -> Body | None:
     where = f"{case.where(f'surfaces.{key}')} ({path.name})"
     if not _check_file(case, f"surfaces.{key}", path, findings):
@@ -220,7 +230,9 @@ def _body(
         surface = read_surface(path, units=given.units, frame=given.frame)
         body = Body(key.removeprefix("bones."), where, surface)
         # Triangles that are all without area pass the reader and fail when the surface is mended.
-        _ = body.index
+        # Coordinates in a wrong unit may fail too; the check of sizes reports the unit.
+        if not (is_sized and np.ptp(surface.vertices, axis=0).max() > FAR_TOO_LONG):
+            _ = body.index
     except CmfsimError as error:
         findings.append(
             Finding(
