@@ -39,7 +39,7 @@ class Scene:
     contact : str
         "bilateral" or "unilateral".
     gap : float, mm
-    contact_tolerance : float
+    contact_tolerance : float, mm
     may_not_settle : bool
         Whether contact may find no rest, and be refused.
     bend : float, degrees
@@ -52,7 +52,7 @@ class Scene:
     moves: Mapping[str, Floats]
     contact: str = "bilateral"
     gap: float = 0.0
-    contact_tolerance: float = 1e-9
+    contact_tolerance: float = 1e-7
     may_not_settle: bool = False
     bend: float = 0.0
 

@@ -250,8 +250,8 @@ class StaticSolver:
         contact: str = "bilateral",
         tolerance: float = 1e-8,
         max_iterations: int | None = None,
-        contact_tolerance: float = 1e-9,
-        contact_iterations: int = 100,
+        contact_tolerance: float = 1e-4,
+        contact_iterations: int = 50,
         memory_limit: float | None = None,
         kinematics: str = "linear",
     ) -> StaticSolver: ...
@@ -307,7 +307,9 @@ class Solution:
     @property
     def contact_gaps(self) -> _Floats: ...
     @property
-    def contact_walls(self) -> NDArray[np.uint8]: ...
+    def contact_unbalanced(self) -> float: ...
+    @property
+    def contact_converged(self) -> bool: ...
     @property
     def timings(self) -> dict[str, float]: ...
 

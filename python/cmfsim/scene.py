@@ -270,9 +270,11 @@ class SolverOptions:
     tolerance : float
         Estimated error of the iterative methods, over the length of the motion.
     max_iterations : int or None
-    contact_tolerance : float
-        Largest gap over the diagonal of the mesh, and largest tangential share of contact forces.
+    contact_tolerance : float, mm
+        Largest distance of a held node from its contact surface; a tenth of it is the way that the
+        force along the surface may still move any node by itself.
     contact_iterations : int
+        Newton steps of the contact solver.
     memory_limit : float or None, MB
     element : str
         "p1", "anp" or "p2", as `cmfsim.MassTensors` takes it.
@@ -290,8 +292,8 @@ class SolverOptions:
     contact: str = "bilateral"
     tolerance: float = 1e-8
     max_iterations: int | None = None
-    contact_tolerance: float = 1e-9
-    contact_iterations: int = 100
+    contact_tolerance: float = 1e-4
+    contact_iterations: int = 50
     memory_limit: float | None = None
     element: str = "p1"
     kinematics: str = "linear"

@@ -20,6 +20,7 @@ from cmfsim._core import (
     Tissue,
     __version__,
 )
+from cmfsim.case import Finding
 from cmfsim.scene import MovedSurface, Scene, SceneResult, SurfaceData, TissueData
 
 __all__ = ["scene_plan", "scene_solver", "solve_scene"]
@@ -144,6 +145,7 @@ def solve_scene(scene: Scene) -> SceneResult:
         solution.error_estimate,
     )
     inverted, findings = _inverted(solver, solution)
+    findings += _contact_findings(solution)
     summary: dict[str, Any] = {
         "scene_sha256": scene.sha256(),
         "n_nodes": scene.n_nodes,
@@ -158,6 +160,8 @@ def solve_scene(scene: Scene) -> SceneResult:
         "error_estimate": _finite(solution.error_estimate),
         "iterations": solution.iterations,
         "contact_gap": _finite(solution.contact_gap),
+        "contact_unbalanced": _finite(solution.contact_unbalanced),
+        "contact_converged": solution.contact_converged,
         "contact_iterations": solution.contact_iterations,
         "inverted_tets": inverted,
         "findings": findings,
@@ -194,12 +198,31 @@ def _inverted(solver: StaticSolver, solution: Solution) -> tuple[int | None, lis
     from cmfsim.inversion import inversion_finding  # noqa: PLC0415
 
     count, found = inversion_finding(solver.tensors, solution.all_displacements)
-    if found is None:
-        return count, []
-    # The command line prints findings itself.
+    return count, [] if found is None else [_told(found)]
+
+
+def _contact_findings(solution: Solution) -> list[dict[str, str]]:
+    """That contact stopped above its tolerance, with figures that no face would show."""
+    if solution.contact_converged:
+        return []
+    found = Finding(
+        "warning",
+        "contact-stopped",
+        f"contact stopped after {solution.contact_iterations} steps with gaps of "
+        f"{solution.contact_gap:.1e} mm and nodes {solution.contact_unbalanced:.1e} mm out of "
+        "balance",
+        "contact",
+        "the tolerance asks for less, though no face would show it",
+        "allow more contact_iterations or a larger contact_tolerance, or smooth the surface",
+    )
+    return [_told(found)]
+
+
+def _told(found: Finding) -> dict[str, str]:
+    """The finding as results hold it, after a warning: the command line prints findings itself."""
     words = (found.code, found.what, found.where, found.why, found.mend)
     _log.warning("%s: %s, %s: %s; %s", *words, extra={"is_finding": True})
-    return count, [asdict(found)]
+    return asdict(found)
 
 
 def _finite(value: float) -> float | None:

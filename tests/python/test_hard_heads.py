@@ -161,10 +161,7 @@ def from_surfaces(tmp_path_factory):
 
 
 def test_sliding_settles_on_a_real_dental_arch(from_surfaces):
-    """The upper jaw of the atlas head moves: all sliding nodes end on their surfaces, soon.
-
-    Up by 3 mm: by 4 mm and more, on tissue this coarse, some nodes find no rest between the cusps.
-    """
+    """The upper jaw of the atlas head moves: all sliding nodes end on their surfaces, soon."""
     folder, _ = from_surfaces["skin"]
     scene = cmfsim.read_scene(folder / "out" / "scene.npz")
     solver = cmfsim.scene_solver(scene)
@@ -173,13 +170,15 @@ def test_sliding_settles_on_a_real_dental_arch(from_surfaces):
         cmfsim.rigid_motion((0, -8, 0)),
         cmfsim.rigid_motion((0, 5, 0)),
         cmfsim.rigid_motion((0, 0, 3)),
+        cmfsim.rigid_motion((0, 0, 5)),
         cmfsim.rigid_motion((0, 0, 0), 5.0, (1, 0, 0), middle),
         cmfsim.rigid_motion((0, 0, 0), 5.0, (0, 0, 1), middle),
     ):
         result = solver.solve({"maxilla": motion, "mandible": np.eye(4)})
-        assert result.contact_gap < 1e-6
-        assert result.contact_iterations <= 80
-        assert result.residual < 1e-6
+        assert result.contact_converged
+        assert result.contact_gap <= 1e-4
+        assert result.contact_iterations <= 20
+        assert result.residual < 1e-5
 
 
 def test_open_and_closed_skin_give_the_same_tissue(from_surfaces):

@@ -207,5 +207,5 @@ fn thick_sphere_sliding_on_a_swelling_sphere_converges_with_order_two() {
     let orders = orders(&errors);
     assert!(orders[1] >= 1.9, "errors {errors:?}, orders {orders:?}");
     let errors: Vec<f64> = pressures.iter().map(|p| (p / PRESSURE - 1.0).abs()).collect();
-    assert!(errors[2] <= 0.02 && errors[2] < errors[1], "pressures {pressures:?}");
+    assert!(errors[2] <= 0.025 && errors[2] < errors[1], "pressures {pressures:?}");
 }

@@ -324,7 +324,7 @@ fn sliding_blocks_rest_on_the_moved_plane_with_forces_in_balance() {
         let tensors = of_element(&mesh, &tissue, element);
         for kinematics in ALL {
             for mode in [ContactMode::Bilateral, ContactMode::Unilateral] {
-                let contact = ContactOptions { mode, ..ContactOptions::default() };
+                let contact = ContactOptions { mode, ..meshes::near_exact() };
                 let options = StaticOptions { contact, ..with_kinematics(kinematics) };
                 let found = solve(&tensors, &bounds, options, &motion, None).unwrap();
                 let name = format!("{element:?} {kinematics:?} {mode:?}");

@@ -7,8 +7,8 @@ use std::sync::Arc;
 
 use meshes::{
     BoxShape, GO_ON, ShellShape, Vec3, affine, along_fibre, at, boundary, carried, isotropic,
-    joined, largest_difference, plan, plane, rigid, sliding, solve, solver, sphere, stays, surface,
-    tensors, with_method,
+    joined, largest_difference, near_exact, plan, plane, rigid, sliding, solve, solver, sphere,
+    stays, surface, tensors, with_method,
 };
 use mtm_core::boundary::{Boundary, Gap, Motion, Plan};
 use mtm_core::contact::{ContactMode, ContactOptions};
@@ -26,7 +26,7 @@ const METHODS: [Method; 3] = [Method::Cholesky, Method::Pcg, Method::Relaxation]
 const POISSON: f64 = 0.45;
 
 fn unilateral(method: Method) -> StaticOptions {
-    let contact = ContactOptions { mode: ContactMode::Unilateral, ..ContactOptions::default() };
+    let contact = ContactOptions { mode: ContactMode::Unilateral, ..near_exact() };
     StaticOptions { method, contact, ..StaticOptions::default() }
 }
 
@@ -106,7 +106,7 @@ fn assert_compression(turn: &RigidMotion, floor: &Arc<Surface>, options: StaticO
     let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
     let found = solve(&tensors, &bounds, options, &motion, None).unwrap();
     let e = largest_difference(&found.displacements, &exact);
-    assert!(e <= 2e-9, "{options:?}: {e:e} mm");
+    assert!(e <= 2e-8, "{options:?}: {e:e} mm");
     let force: f64 = found.contact.forces.iter().sum();
     assert!((force - 0.01 * 0.05 * 25.0).abs() <= 1e-8 * force, "{options:?}: {force:e} N");
     assert!(found.contact_gap() <= 1e-9 && tangential_share(&found) <= 1e-6);
@@ -157,12 +157,12 @@ fn triangulation_of_a_flat_floor_does_not_matter() {
     }
 }
 
-/// A shell on a swelling sphere, outer surface moved alike: u = a x. On the icosphere's first two levels
-/// every vertex lies on a symmetry axis, so polygonal area and averaged normals are radial and the
-/// answer is exact: isotropic stress p = 3 K a = E a / (1 − 2ν).
+/// A shell on a swelling sphere, outer surface moved alike: u = a x, with the isotropic stress
+/// p = 3 K a = E a / (1 − 2ν). Facets are felt as curved by their corners' normals: what is left is the
+/// facets' size to the fourth power.
 #[test]
 fn shell_on_a_swelling_sphere_dilates_uniformly() {
-    for levels in [0, 1] {
+    for (levels, near) in [(2, 1e-2), (3, 3e-3)] {
         let shape = ShellShape { levels, layers: 3, inner: 10.0, outer: 16.0 };
         let mesh = shape.mesh();
         let rest = surface(sphere(levels, 10.0));
@@ -179,7 +179,7 @@ fn shell_on_a_swelling_sphere_dilates_uniformly() {
         for method in METHODS {
             let found = solve(&tensors, &bounds, with_method(method), &motion, None).unwrap();
             let e = largest_difference(&found.displacements, &exact);
-            assert!(e <= 1e-7, "level {levels}, {method:?}: {e:e} mm");
+            assert!(e <= near, "level {levels}, {method:?}: {e:e} mm");
             // Radial components of the polyhedron's forces: Σ f_i·x_i = ∫ p n·x = 3 p V.
             let virial: f64 = found
                 .contact
@@ -191,7 +191,10 @@ fn shell_on_a_swelling_sphere_dilates_uniformly() {
             // Stretched, not pressed: the ball pulls the tissue inward.
             let stress = 0.01 * dilation / (1.0 - 2.0 * POISSON);
             let expected = -3.0 * stress * rest.volume().unwrap();
-            assert!((virial - expected).abs() <= 1e-6 * expected.abs(), "{virial} {expected}");
+            assert!(
+                (virial - expected).abs() <= 10.0 * near * expected.abs(),
+                "{virial} {expected}"
+            );
         }
     }
 }
@@ -239,11 +242,17 @@ fn sliding_nodes_end_on_the_moved_surface_without_traction() {
     let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
     let motion = twist();
     let Motion::Rigid(turned) = &motion[1].1 else { panic!() };
-    let moved = ball.transformed(turned.matrix()).unwrap();
+    let centre = Vec3::from(turned.apply([0.0; 3]));
     for method in METHODS {
         let found = solve(&tensors, &bounds, with_method(method), &motion, None).unwrap();
-        let off = off_surface(&mesh, &shape.layer(0), &found, &moved);
-        assert!(off <= 1e-6, "{method:?}: {off:e} mm off the surface");
+        // Off the sphere itself: its facets lie up to 0.08 mm within.
+        let radius = |j: u32| {
+            let end =
+                Vec3::from(mesh.nodes()[j as usize]) + Vec3::from(found.displacements[j as usize]);
+            ((end - centre).norm() - 10.0).abs()
+        };
+        let off = shape.layer(0).into_iter().map(radius).fold(0.0, f64::max);
+        assert!(off <= 0.02, "{method:?}: {off:e} mm off the sphere");
         let share = tangential_share(&found);
         assert!(share <= 1e-6, "{method:?}: tangential share {share:e}");
         assert!(found.residual <= 1e-6, "{method:?}: residual {:e}", found.residual);
@@ -342,7 +351,8 @@ fn surface_motion_of_a_rigid_move_equals_the_rigid_motion() {
     let a = solve(&tensors, &bounds, options, &motion, None).unwrap();
     let b = solve(&tensors, &bounds, options, &other, None).unwrap();
     let e = largest_difference(&a.displacements, &b.displacements);
-    assert!(e <= 1e-8, "{e:e} mm");
+    // The lattices of the two fields lie differently on the surface.
+    assert!(e <= 5e-3, "{e:e} mm");
 }
 
 /// |x + u − c| = g: a floor g below the nodes at rest changes nothing; a wish for another gap lifts them.
@@ -530,12 +540,12 @@ fn coarse_convex_contact_surface_faces_the_tissue() {
 fn contact_that_does_not_settle_is_an_error_with_its_nodes() {
     let (mesh, bounds, _) = shell(2);
     let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
-    let contact = ContactOptions { max_iterations: 2, ..ContactOptions::default() };
+    let contact = ContactOptions { max_iterations: 1, ..near_exact() };
     for method in METHODS {
         let options = StaticOptions { contact, ..with_method(method) };
         let error = solve(&tensors, &bounds, options, &twist(), None).unwrap_err();
         let MtmError::ContactCycle { iterations, nodes, gap } = &error else { panic!("{error}") };
-        assert_eq!(*iterations, 2);
+        assert_eq!(*iterations, 1);
         assert!(!nodes.is_empty() && nodes.len() <= 10 && *gap > 0.0, "{error}");
         assert!(nodes.iter().all(|&j| j < 162), "sliding nodes are the first 162: {nodes:?}");
         assert!(!error.is_input());
@@ -566,8 +576,11 @@ fn spiky_contact_surface_settles_or_is_refused() {
                 let held = found.contact.nodes.iter().zip(&found.contact.active);
                 let held: Vec<u32> = held.filter(|(_, a)| **a).map(|(&j, _)| j).collect();
                 let off = off_surface(&mesh, &held, &found, &spiky);
-                assert!(off <= 1e-6, "{off:e} mm off the surface");
-                assert!(tangential_share(&found) <= 1e-6);
+                assert!(
+                    off <= 0.5,
+                    "{off:e} mm off spikes of 1 mm, which are finer than the tissue"
+                );
+                assert!(found.contact.converged && tangential_share(&found) <= 1e-5);
             }
             Err(error) => assert!(matches!(error, MtmError::ContactCycle { .. }), "{error}"),
         }
@@ -599,13 +612,13 @@ fn star(
     (tensors, own[0])
 }
 
-/// Where the star's node ends, its contact force vector, and the walls that hold it.
+/// Where the star's node ends, its contact force vector, and the stiffness that holds it.
 fn drawn_to(
     goal: Vec3,
     wall: &Arc<Surface>,
     gap: f64,
     options: StaticOptions,
-) -> (Vec3, Vec3, u8, f64) {
+) -> (Vec3, Vec3, f64) {
     let centre = Vec3::new(0.3, 0.1, 1.5);
     let (tensors, k) = star(centre, |mesh| tensors(mesh, &isotropic(0.01, POISSON)));
     let slide = sliding("bone", vec![0], wall, Gap::Uniform(gap));
@@ -614,10 +627,10 @@ fn drawn_to(
     let motion = plan([("body", Motion::Rigid(shift)), ("bone", stays())]);
     let found = solve(&tensors, &bounds, options, &motion, None).unwrap();
     let c = &found.contact;
-    assert!(found.contact_gap() <= 1e-9, "{:e} mm", found.contact_gap());
-    assert!(found.residual <= 1e-7, "{:e}", found.residual);
+    assert!(found.contact_gap() <= 1e-8, "{:e} mm", found.contact_gap());
+    assert!(found.residual <= 1e-6, "{:e}", found.residual);
     let end = centre + Vec3::from(found.displacements[0]);
-    (end, Vec3::from(c.normals[0]) * c.forces[0], c.walls[0], k)
+    (end, Vec3::from(c.normals[0]) * c.forces[0], k)
 }
 
 /// Two planes that meet in a valley along y.
@@ -626,37 +639,34 @@ fn groove(slope: f64) -> Arc<Surface> {
     surface((vertices.iter().map(|v| [v[0], v[1], v[0].abs() * slope]).collect(), triangles))
 }
 
-/// A node drawn into a groove rests on both walls and slides along it: x = 0, z = g / cos α, y and the
-/// force k (u − t) as if y were free; drawn onto one wall it is held by that wall alone.
+/// How far a crease is rounded off, mm: about the lattice spacing, half an edge of the star.
+const ROUNDED: f64 = 0.5;
+
+/// A node drawn into a groove rests near its bottom and slides along it: y and the force k (u − t) as if y
+/// were free. Drawn onto one wall, away from the crease, it is held by that wall exactly.
 #[test]
-fn node_in_a_groove_rests_on_both_walls() {
+fn node_in_a_groove_rests_near_its_bottom() {
     let angle = 40.0_f64.to_radians();
     let wall = groove(angle.tan());
-    for gap in [0.0, 0.4] {
-        let z = gap / angle.cos();
-        for method in METHODS {
-            for options in [with_method(method), unilateral(method)] {
-                let goal = Vec3::new(0.1, 0.7, z - 1.0);
-                let (end, force, walls, k) = drawn_to(goal, &wall, gap, options);
-                let exact = Vec3::new(0.0, 0.7, z);
-                assert_eq!(walls, 2, "{options:?}");
-                assert!((end - exact).norm() <= 1e-7, "{options:?}: {end}");
-                assert!((force - (exact - goal) * k).norm() <= 1e-7 * k, "{options:?}: {force}");
+    for method in METHODS {
+        for options in [with_method(method), unilateral(method)] {
+            let goal = Vec3::new(0.1, 0.7, -1.0);
+            let (end, force, k) = drawn_to(goal, &wall, 0.0, options);
+            assert!(end.x.abs() <= ROUNDED && (end.y - 0.7).abs() <= 1e-7, "{options:?}: {end}");
+            assert!((-0.1..=ROUNDED).contains(&end.z), "{options:?}: {end}");
+            assert!((force - (end - goal) * k).norm() <= 1e-6 * k, "{options:?}: {force}");
 
-                // Outside the cone of the two normals the nearest point lies on one wall.
-                let goal = Vec3::new(2.0, 0.7, z - 1.0);
-                let n = Vec3::new(-angle.sin(), 0.0, angle.cos());
-                let exact = goal - n * (n.dot(&goal) - gap);
-                let (end, force, walls, k) = drawn_to(goal, &wall, gap, options);
-                assert_eq!(walls, 1, "{options:?}");
-                assert!((end - exact).norm() <= 1e-7, "{options:?}: {end}");
-                assert!((force - (exact - goal) * k).norm() <= 1e-7 * k, "{options:?}: {force}");
-            }
-            // A node that may lift off is held by no wall where it floats above both.
-            let goal = Vec3::new(0.1, 0.7, z + 0.5);
-            let (end, force, walls, _) = drawn_to(goal, &wall, gap, unilateral(method));
-            assert!(walls == 0 && force.norm() == 0.0 && (end - goal).norm() <= 1e-7, "{end}");
+            let goal = Vec3::new(4.0, 0.7, 1.0);
+            let n = Vec3::new(-angle.sin(), 0.0, angle.cos());
+            let exact = goal - n * n.dot(&goal);
+            let (end, force, k) = drawn_to(goal, &wall, 0.0, options);
+            assert!((end - exact).norm() <= 1e-7, "{options:?}: {end}");
+            assert!((force - (exact - goal) * k).norm() <= 1e-7 * k, "{options:?}: {force}");
         }
+        // A node that may lift off is not held where it floats above both walls.
+        let goal = Vec3::new(0.1, 0.7, 1.5);
+        let (end, force, _) = drawn_to(goal, &wall, 0.0, unilateral(method));
+        assert!(force.norm() == 0.0 && (end - goal).norm() <= 1e-7, "{end}");
     }
 }
 
@@ -686,9 +696,9 @@ fn block_that_walls_alone_carry_has_a_residual_of_rounding() {
     assert!(found.residual <= 1e-9, "{:e}", found.residual);
 }
 
-/// Three walls that meet in a pit: a node drawn into it rests in the corner, whatever the direction.
+/// Three walls that meet in a pit: a node drawn into it rests near the corner, whatever the direction.
 #[test]
-fn node_in_a_corner_rests_on_three_walls() {
+fn node_in_a_corner_rests_near_it() {
     let angle = 45.0_f64.to_radians();
     let mut vertices = vec![[0.0; 3]];
     for k in 0..3 {
@@ -696,16 +706,12 @@ fn node_in_a_corner_rests_on_three_walls() {
         vertices.push([12.0 * turn.cos(), 12.0 * turn.sin(), 6.0 * angle.tan()]);
     }
     let pit = surface((vertices, vec![[0, 1, 2], [0, 2, 3], [0, 3, 1]]));
-    for gap in [0.0, 0.3] {
-        let exact = Vec3::new(0.0, 0.0, gap / angle.cos());
-        for method in METHODS {
-            for options in [with_method(method), unilateral(method)] {
-                let goal = Vec3::new(0.05, -0.08, exact.z - 1.0);
-                let (end, force, walls, k) = drawn_to(goal, &pit, gap, options);
-                assert_eq!(walls, 3, "{options:?}");
-                assert!((end - exact).norm() <= 1e-7, "{options:?}: {end}");
-                assert!((force - (exact - goal) * k).norm() <= 1e-7 * k, "{options:?}: {force}");
-            }
+    for method in METHODS {
+        for options in [with_method(method), unilateral(method)] {
+            let goal = Vec3::new(0.05, -0.08, -1.0);
+            let (end, force, k) = drawn_to(goal, &pit, 0.0, options);
+            assert!(end.norm() <= 1.5 * ROUNDED, "{options:?}: {end}");
+            assert!((force - (end - goal) * k).norm() <= 1e-6 * k, "{options:?}: {force}");
         }
     }
 }
@@ -725,10 +731,9 @@ fn on_teeth() -> (Arc<TetMesh>, Arc<Boundary>, Arc<Surface>, Plan) {
     (mesh, bounds, row, plan([("lid", Motion::Rigid(shift)), ("teeth", stays())]))
 }
 
-/// Tissue on a row of teeth settles, with nodes in the valleys: each ends on the surface, its force lies
-/// between the normals of its walls, and all ways of solving agree.
+/// Tissue on a row of teeth converges, with nodes in the valleys, and all ways of solving agree.
 #[test]
-fn tissue_on_a_row_of_teeth_settles_with_nodes_in_the_valleys() {
+fn tissue_on_a_row_of_teeth_converges_with_nodes_in_the_valleys() {
     let (mesh, bounds, _, motion) = on_teeth();
     let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
     let mut answers: Vec<Solution> = Vec::new();
@@ -736,12 +741,10 @@ fn tissue_on_a_row_of_teeth_settles_with_nodes_in_the_valleys() {
         let found = solve(&tensors, &bounds, with_method(method), &motion, None).unwrap();
         assert!(found.contact_gap() <= 1e-6, "{method:?}: {:e} mm", found.contact_gap());
         assert!(found.residual <= 1e-6 && tangential_share(&found) <= 1e-6);
-        assert!(found.contact.walls.iter().any(|&w| w > 1), "{:?}", found.contact.walls);
         answers.push(found);
     }
     let e = largest_difference(&answers[0].displacements, &answers[1].displacements);
     assert!(e <= 1e-6, "{e:e} mm");
-    assert_eq!(answers[0].contact.walls, answers[1].contact.walls);
     let found = solve(&tensors, &bounds, unilateral(Method::Cholesky), &motion, None).unwrap();
     assert_signorini("teeth", &found);
 }
@@ -772,9 +775,73 @@ fn plan_operator_equals_the_solution_in_creases() {
     for method in [Method::Cholesky, Method::Pcg] {
         let solver = solver(&tensors, &bounds, with_method(method)).unwrap();
         let found = solver.solve(&motion, None, GO_ON).unwrap();
-        assert!(found.contact.walls.iter().any(|&w| w > 1));
         let operator = solver.plan_operator(None, Some(&motion), GO_ON).unwrap();
         let e = largest_difference(&operator.apply(&motion).unwrap(), &found.displacements);
         assert!(e <= 1e-6, "{method:?}: {e:e} mm");
     }
+}
+
+/// A node exactly on its surface at rest is off it by rounding after a turn, in no direction that means
+/// anything: once it ended in a division by its distance, zero. Any turn of the ball leaves finite answers.
+#[test]
+fn nodes_exactly_on_their_surface_at_rest_turn_with_it() {
+    let shape = ShellShape { levels: 2, layers: 2, inner: 10.0, outer: 16.0 };
+    let ball = surface(sphere(2, 10.0));
+    let slide = sliding("ball", shape.layer(0), &ball, Gap::Rest);
+    let bounds = boundary(vec![], vec![joined("skin", shape.layer(2)), slide]);
+    let tensors = tensors(&shape.mesh(), &isotropic(0.01, POISSON));
+    let solver = solver(
+        &tensors,
+        &bounds,
+        StaticOptions { method: Method::Cholesky, ..StaticOptions::default() },
+    )
+    .unwrap();
+    for k in 0..24 {
+        let t = f64::from(k);
+        let turn = rigid(
+            [t.sin(), (2.0 * t).cos(), 0.3],
+            0.05 * t,
+            [0.1 * t, -65.0, -40.0],
+            [0.2, 0.1, -0.3],
+        );
+        let motion = plan([("skin", stays()), ("ball", Motion::Rigid(turn))]);
+        let found = solver.solve(&motion, None, GO_ON).unwrap();
+        assert!(found.contact.converged && found.residual <= 1e-4, "{k}: {:e}", found.residual);
+        assert!(found.displacements.as_flattened().iter().all(|v| v.is_finite()), "{k}");
+    }
+}
+
+/// About its reference the operator goes on as the solutions do, to first order: over half the way its error is
+/// a quarter.
+#[test]
+fn plan_operator_follows_contact_to_first_order() {
+    let (mesh, bounds, _) = shell(2);
+    let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
+    let reference = twist();
+    let on = |share: f64| {
+        let more = rigid(
+            [0.3, 1.0, -0.2],
+            4.0 * share,
+            [1.0, 0.0, 2.0],
+            [0.2 * share, 0.5 * share, 0.3 * share],
+        );
+        let Motion::Rigid(ball) = &twist()[1].1 else { panic!() };
+        let both = RigidMotion::new("ball", &product(more.matrix(), ball.matrix())).unwrap();
+        plan([("skin", twist()[0].1.clone()), ("ball", Motion::Rigid(both))])
+    };
+    for method in [Method::Cholesky, Method::Pcg] {
+        let solver = solver(&tensors, &bounds, with_method(method)).unwrap();
+        let operator = solver.plan_operator(None, Some(&reference), GO_ON).unwrap();
+        let error = |share: f64| {
+            let exact = solver.solve(&on(share), None, GO_ON).unwrap().displacements;
+            largest_difference(&exact, &operator.apply(&on(share)).unwrap())
+        };
+        let (whole, half) = (error(1.0), error(0.5));
+        assert!(error(0.0) <= 1e-5 && whole > 1e-3, "{method:?}: {whole:e}");
+        assert!(half <= 0.32 * whole, "{method:?}: {half:e} of {whole:e} mm");
+    }
+}
+
+fn product(a: &[[f64; 4]; 4], b: &[[f64; 4]; 4]) -> [[f64; 4]; 4] {
+    [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| (0..4).map(|k| a[i][k] * b[k][j]).sum()))
 }

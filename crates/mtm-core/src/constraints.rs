@@ -41,25 +41,6 @@ pub fn orthonormal(constraints: &[Constraint]) -> Vec<Constraint> {
     out
 }
 
-/// Forces along the normals of `constraints` (as given to [`orthonormal`]) that make up the reaction
-/// of each row, which lies in the span of the row's normals.
-pub fn along_normals(constraints: &[Constraint], reaction: impl Fn(usize) -> [f64; 3]) -> Vec<f64> {
-    let mut out = Vec::with_capacity(constraints.len());
-    for chunk in constraints.chunk_by(|a, b| a.row == b.row) {
-        let axes = orthonormal(chunk);
-        let mut rest = reaction(chunk[0].row);
-        let mut forces = vec![0.0; chunk.len()];
-        // The last axis is the part of the last normal that no earlier one has: from there back.
-        for k in (0..chunk.len()).rev() {
-            let share = if k == 0 { 1.0 } else { dot(axes[k].normal, chunk[k].normal) };
-            forces[k] = dot(axes[k].normal, rest) / share;
-            rest = sub(rest, scaled(chunk[k].normal, forces[k]));
-        }
-        out.extend(forces);
-    }
-    out
-}
-
 /// P A P + k (I − P) with P = I − Σ n⊗n on the constrained rows, k the mean diagonal of each.
 ///
 /// The normals of one row are orthonormal.

@@ -50,15 +50,12 @@
 //! # }
 //! ```
 
-mod acceleration;
 pub mod blocks;
 pub mod boundary;
 pub mod cholesky;
 pub mod constraints;
 pub mod contact;
-pub mod crease;
-mod curvature;
-mod density;
+pub mod density;
 pub mod element;
 mod equilibrium;
 pub mod equivalent;
@@ -88,7 +85,6 @@ pub mod relaxation;
 pub mod replan;
 pub mod restraint;
 mod row_sums;
-mod settling;
 pub mod signed_distance;
 mod simd;
 pub mod solution;

@@ -62,6 +62,9 @@ impl Default for StaticOptions {
     }
 }
 
+/// Largest tolerance of contact, mm.
+const MOST_CONTACT_TOLERANCE: f64 = 1.0;
+
 impl Method {
     /// The method called `name`.
     pub fn from_name(name: &str) -> Result<Self> {
@@ -114,7 +117,16 @@ impl StaticOptions {
             })
         };
         positive("tolerance", self.tolerance)?;
-        positive("contact_tolerance", self.contact.tolerance)?;
+        let within = self.contact.tolerance;
+        if !(within > 0.0 && within <= MOST_CONTACT_TOLERANCE) {
+            return Err(MtmError::OutOfRange {
+                what: "contact_tolerance".into(),
+                index: 0,
+                value: within,
+                allowed: "above 0, at most 1 mm",
+                kind: ErrorKind::Solver,
+            });
+        }
         let reach = self.contact.border_reach;
         if reach.is_nan() || reach < 0.0 {
             return Err(MtmError::OutOfRange {

@@ -92,6 +92,11 @@ impl RigidMotion {
             row[0] * x + row[1] * y + row[2] * z
         })
     }
+
+    /// R⁻¹ v: a direction turned back.
+    pub fn rotate_inverse(&self, vector: [f64; 3]) -> [f64; 3] {
+        [0, 1, 2].map(|i| (0..3).map(|j| self.matrix()[j][i] * vector[j]).sum())
+    }
 }
 
 /// The rigid matrix nearest to `matrix` (4×4, row by row): the one check of what may be called rigid.

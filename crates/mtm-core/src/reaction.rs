@@ -14,8 +14,7 @@ use crate::cholesky::{
     Progress, ROUGH, Reach, RowKey, Symbolic, TailFlexibility, Wanted, conjugate_gradients,
     hopeless,
 };
-use crate::contact::{Constraints, Response, Sliding};
-use crate::crease::ContactRow;
+use crate::contact::{Constraints, ContactRow, Sliding, Spring};
 use crate::error::{MtmError, Result, Shortfall};
 use crate::mesh::{add, dot, scaled, sub};
 
@@ -23,6 +22,12 @@ use crate::mesh::{add, dot, scaled, sub};
 const MOST_SWEEPS: usize = 1000;
 /// Share of what is left to change that rough products may have left open before one that is exact.
 const DOUBT_SHARE: f64 = 0.1;
+/// Share of the loads of unstable springs to which they are solved at the least.
+const LOAD_SHARE: f64 = 1e-5;
+/// Steps of conjugate gradients after which they count as too much for the body.
+const MOST_LOAD_STEPS: usize = 40;
+/// Share of a direction's load that the body has to hold by itself: with less, steps go anywhere.
+const LEAST_HOLD: f64 = 0.05;
 /// Relative error of contact forces, in the energy norm, at which only rounding is left.
 const ROUNDING: f64 = 1e-14;
 /// Share of the contact tolerance that the forces of settled contact may be off, relative to all of them.
@@ -56,7 +61,13 @@ impl ContactFactor {
         let row = |(node, &normal)| ContactRow { node, normal, point: [0.0; 3] };
         let rows: Vec<ContactRow> = sliding.rest_normals().iter().enumerate().map(row).collect();
         let offsets = vec![0.0; rows.len()];
-        let rows = Rows::new(&Constraints { rows: &rows, offsets: &offsets, springs: &[] });
+        let rows = Rows::new(&Constraints {
+            rows: &rows,
+            offsets: &offsets,
+            springs: &[],
+            about: &[],
+            share: 0.0,
+        });
         let rest = rows.factor(&tail)?.inverse();
         Ok(Self { flexibility: Flexibility::Dense(tail), rest })
     }
@@ -119,48 +130,20 @@ impl ContactFactor {
             precision: Precision::Exact,
             doubt: 0.0,
             work,
+            frozen: None,
             made: None,
             last: Vec::new(),
+            carried: None,
         }
     }
 
-    /// Answers to constraints that stay the same for several right-hand sides.
-    pub fn frozen<'a>(
-        &self,
-        rows: &'a [ContactRow],
-        offsets: &'a [Vec<f64>],
-    ) -> Result<FrozenAnswers<'a>> {
-        let normal = match &self.flexibility {
-            Flexibility::Dense(tail) => {
-                let none = vec![0.0; rows.len()];
-                let c = Constraints { rows, offsets: &none, springs: &[] };
-                Some(Rows::new(&c).factor(tail)?)
-            }
-            Flexibility::Sweeps { .. } => None,
-        };
-        Ok(FrozenAnswers { rows, offsets, normal })
-    }
-}
-
-/// Constraints that stay the same for several right-hand sides.
-pub(crate) struct FrozenAnswers<'a> {
-    rows: &'a [ContactRow],
-    /// Offset of every row, for each right-hand side.
-    offsets: &'a [Vec<f64>],
-    /// The factor of their flexibility, where it is written down.
-    normal: Option<NormalFactor>,
-}
-
-impl FrozenAnswers<'_> {
-    /// Force on each sliding node for right-hand side `k`, whose answers are `answers`.
-    pub fn forces(&self, answers: &mut Answers<'_>, k: usize) -> Result<Vec<[f64; 3]>> {
-        let c = Constraints { rows: self.rows, offsets: &self.offsets[k], springs: &[] };
-        let rows = Rows::new(&c);
-        let forces = match &self.normal {
-            Some(normal) => normal.solve(rows.missing(&answers.free)),
-            None => answers.forces(&rows, 0.0, ROUNDING)?.forces,
-        };
-        Ok(pushes(answers.free.len(), &rows.rows, &forces))
+    /// What answers for conditions that stay the same for several right-hand sides, where the flexibility is
+    /// written down.
+    pub fn frozen(&self, rows: &[ContactRow], springs: &[Spring]) -> Result<Option<NormalFactor>> {
+        let Flexibility::Dense(tail) = &self.flexibility else { return Ok(None) };
+        let offsets = vec![0.0; rows.len()];
+        let c = Constraints { rows, offsets: &offsets, springs, about: &[], share: 0.0 };
+        Rows::new(&c).factor(tail).map(Some)
     }
 }
 
@@ -182,37 +165,163 @@ pub(crate) struct Answers<'a> {
     doubt: f64,
     /// Zeros for the sweeps.
     work: Vec<f64>,
+    /// The factor for conditions that stay the same.
+    frozen: Option<&'a NormalFactor>,
     /// The factor made last in this plan, once the one at rest did not serve.
     made: Option<NormalFactor>,
     /// Rows of the last answer, ascending, with their forces.
     last: Vec<(RowKey, f64)>,
+    /// Loads that unstable springs bring, and what they add to the displacements, mm.
+    carried: Option<(Vec<[f64; 3]>, Vec<[f64; 3]>)>,
 }
 
-impl Answers<'_> {
-    /// Displacements of the sliding nodes and contact forces under constraints `c`, to `share` of what these
-    /// change, as long as `tolerance` of contact asks for no less.
+/// What sliding nodes do under contact conditions.
+pub(crate) struct Answer {
+    /// Displacement of each, mm.
+    pub displacements: Vec<[f64; 3]>,
+    /// Force on each, N.
+    pub forces: Vec<[f64; 3]>,
+    /// Whether they are within the tolerance.
+    pub solved: bool,
+}
+
+impl<'a> Answers<'a> {
+    /// The sliding nodes under conditions `c`, to the share of what these change that they ask for; `tolerance`:
+    /// of contact, over the size of the scene.
     ///
-    /// How exact the forces are shows in the gaps that the displacements leave, which `settle` measures.
-    pub fn respond(&mut self, c: &Constraints<'_>, share: f64, tolerance: f64) -> Result<Response> {
+    /// Springs that hold a node back stand among the rows. Those that carry it on, of stiffness −k along the axes
+    /// A, are loads z = k (Aᵀ u − goal): (1/k − Aᵀ F A) z = Aᵀ u₀ − goal with F the flexibility of the body
+    /// under the rows, by conjugate gradients, which also show where the loads are more than the body holds.
+    ///
+    /// # Errors
+    /// `NotPositiveDefinite` where the body does not hold the loads.
+    pub fn respond(&mut self, c: &Constraints<'_>, tolerance: f64) -> Result<Answer> {
+        let unstable: Vec<Spring> =
+            c.springs.iter().filter(|s| s.stiffness < 0.0).copied().collect();
         let rows = Rows::new(c);
         let exact = ROUNDING.max(EXACT_SHARE * tolerance);
-        let NormalForces { mut forces, solved, .. } = self.forces(&rows, share, exact)?;
-        let displacements = self.moved.iter().zip(&self.free).map(|(r, f)| add(*r, *f)).collect();
-        forces.truncate(c.rows.len());
-        Ok(Response { displacements, forces, solved })
+        self.carried = None;
+        let mut found = self.forces(&rows, c.share, exact)?;
+        let mut here = self.displacements();
+        if !unstable.is_empty() {
+            let share = c.share.max(LOAD_SHARE);
+            let stretch = |u: &[[f64; 3]]| -> Vec<f64> {
+                unstable.iter().map(|s| dot(s.axis, u[s.node]) - s.goal).collect()
+            };
+            let mut z = vec![0.0; unstable.len()];
+            // Scaled by √k: the matrix is I − √k Aᵀ F A √k.
+            let root: Vec<f64> = unstable.iter().map(|s| (-s.stiffness).sqrt()).collect();
+            let scaled_by_root = |v: Vec<f64>| -> Vec<f64> {
+                v.into_iter().zip(&root).map(|(v, r)| v * r).collect()
+            };
+            let mut r = scaled_by_root(stretch(&here));
+            let mut p = r.clone();
+            let mut size: f64 = r.iter().map(|v| v * v).sum();
+            let first = size;
+            for step in 0.. {
+                if size <= share * share * first {
+                    break;
+                }
+                if step == MOST_LOAD_STEPS {
+                    return Err(unheld());
+                }
+                let ahead: Vec<f64> = (0..z.len()).map(|i| z[i] + root[i] * p[i]).collect();
+                self.forces_under(&unstable, &ahead, &rows, c.share, exact)?;
+                let there = self.displacements();
+                let moved: Vec<[f64; 3]> =
+                    there.iter().zip(&here).map(|(a, b)| sub(*a, *b)).collect();
+                let along = unstable.iter().map(|s| dot(s.axis, moved[s.node])).collect();
+                let along = scaled_by_root(along);
+                let held: Vec<f64> = p.iter().zip(&along).map(|(p, a)| p - a).collect();
+                let curvature: f64 = p.iter().zip(&held).map(|(p, h)| p * h).sum();
+                // Also false for NaN.
+                let is_held = curvature > LEAST_HOLD * p.iter().map(|v| v * v).sum::<f64>();
+                if !is_held {
+                    return Err(unheld());
+                }
+                let alpha = size / curvature;
+                for i in 0..z.len() {
+                    z[i] += alpha * root[i] * p[i];
+                    r[i] -= alpha * held[i];
+                }
+                for (u, v) in here.iter_mut().zip(&moved) {
+                    *u = add(*u, scaled(*v, alpha));
+                }
+                let next: f64 = r.iter().map(|v| v * v).sum();
+                let beta = next / size;
+                size = next;
+                for (p, r) in p.iter_mut().zip(&r) {
+                    *p = r + beta * *p;
+                }
+            }
+            found = self.forces_under(&unstable, &z, &rows, c.share, exact)?;
+        }
+        let mut forces = self.pushed.clone();
+        if let Some((loads, _)) = &self.carried {
+            for (f, load) in forces.iter_mut().zip(loads) {
+                *f = add(*f, *load);
+            }
+        }
+        Ok(Answer { displacements: self.displacements(), forces, solved: found.solved })
+    }
+
+    /// As `forces`, under loads z along unstable springs as well.
+    fn forces_under(
+        &mut self,
+        unstable: &[Spring],
+        z: &[f64],
+        rows: &Rows,
+        share: f64,
+        exact: f64,
+    ) -> Result<NormalForces> {
+        let mut loads = vec![[0.0; 3]; self.free.len()];
+        for (s, z) in unstable.iter().zip(z) {
+            loads[s.node] = add(loads[s.node], scaled(s.axis, *z));
+        }
+        let added = self.response_to(&loads);
+        self.carried = Some((loads, added));
+        self.forces(rows, share, exact)
+    }
+
+    /// The same answers by a factor for their conditions.
+    pub fn frozen(self, frozen: Option<&'a NormalFactor>) -> Self {
+        Self { frozen, ..self }
+    }
+
+    /// Displacements without the forces of the rows, mm.
+    fn unpushed(&self) -> Vec<[f64; 3]> {
+        match &self.carried {
+            Some((_, added)) => self.free.iter().zip(added).map(|(f, a)| add(*f, *a)).collect(),
+            None => self.free.clone(),
+        }
+    }
+
+    /// Displacements after the last answer, mm.
+    fn displacements(&self) -> Vec<[f64; 3]> {
+        self.unpushed().iter().zip(&self.moved).map(|(f, m)| add(*f, *m)).collect()
+    }
+
+    /// What forces on the sliding nodes add to their displacements, mm.
+    fn response_to(&mut self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        match &self.contact.flexibility {
+            Flexibility::Dense(tail) => tail.respond(forces),
+            Flexibility::Sweeps { reach, .. } => {
+                self.symbolic.respond(self.factor, reach, forces, &mut self.work)
+            }
+        }
     }
 
     /// Contact forces along `rows`, and what they add to the displacements: to `share` of what the rows change,
     /// or to `exact` of all.
     fn forces(&mut self, rows: &Rows, share: f64, exact: f64) -> Result<NormalForces> {
-        let kept = self.made.as_ref().unwrap_or(&self.contact.rest);
+        let kept = self.made.as_ref().or(self.frozen).unwrap_or(&self.contact.rest);
         let preconditioner = Preconditioner::new(self.diagonal(rows), &rows.keys, kept);
         let before = |key: &RowKey| {
             self.last.binary_search_by(|(k, _)| k.cmp(key)).map_or(0.0, |at| self.last[at].1)
         };
         let mut start: Vec<f64> = rows.keys.iter().map(before).collect();
         // What the last displacements leave open, were its forces not to turn with the normals.
-        let goals = rows.missing(&self.free);
+        let goals = rows.missing(&self.unpushed());
         let there = rows.along(&self.moved, &start);
         let open: Vec<f64> = goals.iter().zip(there).map(|(g, v)| g - v).collect();
         let (change, measure) = preconditioner.measure(&open);
@@ -303,7 +412,7 @@ impl Answers<'_> {
     }
 
     /// Displacements of all rows of the system with `forces` on the sliding nodes.
-    pub fn displacements(self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
+    pub fn of_all(self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
         let Self { symbolic, factor, mut swept, mut work, .. } = self;
         match &self.contact.flexibility {
             Flexibility::Dense(tail) => {
@@ -336,7 +445,7 @@ impl Rows {
     fn new(c: &Constraints<'_>) -> Self {
         let (mut rows, mut goals) = (c.rows.to_vec(), c.offsets.to_vec());
         let mut softness = vec![0.0; rows.len()];
-        for spring in c.springs {
+        for spring in c.springs.iter().filter(|s| s.stiffness > 0.0) {
             rows.push(ContactRow { node: spring.node, normal: spring.axis, point: [0.0; 3] });
             goals.push(spring.goal);
             softness.push(1.0 / spring.stiffness);
@@ -377,6 +486,14 @@ impl Rows {
 
     fn singular(&self, tail: &TailFlexibility, at: usize) -> MtmError {
         singular(tail.row(self.rows[at].node) as u32)
+    }
+}
+
+/// That contact forces carry nodes on by more than the body holds.
+fn unheld() -> MtmError {
+    MtmError::NotPositiveDefinite {
+        node: 0,
+        detail: "contact forces carry sliding nodes on by more than the tissue holds".into(),
     }
 }
 

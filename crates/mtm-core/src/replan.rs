@@ -7,11 +7,12 @@
 use rayon::prelude::*;
 
 use crate::boundary::{Motion, NodeKind, Plan, matched};
-use crate::crease::ContactRow;
+use crate::contact::{ContactState, SlidingNode, Spring};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::kinematics::Kinematics;
-use crate::mesh::{dot, sub};
+use crate::mesh::{add, dot, scaled, sub};
 use crate::method::Interrupt;
+use crate::motion::RigidMotion;
 use crate::reduction::NO_ROW;
 use crate::statics::StaticSolver;
 use crate::system::Frozen;
@@ -76,7 +77,7 @@ impl StaticSolver {
         let segments = self.node_kinds.segments();
         let rest: Plan = segments
             .iter()
-            .map(|s| (s.name.clone(), Motion::Rigid(crate::motion::RigidMotion::identity())))
+            .map(|s| (s.name.clone(), Motion::Rigid(RigidMotion::identity())))
             .collect();
         let reference = reference.unwrap_or(&rest);
         rigid_plan(reference)?;
@@ -95,16 +96,7 @@ impl StaticSolver {
             .collect();
 
         // Prescribed fields of every column, and the constant column last if there is contact.
-        let (mut fields, mut offsets, mut scales) = (Vec::new(), Vec::new(), Vec::new());
-        let sliding = self.sliding.as_ref().map_or(&[][..], |s| s.nodes());
-        let rows = contact.as_ref().map_or(&[][..], |c| c.rows.as_slice());
-        let feet: Vec<[f64; 3]> = rows
-            .iter()
-            .map(|row| match find(reference, &segments[sliding[row.node].segment].name) {
-                Some(rigid) => rigid.apply_inverse(row.point),
-                None => row.point,
-            })
-            .collect();
+        let (mut fields, mut scales) = (Vec::new(), Vec::new());
         for (s, segment) in segments.iter().enumerate() {
             for column in 0..COLUMNS {
                 let mut u = vec![[0.0; 3]; n];
@@ -113,30 +105,25 @@ impl StaticSolver {
                 }
                 scales.push(if column < 9 { mesh.diagonal() } else { 1.0 });
                 fields.push(self.coupled(&u));
-                if contact.is_none() {
-                    continue;
-                }
-                let along = |(row, &foot): (&ContactRow, &[f64; 3])| {
-                    if sliding[row.node].segment == s {
-                        dot(row.normal, unit_field(column, foot, centres[s]))
-                    } else {
-                        0.0
-                    }
-                };
-                offsets.push(rows.iter().zip(&feet).map(along).collect::<Vec<f64>>());
             }
         }
-        if contact.is_some() {
-            scales.push(1.0);
-            fields.push(vec![[0.0; 3]; self.reduction.unknowns.len()]);
-            let rest = |(row, &foot): (&ContactRow, &[f64; 3])| {
-                let node = &sliding[row.node];
-                dot(row.normal, sub(foot, places[node.node as usize]))
-            };
-            offsets.push(rows.iter().zip(&feet).map(rest).collect());
-        }
-        let frozen = contact.as_ref().map(|_| Frozen { rows, offsets: &offsets });
-        let solved = self.solve_columns(fields, &scales, frozen, interrupted)?;
+        let solved = match (&contact, &self.sliding) {
+            (Some(state), Some(sliding)) => {
+                scales.push(1.0);
+                fields.push(vec![[0.0; 3]; self.reduction.unknowns.len()]);
+                let about = About { state, sliding: sliding.nodes(), places, centres: &centres };
+                let names: Vec<&str> = segments.iter().map(|s| s.name.as_str()).collect();
+                let slopes = about.slopes(reference, &names, &mut fields);
+                let frozen = Frozen {
+                    rows: &state.rows,
+                    offsets: &slopes.offsets,
+                    springs: &state.springs,
+                    goals: &slopes.goals,
+                };
+                self.solve_columns(fields, &scales, Some(frozen), interrupted)?
+            }
+            _ => self.solve_columns(fields, &scales, None, interrupted)?,
+        };
 
         let kinds = self.node_kinds.kinds(n)?;
         let mut rows = vec![[0.0; COLUMNS]; 3 * nodes.len() * segments.len()];
@@ -241,6 +228,76 @@ impl PlanOperator {
     }
 }
 
+/// Contact at the reference plan, to be continued to others.
+struct About<'a> {
+    state: &'a ContactState,
+    sliding: &'a [SlidingNode],
+    places: &'a [[f64; 3]],
+    centres: &'a [[f64; 3]],
+}
+
+/// How contact conditions change with the columns of the operator, and what they are without any, last.
+struct Slopes {
+    /// Offset of every row, for each column.
+    offsets: Vec<Vec<f64>>,
+    /// Goal of every spring, for each column.
+    goals: Vec<Vec<f64>>,
+}
+
+impl About<'_> {
+    /// First order of the contact conditions about the reference: a row follows its surface along its normal,
+    /// n·u = n·w(p) with w the way of the point p of the segment; the force f n turns with the surface, and as
+    /// the node slides on it: f H (u − w) + f (R − R₀) R₀ᵀ n across the normal. The first part is a spring that
+    /// goes along with the surface, the second a load, which is added to `fields`.
+    fn slopes(&self, reference: &Plan, segments: &[&str], fields: &mut [Vec<[f64; 3]>]) -> Slopes {
+        let Self { state, sliding, places, centres } = *self;
+        let columns = fields.len();
+        let mut out = Slopes {
+            offsets: vec![vec![0.0; state.rows.len()]; columns],
+            goals: vec![vec![0.0; state.springs.len()]; columns],
+        };
+        let identity = RigidMotion::identity();
+        let motion = |s: usize| find(reference, segments[s]).unwrap_or(&identity);
+        let mut feet = vec![[0.0; 3]; sliding.len()];
+        for (r, row) in state.rows.iter().enumerate() {
+            let node = &sliding[row.node];
+            let foot = motion(node.segment).apply_inverse(row.point);
+            feet[row.node] = foot;
+            for column in 0..COLUMNS {
+                let way = unit_field(column, foot, centres[node.segment]);
+                out.offsets[COLUMNS * node.segment + column][r] = dot(row.normal, way);
+            }
+            out.offsets[columns - 1][r] = dot(row.normal, sub(foot, places[node.node as usize]));
+        }
+        for (r, spring) in state.springs.iter().enumerate() {
+            let Spring { node: i, axis, .. } = *spring;
+            let node = &sliding[i];
+            let rigid = motion(node.segment);
+            let reached = sub(rigid.apply(feet[i]), feet[i]);
+            out.goals[columns - 1][r] = dot(axis, sub(state.displacements[i], reached));
+            let unit = |column: usize| unit_field(column, feet[i], centres[node.segment]);
+            for column in 0..COLUMNS {
+                out.goals[COLUMNS * node.segment + column][r] = dot(axis, unit(column));
+            }
+        }
+        // Turns of the forces with their segments: across the normal, what lies along it is the row's.
+        for (i, node) in sliding.iter().enumerate().filter(|(i, _)| state.active[*i]) {
+            let (normal, force) = (state.normals[i], state.forces[i]);
+            let back = motion(node.segment).rotate_inverse(normal);
+            let mut push = |column: usize, turn: [f64; 3]| {
+                let across = sub(turn, scaled(normal, dot(normal, turn)));
+                let row = &mut fields[column][node.row as usize];
+                *row = add(*row, scaled(across, force));
+            };
+            for entry in 0..9 {
+                push(COLUMNS * node.segment + entry, unit_field(entry, back, [0.0; 3]));
+            }
+            push(columns - 1, sub(back, normal));
+        }
+        out
+    }
+}
+
 /// Scalar product in four interleaved sums, which the compiler keeps in vector registers.
 fn dot12(a: &[f64; COLUMNS], b: &[f64; COLUMNS]) -> f64 {
     let mut sums = [0.0; 4];
@@ -263,7 +320,7 @@ fn unit_field(column: usize, x: [f64; 3], centre: [f64; 3]) -> [f64; 3] {
     u
 }
 
-fn find<'a>(plan: &'a Plan, name: &str) -> Option<&'a crate::motion::RigidMotion> {
+fn find<'a>(plan: &'a Plan, name: &str) -> Option<&'a RigidMotion> {
     plan.iter().find_map(|(segment, motion)| match motion {
         Motion::Rigid(rigid) if segment == name => Some(rigid),
         _ => None,

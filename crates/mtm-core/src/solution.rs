@@ -6,7 +6,7 @@ use std::time::Instant;
 pub type Timings = Vec<(&'static str, f64)>;
 
 /// Contact at the sliding nodes after a solve.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct ContactResult {
     /// The sliding nodes, segment by segment.
     pub nodes: Vec<u32>,
@@ -21,8 +21,27 @@ pub struct ContactResult {
     pub gaps: Vec<f64>,
     /// Whether the node is held to the surface.
     pub active: Vec<bool>,
-    /// Walls that hold the node: one as a rule, two in a crease, three in a corner, none if lifted off.
-    pub walls: Vec<u8>,
+    /// Largest way, mm, that the force along the surface would still move a sliding node by itself.
+    pub unbalanced: f64,
+    /// Whether gaps and forces are within the tolerance. Where they are not, they are so small that no face
+    /// would show it.
+    pub converged: bool,
+}
+
+impl Default for ContactResult {
+    /// No sliding nodes.
+    fn default() -> Self {
+        Self {
+            nodes: Vec::new(),
+            points: Vec::new(),
+            normals: Vec::new(),
+            forces: Vec::new(),
+            gaps: Vec::new(),
+            active: Vec::new(),
+            unbalanced: 0.0,
+            converged: true,
+        }
+    }
 }
 
 /// Displacements under one plan.
@@ -49,7 +68,7 @@ pub struct Solution {
     pub residual_history: Vec<f64>,
     /// Contact at the sliding nodes.
     pub contact: ContactResult,
-    /// Outer iterations of the contact loop, over all of Newton's steps.
+    /// Newton steps of the contact solver, over all of Newton's steps.
     pub contact_iterations: usize,
     /// Seconds by stage.
     pub timings: Timings,

@@ -405,7 +405,8 @@ impl StaticSolver {
             normals: state.normals,
             forces: state.forces,
             gaps: state.gaps,
-            walls: state.walls,
+            unbalanced: state.unbalanced,
+            converged: state.converged,
             active: state.active,
         }
     }

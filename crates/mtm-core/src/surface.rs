@@ -33,9 +33,6 @@ const BOUND_SLACK: f64 = 1.0 - 16.0 * f64::EPSILON;
 /// Length of a blended normal below which its direction is lost and the facet normal stands in.
 const NORMAL_CANCELLED: f64 = 1e-6;
 
-/// Relative difference of two distances to one point of a crease, measured on its triangles.
-const SAME_DISTANCE: f64 = 1e-12;
-
 /// Points a thread takes at once: large enough to hide the hand-over.
 const POINTS_PER_TASK: usize = 64;
 
@@ -241,48 +238,6 @@ impl Surface {
             self.shape.bvh.find_best(start_squared + f64::MIN_POSITIVE, bound, leaf);
         let (_, t, found) = best.get();
         self.describe(&p, t, &found)
-    }
-
-    /// Closest point to `point` (mm, finite) of the part of the surface that goes down to it from
-    /// `triangle`: the nearest point of one wall where another wall may be nearer.
-    ///
-    /// `triangle`: its index, below the number of triangles. A local minimum of the distance, found
-    /// across edges and round corners where normals are continuous; creases end a wall.
-    pub fn closest_from(&self, point: [f64; 3], triangle: u32) -> Closest {
-        let p = Vec3::from(point);
-        let squared = |found: &TrianglePoint| (p - found.point).norm_squared();
-        let (mut at, mut found) = (triangle, self.closest_on(&p, triangle));
-        loop {
-            let nearer = self
-                .topology
-                .round(at, found.feature)
-                .into_iter()
-                .map(|t| (t, self.closest_on(&p, t)))
-                .min_by(|a, b| squared(&a.1).total_cmp(&squared(&b.1)).then(a.0.cmp(&b.0)))
-                .filter(|(_, candidate)| squared(candidate) < squared(&found));
-            // Each step is strictly nearer: no triangle comes twice.
-            let Some((t, candidate)) = nearer else {
-                return self.describe(&p, at, &found);
-            };
-            (at, found) = (t, candidate);
-        }
-    }
-
-    /// `found`, the closest point to `point`, on the wall that faces it most: on a crease, the triangles
-    /// that meet there differ in their normals, and `closest_one` takes the one that comes first.
-    pub(crate) fn facing(&self, point: [f64; 3], found: &Closest) -> Closest {
-        if found.feature == Feature::Face || found.distance == 0.0 {
-            return *found;
-        }
-        let p = Vec3::from(point);
-        let away = (p - Vec3::from(found.point)) / found.signed_distance;
-        let faces = |c: &Closest| away.dot(&Vec3::from(c.normal));
-        self.topology
-            .all_round(found.triangle, found.feature)
-            .into_iter()
-            .map(|t| self.describe(&p, t, &self.closest_on(&p, t)))
-            .filter(|c| c.distance <= found.distance * (1.0 + SAME_DISTANCE))
-            .fold(*found, |best, c| if faces(&c) > faces(&best) { c } else { best })
     }
 
     /// The point of a triangle with the weights `barycentric` of its corners, mm.

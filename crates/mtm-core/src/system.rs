@@ -4,17 +4,14 @@
 use crate::blocks::BlockMatrix;
 use crate::boundary::Motion;
 use crate::cholesky::{Factor, Symbolic};
-use crate::constraints::{
-    Constraint, add_offsets, along_normals, orthonormal, projected, projected_rhs,
-};
-use crate::contact::{Constraints, ContactMode, ContactState, Response, Sliding, Spring};
-use crate::crease::ContactRow;
+use crate::constraints::{Constraint, add_offsets, orthonormal, projected, projected_rhs};
+use crate::contact::{Body, Constraints, ContactRow, ContactState, Response, Sliding, Spring};
 use crate::error::{MtmError, Result};
 use crate::iterative::{Effort, Extremes, Iterative, Trail};
-use crate::mesh::{add, norm, scaled, sub};
+use crate::mesh::{add, dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
-use crate::reaction::ContactFactor;
-use crate::restraint::Held;
+use crate::reaction::{Answer, Answers, ContactFactor};
+use crate::restraint::Held as Restraint;
 use crate::row_sums::in_pool;
 use crate::solution::Clock;
 
@@ -24,11 +21,6 @@ const MAX_DENSE_SLIDING: usize = 2500;
 /// Most sliding nodes of which the flexibility along the normals at rest is kept: 8 bytes a pair.
 const MAX_KEPT_SLIDING: usize = 6000;
 
-/// Share of the error at its start to which a contact iteration is solved, until the tolerance is near:
-/// what it leaves is less than what the next closest points change.
-const STEP_SHARE: f64 = 1e-2;
-/// The same where nodes may lift off: small forces decide which.
-const LIFTING_STEP_SHARE: f64 = 1e-4;
 /// Share of the error allowed to an iterative solve that contact may have as well: it cannot settle nearer
 /// than the solves repeat.
 const CONTACT_SHARE: f64 = 0.1;
@@ -38,6 +30,9 @@ const TRIAL_SAFETY: f64 = 100.0;
 
 /// Multiple of the largest gap that contact leaves which stands for the error of a solution with it.
 const GAP_SAFETY: f64 = 10.0;
+
+/// One row of three for each unknown node.
+type Rows = Vec<[f64; 3]>;
 
 /// What is kept from one plan to the next.
 enum Kept {
@@ -67,6 +62,18 @@ pub(crate) struct Frozen<'a> {
     pub rows: &'a [ContactRow],
     /// Offset of every row, for each right-hand side.
     pub offsets: &'a [Vec<f64>],
+    /// How the contact forces turn as nodes slide.
+    pub springs: &'a [Spring],
+    /// Goal of every spring, for each right-hand side.
+    pub goals: &'a [Vec<f64>],
+}
+
+impl Frozen<'_> {
+    /// The springs with their goals for right-hand side `k`.
+    fn springs(&self, k: usize) -> Vec<Spring> {
+        let goals = self.springs.iter().zip(&self.goals[k]);
+        goals.map(|(spring, &goal)| Spring { goal, ..*spring }).collect()
+    }
 }
 
 impl System {
@@ -77,7 +84,7 @@ impl System {
         matrix: BlockMatrix,
         positions: &[[f64; 3]],
         sliding: Option<&Sliding>,
-        held: Held,
+        held: Restraint,
         tissue: Extremes,
         options: &StaticOptions,
         clock: &mut Clock,
@@ -90,7 +97,7 @@ impl System {
                 sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
             // Where sliding nodes alone hold a part, there is no flexibility without them.
             let kept = !slide_rows.is_empty()
-                && held == Held::ByPrescribed
+                && held == Restraint::ByPrescribed
                 && slide_rows.len() <= MAX_KEPT_SLIDING;
             let dense = kept && slide_rows.len() <= MAX_DENSE_SLIDING;
             let symbolic = Symbolic::new(&matrix, if dense { &slide_rows } else { &[] })?;
@@ -176,36 +183,31 @@ impl System {
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, ContactState, f64)> {
         let clock = Clock::new();
-        let share = match options.contact.mode {
-            ContactMode::Bilateral => STEP_SHARE,
-            ContactMode::Unilateral => LIFTING_STEP_SHARE,
-        };
         let (first, rows) = begin.map_or((None, &[][..]), |b| (Some(b.contact), b.rows));
         if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
             // Each on a thread of the pool, so that loops inside begin without a hand-over; not all at once:
             // interrupts are of the calling thread.
-            let mut answers = in_pool(|| contact.answers(symbolic, factor, b));
+            let answers = in_pool(|| contact.answers(symbolic, factor, b));
             let tolerance = sliding.gap_limit(&options.contact) / sliding.diagonal;
-            let state = sliding.settle(motions, first, &options.contact, interrupted, |c| {
-                in_pool(|| answers.respond(c, share, tolerance))
-            })?;
+            let mut body = Flexible { answers, tolerance, last: None, is_known: false };
+            let state = sliding.solve(motions, first, &options.contact, interrupted, &mut body)?;
             let seconds = clock.total();
-            let x = in_pool(|| answers.displacements(&pushes(&state.normals, &state.forces)));
-            let gap = state.largest_gap();
-            effort.error_estimate = direct_error(factor, &x).max(GAP_SAFETY * gap);
+            let x = in_pool(|| body.answers.of_all(&state.reactions));
+            effort.error_estimate = direct_error(factor, &x).max(left_by(&state));
             return Ok((x, state, seconds));
         }
-        let mut trail = Trail::starting(rows.to_vec());
-        let share = Some(share);
         let mut contact = options.contact;
         if let Kept::Iterative(_) = self.kept {
             let far = scale.max(sliding.farthest(motions));
             contact.allowed = contact.allowed.max(CONTACT_SHARE * options.tolerance * far);
         }
-        let state = sliding.settle(motions, first, &contact, interrupted, |c| {
-            self.solve_projected(b, sliding, c, scale, share, &mut trail, effort, interrupted)
-        })?;
-        Ok((trail.rows, state, clock.total()))
+        let trail = Trail::starting(rows.to_vec());
+        let mut body =
+            Held { system: self, b, sliding, scale, trail, effort, interrupted, last: None };
+        let state = sliding.solve(motions, first, &contact, interrupted, &mut body)?;
+        let rows = body.trail.rows;
+        effort.error_estimate = effort.error_estimate.max(left_by(&state));
+        Ok((rows, state, clock.total()))
     }
 
     /// Rows for several right-hand sides; `scales` is the length of each one's prescribed field, mm.
@@ -225,32 +227,47 @@ impl System {
             let each = columns.iter().zip(scales);
             return each.map(|(b, &s)| self.solve(b, s, &mut effort, interrupted)).collect();
         };
-        if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
-            let frozen = contact.frozen(frozen.rows, frozen.offsets)?;
-            let solve = |(k, b): (usize, &Vec<[f64; 3]>)| {
-                if interrupted() {
-                    return Err(MtmError::Interrupted);
-                }
-                let mut answers = contact.answers(symbolic, factor, b);
-                let forces = frozen.forces(&mut answers, k)?;
-                Ok(answers.displacements(&forces))
-            };
-            return columns.iter().enumerate().map(solve).collect();
-        }
-        let solve = |((b, offsets), &scale): ((&Vec<[f64; 3]>, &Vec<f64>), &f64)| {
+        let still = vec![[0.0; 3]; sliding.nodes().len()];
+        let conditions = |k: usize, solve: &mut dyn FnMut(&Constraints<'_>) -> Result<Rows>| {
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
-            let c = Constraints { rows: frozen.rows, offsets, springs: &[] };
-            let (mut trail, effort) = (Trail::default(), &mut effort);
-            self.solve_projected(b, sliding, &c, scale, None, &mut trail, effort, interrupted)?;
-            Ok(trail.rows)
+            let (rows, offsets) = (frozen.rows, &frozen.offsets[k][..]);
+            let springs = frozen.springs(k);
+            solve(&Constraints { rows, offsets, springs: &springs, about: &still, share: 0.0 })
         };
-        columns.iter().zip(frozen.offsets).zip(scales).map(solve).collect()
+        if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
+            let kept = contact.frozen(frozen.rows, frozen.springs)?;
+            let solve = |(k, b): (usize, &Rows)| {
+                conditions(k, &mut |c| {
+                    let mut answers = contact.answers(symbolic, factor, b).frozen(kept.as_ref());
+                    let found = answers.respond(c, 0.0)?;
+                    Ok(answers.of_all(&found.forces))
+                })
+            };
+            return columns.iter().enumerate().map(solve).collect();
+        }
+        let mut solve = |((k, b), &scale): ((usize, &Rows), &f64)| {
+            conditions(k, &mut |c| {
+                let mut trail = Trail::default();
+                let found = self.solve_projected(
+                    b,
+                    sliding,
+                    c,
+                    scale,
+                    None,
+                    &mut trail,
+                    &mut effort,
+                    interrupted,
+                );
+                found.map(|(x, _)| x)
+            })
+        };
+        columns.iter().enumerate().zip(scales).map(&mut solve).collect()
     }
 
-    /// One constrained solve on the projected system, P A P + k (I − P), P = I − n⊗n on held nodes; its
-    /// rows are left in `trail`.
+    /// Rows of the projected system, P A P + k (I − P), P = I − n⊗n on held nodes, and whether they are within
+    /// the tolerance.
     ///
     /// `share`: see [`Iterative::solve_projected`].
     fn solve_projected(
@@ -263,7 +280,7 @@ impl System {
         trail: &mut Trail,
         effort: &mut Effort,
         interrupted: Interrupt<'_>,
-    ) -> Result<Response> {
+    ) -> Result<(Vec<[f64; 3]>, bool)> {
         let row = |node: usize| sliding.nodes()[node].row as usize;
         let asked: Vec<Constraint> = c
             .rows
@@ -280,21 +297,17 @@ impl System {
             }
             rhs
         };
-        let (matrix, (mut x, solved)) = match &self.kept {
-            Kept::Iterative(iterative) => {
-                let matrix = iterative.matrix();
-                let found = iterative.solve_projected(
-                    &pushed(matrix),
-                    &constraints,
-                    &springs,
-                    scale,
-                    share,
-                    trail,
-                    effort,
-                    interrupted,
-                )?;
-                (matrix, found)
-            }
+        let (mut x, solved) = match &self.kept {
+            Kept::Iterative(iterative) => iterative.solve_projected(
+                &pushed(iterative.matrix()),
+                &constraints,
+                &springs,
+                scale,
+                share,
+                trail,
+                effort,
+                interrupted,
+            )?,
             Kept::Refactored { symbolic, matrix } => {
                 let mut system = projected(matrix, &constraints);
                 for (row, s) in &springs {
@@ -303,24 +316,170 @@ impl System {
                 let factor = symbolic.factor(&system)?;
                 let x = symbolic.solve(&factor, &pushed(matrix));
                 effort.error_estimate = direct_error(&factor, &x);
-                (matrix, (x, true))
+                (x, true)
             }
             Kept::Direct { .. } => unreachable!("the factor without contact serves there"),
         };
         add_offsets(&mut x, &constraints);
-        let forces = along_normals(&asked, |row| sub(matrix.row_product(row, &x), b[row]));
-        let displacements = sliding.nodes().iter().map(|n| x[n.row as usize]).collect();
-        trail.rows = x;
-        Ok(Response { displacements, forces, solved })
+        Ok((x, solved))
     }
+
+    /// The matrix without constraints, where it is kept.
+    fn matrix(&self) -> &BlockMatrix {
+        match &self.kept {
+            Kept::Iterative(iterative) => iterative.matrix(),
+            Kept::Refactored { matrix, .. } => matrix,
+            Kept::Direct { .. } => unreachable!("the factor without contact serves there"),
+        }
+    }
+}
+
+/// The body by what its sliding nodes do to one another: every other node follows them exactly.
+struct Flexible<'a> {
+    answers: Answers<'a>,
+    tolerance: f64,
+    last: Option<Step>,
+    /// Whether the forces at the start of the last step are known.
+    is_known: bool,
+}
+
+/// A step of some rows with the forces out of balance at its ends, N.
+struct Step {
+    from: Vec<[f64; 3]>,
+    to: Vec<[f64; 3]>,
+    forces_from: Vec<[f64; 3]>,
+    forces_to: Vec<[f64; 3]>,
+}
+
+impl Step {
+    /// Slopes of the energy along the step, at its start and at its end.
+    fn slopes(&self) -> (f64, f64) {
+        let (mut first, mut last) = (0.0, 0.0);
+        let forces = self.forces_from.iter().zip(&self.forces_to);
+        for ((a, b), (f, g)) in self.from.iter().zip(&self.to).zip(forces) {
+            let way = sub(*b, *a);
+            first += dot(*f, way);
+            last += dot(*g, way);
+        }
+        (first, last)
+    }
+
+    /// The step to `share` of the way; energy is quadratic, forces are linear.
+    fn shorten(&mut self, share: f64) {
+        for (ends, starts) in [(&mut self.to, &self.from), (&mut self.forces_to, &self.forces_from)]
+        {
+            for (end, start) in ends.iter_mut().zip(starts) {
+                *end = add(*start, scaled(sub(*end, *start), share));
+            }
+        }
+    }
+}
+
+impl Body for Flexible<'_> {
+    fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
+        let Self { answers, tolerance, .. } = self;
+        let Answer { displacements, forces, solved } = in_pool(|| answers.respond(c, *tolerance))?;
+        let before = self.last.take().map(|last| (last.to, last.forces_to));
+        self.is_known = before.is_some();
+        let (from, forces_from) = before.unwrap_or_else(|| (displacements.clone(), forces.clone()));
+        let step = Step { from, to: displacements.clone(), forces_from, forces_to: forces.clone() };
+        let slopes = self.is_known.then(|| step.slopes());
+        self.last = Some(step);
+        Ok(Response { displacements, reactions: forces, slopes, solved })
+    }
+
+    fn shorten(&mut self, share: f64) {
+        if !self.is_known {
+            // What a share of the way takes depends on the forces at its start.
+            self.last = None;
+        } else if let Some(step) = &mut self.last {
+            step.shorten(share);
+        }
+    }
+}
+
+/// The body by all its rows, those of held nodes projected.
+struct Held<'a> {
+    system: &'a System,
+    b: &'a [[f64; 3]],
+    sliding: &'a Sliding,
+    scale: f64,
+    trail: Trail,
+    effort: &'a mut Effort,
+    interrupted: Interrupt<'a>,
+    last: Option<Step>,
+}
+
+impl Held<'_> {
+    /// Forces out of balance of all rows, A x − b.
+    fn forces(&self, x: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let mut out = self.system.matrix().multiply(x);
+        for (f, b) in out.iter_mut().zip(self.b) {
+            *f = sub(*f, *b);
+        }
+        out
+    }
+}
+
+impl Body for Held<'_> {
+    fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
+        let (from, forces_from) = match self.last.take() {
+            Some(last) => (last.to, last.forces_to),
+            None => {
+                let mut rows = std::mem::take(&mut self.trail.rows);
+                rows.resize(self.b.len(), [0.0; 3]);
+                for (node, &u) in self.sliding.nodes().iter().zip(c.about) {
+                    rows[node.row as usize] = u;
+                }
+                let forces = self.forces(&rows);
+                (rows, forces)
+            }
+        };
+        self.trail.rows.clone_from(&from);
+        let found = self.system.solve_projected(
+            self.b,
+            self.sliding,
+            c,
+            self.scale,
+            (c.share > 0.0).then_some(c.share),
+            &mut self.trail,
+            self.effort,
+            self.interrupted,
+        );
+        let (x, solved) = match found {
+            Ok(found) => found,
+            Err(error) => {
+                let (to, forces_to) = (from.clone(), forces_from.clone());
+                self.last = Some(Step { from, to, forces_from, forces_to });
+                return Err(error);
+            }
+        };
+        let forces = self.forces(&x);
+        let of = |rows: &[[f64; 3]]| {
+            self.sliding.nodes().iter().map(|n| rows[n.row as usize]).collect::<Vec<_>>()
+        };
+        let (displacements, reactions) = (of(&x), of(&forces));
+        let step = Step { from, to: x, forces_from, forces_to: forces };
+        let slopes = Some(step.slopes());
+        self.trail.rows.clone_from(&step.to);
+        self.last = Some(step);
+        Ok(Response { displacements, reactions, slopes, solved })
+    }
+
+    fn shorten(&mut self, share: f64) {
+        if let Some(step) = &mut self.last {
+            step.shorten(share);
+            self.trail.rows.clone_from(&step.to);
+        }
+    }
+}
+
+/// What contact leaves of error, mm.
+fn left_by(state: &ContactState) -> f64 {
+    GAP_SAFETY * state.largest_gap().max(state.unbalanced)
 }
 
 /// Estimate of the largest nodal error of a solution by factor, mm.
 fn direct_error(factor: &Factor, x: &[[f64; 3]]) -> f64 {
     TRIAL_SAFETY * factor.trial_error() * x.iter().fold(0.0_f64, |m, v| m.max(norm(*v)))
-}
-
-/// Force vector of each sliding node.
-fn pushes(normals: &[[f64; 3]], forces: &[f64]) -> Vec<[f64; 3]> {
-    normals.iter().zip(forces).map(|(&n, &f)| scaled(n, f)).collect()
 }

@@ -1,6 +1,6 @@
 //! How the triangles of a surface hang together: edges, neighbours, border, smoothing groups.
 
-use crate::triangle::{Feature, Vec3};
+use crate::triangle::Vec3;
 use rayon::prelude::*;
 
 /// Stands for "no neighbour": a border, non-manifold or flipped edge.
@@ -50,69 +50,6 @@ struct Side {
 }
 
 impl Topology {
-    /// The other triangles at a feature of triangle `t`: across an edge, or round a corner, as far as
-    /// normals are continuous.
-    pub fn round(&self, t: u32, feature: Feature) -> Vec<u32> {
-        self.walk(t, feature, |at, k| self.smooth_neighbour(at, k))
-    }
-
-    fn walk(
-        &self,
-        t: u32,
-        feature: Feature,
-        across: impl Fn(usize, usize) -> Option<u32>,
-    ) -> Vec<u32> {
-        let start = t as usize;
-        match feature {
-            Feature::Face => Vec::new(),
-            Feature::Edge(k) => across(start, k as usize).into_iter().collect(),
-            Feature::Vertex(k) => {
-                let vertex = self.triangles[start][k as usize];
-                let mut out = Vec::new();
-                // One way round, and the other way where a crease or border stopped the first.
-                for first in [k as usize, (k as usize + 2) % 3] {
-                    let (mut edge, mut at) = (first, start);
-                    while let Some(next) = across(at, edge) {
-                        if next == t {
-                            return out;
-                        }
-                        if out.contains(&next) {
-                            break;
-                        }
-                        out.push(next);
-                        let corners = self.triangles[next as usize];
-                        let Some(j) = corners.iter().position(|&v| v == vertex) else { break };
-                        let back = self.neighbours[next as usize][j] == at as u32;
-                        (edge, at) = (if back { (j + 2) % 3 } else { j }, next as usize);
-                    }
-                }
-                out
-            }
-        }
-    }
-
-    /// The other triangles at a feature of triangle `t`, creases or not, as far as edges join two.
-    pub fn all_round(&self, t: u32, feature: Feature) -> Vec<u32> {
-        self.walk(t, feature, |at, k| {
-            Some(self.neighbours[at][k]).filter(|&next| next != NO_TRIANGLE)
-        })
-    }
-
-    /// Triangle across edge `k` of triangle `t` if normals are continuous there.
-    fn smooth_neighbour(&self, t: usize, k: usize) -> Option<u32> {
-        let next = self.neighbours[t][k];
-        if next == NO_TRIANGLE {
-            return None;
-        }
-        let other = next as usize;
-        let continuous = [k, (k + 1) % 3].into_iter().all(|corner| {
-            let vertex = self.triangles[t][corner];
-            let same = |&j: &usize| self.triangles[other][j] == vertex;
-            (0..3).find(same).is_some_and(|j| self.groups[other][j] == self.groups[t][corner])
-        });
-        continuous.then_some(next)
-    }
-
     /// Connectivity of triangles whose indices lie in `0..n_vertices`.
     ///
     /// Two triangles are smooth across their edge if they are the only ones there, run through it

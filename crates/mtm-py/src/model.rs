@@ -275,9 +275,11 @@ fn plan(value: &Bound<'_, PyAny>) -> PyResult<Plan> {
 /// max_iterations : int, optional
 ///     Of the iterative methods.
 /// contact_tolerance : float
-///     Largest gap over the diagonal of the mesh, and largest tangential share of contact forces.
+///     Largest distance of a held node from its contact surface, mm; a tenth of it is the way that the force
+///     along the surface may still move any node by itself.
 /// contact_iterations : int
-///     Outer iterations of the contact loop.
+///     Newton steps of the contact solver. Where they run out above the tolerance, a state whose gaps and
+///     imbalance no face would show (0.02 mm) is handed out with `contact_converged` False.
 /// memory_limit : float, optional
 ///     MB that a factor may take; 80 % of the free memory by default, where that is known.
 /// kinematics : {"linear", "corotational", "hyperelastic"}
@@ -304,11 +306,11 @@ impl PyStaticSolver {
     #[pyo3(
         signature = (
             tensors, boundary, method = "auto", *, contact = "bilateral", tolerance = 1e-8,
-            max_iterations = None, contact_tolerance = 1e-9, contact_iterations = None,
+            max_iterations = None, contact_tolerance = 1e-4, contact_iterations = None,
             memory_limit = None, kinematics = "linear"
         ),
         text_signature = "(tensors, boundary, method='auto', *, contact='bilateral', tolerance=1e-08, \
-                          max_iterations=None, contact_tolerance=1e-09, contact_iterations=100, \
+                          max_iterations=None, contact_tolerance=0.0001, contact_iterations=50, \
                           memory_limit=None, kinematics='linear')"
     )]
     fn new(
@@ -585,11 +587,17 @@ impl PySolution {
         self.core.contact.gaps.clone().into_pyarray(py)
     }
 
-    /// Walls of the contact surface that hold each sliding node, (s,) uint8: one as a rule, two in a
-    /// crease, three in a corner, none where it has lifted off.
+    /// Largest way, mm, that the force along the contact surface would still move a sliding node by itself.
     #[getter]
-    fn contact_walls<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u8>> {
-        self.core.contact.walls.clone().into_pyarray(py)
+    fn contact_unbalanced(&self) -> f64 {
+        self.core.contact.unbalanced
+    }
+
+    /// Whether gaps and forces of the sliding nodes are within the tolerance. Where they are not, they are
+    /// below 0.02 mm: too small to show on a face.
+    #[getter]
+    fn contact_converged(&self) -> bool {
+        self.core.contact.converged
     }
 
     /// Seconds of each stage, set-up included; exactly 0 for what the scene does not need.

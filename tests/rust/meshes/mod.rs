@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, Plan, Segment};
+use mtm_core::contact::ContactOptions;
 use mtm_core::error::Result;
 use mtm_core::material::{Elastic, FibreElastic, FibreLaw, Tissue, Voigt};
 use mtm_core::mesh::TetMesh;
@@ -409,7 +410,12 @@ pub fn stays() -> Motion {
 }
 
 pub fn with_method(method: Method) -> StaticOptions {
-    StaticOptions { method, ..StaticOptions::default() }
+    StaticOptions { method, contact: near_exact(), ..StaticOptions::default() }
+}
+
+/// Contact as exact as closed forms are compared.
+pub fn near_exact() -> ContactOptions {
+    ContactOptions { tolerance: 1e-8, ..ContactOptions::default() }
 }
 
 pub fn solver(

@@ -10,10 +10,8 @@ use std::sync::{Arc, OnceLock};
 
 use crate::blocks::BlockMatrix;
 use crate::cholesky::Symbolic;
-use crate::constraints::{
-    Constraint, add_offsets, along_normals, orthonormal, projected, projected_rhs,
-};
-use crate::contact::{Constraints, ContactState, Response, Sliding};
+use crate::constraints::{Constraint, add_offsets, orthonormal, projected, projected_rhs};
+use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, Shortfall};
 use crate::iterative::{Confirmed, Effort, Extremes, is_doubtful};
 use crate::krylov::{PcgOptions, Preconditioner, Spectrum};
@@ -66,6 +64,47 @@ pub(crate) struct Equilibrium {
     solver: TangentSolver,
     options: StaticOptions,
     tissue: Extremes,
+}
+
+/// A body of large deformation that follows contact conditions, each to its equilibrium.
+struct Followed<'a> {
+    equilibrium: &'a Equilibrium,
+    reduction: &'a Reduction,
+    target: Target<'a>,
+    sliding: &'a Sliding,
+    u: Vec<[f64; 3]>,
+    effort: &'a mut Effort,
+    interrupted: Interrupt<'a>,
+}
+
+impl Body for Followed<'_> {
+    fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
+        let (asked, springs) = on_rows(self.sliding, c);
+        self.target.constraints = orthonormal(&asked);
+        self.target.springs = springs;
+        let u = self.equilibrium.follow(
+            self.reduction,
+            self.u.clone(),
+            &self.target,
+            self.effort,
+            self.interrupted,
+        )?;
+        let forces = self.equilibrium.forces(&u)?;
+        let loads = self.target.loads;
+        let reaction = |j: u32| {
+            let f = forces[j as usize];
+            loads.map_or(f, |l| sub(f, l[j as usize]))
+        };
+        let nodes = self.sliding.nodes();
+        let displacements = nodes.iter().map(|n| u[n.node as usize]).collect();
+        let reactions = nodes.iter().map(|n| reaction(n.node)).collect();
+        self.u = u;
+        Ok(Response { displacements, reactions, slopes: None, solved: true })
+    }
+
+    fn shorten(&mut self, _share: f64) {
+        // Its steps have no slopes, and are taken whole.
+    }
 }
 
 /// What the boundary asks for.
@@ -205,22 +244,17 @@ impl Equilibrium {
             Err(error) => return Err(error),
         }
         let Slide { sliding, motions, .. } = slide;
-        let state = sliding.settle(motions, None, &self.options.contact, interrupted, |c| {
-            let (asked, springs) = on_rows(sliding, c);
-            let target = target(orthonormal(&asked), springs);
-            let begin = std::mem::take(&mut u);
-            u = self.follow(reduction, begin, &target, effort, interrupted)?;
-            let forces = self.forces(&u)?;
-            let reaction = |row: usize| {
-                let j = reduction.unknowns[row] as usize;
-                loads.map_or(forces[j], |l| sub(forces[j], l[j]))
-            };
-            let forces = along_normals(&asked, reaction);
-            let displacement = |node: u32| u[node as usize];
-            let displacements = sliding.nodes().iter().map(|n| displacement(n.node)).collect();
-            Ok(Response { displacements, forces, solved: true })
-        })?;
-        Ok((reduction.rows(&u), Some(state), clock.total()))
+        let mut body = Followed {
+            equilibrium: self,
+            reduction,
+            target: target(vec![], vec![]),
+            sliding,
+            u,
+            effort,
+            interrupted,
+        };
+        let state = sliding.solve(motions, None, &self.options.contact, interrupted, &mut body)?;
+        Ok((reduction.rows(&body.u), Some(state), clock.total()))
     }
 
     /// The state that `target` asks for, from the state `u`: at once, or by shares of the way where Newton's

@@ -1,21 +1,27 @@
 //! Sliding contact: nodes stay on the moved surface of their bone segment and feel no force along it.
 //!
-//! A sliding node x keeps its distance from the moved contact surface, |x + u − c| = g with c the closest
-//! point, and its force follows the continuous unit normal n there (Kim et al. 2010, section 2.5 and eq. 2:
-//! forces act in the tangent plane). What the outer loop needs is here; the loop is in `settling`.
+//! A sliding node x keeps its distance from the moved contact surface, φ(x + u) = g, and its force follows
+//! the gradient of φ (Kim et al. 2010, section 2.5 and eq. 2: no force acts in the tangent plane). The
+//! smooth distance φ is in `field`, where each node lies on it in `seat`, the solver in `newton`.
 
-use std::sync::Arc;
+mod field;
+mod newton;
+mod seat;
 
 use crate::boundary::{Boundary, Gap, Motion};
-use crate::crease::{ContactRow, MovedSurface, Seat};
 use crate::error::{MtmError, Result};
 use crate::mesh::{TetMesh, add, dot, norm, scaled, sub};
 use crate::surface::{Closest, Surface};
+use field::Field;
 
 /// Share of sliding nodes that may face away from the contact surface before it counts as inverted.
 const MOSTLY: f64 = 0.5;
 /// Rounding of the area vector round a node, relative to the areas summed: less has no direction.
 const FACING_ROUNDING: f64 = 1e-12;
+
+/// Lattice spacing of a contact field over the mean edge of the tissue at it: what is sharper, the tissue's
+/// nodes cannot follow.
+const LATTICE_SHARE: f64 = 0.5;
 
 /// Whether nodes may lift off.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,17 +32,17 @@ pub enum ContactMode {
     Unilateral,
 }
 
-/// When the contact loop stops.
+/// When the contact problem counts as solved.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ContactOptions {
     /// Whether nodes may lift off.
     pub mode: ContactMode,
-    /// Largest gap over the diagonal of the mesh, and largest tangential share of the contact force.
+    /// Largest distance of a held node from its surface, mm; a tenth of it is the way that the force along
+    /// the surface may still move any node by itself.
     pub tolerance: f64,
-    /// Gap that is allowed whatever the tolerance says, and tangential force over the node's own stiffness, mm:
-    /// for a state that is only a step on the way.
+    /// Distance that is allowed whatever the tolerance says, mm: for a state that is only a step on the way.
     pub allowed: f64,
-    /// Outer iterations after which the loop gives up.
+    /// Newton steps after which the solver stops.
     pub max_iterations: usize,
     /// How far past the border of an open contact surface a node may end, over the surface's mean edge.
     pub border_reach: f64,
@@ -46,9 +52,9 @@ impl Default for ContactOptions {
     fn default() -> Self {
         Self {
             mode: ContactMode::Bilateral,
-            tolerance: 1e-9,
+            tolerance: 1e-4,
             allowed: 0.0,
-            max_iterations: 100,
+            max_iterations: 50,
             border_reach: 0.25,
         }
     }
@@ -76,8 +82,10 @@ pub struct Sliding {
     gaps: Vec<Option<f64>>,
     /// Stiffness of each node by itself, N/mm.
     pub(crate) stiffness: Vec<f64>,
-    surfaces: Vec<Option<Arc<Surface>>>,
+    /// Contact surface of each segment that has one, as its nodes feel it.
+    fields: Vec<Option<Field>>,
     pub(crate) names: Vec<String>,
+    /// Diagonal of the mesh, mm.
     pub(crate) diagonal: f64,
 }
 
@@ -86,23 +94,28 @@ pub struct Sliding {
 pub struct ContactState {
     /// Displacement of each sliding node, mm.
     pub displacements: Vec<[f64; 3]>,
+    /// Force that the bone exerts on each, N: along the normal but for what the tolerance leaves.
+    pub reactions: Vec<[f64; 3]>,
     /// Closest point of the moved surface, mm.
     pub points: Vec<[f64; 3]>,
-    /// Unit normal that the contact force follows.
+    /// Unit normal of the contact surface at each node, out of the bone.
     pub normals: Vec<[f64; 3]>,
     /// Contact force along the normal, N; positive pushes the tissue away from the bone.
     pub forces: Vec<f64>,
-    /// Walls that hold each node: one on a smooth part, two in a crease, three in a corner, none where it
-    /// has lifted off.
-    pub walls: Vec<u8>,
-    /// Normal and closest point of each of these walls, node by node.
+    /// Constraint of each held node.
     pub rows: Vec<ContactRow>,
+    /// How the forces turn as held nodes slide.
+    pub springs: Vec<Spring>,
     /// Distance of each node from its surface at the end, out of the bone, mm.
     pub gaps: Vec<f64>,
     /// Whether the node is held to the surface.
     pub active: Vec<bool>,
-    /// Outer iterations done.
+    /// Newton steps done.
     pub iterations: usize,
+    /// Largest way, mm, that the force along the surface would still move a node by itself.
+    pub unbalanced: f64,
+    /// Whether the tolerance was reached.
+    pub converged: bool,
 }
 
 impl ContactState {
@@ -113,14 +126,30 @@ impl ContactState {
     }
 }
 
-/// Constraints n_r·u_i = offset_r on the sliding nodes that are held.
+/// Linearised constraint of one sliding node: n·(x + u − p) = 0.
+#[derive(Debug, Clone, Copy)]
+pub struct ContactRow {
+    /// Index among the sliding nodes.
+    pub node: usize,
+    /// Unit normal n.
+    pub normal: [f64; 3],
+    /// Point p of the surface that the node slides on, mm.
+    pub point: [f64; 3],
+}
+
+/// Contact conditions linearised about a state: n_r·u_i = offset_r on the sliding nodes that are held.
 pub struct Constraints<'a> {
     /// Node and normal of each constraint, nodes ascending.
     pub rows: &'a [ContactRow],
     /// Offset of every row, mm.
     pub offsets: &'a [f64],
-    /// Springs across the normals of nodes with one row.
+    /// How the contact forces turn as nodes slide, across the normals of their rows.
     pub springs: &'a [Spring],
+    /// Displacements of all sliding nodes that they are linearised about, mm.
+    pub about: &'a [[f64; 3]],
+    /// Share of what the conditions change to which the answer may be off; 0 for one as good as the solver's
+    /// tolerance asks.
+    pub share: f64,
 }
 
 /// A spring on one sliding node along an axis of its tangent plane.
@@ -130,20 +159,35 @@ pub struct Spring {
     pub node: usize,
     /// Unit vector.
     pub axis: [f64; 3],
-    /// N/mm.
+    /// N/mm; negative where the force carries the node on.
     pub stiffness: f64,
     /// Displacement along the axis at which it is slack, mm.
     pub goal: f64,
 }
 
-/// Displacements (mm) of all sliding nodes and contact forces (N) along the rows.
+/// What a body does under linearised contact conditions.
 pub struct Response {
-    /// Displacement of every sliding node.
+    /// Displacement of every sliding node, mm.
     pub displacements: Vec<[f64; 3]>,
-    /// Contact force of each of `Constraints::rows`.
-    pub forces: Vec<f64>,
+    /// Internal force less loads of every sliding node, N: what the bone has to exert.
+    pub reactions: Vec<[f64; 3]>,
+    /// Slope of the elastic energy along the step from the state before to this one, at its start and at
+    /// its end, N mm; none where the body does not know it.
+    pub slopes: Option<(f64, f64)>,
     /// Whether they are within the tolerance of the solver: contact cannot end before that.
     pub solved: bool,
+}
+
+/// An elastic body in contact: what the contact solver asks of it.
+pub trait Body {
+    /// The body under `conditions`, from its state before.
+    ///
+    /// # Errors
+    /// `NotPositiveDefinite` where the springs make it unstable; those of its solver.
+    fn respond(&mut self, conditions: &Constraints<'_>) -> Result<Response>;
+
+    /// Goes back to `share` of the way from the state before to the last one.
+    fn shorten(&mut self, share: f64);
 }
 
 impl Sliding {
@@ -172,14 +216,14 @@ impl Sliding {
             rest_normals: Vec::new(),
             gaps: Vec::new(),
             stiffness: Vec::new(),
-            surfaces: Vec::new(),
+            fields: Vec::new(),
             names: Vec::new(),
             diagonal: mesh.diagonal(),
         };
         for (s, segment) in boundary.segments().iter().enumerate() {
             sliding.names.push(segment.name.clone());
             let (false, Some(surface)) = (segment.sliding.is_empty(), &segment.contact) else {
-                sliding.surfaces.push(None);
+                sliding.fields.push(None);
                 continue;
             };
             let positions: Vec<[f64; 3]> =
@@ -198,9 +242,10 @@ impl Sliding {
                 sliding.nodes.push(SlidingNode { node, row, segment: s });
             }
             sliding.rest.extend(closest);
-            sliding.positions.extend(positions);
             sliding.rest_normals.extend(normals);
-            sliding.surfaces.push(Some(surface.clone()));
+            let (origin, spacing) = lattice(mesh, &segment.sliding, &positions, surface);
+            sliding.fields.push(Some(Field::new(surface.clone(), origin, spacing)));
+            sliding.positions.extend(positions);
         }
         Ok(Some(sliding))
     }
@@ -213,29 +258,6 @@ impl Sliding {
     /// Unit normal of the contact surface at rest for each sliding node.
     pub fn rest_normals(&self) -> &[[f64; 3]] {
         &self.rest_normals
-    }
-
-    /// Where the sliding nodes would be if they clung to their segment, and where their surfaces lie.
-    ///
-    /// A node without a prescribed gap slides on the contact surface shifted to where it lies itself: by
-    /// its offset at rest, carried with the segment. However far off the contact surface it lies, its
-    /// own surface is as smooth; the surface at its distance may fold.
-    pub(crate) fn carried(
-        &self,
-        motions: &[&Motion],
-        surfaces: &[MovedSurface],
-    ) -> (Vec<[f64; 3]>, Vec<Seat>) {
-        let out = self.clinging(motions);
-        let seats = (0..self.nodes.len())
-            .map(|i| match self.gaps[i] {
-                Some(gap) => Seat { offset: [0.0; 3], gap },
-                None => {
-                    let foot = surfaces[self.nodes[i].segment].carried(&self.rest[i]);
-                    Seat { offset: sub(out[i], foot), gap: 0.0 }
-                }
-            })
-            .collect();
-        (out, seats)
     }
 
     /// Where the sliding nodes would be if they clung to their segment.
@@ -264,31 +286,45 @@ impl Sliding {
         out
     }
 
+    /// Distance of node `i` from its contact surface at rest, mm; past a border, from the tangent plane there.
+    fn rest_distance(&self, i: usize) -> f64 {
+        let rest = &self.rest[i];
+        if rest.on_border {
+            return dot(rest.normal, sub(self.positions[i], rest.point));
+        }
+        rest.signed_distance
+    }
+
     /// Largest motion of a sliding node that clings to its segment, mm.
     pub(crate) fn farthest(&self, motions: &[&Motion]) -> f64 {
         let clinging = self.clinging(motions);
         let moved = clinging.iter().zip(&self.positions).map(|(c, x)| norm(sub(*c, *x)));
         moved.fold(0.0, f64::max)
     }
+}
 
-    pub(crate) fn moved_surfaces(&self, motions: &[&Motion]) -> Result<Vec<MovedSurface>> {
-        self.surfaces
-            .iter()
-            .zip(motions)
-            .map(|(surface, motion)| {
-                Ok(match (surface, motion) {
-                    (None, _) | (_, Motion::Nodes(_)) => MovedSurface::Unused,
-                    (Some(rest), Motion::Rigid(rigid)) => MovedSurface::Rigid(rest.clone(), *rigid),
-                    (Some(rest), Motion::Surface(surface)) => {
-                        let u = surface.displacement(rest.vertices());
-                        let moved =
-                            rest.vertices().iter().zip(u).map(|(&x, u)| add(x, u)).collect();
-                        MovedSurface::Moved(rest.moved(moved)?)
-                    }
-                })
-            })
-            .collect()
+/// A point of the lattice of a contact field, and its spacing, mm.
+///
+/// The point goes along with the nodes, so that a head elsewhere, or its mirror image, has the same field.
+fn lattice(
+    mesh: &TetMesh,
+    nodes: &[u32],
+    positions: &[[f64; 3]],
+    surface: &Surface,
+) -> ([f64; 3], f64) {
+    let count = positions.len() as f64;
+    let centre = positions.iter().fold([0.0; 3], |c, &x| add(c, scaled(x, 1.0 / count)));
+    let (mut sum, mut edges) = (0.0, 0.0);
+    for &j in nodes.iter().filter(|&&j| (j as usize) < mesh.n_nodes()) {
+        for &t in mesh.tets_of_node(j as usize) {
+            for &k in mesh.tets()[t as usize].iter().filter(|&&k| k != j) {
+                sum += norm(sub(mesh.nodes()[k as usize], mesh.nodes()[j as usize]));
+                edges += 1.0;
+            }
+        }
     }
+    let edge = if edges > 0.0 { sum / edges } else { surface.mean_edge_length() };
+    (centre, LATTICE_SHARE * edge)
 }
 
 /// Refuses a contact surface that faces away from the tissue, where the side matters: always if nodes

@@ -1,0 +1,189 @@
+"""Solves random plans with sliding contact on heads: contact_plans.py CASE [CASE …] --plans 200.
+
+Each plan moves one or more segments of the case by up to 10 mm along each axis and up to 8° about
+any axis; plans whose bones would pass through each other are drawn again. The table tells how many
+plans converge and in how many Newton steps. Exit code 1 if one does not converge.
+"""
+
+import argparse
+import itertools
+import os
+import platform
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import cmfsim
+from marked import replace_marked
+
+Floats = NDArray[np.float64]
+Plan = dict[str, Floats]
+
+# Tries to find a plan whose bones keep clear of each other.
+MOST_DRAWS = 2000
+# Points of a bone at which its depth in another is looked at.
+SAMPLES = 3000
+HEAD = (
+    "| head | model | tets | sliding | plans | converged | steps: median | P95 | most "
+    "| largest gap, µm |"
+)
+
+
+@dataclass
+class Tally:
+    """What came of the plans of one model of one head."""
+
+    head: str
+    model: str
+    tets: int
+    sliding: int
+    steps: list[int] = field(default_factory=list)
+    gaps: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+
+    def row(self) -> str:
+        """The table's row."""
+        n = len(self.steps) + len(self.failures)
+        steps = np.array(self.steps or [0])
+        return (
+            f"| {self.head} | {self.model} | {self.tets:,} | {self.sliding} | {n} "
+            f"| {len(self.steps)} | {np.median(steps):g} | {np.percentile(steps, 95):.0f} "
+            f"| {steps.max()} | {1e3 * max(self.gaps, default=0.0):.1g} |"
+        )
+
+
+class Jaws:
+    """Bones of a head as they move: whether a plan drives them through each other."""
+
+    def __init__(self, model: cmfsim.PatientModel, overlap: float) -> None:
+        self.overlap = overlap
+        self.surfaces: dict[str, cmfsim.Surface] = {}
+        self.points: dict[str, Floats] = {}
+        for segment in model.segments:
+            mesh = segment.surface
+            self.surfaces[segment.name] = cmfsim.Surface(mesh.vertices, mesh.triangles)
+            vertices = np.asarray(mesh.vertices)
+            self.points[segment.name] = vertices[:: -(-len(vertices) // SAMPLES)]
+        rest = {name: np.eye(4) for name in self.surfaces}
+        self.before = {pair: self._depth(*pair, rest) for pair in self._pairs()}
+
+    def _pairs(self) -> Iterator[tuple[str, str]]:
+        return itertools.permutations(self.surfaces, 2)
+
+    def _depth(self, one: str, other: str, plan: Mapping[str, Floats]) -> float:
+        """How deep a bone lies in another, mm."""
+        back = np.linalg.inv(plan.get(other, np.eye(4))) @ plan.get(one, np.eye(4))
+        points = self.points[one] @ back[:3, :3].T + back[:3, 3]
+        inside = self.surfaces[other].winding_number(points) > 0.5
+        if not inside.any():
+            return 0.0
+        nearest = self.surfaces[other].closest(points[inside])[0]
+        return float(np.linalg.norm(nearest - points[inside], axis=1).max())
+
+    def clear(self, plan: Mapping[str, Floats]) -> bool:
+        """Whether no bone passes more than the allowed overlap deeper into another than at rest."""
+        for pair in self._pairs():
+            if np.array_equal(plan.get(pair[0], np.eye(4)), plan.get(pair[1], np.eye(4))):
+                continue
+            if self._depth(*pair, plan) > self.before[pair] + self.overlap:
+                return False
+        return True
+
+
+def draw(
+    model: cmfsim.PatientModel, count: int, reach: tuple[float, float], overlap: float, seed: int
+) -> list[Plan]:
+    """Random plans: each segment that the case's plan moves stays or goes."""
+    rng = np.random.default_rng(seed)
+    jaws = Jaws(model, overlap)
+    nodes = np.asarray(model.scene.nodes)
+    segments = model.scene.segments
+    movable = [n for n, m in model.scene.plan.items() if not np.allclose(m, np.eye(4))]
+    centres = {
+        n: nodes[np.concatenate([segments[n].joined, segments[n].sliding])].mean(axis=0)
+        for n in movable
+    }
+    plans: list[Plan] = []
+    for _ in range(MOST_DRAWS):
+        if len(plans) == count:
+            break
+        chosen = [n for n in movable if rng.random() < 0.7] or [rng.choice(movable)]
+        plan = {name: np.eye(4) for name in segments}
+        for name in chosen:
+            way = rng.uniform(-reach[0], reach[0], 3)
+            axis = rng.normal(size=3)
+            angle = float(rng.uniform(-reach[1], reach[1]))
+            plan[name] = cmfsim.rigid_motion(tuple(way), angle, tuple(axis), tuple(centres[name]))
+        if jaws.clear(plan):
+            plans.append(plan)
+    return plans
+
+
+def run(tally: Tally, scene: cmfsim.Scene, plans: Sequence[Plan], method: str) -> None:
+    """Solves the plans; each failure is printed."""
+    options = replace(scene.options, method=method)
+    solver = cmfsim.scene_solver(replace(scene, options=options))
+    for k, plan in enumerate(plans):
+        begin = time.perf_counter()
+        try:
+            found = solver.solve(plan)
+        except cmfsim.CmfsimError as error:
+            tally.failures.append(f"plan {k}: {error}")
+            print(f"{tally.head} {tally.model} plan {k}: {error}", file=sys.stderr, flush=True)
+            continue
+        tally.seconds.append(time.perf_counter() - begin)
+        if not found.contact_converged:
+            tally.failures.append(f"plan {k}: gap {found.contact_gap:.1e} mm")
+            continue
+        tally.steps.append(found.contact_iterations)
+        tally.gaps.append(found.contact_gap)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """The exit code; prints the table, or fills it into a page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("cases", type=Path, nargs="+", help="case.toml, or its folder")
+    parser.add_argument("--plans", type=int, default=200, help="of each head, half of each model")
+    parser.add_argument("--models", nargs="+", default=["H+S", "M+S"])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--distance", type=float, default=10.0, help="mm along each axis")
+    parser.add_argument("--angle", type=float, default=8.0, help="degrees")
+    parser.add_argument("--overlap", type=float, default=2.0, help="of bones, mm")
+    parser.add_argument("--method", default="auto")
+    parser.add_argument("--fill", type=Path, help="page whose table is written anew")
+    options = parser.parse_args(words)
+    tallies = []
+    for path in options.cases:
+        case = cmfsim.Case.load(path)
+        model = cmfsim.build_case(case)
+        reach = (options.distance, options.angle)
+        each = -(-options.plans // len(options.models))
+        plans = draw(model, options.plans, reach, options.overlap, options.seed)
+        for k, name in enumerate(options.models):
+            scene = cmfsim.model_scene(model, name)
+            sliding = sum(len(s.sliding) for s in scene.segments.values())
+            tally = Tally(case.name, name, scene.n_tets, sliding)
+            run(tally, scene, plans[k * each : (k + 1) * each], options.method)
+            tallies.append(tally)
+            print(tally.row(), file=sys.stderr, flush=True)
+    lines = [HEAD, "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"]
+    text = "\n".join([*lines, *(tally.row() for tally in tallies)])
+    text += (
+        f"\n\nPlans of up to {options.distance:g} mm and {options.angle:g}°, seed {options.seed}; "
+        f"{platform.machine()}, {os.cpu_count()} cores, cmfsim {cmfsim.__version__}.\n"
+    )
+    if options.fill:
+        replace_marked(options.fill, "contact_plans", text)
+    else:
+        print(text)
+    return 1 if any(tally.failures for tally in tallies) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,570 @@
+//! The contact problem: least elastic energy among the states whose sliding nodes lie on their surfaces
+//! (bilateral) or on and above them (unilateral), by Newton's method.
+//!
+//! Each step solves the body under the conditions linearised about the last state, with the curvature of the
+//! surfaces under the contact forces: the Hessian of the Lagrangian, so that steps near the solution converge
+//! quadratically. A step is taken as far as it brings down the augmented Lagrangian E − Σ λ φ + ½ Σ ρ φ²
+//! (Rockafellar 1973; for inequalities the terms of nodes in the air are −λ²/2ρ), whose minimum the solution is
+//! for any large enough ρ; ρ only grows, so that no state comes twice. Which nodes are held follows from force
+//! and gap together (primal-dual active set; Hintermüller, Ito & Kunisch 2002).
+
+use crate::boundary::Motion;
+use crate::error::{ErrorKind, MtmError, Result};
+use crate::mesh::{add, dot, norm, scaled, sub};
+use crate::triangle::Vec3;
+
+use super::seat::{Seats, Touch};
+use super::{Body, Constraints, ContactMode, ContactOptions, ContactRow, ContactState, Response};
+use super::{Sliding, Spring};
+
+/// Most nodes an error names.
+const NAMED_NODES: usize = 10;
+/// Share of a node's own stiffness below which the turn of its contact force is left out of a step, and of
+/// what a plan operator keeps.
+const SPRING_SHARE: f64 = 1e-2;
+const FROZEN_SPRING_SHARE: f64 = 1e-3;
+/// Share of a node's own stiffness up to which a contact force may carry it on, less and less: a body holds
+/// nodes one by one more firmly than many at once.
+const BOLDNESS: [f64; 4] = [f64::INFINITY, 0.4, 0.2, 0.0];
+/// Gap over the diagonal of the mesh above which the next conditions differ so much that a rough step will do.
+const COARSE: f64 = 5e-4;
+/// Share to which a rough step, a finer one, and one with nodes that may lift off is solved.
+const COARSE_SHARE: f64 = 0.1;
+const FINE_SHARE: f64 = 1e-2;
+const LIFTING_SHARE: f64 = 1e-4;
+/// Penalty of the merit at the start over the own stiffness of each node.
+const FIRST_PENALTY: f64 = 10.0;
+/// Largest penalty over the own stiffness: from there on steps would follow the surface alone.
+const MOST_PENALTY: f64 = 1e4;
+/// Share of what closing gaps take off the merit that all else may add.
+const CLOSING_SHARE: f64 = 0.5;
+/// Steps in a row that may lead nowhere.
+const MOST_STALLS: usize = 3;
+/// Share of its slope by which the merit has to fall (Armijo 1966).
+const DESCENT: f64 = 1e-4;
+/// Share of its largest gap that a step may leave where that is more than the reach of the surfaces.
+const STEADY_GAP: f64 = 0.6;
+/// Shortest step over the full one.
+const SHORTEST: f64 = 1.0 / 64.0;
+/// Rounding of the merit over the work of all contact forces on the way.
+const MERIT_ROUNDING: f64 = 1e-9;
+/// Share of the tolerance that the force along the surface may still move a node by itself.
+const BALANCE_SHARE: f64 = 0.1;
+/// Imbalance over the one allowed from which the next step is solved for good: it is far smaller after it.
+const NEAR: f64 = 30.0;
+/// Gap and imbalance, mm, that no face would show, and the same over the diagonal of the mesh: a state
+/// within is handed out though the steps ran out.
+const UNSEEN: f64 = 0.02;
+const UNSEEN_SHARE: f64 = 1e-4;
+/// Largest tolerance over the diagonal of the mesh: scenes may be small.
+const MOST_TOLERANCE: f64 = 1e-5;
+/// Roundings of a coordinate that a displacement gathers on its way.
+const ROUNDINGS: f64 = 64.0;
+
+/// A state of the sliding nodes.
+struct State {
+    displacements: Vec<[f64; 3]>,
+    touches: Vec<Touch>,
+    /// Forces of the bone; none before the body has answered.
+    reactions: Vec<[f64; 3]>,
+    /// Contact forces along the normals, 0 for nodes in the air.
+    forces: Vec<f64>,
+}
+
+impl Sliding {
+    /// The state of contact under `motions` (one per segment) of the body that answers.
+    ///
+    /// `begin`: where contact was for motions or a body a little different; from where the nodes would be if
+    /// they clung to their segment if none.
+    ///
+    /// # Errors
+    /// `ContactCycle` where the steps run out far from a solution, `ContactSurface` where a node ends past the
+    /// border of its surface, whatever the body reports.
+    pub fn solve(
+        &self,
+        motions: &[&Motion],
+        begin: Option<&ContactState>,
+        options: &ContactOptions,
+        interrupted: &(dyn Fn() -> bool + Sync),
+        body: &mut dyn Body,
+    ) -> Result<ContactState> {
+        if options.max_iterations == 0 {
+            return Err(MtmError::OutOfRange {
+                what: "contact_iterations".into(),
+                index: 0,
+                value: 0.0,
+                allowed: "1 or more",
+                kind: ErrorKind::Solver,
+            });
+        }
+        let seats = Seats::new(self, motions)?;
+        let problem = Problem { sliding: self, seats: &seats, options };
+        let mut state = problem.start(begin);
+        let mut active = problem.held(&state, None);
+        let mut penalty = FIRST_PENALTY;
+        let (mut stalls, mut caution, mut near) = (0, 0, false);
+        let mut gap = f64::INFINITY;
+        let mut iteration = 0;
+        loop {
+            iteration += 1;
+            if interrupted() {
+                return Err(MtmError::Interrupted);
+            }
+            let share = problem.share(gap, near);
+            let response = problem.step(&state, &active, &mut caution, share, body)?;
+            let found = problem.search(&state, &active, &response, near, &mut penalty);
+            let way = found.as_ref().map_or(0.0, |(_, way)| *way);
+            if way < 1.0 {
+                body.shorten(way);
+                let steps = if way == 0.0 { BOLDNESS.len() } else { 1 };
+                caution = (caution + steps).min(BOLDNESS.len() - 1);
+            } else {
+                caution = caution.saturating_sub(1);
+            }
+            stalls = if way == 0.0 { stalls + 1 } else { 0 };
+            if let Some((next, _)) = found {
+                state = next;
+            }
+            let held = problem.held(&state, Some(&active));
+            let changed = held != active;
+            let unbalanced;
+            (gap, unbalanced) = problem.left(&state, &active);
+            near = way == 1.0
+                && !changed
+                && gap <= self.gap_limit(options)
+                && unbalanced <= NEAR * problem.balance();
+            let done = near && response.solved && unbalanced <= problem.balance();
+            if done || iteration == options.max_iterations || stalls > MOST_STALLS {
+                if !done && !(response.solved && gap.max(unbalanced) <= problem.unseen()) {
+                    return Err(problem.far(&state, &active, iteration, gap));
+                }
+                return problem.end(state, &active, (gap, unbalanced), done, iteration);
+            }
+            active = held;
+        }
+    }
+
+    /// Gap up to which a held node counts as on its surface, mm.
+    pub fn gap_limit(&self, options: &ContactOptions) -> f64 {
+        let furthest = self.positions.iter().flatten().fold(0.0_f64, |m, x| m.max(x.abs()));
+        let tolerance = options.tolerance.min(MOST_TOLERANCE * self.diagonal);
+        options.allowed.max(tolerance).max(ROUNDINGS * f64::EPSILON * furthest)
+    }
+}
+
+/// One contact problem.
+struct Problem<'a> {
+    sliding: &'a Sliding,
+    seats: &'a Seats<'a>,
+    options: &'a ContactOptions,
+}
+
+impl Problem<'_> {
+    fn count(&self) -> usize {
+        self.sliding.nodes.len()
+    }
+
+    fn is_unilateral(&self) -> bool {
+        self.options.mode == ContactMode::Unilateral
+    }
+
+    /// Way by itself, mm, that the force along the surface may leave each node.
+    fn balance(&self) -> f64 {
+        BALANCE_SHARE * self.sliding.gap_limit(self.options)
+    }
+
+    /// Gap and imbalance, mm, that no face would show.
+    fn unseen(&self) -> f64 {
+        UNSEEN.min(UNSEEN_SHARE * self.sliding.diagonal).max(self.options.allowed)
+    }
+
+    fn places(&self, displacements: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        self.sliding.positions.iter().zip(displacements).map(|(x, u)| add(*x, *u)).collect()
+    }
+
+    fn start(&self, begin: Option<&ContactState>) -> State {
+        let (displacements, reactions) = match begin {
+            Some(begin) => (begin.displacements.clone(), begin.reactions.clone()),
+            None => {
+                let clinging = self.seats.clinging.iter().zip(&self.sliding.positions);
+                let displacements = clinging.map(|(c, x)| sub(*c, *x)).collect();
+                (displacements, vec![[0.0; 3]; self.count()])
+            }
+        };
+        let touches = self.seats.touches(&self.places(&displacements));
+        let forces = along(&reactions, &touches);
+        State { displacements, touches, reactions, forces }
+    }
+
+    /// Which nodes are held: all of them, or those that are pressed more than they are apart.
+    fn held(&self, state: &State, before: Option<&[bool]>) -> Vec<bool> {
+        if !self.is_unilateral() {
+            return vec![true; self.count()];
+        }
+        let limit = self.sliding.gap_limit(self.options);
+        (0..self.count())
+            .map(|i| {
+                let (gap, force) = (state.touches[i].gap, state.forces[i]);
+                match before {
+                    // Nothing has pressed yet.
+                    None => gap <= limit,
+                    Some(before) if before[i] => force >= 0.0,
+                    Some(_) => gap < -limit,
+                }
+            })
+            .collect()
+    }
+
+    /// The body under the conditions linearised about `state`, as bold as it bears.
+    fn step(
+        &self,
+        state: &State,
+        active: &[bool],
+        caution: &mut usize,
+        share: f64,
+        body: &mut dyn Body,
+    ) -> Result<Response> {
+        let rows = self.rows(state, active);
+        let offsets: Vec<f64> = rows
+            .iter()
+            .map(|r| dot(r.normal, sub(r.point, self.sliding.positions[r.node])))
+            .collect();
+        let mut springs = self.springs(state, active, SPRING_SHARE);
+        loop {
+            for s in &mut springs {
+                s.stiffness = s.stiffness.max(-BOLDNESS[*caution] * self.sliding.stiffness[s.node]);
+            }
+            springs.retain(|s| s.stiffness != 0.0);
+            let conditions = Constraints {
+                rows: &rows,
+                offsets: &offsets,
+                springs: &springs,
+                about: &state.displacements,
+                share,
+            };
+            match body.respond(&conditions) {
+                Ok(response) => return Ok(response),
+                // Forces carry their nodes on by more than the body can hold: with less of that.
+                Err(MtmError::NotPositiveDefinite { .. })
+                    if *caution + 1 < BOLDNESS.len()
+                        && springs.iter().any(|s| s.stiffness < 0.0) =>
+                {
+                    *caution += 1;
+                }
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    /// Share to which the next step is solved: what it leaves is less than what the next conditions change.
+    fn share(&self, gap: f64, near: bool) -> f64 {
+        match self.options.mode {
+            _ if near => 0.0,
+            // Small forces decide which nodes lift off.
+            ContactMode::Unilateral => LIFTING_SHARE,
+            ContactMode::Bilateral if gap > COARSE * self.sliding.diagonal => COARSE_SHARE,
+            ContactMode::Bilateral => FINE_SHARE,
+        }
+    }
+
+    fn rows(&self, state: &State, active: &[bool]) -> Vec<ContactRow> {
+        (0..self.count())
+            .filter(|&i| active[i])
+            .map(|i| {
+                let touch = &state.touches[i];
+                let place = add(self.sliding.positions[i], state.displacements[i]);
+                let point = sub(place, scaled(touch.normal, touch.gap));
+                ContactRow { node: i, normal: touch.normal, point }
+            })
+            .collect()
+    }
+
+    /// How the contact forces turn as held nodes slide: −f H across the normals.
+    ///
+    /// `least`: share of a node's own stiffness below which they are left out.
+    fn springs(&self, state: &State, active: &[bool], least: f64) -> Vec<Spring> {
+        let mut out = Vec::new();
+        for i in (0..self.count()).filter(|&i| active[i] && state.forces[i] != 0.0) {
+            let touch = &state.touches[i];
+            let own = self.sliding.stiffness[i];
+            for (curvature, axis) in curvatures(touch) {
+                let stiffness = -state.forces[i] * curvature;
+                if stiffness.abs() > least * own {
+                    let goal = dot(axis, state.displacements[i]);
+                    out.push(Spring { node: i, axis, stiffness, goal });
+                }
+            }
+        }
+        out
+    }
+
+    /// The state at the end of the step to `response`, shortened until the merit falls, and its share; none
+    /// where the merit falls at no length.
+    fn search(
+        &self,
+        state: &State,
+        active: &[bool],
+        response: &Response,
+        near: bool,
+        penalty: &mut f64,
+    ) -> Option<(State, f64)> {
+        let target = along(&response.reactions, &state.touches);
+        let forces: Vec<f64> =
+            (0..self.count()).map(|i| if active[i] { target[i] } else { 0.0 }).collect();
+        let ways: Vec<[f64; 3]> = response
+            .displacements
+            .iter()
+            .zip(&state.displacements)
+            .map(|(to, from)| sub(*to, *from))
+            .collect();
+        let reach = (STEADY_GAP * farthest(&state.touches, active)).max(self.seats.reach());
+        // Of the last steps the merit shows little but rounding.
+        let negligible = BALANCE_SHARE * self.sliding.gap_limit(self.options);
+        let is_tiny = near || ways.iter().all(|way| norm(*way) <= negligible);
+        let slope = match response.slopes {
+            Some((first, _)) if !is_tiny => {
+                self.slope(state, active, &forces, &ways, first, penalty)?
+            }
+            _ => 0.0,
+        };
+        let work = state.reactions.iter().zip(&response.reactions).zip(&ways);
+        let work: f64 = work.map(|((a, b), way)| (norm(*a) + norm(*b)) * norm(*way)).sum();
+        let rounding = MERIT_ROUNDING * work;
+        let mut share = 1.0;
+        while share >= SHORTEST {
+            let displacements = between(&state.displacements, &response.displacements, share);
+            let touches = self.seats.touches(&self.places(&displacements));
+            let near = farthest(&touches, active) <= reach;
+            let falls = || match response.slopes {
+                Some(slopes) if !is_tiny => {
+                    let rise = self.rise(state, &forces, &touches, slopes, share, *penalty);
+                    rise <= DESCENT * share * slope + rounding
+                }
+                _ => true,
+            };
+            if near && falls() {
+                let reactions = between(&state.reactions, &response.reactions, share);
+                return Some((self.reached(displacements, touches, reactions, active), share));
+            }
+            share *= 0.5;
+        }
+        None
+    }
+
+    /// Slope of the merit at the start of a step, negative, with the penalty that makes it so; none where no
+    /// penalty does.
+    fn slope(
+        &self,
+        state: &State,
+        active: &[bool],
+        forces: &[f64],
+        ways: &[[f64; 3]],
+        energy: f64,
+        penalty: &mut f64,
+    ) -> Option<f64> {
+        let at = |penalty: f64| {
+            let (mut slope, mut closing) = (energy, 0.0);
+            for i in 0..self.count() {
+                let own = self.sliding.stiffness[i];
+                let touch = &state.touches[i];
+                let rate = touch.level_rate(ways[i]);
+                let turn = touch.multiplier(forces[i] - state.forces[i]);
+                let multiplier = touch.multiplier(state.forces[i]);
+                let (by_level, by_force) =
+                    self.merit_slopes(multiplier, touch.level(), penalty * own);
+                slope += by_level * rate + by_force * turn;
+                if active[i] {
+                    closing -= own * touch.level() * rate;
+                }
+            }
+            (slope, closing)
+        };
+        let (slope, closing) = at(*penalty);
+        // What does not depend on the penalty, and what gaps that close take off: the latter is to win clearly.
+        let rest = slope + *penalty * closing;
+        if rest <= CLOSING_SHARE * *penalty * closing {
+            return Some(slope).filter(|slope| *slope < 0.0);
+        }
+        let needed = rest / (CLOSING_SHARE * closing);
+        if !(needed > *penalty && needed <= MOST_PENALTY) {
+            return Some(slope).filter(|slope| *slope < 0.0);
+        }
+        *penalty = needed;
+        Some(at(needed).0).filter(|slope| *slope < 0.0)
+    }
+
+    /// How much the merit rises over `share` of a step to where the nodes feel `touches`.
+    fn rise(
+        &self,
+        state: &State,
+        forces: &[f64],
+        touches: &[Touch],
+        (first, last): (f64, f64),
+        share: f64,
+        penalty: f64,
+    ) -> f64 {
+        let mut rise = share * first + 0.5 * share * share * (last - first);
+        for i in 0..self.count() {
+            let rho = penalty * self.sliding.stiffness[i];
+            let (here, there) = (&state.touches[i], &touches[i]);
+            let start = here.multiplier(state.forces[i]);
+            let end = start + share * here.multiplier(forces[i] - state.forces[i]);
+            let before = self.merit(start, here.level(), rho);
+            let after = self.merit(end, there.level(), rho);
+            rise += after - before;
+        }
+        rise
+    }
+
+    fn reached(
+        &self,
+        displacements: Vec<[f64; 3]>,
+        touches: Vec<Touch>,
+        reactions: Vec<[f64; 3]>,
+        active: &[bool],
+    ) -> State {
+        let mut forces = along(&reactions, &touches);
+        for (force, held) in forces.iter_mut().zip(active) {
+            if !held {
+                *force = 0.0;
+            }
+        }
+        State { displacements, touches, reactions, forces }
+    }
+
+    /// Term of one node in the augmented Lagrangian.
+    fn merit(&self, multiplier: f64, level: f64, rho: f64) -> f64 {
+        if self.is_unilateral() && multiplier < rho * level {
+            return -0.5 * multiplier * multiplier / rho;
+        }
+        (0.5 * rho * level - multiplier) * level
+    }
+
+    /// Its slopes by level and by multiplier.
+    fn merit_slopes(&self, multiplier: f64, level: f64, rho: f64) -> (f64, f64) {
+        if self.is_unilateral() && multiplier < rho * level {
+            return (0.0, -multiplier / rho);
+        }
+        (rho * level - multiplier, -level)
+    }
+
+    /// Largest gap of a held node, and largest way, mm, that the force along the surface would move one.
+    fn left(&self, state: &State, active: &[bool]) -> (f64, f64) {
+        let (mut gap, mut unbalanced) = (0.0_f64, 0.0_f64);
+        for i in 0..self.count() {
+            let touch = &state.touches[i];
+            let along = if active[i] {
+                gap = gap.max(touch.gap.abs());
+                sub(state.reactions[i], scaled(touch.normal, dot(state.reactions[i], touch.normal)))
+            } else {
+                gap = gap.max(-touch.gap);
+                state.reactions[i]
+            };
+            unbalanced = unbalanced.max(norm(along) / self.sliding.stiffness[i]);
+        }
+        (gap, unbalanced)
+    }
+
+    fn end(
+        &self,
+        state: State,
+        active: &[bool],
+        (_, unbalanced): (f64, f64),
+        converged: bool,
+        iterations: usize,
+    ) -> Result<ContactState> {
+        let places = self.places(&state.displacements);
+        let closest: Vec<_> =
+            places.iter().enumerate().map(|(i, &x)| self.seats.closest(i, x)).collect();
+        for (i, (found, past)) in closest.iter().enumerate().filter(|(i, _)| active[*i]) {
+            let s = self.sliding.nodes[i].segment;
+            let reach = self.options.border_reach * self.seats.mean_edge(s);
+            if let Some(past) = past.filter(|&past| past > reach) {
+                return Err(MtmError::ContactSurface {
+                    segment: self.sliding.names[s].clone(),
+                    problem: format!(
+                        "is open and node {} ends {past:.4} mm past its border, near ({:.3}, {:.3}, \
+                         {:.3}) (allowed {reach:.4} mm): extend or close the surface there, or let \
+                         the node be free",
+                        self.sliding.nodes[i].node, found.point[0], found.point[1], found.point[2]
+                    ),
+                });
+            }
+        }
+        let rows = self.rows(&state, active);
+        let springs = self.springs(&state, active, FROZEN_SPRING_SHARE);
+        Ok(ContactState {
+            points: closest.iter().map(|(found, _)| found.point).collect(),
+            normals: state.touches.iter().map(|t| t.normal).collect(),
+            gaps: state.touches.iter().map(|t| t.gap).collect(),
+            displacements: state.displacements,
+            reactions: state.reactions,
+            forces: state.forces,
+            rows,
+            springs,
+            active: active.to_vec(),
+            iterations,
+            unbalanced,
+            converged,
+        })
+    }
+
+    /// That the steps ran out far from a solution, with the nodes that are farthest.
+    fn far(&self, state: &State, active: &[bool], iterations: usize, gap: f64) -> MtmError {
+        let badness = |i: usize| {
+            let touch = &state.touches[i];
+            let across = sub(
+                state.reactions[i],
+                scaled(touch.normal, dot(state.reactions[i], touch.normal)),
+            );
+            let gap = if active[i] { touch.gap.abs() } else { (-touch.gap).max(0.0) };
+            gap + norm(across) / self.sliding.stiffness[i]
+        };
+        let mut order: Vec<usize> = (0..self.count()).collect();
+        order.sort_by(|&a, &b| badness(b).total_cmp(&badness(a)).then(a.cmp(&b)));
+        let nodes = order.iter().take(NAMED_NODES);
+        let nodes = nodes.map(|&i| self.sliding.nodes[i].node as usize).collect();
+        MtmError::ContactCycle { iterations, nodes, gap }
+    }
+}
+
+/// Largest gap of a held node, mm.
+fn farthest(touches: &[Touch], active: &[bool]) -> f64 {
+    let held = touches.iter().zip(active).filter(|(_, held)| **held);
+    held.fold(0.0, |m, (touch, _)| m.max(touch.gap.abs()))
+}
+
+/// Component of each reaction along the normal of its node.
+fn along(reactions: &[[f64; 3]], touches: &[Touch]) -> Vec<f64> {
+    reactions.iter().zip(touches).map(|(r, t)| dot(*r, t.normal)).collect()
+}
+
+/// a + s (b − a), and b itself for s = 1.
+fn between(a: &[[f64; 3]], b: &[[f64; 3]], share: f64) -> Vec<[f64; 3]> {
+    if share == 1.0 {
+        return b.to_vec();
+    }
+    a.iter().zip(b).map(|(a, b)| add(*a, scaled(sub(*b, *a), share))).collect()
+}
+
+/// Principal curvatures of the level through a node, 1/mm, with their unit directions across the normal.
+fn curvatures(touch: &Touch) -> [(f64, [f64; 3]); 2] {
+    let [x, y] = across(&Vec3::from(touch.normal));
+    let times = |a: &Vec3, b: &Vec3| -> f64 {
+        (0..3).map(|i| a[i] * (0..3).map(|j| touch.hessian[i][j] * b[j]).sum::<f64>()).sum()
+    };
+    let (xx, yy, xy) = (times(&x, &x), times(&y, &y), times(&x, &y));
+    let (sin, cos) = (0.5 * (2.0 * xy).atan2(xx - yy)).sin_cos();
+    let (one, two) = (x * cos + y * sin, y * cos - x * sin);
+    let (mean, half) = (0.5 * (xx + yy), (0.5 * (xx - yy)).hypot(xy));
+    [(mean + half, one.into()), (mean - half, two.into())]
+}
+
+/// Two unit vectors that make an orthonormal basis with the unit vector `n`.
+fn across(n: &Vec3) -> [Vec3; 2] {
+    // The axis that n is least along keeps the cross product away from zero.
+    let mut axis = Vec3::zeros();
+    axis[n.abs().imin()] = 1.0;
+    let one = n.cross(&axis).normalize();
+    [one, n.cross(&one)]
+}

@@ -1,0 +1,247 @@
+//! Where each sliding node lies on its contact surface under a plan: gap, normal and curvature there.
+
+use rayon::prelude::*;
+
+use super::Sliding;
+use super::field::{Field, FieldValue};
+use crate::boundary::Motion;
+use crate::error::Result;
+use crate::mesh::{add, dot, norm, scaled, sub};
+use crate::motion::RigidMotion;
+use crate::surface::Closest;
+
+/// Gradient of the distance below which it counts as lost: nodes there lie in the middle of a sheet that is
+/// far thinner than the tissue's mesh resolves.
+const LEAST_SLOPE: f64 = 0.1;
+
+/// Distance from its gap at rest, over the lattice spacing, up to which a node counts as lying at it.
+const AT_REST: f64 = 0.05;
+/// Reach of a surface over the lattice spacing of its field.
+const REACH: f64 = 1.5;
+
+/// The surface that one node slides on: a level of its segment's field, shifted.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Seat {
+    /// Shift from the contact surface, mm.
+    pub offset: [f64; 3],
+    /// Level of the field, mm.
+    level: f64,
+}
+
+/// What a node feels of its surface.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Touch {
+    /// Distance of the node from its surface, negative behind it, mm, to first order.
+    pub gap: f64,
+    /// Unit normal, out of the bone.
+    pub normal: [f64; 3],
+    /// Length of the gradient that the gap and the Hessian are relative to.
+    slope: f64,
+    /// Hessian of the distance over the slope, 1/mm.
+    pub hessian: [[f64; 3]; 3],
+}
+
+impl Touch {
+    /// Distance as the field has it, mm: smooth, where `gap` divides by the slope.
+    pub fn level(&self) -> f64 {
+        self.gap * self.slope
+    }
+
+    /// Multiplier of the level that is a force along the normal, N.
+    pub fn multiplier(&self, force: f64) -> f64 {
+        force / self.slope
+    }
+
+    /// How fast the level changes along `way`.
+    pub fn level_rate(&self, way: [f64; 3]) -> f64 {
+        self.slope * dot(self.normal, way)
+    }
+}
+
+/// Contact surfaces under a plan, and where each node lies on them.
+pub(super) struct Seats<'a> {
+    sliding: &'a Sliding,
+    surfaces: Vec<Moved<'a>>,
+    seats: Vec<Seat>,
+    /// Where the nodes would be if they clung to their segment, mm.
+    pub clinging: Vec<[f64; 3]>,
+}
+
+/// A contact surface under a plan.
+enum Moved<'a> {
+    /// Points are carried back to the field at rest, whose samples serve every plan.
+    Rigid(&'a Field, RigidMotion),
+    /// A surface with new vertices.
+    Deformed(Field),
+    /// The segment has no sliding nodes.
+    Unused,
+}
+
+impl<'a> Seats<'a> {
+    /// The surfaces of `sliding` moved by `motions`, one per segment.
+    ///
+    /// A node without a prescribed gap slides on the contact surface shifted to where it lies itself: by
+    /// its offset at rest, carried with the segment. However far off the contact surface it lies, its own
+    /// surface is as smooth; the surface at its distance may fold.
+    pub fn new(sliding: &'a Sliding, motions: &[&Motion]) -> Result<Self> {
+        let surfaces = sliding
+            .fields
+            .iter()
+            .zip(motions)
+            .map(|(field, motion)| {
+                Ok(match (field, motion) {
+                    (None, _) | (_, Motion::Nodes(_)) => Moved::Unused,
+                    (Some(field), Motion::Rigid(rigid)) => Moved::Rigid(field, *rigid),
+                    (Some(field), Motion::Surface(surface)) => {
+                        let rest = field.surface();
+                        let u = surface.displacement(rest.vertices());
+                        let vertices = rest.vertices().iter().zip(u);
+                        let moved = vertices.map(|(&x, u)| add(x, u)).collect();
+                        Moved::Deformed(field.of(rest.moved(moved)?))
+                    }
+                })
+            })
+            .collect::<Result<Vec<_>>>()?;
+        let clinging = sliding.clinging(motions);
+        let seats = vec![Seat { offset: [0.0; 3], level: 0.0 }; clinging.len()];
+        let mut out = Self { sliding, surfaces, seats, clinging };
+        let feet: Vec<[f64; 3]> = (0..out.seats.len()).map(|i| out.foot(i)).collect();
+        for (i, (gap, &foot)) in sliding.gaps.iter().zip(&feet).enumerate() {
+            out.seats[i] = match gap {
+                Some(_) => Seat { offset: [0.0; 3], level: 0.0 },
+                None => Seat { offset: sub(out.clinging[i], foot), level: 0.0 },
+            };
+        }
+        // A node that lies at its gap stays there at rest, whatever the field makes of the surface.
+        let levels = out.touches(&out.clinging.clone());
+        for (i, (touch, gap)) in levels.iter().zip(&sliding.gaps).enumerate() {
+            let near = AT_REST * out.spacing(sliding.nodes[i].segment);
+            out.seats[i].level = match *gap {
+                None => touch.level(),
+                Some(gap) if (sliding.rest_distance(i) - gap).abs() <= near => touch.level(),
+                Some(gap) => gap,
+            };
+        }
+        Ok(out)
+    }
+
+    /// Where the closest point of node `i` at rest lies now, mm.
+    fn foot(&self, i: usize) -> [f64; 3] {
+        let rest = &self.sliding.rest[i];
+        match &self.surfaces[self.sliding.nodes[i].segment] {
+            Moved::Rigid(_, rigid) => rigid.apply(rest.point),
+            Moved::Deformed(field) => field.surface().point_at(rest.triangle, rest.barycentric),
+            Moved::Unused => rest.point,
+        }
+    }
+
+    /// What each node feels at its place of `at`, mm.
+    pub fn touches(&self, at: &[[f64; 3]]) -> Vec<Touch> {
+        let mut out = Vec::with_capacity(at.len());
+        // Nodes stand segment by segment.
+        for chunk in self.sliding.nodes.chunk_by(|a, b| a.segment == b.segment) {
+            let first = out.len();
+            let seats = &self.seats[first..first + chunk.len()];
+            let own: Vec<[f64; 3]> = at[first..first + chunk.len()]
+                .iter()
+                .zip(seats)
+                .map(|(&x, seat)| sub(x, seat.offset))
+                .collect();
+            match &self.surfaces[chunk[0].segment] {
+                Moved::Rigid(field, rigid) => {
+                    let back: Vec<[f64; 3]> = own.iter().map(|&x| rigid.apply_inverse(x)).collect();
+                    let turn = |value: FieldValue| FieldValue {
+                        distance: value.distance,
+                        gradient: rigid.rotate(value.gradient),
+                        hessian: turned(rigid, &value.hessian),
+                    };
+                    felt(field, &back, seats, turn, &mut out);
+                }
+                Moved::Deformed(field) => felt(field, &own, seats, |value| value, &mut out),
+                Moved::Unused => out.extend(own.iter().map(|_| Touch {
+                    gap: 0.0,
+                    normal: [0.0, 0.0, 1.0],
+                    slope: 1.0,
+                    hessian: [[0.0; 3]; 3],
+                })),
+            }
+        }
+        out
+    }
+
+    /// Closest point of the moved triangle surface to node `i` at `at`, and how far past its border it is,
+    /// mm, if it is.
+    pub fn closest(&self, i: usize, at: [f64; 3]) -> (Closest, Option<f64>) {
+        let own = sub(at, self.seats[i].offset);
+        let found = match &self.surfaces[self.sliding.nodes[i].segment] {
+            Moved::Rigid(field, rigid) => {
+                let found = field.surface().closest_one(rigid.apply_inverse(own));
+                Closest {
+                    point: rigid.apply(found.point),
+                    normal: rigid.rotate(found.normal),
+                    ..found
+                }
+            }
+            Moved::Deformed(field) => field.surface().closest_one(own),
+            Moved::Unused => Closest { point: own, on_border: false, ..self.sliding.rest[i] },
+        };
+        let away = sub(own, found.point);
+        let past = norm(sub(away, scaled(found.normal, dot(found.normal, away))));
+        (found, found.on_border.then_some(past))
+    }
+
+    /// How far off their surfaces nodes may be on the way, mm: farther off, and behind thin bone, the nearest
+    /// surface may be another one.
+    pub fn reach(&self) -> f64 {
+        let spacings = (0..self.surfaces.len()).map(|s| self.spacing(s));
+        REACH * spacings.fold(f64::INFINITY, f64::min)
+    }
+
+    /// Lattice spacing of the field of segment `s`, mm.
+    fn spacing(&self, s: usize) -> f64 {
+        match &self.surfaces[s] {
+            Moved::Rigid(field, _) => field.spacing(),
+            Moved::Deformed(field) => field.spacing(),
+            Moved::Unused => f64::INFINITY,
+        }
+    }
+
+    /// Mean edge of the surface of segment `s`, mm.
+    pub fn mean_edge(&self, s: usize) -> f64 {
+        match &self.surfaces[s] {
+            Moved::Rigid(field, _) => field.surface().mean_edge_length(),
+            Moved::Deformed(field) => field.surface().mean_edge_length(),
+            Moved::Unused => 0.0,
+        }
+    }
+}
+
+/// Adds what nodes at `points` of the field feel; `turn` carries values to where the surface is.
+fn felt(
+    field: &Field,
+    points: &[[f64; 3]],
+    seats: &[Seat],
+    turn: impl Fn(FieldValue) -> FieldValue + Sync,
+    out: &mut Vec<Touch>,
+) {
+    let ready = field.at(points);
+    out.par_extend(points.par_iter().zip(seats).with_min_len(64).map(|(&point, seat)| {
+        let value = turn(ready.value(point));
+        let length = norm(value.gradient);
+        let slope = length.max(LEAST_SLOPE);
+        Touch {
+            gap: (value.distance - seat.level) / slope,
+            normal: scaled(value.gradient, 1.0 / length.max(f64::MIN_POSITIVE)),
+            slope,
+            hessian: value.hessian.map(|row| scaled(row, 1.0 / slope)),
+        }
+    }));
+}
+
+/// R H Rᵀ.
+fn turned(rigid: &RigidMotion, hessian: &[[f64; 3]; 3]) -> [[f64; 3]; 3] {
+    // R H, by the symmetry of H row by row; the same again from the other side.
+    let half: Vec<[f64; 3]> = hessian.iter().map(|&row| rigid.rotate(row)).collect();
+    let column = |c: usize| rigid.rotate([half[0][c], half[1][c], half[2][c]]);
+    [column(0), column(1), column(2)]
+}

@@ -1,0 +1,68 @@
+"""Contact on a head: random plans converge soon, and the face follows the plan continuously."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import cmfsim
+import contact_plans
+import phantom_case
+
+pytest.importorskip("skimage", reason="needs scikit-image (pip install 'cmfsim[imaging]')")
+
+REACH = (6.0, 6.0)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """A made head, coarse, from its surfaces."""
+    head = cmfsim.make_head()
+    folder = tmp_path_factory.mktemp("surfaces")
+    path = phantom_case.surface_case(folder, head, head.anatomy(2.0))
+    return cmfsim.build_case(cmfsim.Case.load(path))
+
+
+@pytest.fixture(scope="module")
+def scene(model):
+    return replace(model.scene, tissue=model.fat)
+
+
+@pytest.fixture(scope="module")
+def plans(model):
+    return contact_plans.draw(model, 8, REACH, 2.0, 5)
+
+
+def test_random_plans_converge_in_few_steps(scene, plans):
+    """The small twin of benches/contact_plans.py."""
+    assert len(plans) == 8
+    tally = contact_plans.Tally("phantom", "H+S", scene.n_tets, 0)
+    contact_plans.run(tally, scene, plans, "auto")
+    assert not tally.failures
+    assert max(tally.steps) <= 20
+    assert np.median(tally.steps) <= 10
+    assert max(tally.gaps) <= scene.options.contact_tolerance
+
+
+def test_the_face_is_a_continuous_function_of_the_plan(model, scene, plans):
+    """0.01 mm more motion moves no point of the skin by more than 0.05 mm."""
+    solver = cmfsim.scene_solver(scene)
+    skin = model.skin_nodes
+    for plan in plans[:4]:
+        name = next(n for n, m in plan.items() if not np.allclose(m, np.eye(4)))
+        more = {**plan, name: cmfsim.rigid_motion((0.006, -0.008, 0.0)) @ plan[name]}
+        here, there = (solver.solve(p).displacements[skin] for p in (plan, more))
+        assert np.linalg.norm(there - here, axis=1).max() <= 0.05
+
+
+def test_the_operator_about_a_plan_is_near_the_solution_beside_it(model, scene, plans):
+    """A millimetre from its reference it is off by hundredths."""
+    solver = cmfsim.scene_solver(scene)
+    plan = plans[0]
+    operator = solver.plan_operator(nodes=model.skin_nodes, plan=plan)
+    name = next(n for n, m in plan.items() if not np.allclose(m, np.eye(4)))
+    more = {**plan, name: cmfsim.rigid_motion((0.0, -0.8, 0.6)) @ plan[name]}
+    exact = solver.solve(more).displacements[model.skin_nodes]
+    error = np.linalg.norm(operator(more) - exact, axis=1)
+    assert error.mean() <= 0.02
+    assert error.max() <= 0.2
