@@ -41,8 +41,8 @@ SEVERITIES = ("error", "warning", "note")
 # Kinds of node (paper 2.5), by the number that files hold.
 NODE_KINDS = ("free", "fixed", "joined", "sliding")
 JAWS = ("upper", "lower")
-# Half the width, and the length, of the smallest arch that a face has, mm; a child's are twice it.
-LEAST_ARCH = 5.0
+# Half the width, and the length, of the smallest arch, mm: less is landmarks exchanged or in cm.
+LEAST_ARCH = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,10 +286,11 @@ class DentalArch(Frozen):
         for name in ("depth_front", "depth_molars"):
             as_number(f"{self.jaw} arch: {name}", getattr(self, name))
         axes = self.axes()
-        if self.half_width < LEAST_ARCH or float(axes[1] @ (self.tip - self.middle)) < LEAST_ARCH:
+        tip, left, right = (np.asarray(place) for place in (self.tip, self.left, self.right))
+        if self.half_width < LEAST_ARCH or float(axes[1] @ (tip - self.middle)) < LEAST_ARCH:
             raise CaseInputError(
-                f"{self.jaw} arch: its front {np.round(self.tip, 1).tolist()} and its molars "
-                f"{np.round(self.left, 1).tolist()} and {np.round(self.right, 1).tolist()} mm span "
+                f"{self.jaw} arch: its front {tip.round(1).tolist()} and its molars "
+                f"{left.round(1).tolist()} and {right.round(1).tolist()} mm span "
                 f"no arch: the front lies ahead of the molars, and these apart, by {LEAST_ARCH:g} "
                 "mm at least; are landmarks exchanged?"
             )

@@ -10,17 +10,16 @@ from importlib import import_module
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cmfsim import _core
 from cmfsim.case import DentalArch, ImageData
-from cmfsim.checks import Floats, as_positive
+from cmfsim.checks import Floats, as_positive, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.osteotomy.surfaces import SurfaceOptions, surface_of_level
-from cmfsim.pickling import Frozen
 from cmfsim.scene import SurfaceData
 
-__all__ = ["ContactSheet", "SheetOptions", "contact_sheet"]
+__all__ = ["ContactSheet", "SheetOptions", "contact_sheet", "sheet_departure"]
 
 Mask = NDArray[np.bool_]
 
@@ -36,7 +35,8 @@ ROUNDED = 2.5
 # How far the sheet goes on past the edges, mm, and over which length its slope dies away.
 BEYOND = 10.0
 SLOPE_LENGTH = 4.0
-# Height over which the slope of the labial face is measured, and the largest that is continued: 20°.
+# Height over which the slope of the labial face is measured, mm, and the largest that is continued:
+# 20°.
 SLOPE_BASE = 3.0
 MOST_SLOPE = 0.36
 # How much the sheet narrows behind the teeth at most, mm per mm: 20°.
@@ -81,7 +81,7 @@ class SheetOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class ContactSheet(Frozen):
+class ContactSheet:
     """The contact sheet of an arch.
 
     Attributes
@@ -149,15 +149,38 @@ def contact_sheet(
     return ContactSheet(SurfaceData(points, triangles), relief, radius)
 
 
+def sheet_departure(
+    sheet: SurfaceData, bone: SurfaceData, nodes: ArrayLike
+) -> tuple[float, float, float]:
+    """How far a sheet lies from the bone where nodes slide: mean, 95th percentile and largest, mm.
+
+    Parameters
+    ----------
+    sheet, bone : SurfaceData
+    nodes : (n, 3) float64, mm
+        Those that slide: the bone's points closest to them are compared with the sheet.
+
+    Returns
+    -------
+    tuple of float
+        All 0 where no node is given.
+    """
+    points = as_rows("nodes", nodes, 3)
+    if not len(points):
+        return 0.0, 0.0, 0.0
+    on_bone, _, _ = _core.Surface(bone.vertices, bone.triangles).closest(points)
+    on_sheet, _, _ = _core.Surface(sheet.vertices, sheet.triangles).closest(on_bone)
+    away = np.linalg.norm(on_sheet - on_bone, axis=1)
+    return float(away.mean()), float(np.percentile(away, 95.0)), float(away.max())
+
+
 class _Grid:
     """A grid along an arch: axes to the left, ahead, and from the roots past the edges of teeth.
 
     Its third coordinate is zero at the plane of the edges.
     """
 
-    def __init__(
-        self, name: str, bone: ImageData, arch: DentalArch, options: SheetOptions
-    ) -> None:
+    def __init__(self, name: str, bone: ImageData, arch: DentalArch, options: SheetOptions) -> None:
         across, forwards, out = arch.axes()
         self.name, self.arch, self.options = name, arch, options
         self.axes: Floats = _frame(across, forwards, -out)
@@ -206,7 +229,7 @@ class _Grid:
         if len(place) < 10:
             raise CaseInputError(
                 f"{self.name!r}: no bone within {self.options.beside:g} mm of the {self.arch.jaw} "
-                "arch: check its landmarks, or set contact_surface = \"bone\" in [node_kinds]"
+                'arch: check its landmarks, or set contact_surface = "bone" in [node_kinds]'
             )
         points = self.low + SPACING * place
         angle = np.arctan2(points[:, 1] + 5.0, points[:, 0])
@@ -366,8 +389,8 @@ def _smallest_radius(level: NDArray[Any], zone: Mask) -> float:
     near &= zone
     if not near.any():
         return np.inf
-    first = np.gradient(np.asarray(level, dtype=np.float64), SPACING)
-    second = [np.gradient(g, SPACING) for g in first]
+    first: list[Floats] = list(np.gradient(np.asarray(level, dtype=np.float64), SPACING))
+    second: list[list[Floats]] = [list(np.gradient(g, SPACING)) for g in first]
     g = np.stack([d[near] for d in first], axis=-1)
     h = np.stack([np.stack([d[near] for d in row], axis=-1) for row in second], axis=-2)
     size = np.maximum(np.linalg.norm(g, axis=1), 1e-6)
