@@ -39,8 +39,10 @@ SLOPE_LENGTH = 4.0
 # 20°.
 SLOPE_BASE = 3.0
 MOST_SLOPE = 0.36
-# How much the sheet narrows behind the teeth at most, mm per mm: 20°.
-TAPER = 0.36
+# How much the sheet narrows backwards at most, mm per mm: behind the teeth by 20°, and from so far
+# above their edges by 45°, where the bone draws in behind the zygomatic process; mm.
+TAPER, STEEP_TAPER = 0.36, 1.0
+TAPERED, STEEP = 8.0, 14.0
 # Half the length of a second molar, and room, mm: further back a lower jaw rises.
 BEHIND_TEETH = 8.0
 # The grid beyond the arch and its vestibule, mm: to the roots, and in front and at the sides.
@@ -308,17 +310,18 @@ def _bridged(solid: Mask, radius: float) -> Mask:
 def _filled(grid: _Grid, solid: Mask) -> Mask:
     """The solid with what lies between it and the middle of the arch, and behind it.
 
-    Backwards it narrows by `TAPER` at most, so that the sheet goes on behind the last tooth and
-    turns gently round the tuberosity.
+    Backwards it narrows gently, so that the sheet goes on behind the last tooth and turns round the
+    tuberosity without a crease before the pterygoid process.
     """
-    s, ahead = grid.lines[0], grid.lines[1]
+    s, ahead, height = grid.lines
+    taper = np.interp(-height, (TAPERED, STEEP), (TAPER, STEEP_TAPER)) * ahead[:, None]
     near = solid & grid.beside(s)[:, None, None]
     filled = solid.copy()
     for side, distance in ((s >= 0.0, s), (s <= 0.0, -s)):
         # Of each row, the outermost bone; of all rows ahead, what they leave of it.
         outer = np.where(near[side], distance[side][:, None, None], -np.inf).max(axis=0)
-        leaning = outer - TAPER * ahead[:, None]
-        width = np.maximum.accumulate(leaning[::-1], axis=0)[::-1] + TAPER * ahead[:, None]
+        leaning = outer - taper
+        width = np.maximum.accumulate(leaning[::-1], axis=0)[::-1] + taper
         filled[side] |= distance[side][:, None, None] <= width
     return filled
 
