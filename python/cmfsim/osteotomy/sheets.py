@@ -133,7 +133,7 @@ def contact_sheet(
     options = options or SheetOptions()
     grid = _Grid(name, bone, arch, options)
     solid = _extended(grid, _filled(grid, _bridged(grid.inside, BRIDGE)))
-    depth = _depth(np.pad(solid, grid.margin))
+    depth = _depth(np.pad(solid, grid.margin), np.pad(grid.near, grid.margin, mode="edge"))
     smoothing = _ndimage()
     for relief in RELIEFS:
         level = smoothing.gaussian_filter(depth, relief / SPACING, mode="nearest", truncate=4.0)
@@ -215,6 +215,10 @@ class _Grid:
         world = self.origin + places @ self.axes
         held = ((world >= bone.lowest) & (world <= bone.highest)).all(axis=1)
         self.inside: Mask = ((values > 0.0) & held).reshape(self.shape)
+        # Distance from the surface of the bone, mm, where it is known better than by voxels.
+        level = values.reshape(self.shape)
+        slope = np.sqrt(sum(np.square(g) for g in np.gradient(level, SPACING)))
+        self.near = level / np.maximum(slope, np.finfo(float).tiny)
 
     def _edges(self, tip: Floats) -> tuple[Floats, Floats]:
         """A point on the plane of the teeth's edges and the unit normal past them, in space."""
@@ -367,12 +371,20 @@ def _signed_slice(mask: Mask) -> Floats:
     return np.asarray(np.where(mask, half - inside, outside - half) * SPACING)
 
 
-def _depth(solid: Mask) -> NDArray[np.float32]:
-    """Signed distance, mm, positive inside."""
-    inside = _core.distance_image(~solid, (SPACING,) * 3)
-    outside = _core.distance_image(solid, (SPACING,) * 3)
-    half = np.float32(0.5 * SPACING)
-    return np.where(solid, inside - half, half - outside)
+def _depth(solid: Mask, near: Floats) -> NDArray[np.float32]:
+    """Signed distance from the surface of a solid, mm, positive inside.
+
+    From the nearest voxel of the other side, and from there, by half a voxel, or as far as it lies
+    from the bone's own surface (`near`, positive inside) where that surface is the solid's.
+    """
+    ndimage = _ndimage()
+    depth = np.empty(solid.shape, dtype=np.float32)
+    for side, sign in ((solid, 1.0), (~solid, -1.0)):
+        distance, other = ndimage.distance_transform_edt(side, return_indices=True)
+        beyond = -sign * near[tuple(other)]
+        rest = np.where((beyond >= 0.0) & (beyond <= SPACING), beyond, 0.5 * SPACING)
+        depth[side] = sign * np.maximum(distance * SPACING - rest, 0.0)[side]
+    return depth
 
 
 def _smallest_radius(level: NDArray[Any], zone: Mask) -> float:
