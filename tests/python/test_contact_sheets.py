@@ -10,6 +10,7 @@ import cmfsim
 import meshes
 from cmfsim.build.contacts import CaseContacts, arch_sheets
 from cmfsim.osteotomy import sheet_departure
+from head_case import HeadCase
 
 ARCHES = cmfsim.DentalArches(
     {"upper": arch_head.arch()}, {"upper": frozenset({0}), "lower": frozenset()}
@@ -352,6 +353,26 @@ def test_options_come_from_plain_values():
     ):
         with pytest.raises(cmfsim.CaseError, match=complaint):
             cmfsim.kind_options(table)
+
+
+def test_a_case_states_its_options_and_errors_name_their_line(tmp_path):
+    case = HeadCase()
+    case.toml += """
+[node_kinds]
+contact_surface = "bone"
+regions = [{segment = "mandible", centre = [0, -160, 1450], radius = 9}]
+"""
+    options = cmfsim.Case.load(case.write(tmp_path)).node_kinds
+    made = cmfsim.kind_options(options)
+    assert made.contact_surface == "bone"
+    assert made.regions[0].radius == 9.0
+    case.replace('contact_surface = "bone"', 'contact_surfaces = "bone"')
+    line = 1 + case.toml.splitlines().index("[node_kinds]")
+    with pytest.raises(cmfsim.CaseError, match=f"case.toml:{line} node_kinds: there is no option"):
+        cmfsim.build_model(case.write(tmp_path), check=False)
+    case.replace("regions = [{", "regions = [3, {")
+    with pytest.raises(cmfsim.CaseError, match="regions is no list of tables"):
+        cmfsim.Case.load(case.write(tmp_path))
 
 
 def test_landmarks_that_span_no_arch_are_refused(jaw):

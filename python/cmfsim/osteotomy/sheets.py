@@ -218,7 +218,8 @@ class _Grid:
         # Distance from the surface of the bone, mm, where it is known better than by voxels.
         level = values.reshape(self.shape)
         slope = np.sqrt(sum(np.square(g) for g in np.gradient(level, SPACING)))
-        self.near = level / np.maximum(slope, np.finfo(float).tiny)
+        # Away from the surface the level is clipped and has no slope.
+        self.near = level / np.maximum(slope, 1e-3)
 
     def _edges(self, tip: Floats) -> tuple[Floats, Floats]:
         """A point on the plane of the teeth's edges and the unit normal past them, in space."""
