@@ -196,6 +196,24 @@ def test_vestibule_and_tuberosity_slide_and_what_is_above_is_joined(classified, 
     assert not (inner & (sliding[:, 1] < -5.0)).any()
 
 
+def test_a_sheet_that_is_not_the_bones_is_reported(jaw, tissue, sheet, classified):
+    """Shifted by 60 mm: no node lies on it, and without a word lips would stick."""
+    shifted = dataclasses.replace(
+        sheet.surface, vertices=np.asarray(sheet.surface.vertices) + [0, 0, 60]
+    )
+    found = cmfsim.classify_nodes(
+        tissue.nodes,
+        tissue.boundary_triangles(),
+        jaw[0],
+        [jaw[1]],
+        moved=["maxilla"],
+        arches=ARCHES,
+        contacts={"maxilla": shifted},
+    )
+    assert "contact-sheet-far" in {f.code for f in found.findings}
+    assert "contact-sheet-far" not in {f.code for f in classified.findings}
+
+
 def test_nothing_moves_when_nothing_moves(classified, tissue, jaw, sheet):
     data = cmfsim.segment_data(classified.kinds, [jaw[1]], contacts={"maxilla": sheet.surface})
     assert len(data["maxilla"].sliding) > 150

@@ -131,9 +131,10 @@ def classify_nodes(
         # Where every segment has regions of its own, no arch is asked for.
         if {segment.name for segment in segments} - {r.segment for r in options.regions}:
             findings += arches.findings
-        slides = sliding_nodes(
+        slides, noticed = sliding_nodes(
             border.points, nearest, anatomy, segments, arches, contacts or {}, options
         )
+        findings += noticed
     moves = np.array([name in moved for name in names])
     carried = on_bone & moves[nearest]
     kind = np.zeros(len(points), dtype=np.uint8)

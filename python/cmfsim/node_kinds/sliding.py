@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface
-from cmfsim.case import Anatomy, BoneSegment, DentalArch
+from cmfsim.case import Anatomy, BoneSegment, DentalArch, Finding
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.node_kinds.arches import DentalArches
@@ -20,6 +20,9 @@ __all__ = ["SHEET_DEPTH", "sliding_nodes"]
 # How far a node lies from its contact sheet at most, mm: what lies deeper behind it lies on another
 # face of the bone, on the palate or where teeth bite.
 SHEET_DEPTH = 3.0
+# Share of the nodes at an arch that lie on its sheet at least (half or more on three heads); others lie
+# on lingual faces and the palate. Fewer nodes than so many on a segment tell nothing.
+LEAST_SHARE, MANY = 0.25, 50
 # How far past half-way to the other arch tissue slides behind the teeth, mm: on the ramus above it
 # temporalis ends.
 PAST_BITE = 4.0
@@ -33,18 +36,20 @@ def sliding_nodes(
     arches: DentalArches,
     contacts: Mapping[str, SurfaceData],
     options: KindOptions,
-) -> NDArray[np.bool_]:
+) -> tuple[NDArray[np.bool_], list[Finding]]:
     """Which points lie on a bone (its number in `nearest`, or −1) within its sliding region.
 
-    Where a segment has a contact sheet in `contacts`, those that lie on the sheet.
+    Where a segment has a contact sheet in `contacts`, those that lie on the sheet; with a finding
+    where few do, for then the sheet is not that of the bone.
     """
+    findings: list[Finding] = []
     slides = np.zeros(len(points), dtype=bool)
     given = {region.segment for region in options.regions}
     for region in options.regions:
         number = next(i for i, s in enumerate(segments) if s.name == region.segment)
         slides |= (nearest == number) & region.holds(points)
     if not arches.by_jaw:
-        return slides
+        return slides, findings
     near_teeth = _near_teeth(points, anatomy, options)
     for number, segment in enumerate(segments):
         jaws = [jaw for jaw, bearers in arches.bearers.items() if number in bearers]
@@ -54,9 +59,25 @@ def sliding_nodes(
         inside = [_in_arch(points, arches.by_jaw[jaw], options, alone=alone) for jaw in jaws]
         mine = np.flatnonzero(np.logical_and.reduce([nearest == number, near_teeth, *inside]))
         if segment.name in contacts and len(mine):
-            mine = mine[_on_sheet(points[mine], contacts[segment.name])]
+            there = mine[_on_sheet(points[mine], contacts[segment.name])]
+            if len(mine) >= MANY and len(there) < LEAST_SHARE * len(mine):
+                findings.append(_far_sheet(segment.name, len(there), len(mine)))
+            mine = there
         slides[mine] = True
-    return slides
+    return slides, findings
+
+
+def _far_sheet(name: str, on_sheet: int, within: int) -> Finding:
+    return Finding(
+        "warning",
+        "contact-sheet-far",
+        f"of {within} nodes on {name!r} at the arch only {on_sheet} lie within {SHEET_DEPTH:g} mm "
+        "of its contact sheet; the others are joined",
+        f"segment {name}",
+        "lips and cheeks would stick to the teeth there",
+        "check the arch's landmarks and the bone in anatomy.png, or set contact_surface = "
+        '"bone" in [node_kinds]',
+    )
 
 
 def _in_arch(
