@@ -29,6 +29,7 @@ from cmfsim.scene import SurfaceData
 __all__ = [
     "NODE_KINDS",
     "SEVERITIES",
+    "SHEET_DEPTH",
     "Anatomy",
     "BoneSegment",
     "DentalArch",
@@ -43,6 +44,9 @@ NODE_KINDS = ("free", "fixed", "joined", "sliding")
 JAWS = ("upper", "lower")
 # Half the width, and the length, of the smallest arch, mm: less is landmarks exchanged or in cm.
 LEAST_ARCH = 2.0
+# How far a node that slides lies from its contact sheet at most, mm: what lies deeper behind is on
+# another face of the bone, on the palate or where teeth bite.
+SHEET_DEPTH = 2.5
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,20 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface
-from cmfsim.case import Anatomy, BoneSegment, DentalArch, Finding
+from cmfsim.case import SHEET_DEPTH, Anatomy, BoneSegment, DentalArch, Finding
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.node_kinds.arches import DentalArches
 from cmfsim.node_kinds.options import KindOptions
 from cmfsim.scene import SurfaceData
 
-__all__ = ["SHEET_DEPTH", "sliding_nodes"]
+__all__ = ["sliding_nodes"]
 
-# How far a node lies from its contact sheet at most, mm: what lies deeper behind it lies on another
-# face of the bone, on the palate or where teeth bite.
-SHEET_DEPTH = 3.0
-# Share of the nodes at an arch that lie on its sheet at least (half or more on three heads); others lie
-# on lingual faces and the palate. Fewer nodes than so many on a segment tell nothing.
+# Share of the nodes at an arch that lie on its sheet at least: half or more on three heads, and the
+# others on lingual faces and the palate. Fewer nodes than so many on a segment tell nothing.
 LEAST_SHARE, MANY = 0.25, 50
 # How far past half-way to the other arch tissue slides behind the teeth, mm: on the ramus above it
 # temporalis ends.

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim import _core
-from cmfsim.case import DentalArch, ImageData
+from cmfsim.case import SHEET_DEPTH, DentalArch, ImageData
 from cmfsim.checks import Floats, as_positive, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.osteotomy.surfaces import SurfaceOptions, surface_of_level
@@ -54,7 +54,7 @@ SECTORS = 16
 # Largest turn of the occlusal direction against the landmarks', cosine: 20°.
 LEAST_AGREEMENT = 0.94
 # Standard deviations of the Gaussian that rounds the sheet, mm: the first that keeps the bound.
-RELIEFS = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+RELIEFS = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,9 @@ class ContactSheet:
     relief : float, mm
         Standard deviation of the Gaussian that rounds it.
     radius : float, mm
-        Smallest radius of curvature where tissue slides.
+        Smallest radius of curvature where tissue slides: of the sheet, and where it is convex of
+        the surface parallel to it and `SHEET_DEPTH` behind it, where nodes may lie that keep their
+        gap. 0 where these would meet.
     """
 
     surface: SurfaceData
@@ -391,7 +393,8 @@ def _depth(solid: Mask, near: Floats) -> NDArray[np.float32]:
 def _smallest_radius(level: NDArray[Any], zone: Mask) -> float:
     """The smallest radius of curvature of the zero surface within a zone, mm.
 
-    Goldman (2005), "Curvature formulas for implicit curves and surfaces".
+    Where it is convex, of the surface `SHEET_DEPTH` behind it. Goldman (2005), "Curvature formulas
+    for implicit curves and surfaces".
     """
     # Where neighbours differ in sign.
     sign = level > 0.0
@@ -415,8 +418,11 @@ def _smallest_radius(level: NDArray[Any], zone: Mask) -> float:
     tangential = np.eye(3) - n[:, :, None] * n[:, None, :]
     shape = tangential @ (h / size[:, None, None]) @ tangential
     shape = 0.5 * (shape + np.swapaxes(shape, 1, 2))
-    bend = np.abs(np.linalg.eigvalsh(shape)).max(axis=1)
-    return float(1.0 / max(float(bend.max()), 1e-9))
+    bends = np.linalg.eigvalsh(shape)
+    # The level falls off on all sides of what is convex.
+    convex = 1.0 / max(float(-bends.min()), 1e-9) - SHEET_DEPTH
+    concave = 1.0 / max(float(bends.max()), 1e-9)
+    return max(min(convex, concave), 0.0)
 
 
 def _ndimage() -> Any:
