@@ -38,7 +38,7 @@ from cmfsim.bench import (
     sweep_choices,
 )
 from cmfsim.build import build_case, build_model, with_muscles, write_phantom_case
-from cmfsim.case import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
+from cmfsim.case import Anatomy, BoneSegment, DentalArch, Finding, ImageData, NodeKinds
 from cmfsim.clinical_plan import ClinicalMotion, clinical_motion
 from cmfsim.doctor import Examination, diagnose, examine
 from cmfsim.equivalent import Mixture, MuscleVolume, equivalent_material
@@ -118,16 +118,22 @@ from cmfsim.model import PatientModel
 from cmfsim.musculature import MuscleSurface, Musculature
 from cmfsim.node_kinds import (
     ClassifiedNodes,
+    DentalArches,
     KindOptions,
     SlidingBox,
     SlidingSphere,
     classify_nodes,
+    dental_arches,
+    kind_options,
     segment_data,
 )
 from cmfsim.osteotomy import (
+    ContactSheet,
     CutBones,
     CuttingPlane,
     Procedure,
+    SheetOptions,
+    contact_sheet,
     contact_surface,
     cut_bones,
     free_cut,
@@ -205,8 +211,11 @@ __all__ = [
     "CmfsimError",
     "Cohort",
     "ContactError",
+    "ContactSheet",
     "CutBones",
     "CuttingPlane",
+    "DentalArch",
+    "DentalArches",
     "DistanceStatistics",
     "ErrorTable",
     "Examination",
@@ -257,6 +266,7 @@ __all__ = [
     "SegmentData",
     "SegmentOptions",
     "SensitivityReport",
+    "SheetOptions",
     "SkinComparison",
     "SlidingBox",
     "SlidingSphere",
@@ -288,9 +298,11 @@ __all__ = [
     "clinical_motion",
     "compare_models",
     "compare_skins",
+    "contact_sheet",
     "contact_surface",
     "cut_bones",
     "decompose_motion",
+    "dental_arches",
     "diagnose",
     "distance_statistics",
     "equivalent_material",
@@ -302,6 +314,7 @@ __all__ = [
     "frontier",
     "icp",
     "import_bodyparts3d",
+    "kind_options",
     "landmark_trials",
     "leave_one_out",
     "make_head",

@@ -162,8 +162,9 @@ def test_tissue_slides_near_the_teeth_alone(head, made):
     nodes, kinds = np.asarray(made.model.scene.nodes), made.model.kinds
     sliding = nodes[kinds.nodes("sliding")]
     assert len(sliding) > 300
+    # The tuberosity and the front of the ramus lie up to 12 mm behind the last teeth.
     teeth = -head.bone_level("teeth", sliding)
-    assert np.percentile(teeth, 95.0) < 14.0
+    assert np.percentile(teeth, 95.0) < 18.0
     low, high = head.skull_landmarks["infradentale"][2], head.skull_landmarks["supradentale"][2]
     assert sliding[:, 2].min() > low - 15.0
     assert sliding[:, 2].max() < high + 15.0

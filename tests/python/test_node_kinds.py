@@ -6,6 +6,7 @@ import pytest
 import cmfsim
 import meshes
 import real_heads
+from cmfsim.build.contacts import arch_sheets
 
 BONE, SKIN, LEVEL, LAYERS = 20.0, 32.0, 3, 4
 CUT = -4.0
@@ -173,8 +174,9 @@ def test_tissue_slides_between_the_vestibules_of_both_arches(head):
         "skull", anatomy.bones["cranium"], cmfsim.SurfaceData(vertices, faces)
     )
     options = cmfsim.KindOptions(
-        upper_front=3, upper_molars=3, lower_front=2, lower_molars=2, behind=4, beside=3
-    )
+        upper_front=3, upper_molars=3, lower_front=2, lower_molars=2, behind=4, beside=3,
+        teeth_distance=12,
+    )  # fmt: skip
 
     def classify(options, anatomy=anatomy, landmarks=None):
         return cmfsim.classify_nodes(
@@ -329,6 +331,8 @@ def test_a_real_head_gets_kinds_that_hold_it_and_solve(head_name):
     mesh = cmfsim.TetMesh(nodes, tets)
     bones = real_heads.cut(head_name)
     back = nodes[:, 1].max()
+    arches = cmfsim.dental_arches(anatomy, bones.segments, points)
+    sheets = arch_sheets(anatomy, bones.segments, arches, cmfsim.KindOptions(), 4.0).surfaces
     found = cmfsim.classify_nodes(
         nodes,
         mesh.boundary_triangles(),
@@ -337,23 +341,27 @@ def test_a_real_head_gets_kinds_that_hold_it_and_solve(head_name):
         moved=["maxilla", "mandible_body", "chin"],
         landmarks=points,
         fixed_planes={"posterior": ((0, back, 0), (0, 1, 0))},
+        contacts=sheets,
     )
     kinds, counts = found.kinds, found.counts
     assert found.findings == ()
-    # At 6 mm a few hundred nodes lie on jaws, and none of them behind the rami.
+    # At 6 mm a few hundred nodes lie on jaws, and none slides far behind the teeth.
     for name in ("maxilla", "mandible_body"):
         assert counts[f"joined on {name}"] > 30
         assert counts[f"sliding on {name}"] > 50
     assert counts["joined on chin"] > 15
-    assert counts["sliding on cranium"] == counts["sliding on ramus_left"] == 0
+    assert counts["sliding on cranium"] == 0
+    for side in ("left", "right"):
+        assert 0 < counts[f"sliding on ramus_{side}"] < 30
     assert set(np.flatnonzero(nodes[:, 1] == back)) <= set(kinds.nodes("fixed"))
     sliding = nodes[kinds.nodes("sliding")]
     bite = 0.5 * (points["supradentale"] + points["infradentale"])
     assert np.abs(sliding[:, 2] - bite[2]).max() < 35
-    assert sliding[:, 1].max() < points["occlusal_line_L"][1]
-    contacts = {n: cmfsim.contact_surface(bones[n]) for n in ("maxilla", "mandible_body")}
-    segments = cmfsim.segment_data(kinds, bones.segments, contacts=contacts)
-    assert sorted(segments) == ["chin", "mandible_body", "maxilla"]
+    molars = max(points[n][1] for n in ("supra_m2_L", "supra_m2_R", "sub_m2_L", "sub_m2_R"))
+    assert molars + 6.0 < sliding[:, 1].max() < molars + cmfsim.KindOptions().behind + 1.0
+    segments = cmfsim.segment_data(kinds, bones.segments, contacts=sheets)
+    names = ["chin", "mandible_body", "maxilla", "ramus_left", "ramus_right"]
+    assert sorted(segments) == names
     scene = cmfsim.Scene(
         nodes,
         tets,

@@ -13,6 +13,7 @@ import numpy as np
 
 from cmfsim._core import Surface, TetMesh, __version__
 from cmfsim.build.clefts import without_clefts
+from cmfsim.build.contacts import CaseContacts, arch_sheets, mean_edge
 from cmfsim.build.ends import end_findings
 from cmfsim.build.held import held_part
 from cmfsim.build.inputs import (
@@ -43,18 +44,23 @@ from cmfsim.meshing import (
     tissue_level,
 )
 from cmfsim.model import PatientModel
-from cmfsim.node_kinds import KindOptions, classify_nodes, segment_data
+from cmfsim.node_kinds import (
+    KindOptions,
+    classify_nodes,
+    dental_arches,
+    kind_options,
+    segment_data,
+)
 from cmfsim.osteotomy import (
     CuttingPlane,
     Procedure,
     check_segments,
-    contact_surface,
     cut_bones,
     free_cut,
     place_procedure,
 )
 from cmfsim.pictures import picture_anatomy, picture_node_kinds
-from cmfsim.scene import MovedSurface, Scene
+from cmfsim.scene import MovedSurface, Scene, SurfaceData
 
 __all__ = ["build_case", "build_model"]
 
@@ -159,6 +165,7 @@ def build_model(
     >>> model = cmfsim.build_model(cmfsim.Case.load("case.toml"))  # doctest: +SKIP
     """
     case = as_case(case)
+    options = _kind_options(case)
     findings = [*findings]
     stages = _Stages(progress or _quiet, findings, on_findings)
     if check:
@@ -197,6 +204,14 @@ def build_model(
     findings += noticed
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
 
+    arches = dental_arches(anatomy, bones.segments, skull) if options.sliding else None
+    contacts = CaseContacts()
+    if arches is not None:
+        stages.begin("making the contact sheets")
+        edge = case.mesh.edge_length if case.mesh.file is None else mean_edge(mesh)
+        contacts = arch_sheets(anatomy, bones.segments, arches, options, edge)
+        findings += contacts.findings
+
     stages.begin("classifying nodes")
     classified = classify_nodes(
         mesh.nodes,
@@ -206,7 +221,9 @@ def build_model(
         moved=moved,
         landmarks=skull,
         fixed_planes=end_planes(region),
-        options=KindOptions(**case.node_kinds),
+        options=options,
+        arches=arches,
+        contacts=contacts.surfaces,
     )
     findings += classified.findings
     kinds, whole = classified.kinds, mesh.n_tets
@@ -230,7 +247,9 @@ def build_model(
     findings[:] = [*dict.fromkeys(findings)]
 
     stages.begin("assembling the scene")
-    scene = _scene(case, mesh, kinds, bones.segments, bones.motions)
+    slid = contacts.of_scene(bones.segments, kinds)
+    scene = _scene(case, mesh, kinds, bones, slid)
+    departures = contacts.summary(bones.segments, kinds, np.asarray(mesh.nodes), slid)
     boundary = np.asarray(mesh.boundary_triangles())
     skin = boundary[on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)]
     stages.end()
@@ -247,6 +266,7 @@ def build_model(
         findings=tuple(findings),
         summary={
             **_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
+            "contact": departures,
             **({} if bones.achieved is None else {"achieved": bones.achieved.as_dict()}),
             "plan_sources": dict(bones.sources),
         },
@@ -428,20 +448,23 @@ def _untouched(
     return tuple(findings)
 
 
+def _kind_options(case: Case) -> KindOptions:
+    """The options of [node_kinds], or an error that names their line."""
+    try:
+        return kind_options(case.node_kinds)
+    except CaseInputError as error:
+        raise CaseInputError(f"{case.where('node_kinds')}: {error}") from error
+
+
 def _scene(
     case: Case,
     mesh: TetMesh,
     kinds: NodeKinds,
-    segments: tuple[BoneSegment, ...],
-    motions: Mapping[str, Floats | MovedSurface],
+    bones: PlannedBones,
+    contacts: Mapping[str, SurfaceData],
 ) -> Scene:
-    contacts = {
-        segment.name: contact_surface(segment)
-        for segment in segments
-        if len(kinds.nodes("sliding", segment.name))
-    }
-    data = segment_data(kinds, segments, contacts=contacts)
-    plan = {name: motions.get(name, np.eye(4)) for name in data}
+    data = segment_data(kinds, bones.segments, contacts=contacts)
+    plan = {name: bones.motions.get(name, np.eye(4)) for name in data}
     return Scene(
         nodes=mesh.nodes,
         tets=mesh.tets,

@@ -46,6 +46,18 @@ def _nodes(summary: Mapping[str, Any]) -> list[str]:
     lines = [f"nodes         {kinds}", f"  {'segment':<{wide}}    joined   sliding"]
     for name, held in zip(names, summary["segments"].values(), strict=True):
         lines.append(f"  {name:<{wide}} {held['joined']:9d} {held['sliding']:9d}")
+    return lines + _contacts(summary, wide)
+
+
+def _contacts(summary: Mapping[str, Any], wide: int) -> list[str]:
+    """What nodes slide on, and how far it lies from the bone under them."""
+    contacts = summary.get("contact", {})
+    if not contacts:
+        return []
+    lines = [f"contact       {'':<{max(wide - 12, 0)}} departure from bone, mm: mean, P95, largest"]
+    for name, contact in contacts.items():
+        away = [f"{contact[f'departure_{key}']:9.2f}" for key in ("mean", "p95", "max")]
+        lines.append(f"  {escaped(name):<{wide}}{''.join(away)}  {contact['surface']}")
     return lines
 
 

@@ -252,7 +252,7 @@ def _read(path: Path) -> Case:
         osteotomies=_osteotomies(document),
         plan={} if _is_achieved(document) else _plan(document, folder),
         achieved=_is_achieved(document),
-        node_kinds=_plain(document.table("node_kinds")),
+        node_kinds=_node_kinds(document.table("node_kinds")),
         tissue=_tissue(document.table("tissue")),
         muscles=_muscles(document.table("muscles"), folder) if "muscles" in document else None,
         solver=_solver(document.table("solver")),
@@ -532,6 +532,14 @@ def _transform(motion: Table, folder: Path) -> CaseMotion:
             "well: remove frame",
         )
     return CaseMotion(transform=file, direction=direction, frame=frame)
+
+
+def _node_kinds(table: Table) -> dict[str, Any]:
+    """The options by name; regions as plain tables."""
+    options = {key: table.plain(key) for key in table if key != "regions"}
+    if "regions" in table:
+        options["regions"] = [_plain(region) for region in table.tables("regions")]
+    return options
 
 
 def _plain(table: Table) -> dict[str, Any]:

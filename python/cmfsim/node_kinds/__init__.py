@@ -3,14 +3,18 @@
 Kim et al. (2010), section 2.5 and Figure 4. Only nodes on the boundary of the mesh get a kind.
 """
 
+from cmfsim.node_kinds.arches import DentalArches, dental_arches
 from cmfsim.node_kinds.classification import ClassifiedNodes, classify_nodes, segment_data
-from cmfsim.node_kinds.options import KindOptions, SlidingBox, SlidingSphere
+from cmfsim.node_kinds.options import KindOptions, SlidingBox, SlidingSphere, kind_options
 
 __all__ = [
     "ClassifiedNodes",
+    "DentalArches",
     "KindOptions",
     "SlidingBox",
     "SlidingSphere",
     "classify_nodes",
+    "dental_arches",
+    "kind_options",
     "segment_data",
 ]

@@ -15,6 +15,7 @@ from cmfsim._core import Surface
 from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, NodeKinds
 from cmfsim.checks import Floats, Indices, as_index_rows, as_rows, check_instance
 from cmfsim.errors import CaseInputError
+from cmfsim.node_kinds.arches import DentalArches, dental_arches
 from cmfsim.node_kinds.options import BORDERS, KindOptions
 from cmfsim.node_kinds.sliding import sliding_nodes
 from cmfsim.scene import SegmentData, SurfaceData
@@ -58,6 +59,8 @@ def classify_nodes(
     landmarks: Mapping[str, ArrayLike] | None = None,
     fixed_planes: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
     options: KindOptions | None = None,
+    arches: DentalArches | None = None,
+    contacts: Mapping[str, SurfaceData] | None = None,
 ) -> ClassifiedNodes:
     """The kind of every node of a tissue mesh, and the segment of those that a bone holds.
 
@@ -78,10 +81,16 @@ def classify_nodes(
         Names of the segments that the plan moves.
     landmarks : mapping of str to (3,) float64, mm, optional
         Skull landmarks, LPS; `supradentale`, `infradentale`, `supra_m2_L/R` and `sub_m2_L/R`
-        place the sliding regions.
+        place the sliding regions; without them the teeth that the anatomy shows do.
     fixed_planes : mapping of str to (point, normal), optional
         Planes that cut the tissue (posterior, neck), by name: each a point (3,) mm and a normal.
     options : KindOptions, optional
+    arches : DentalArches, optional
+        What `dental_arches` gives, where it is known already.
+    contacts : mapping of str to SurfaceData, optional
+        Contact sheets (`contact_sheet`) by segment: at the arches, only nodes on them slide. Those
+        deeper behind them, on the palate or where teeth bite, are joined or fixed as other nodes
+        on the bone are.
 
     Returns
     -------
@@ -117,16 +126,15 @@ def classify_nodes(
     on_plane = _on_planes(border, anatomy, fixed_planes or {}, options)
     slides = np.zeros(len(border.points), dtype=bool)
     if options.sliding:
-        slides = sliding_nodes(
-            border.points,
-            nearest,
-            anatomy,
-            segments,
-            surfaces,
-            landmarks or {},
-            options,
-            findings,
+        if arches is None:
+            arches = dental_arches(anatomy, segments, landmarks)
+        # Where every segment has regions of its own, no arch is asked for.
+        if {segment.name for segment in segments} - {r.segment for r in options.regions}:
+            findings += arches.findings
+        slides, noticed = sliding_nodes(
+            border.points, nearest, anatomy, segments, arches, contacts or {}, options
         )
+        findings += noticed
     moves = np.array([name in moved for name in names])
     carried = on_bone & moves[nearest]
     kind = np.zeros(len(points), dtype=np.uint8)

@@ -1,7 +1,8 @@
 """Distances and regions that decide the kinds of nodes."""
 
-from dataclasses import dataclass
-from typing import cast
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.checks import Floats, as_number, as_positive, as_rows, as_text, check_one_of
 from cmfsim.errors import CaseInputError
 
-__all__ = ["BORDERS", "KindOptions", "SlidingBox", "SlidingSphere"]
+__all__ = ["BORDERS", "KindOptions", "SlidingBox", "SlidingSphere", "kind_options"]
 
+CONTACT_SURFACES = ("sheet", "bone")
 BORDERS = ("left", "right", "anterior", "posterior", "inferior", "superior")
 
 
@@ -93,19 +95,24 @@ class KindOptions:
         False: what would slide is joined or fixed with its bone.
     upper_front, upper_molars : float, mm
         How far above supradentale, and above supra-M2, tissue slides on the upper jaw: the depth
-        of the vestibule.
+        of the vestibule. Above, muscles arise and tissue is attached: nodes are joined.
     lower_front, lower_molars : float, mm
         How far below infradentale, and below sub-M2, it slides on the lower jaw. Sub-M2 lies at
         mid-height of the body, as deep as the vestibule is there.
     behind : float, mm
-        How far behind the second molars' landmarks. Further back nodes would slide round the
-        tuberosity and the edges of the cuts, where contact does not settle.
+        How far behind the second molars' landmarks: over the tuberosity of the upper jaw, and to
+        the front edge of the ramus of the lower, where masseter and temporalis begin.
     beside : float, mm
         How far beside them.
     teeth_distance : float, mm
         Largest distance from the teeth, where these are known apart from bone.
+    contact_surface : str
+        What they slide on at the arches: "sheet", the labial and buccal face of gums and crowns,
+        bridged between teeth and continued past their edges (`contact_sheet`), or "bone", the
+        blurred bone (`contact_surface`), on which nodes also lie on palate and biting faces.
     regions : tuple of SlidingBox or SlidingSphere
-        Where nodes slide on the segments that they name, instead of the above.
+        Where nodes slide on the segments that they name, instead of the above, and on the blurred
+        bone.
     """
 
     bone_distance: float = 0.5
@@ -113,13 +120,14 @@ class KindOptions:
     plane_distance: float = 0.25
     fixed_borders: tuple[str, ...] = ()
     sliding: bool = True
-    upper_front: float = 8.0
+    upper_front: float = 10.0
     upper_molars: float = 5.0
     lower_front: float = 8.0
     lower_molars: float = 0.0
-    behind: float = 0.0
+    behind: float = 12.0
     beside: float = 8.0
-    teeth_distance: float = 12.0
+    teeth_distance: float = 15.0
+    contact_surface: str = "sheet"
     regions: tuple[SlidingBox | SlidingSphere, ...] = ()
 
     def __post_init__(self) -> None:
@@ -131,8 +139,66 @@ class KindOptions:
             as_number(name, getattr(self, name))
         if not 0.0 <= as_number("facing", self.facing) <= 1.0:
             raise CaseInputError(f"facing is {self.facing:g}: 0 to 1 is allowed")
+        check_one_of("contact_surface", self.contact_surface, CONTACT_SURFACES)
         for border in self.fixed_borders:
             check_one_of("fixed border", border, BORDERS)
         for region in self.regions:
             if not isinstance(region, SlidingBox | SlidingSphere):
                 raise CaseInputError(f"region is {region!r}: a SlidingBox or SlidingSphere needed")
+
+
+def kind_options(table: Mapping[str, Any]) -> KindOptions:
+    """The options that a table of plain values states, as `[node_kinds]` in a case file.
+
+    Parameters
+    ----------
+    table : mapping of str to plain values
+        Names of `KindOptions`. `regions` holds tables: `segment` with `low` and `high`, or with
+        `centre` and `radius`.
+
+    Returns
+    -------
+    KindOptions
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Another name, or a value of another kind or out of range.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.kind_options({"contact_surface": "bone"}).contact_surface
+    'bone'
+    """
+    known = [field.name for field in fields(KindOptions)]
+    for name in table:
+        if name not in known:
+            raise CaseInputError(f"there is no option {name!r}; options are: {', '.join(known)}")
+    values = dict(table)
+    if not isinstance(values.get("sliding", True), bool):
+        raise CaseInputError(f"sliding is {values['sliding']!r}: true or false is needed")
+    for name, of in (("fixed_borders", "borders"), ("regions", "tables")):
+        if name in values:
+            if not isinstance(values[name], list | tuple):
+                raise CaseInputError(f"{name} is {values[name]!r}: a list of {of} is needed")
+            values[name] = tuple(values[name])
+    if "regions" in values:
+        values["regions"] = tuple(_region(entry) for entry in values["regions"])
+    return KindOptions(**values)
+
+
+def _region(entry: object) -> SlidingBox | SlidingSphere:
+    """A region from its table; what is no table is left for `KindOptions` to refuse."""
+    if not isinstance(entry, Mapping):
+        return cast("SlidingBox", entry)
+    for kind, keys in (
+        (SlidingBox, {"segment", "low", "high"}),
+        (SlidingSphere, {"segment", "centre", "radius"}),
+    ):
+        if set(entry) == keys:
+            return kind(**entry)
+    raise CaseInputError(
+        f"a region has {', '.join(map(str, sorted(entry)))}: segment with low and high, or segment "
+        "with centre and radius, are needed"
+    )

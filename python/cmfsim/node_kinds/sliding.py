@@ -2,22 +2,27 @@
 
 from collections.abc import Mapping, Sequence
 from importlib import import_module
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from cmfsim._core import Surface
-from cmfsim.case import Anatomy, BoneSegment, Finding
-from cmfsim.checks import Floats, as_rows
+from cmfsim.case import SHEET_DEPTH, Anatomy, BoneSegment, DentalArch, Finding
+from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
+from cmfsim.node_kinds.arches import DentalArches
 from cmfsim.node_kinds.options import KindOptions
+from cmfsim.scene import SurfaceData
 
-__all__ = ["LOWER_ARCH", "UPPER_ARCH", "sliding_nodes"]
+__all__ = ["sliding_nodes"]
 
-# Bone landmarks of the two dental arches: front, left and right.
-UPPER_ARCH = ("supradentale", "supra_m2_L", "supra_m2_R")
-LOWER_ARCH = ("infradentale", "sub_m2_L", "sub_m2_R")
+# Share of the nodes at an arch that lie on its sheet at least: half or more on three heads, and the
+# others on lingual faces and the palate. Fewer nodes than so many on a segment tell nothing.
+LEAST_SHARE, MANY = 0.25, 50
+# How far past half-way to the other arch tissue slides behind the teeth, mm: on the ramus above it
+# temporalis ends.
+PAST_BITE = 4.0
 
 
 def sliding_nodes(
@@ -25,114 +30,88 @@ def sliding_nodes(
     nearest: NDArray[np.intp],
     anatomy: Anatomy,
     segments: Sequence[BoneSegment],
-    surfaces: Sequence[Surface],
-    landmarks: Mapping[str, ArrayLike],
+    arches: DentalArches,
+    contacts: Mapping[str, SurfaceData],
     options: KindOptions,
-    findings: list[Finding],
-) -> NDArray[np.bool_]:
-    """Which points lie on a bone (its number in `nearest`, or −1) within its sliding region."""
+) -> tuple[NDArray[np.bool_], list[Finding]]:
+    """Which points lie on a bone (its number in `nearest`, or −1) within its sliding region.
+
+    Where a segment has a contact sheet in `contacts`, those that lie on the sheet; with a finding
+    where few do, for then the sheet is not that of the bone.
+    """
+    findings: list[Finding] = []
     slides = np.zeros(len(points), dtype=bool)
     given = {region.segment for region in options.regions}
     for region in options.regions:
         number = next(i for i, s in enumerate(segments) if s.name == region.segment)
         slides |= (nearest == number) & region.holds(points)
-    rest = [i for i, s in enumerate(segments) if s.name not in given]
-    missing = [n for n in (*UPPER_ARCH, *LOWER_ARCH) if n not in landmarks]
-    if missing:
-        if rest:
-            findings.append(
-                Finding(
-                    "warning",
-                    "sliding-landmarks",
-                    f"no sliding region at the teeth: landmarks {', '.join(missing)} are missing",
-                    "landmarks",
-                    "lips and cheeks would stick to the teeth",
-                    "place them, give regions, or set sliding = false",
-                )
-            )
-        return slides
-    places = {n: as_rows(f"landmark {n!r}", np.reshape(landmarks[n], (1, -1)), 3)[0]
-              for n in (*UPPER_ARCH, *LOWER_ARCH)}  # fmt: skip
+    if not arches.by_jaw:
+        return slides, findings
     near_teeth = _near_teeth(points, anatomy, options)
-    up = _above(places, UPPER_ARCH, LOWER_ARCH)
-    inside = {
-        "upper": _in_arch(points, places, UPPER_ARCH, up, options),
-        "lower": _in_arch(points, places, LOWER_ARCH, -up, options),
-    }
-    bearers = {
-        "upper": _bearers(surfaces, [places[n] for n in UPPER_ARCH]),
-        "lower": _bearers(surfaces, [places[n] for n in LOWER_ARCH]),
-    }
-    for number in rest:
-        arches = [inside[jaw] for jaw in inside if number in bearers[jaw]]
-        if arches:
-            region = np.logical_and.reduce([*arches, near_teeth])
-            slides |= (nearest == number) & region
-    return slides
+    for number, segment in enumerate(segments):
+        jaws = [jaw for jaw, bearers in arches.bearers.items() if number in bearers]
+        if segment.name in given or not jaws:
+            continue
+        alone = len(jaws) == 1
+        inside = [_in_arch(points, arches.by_jaw[jaw], options, alone=alone) for jaw in jaws]
+        mine = np.flatnonzero(np.logical_and.reduce([nearest == number, near_teeth, *inside]))
+        if segment.name in contacts and len(mine):
+            there = mine[_on_sheet(points[mine], contacts[segment.name])]
+            if len(mine) >= MANY and len(there) < LEAST_SHARE * len(mine):
+                findings.append(_far_sheet(segment.name, len(there), len(mine)))
+            mine = there
+        slides[mine] = True
+    return slides, findings
 
 
-def _above(
-    places: Mapping[str, Floats], upper: tuple[str, str, str], lower: tuple[str, str, str]
-) -> Floats:
-    """The unit vector from the lower arch to the upper, at right angles to left and front."""
-    middle = [np.mean([places[n] for n in names], axis=0) for names in (lower, upper)]
-    left = places[upper[1]] - places[upper[2]] + places[lower[1]] - places[lower[2]]
-    left = left / np.linalg.norm(left)
-    front = np.zeros(3)
-    for tip, one, other in (upper, lower):
-        front = front + places[tip] - 0.5 * (places[one] + places[other])
-    front = front - (front @ left) * left
-    front = front / np.linalg.norm(front)
-    up = middle[1] - middle[0]
-    up = up - (up @ left) * left - (up @ front) * front
-    length = float(np.linalg.norm(up))
-    if not np.isfinite(length) or length < 1.0:
-        raise CaseInputError(
-            f"landmarks of the upper and lower arch lie {length:.2g} mm apart in height: misplaced"
-        )
-    return cast("Floats", up / length)
+def _far_sheet(name: str, on_sheet: int, within: int) -> Finding:
+    return Finding(
+        "warning",
+        "contact-sheet-far",
+        f"of {within} nodes on {name!r} at the arch only {on_sheet} lie within {SHEET_DEPTH:g} mm "
+        "of its contact sheet; the others are joined",
+        f"segment {name}",
+        "lips and cheeks would stick to the teeth there",
+        "check the arch's landmarks and the bone in anatomy.png, or set contact_surface = "
+        '"bone" in [node_kinds]',
+    )
 
 
 def _in_arch(
-    points: Floats,
-    places: Mapping[str, Floats],
-    arch: tuple[str, str, str],
-    out: Floats,
-    options: KindOptions,
+    points: Floats, arch: DentalArch, options: KindOptions, *, alone: bool
 ) -> NDArray[np.bool_]:
     """Which points lie between the vestibule of an arch and the bite, and not behind or beside it.
 
-    `out` points from the bite to the roots of this arch.
+    Parameters
+    ----------
+    alone : bool
+        The bone bears this arch and not the other: behind the teeth it ends at the bite.
     """
-    tip, left, right = (places[name] for name in arch)
-    upper = arch is UPPER_ARCH
+    upper = arch.jaw == "upper"
     front_depth = options.upper_front if upper else options.lower_front
     molar_depth = options.upper_molars if upper else options.lower_molars
+    across, forwards, out = arch.axes()
+    tip, left, right = (np.asarray(place) for place in (arch.tip, arch.left, arch.right))
     a = tip + front_depth * out
     b, c = left + molar_depth * out, right + molar_depth * out
     normal = np.cross(b - a, c - a)
     normal = normal * np.sign(normal @ out)
-    across = (left - right) / np.linalg.norm(left - right)
-    middle = 0.5 * (left + right)
-    ahead = tip - middle
-    ahead = ahead - (ahead @ across) * across - (ahead @ out) * out
-    ahead = ahead / np.linalg.norm(ahead)
-    offset = points - middle
-    half = 0.5 * float(np.linalg.norm(left - right))
-    return (
+    offset = points - arch.middle
+    ahead = offset @ forwards
+    region = (
         ((points - a) @ normal <= 0.0)
-        & (offset @ ahead >= -options.behind)
-        & (np.abs(offset @ across) <= half + options.beside)
+        & (ahead >= -options.behind)
+        & (np.abs(offset @ across) <= arch.half_width + options.beside)
     )
+    if alone:
+        bite = 0.5 * arch.depth_molars + PAST_BITE
+        region &= (ahead >= 0.0) | (-(offset @ out) <= bite)
+    return np.asarray(region)
 
 
-def _bearers(surfaces: Sequence[Surface], arch: Sequence[Floats]) -> set[int]:
-    """The segments that lie nearest to the landmarks of an arch: those that bear its teeth."""
-    distances = []
-    for surface in surfaces:
-        closest, _, _ = surface.closest(np.array(arch))
-        distances.append(np.linalg.norm(closest - np.array(arch), axis=1))
-    return set(np.argmin(distances, axis=0).tolist())
+def _on_sheet(points: Floats, sheet: SurfaceData) -> NDArray[np.bool_]:
+    closest, _, _ = Surface(sheet.vertices, sheet.triangles).closest(points)
+    return np.asarray(np.linalg.norm(closest - points, axis=1) <= SHEET_DEPTH)
 
 
 def _near_teeth(points: Floats, anatomy: Anatomy, options: KindOptions) -> NDArray[np.bool_]:

@@ -5,17 +5,21 @@ from cmfsim.osteotomy.parting import part_segment
 from cmfsim.osteotomy.planes import Cut, CuttingPlane, Procedure, free_cut
 from cmfsim.osteotomy.procedures import PROCEDURES, place_procedure, procedure_options
 from cmfsim.osteotomy.segment_checks import check_segments
+from cmfsim.osteotomy.sheets import ContactSheet, SheetOptions, contact_sheet, sheet_departure
 from cmfsim.osteotomy.surfaces import SurfaceOptions, contact_surface, surface_of_level
 
 __all__ = [
     "PROCEDURES",
+    "ContactSheet",
     "Cut",
     "CutBones",
     "CutOptions",
     "CuttingPlane",
     "Procedure",
+    "SheetOptions",
     "SurfaceOptions",
     "check_segments",
+    "contact_sheet",
     "contact_surface",
     "cut_bones",
     "free_cut",
@@ -23,5 +27,6 @@ __all__ = [
     "place_procedure",
     "procedure_options",
     "segments_from_surfaces",
+    "sheet_departure",
     "surface_of_level",
 ]
