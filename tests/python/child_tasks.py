@@ -39,6 +39,21 @@ def allocate(size):
     return Answer({}, {"all": np.ones(size, np.uint8)})
 
 
+KEPT = []
+
+
+def keep(size):
+    KEPT.append(np.ones(size, np.uint8))
+    return Answer({"kept": len(KEPT)}, {})
+
+
+def compute(seconds):
+    begun = time.process_time()
+    while time.process_time() - begun < seconds:
+        pass
+    return Answer({"done": True}, {})
+
+
 def chatter():
     os.write(1, b"warning: 12\n")
     print("warning: 13")  # noqa: T201 (what libraries do)

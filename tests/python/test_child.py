@@ -53,6 +53,27 @@ def test_a_reader_that_never_ends_is_stopped():
     assert time.monotonic() - begun < 30.0
 
 
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes on Linux")
+def test_a_reader_that_gets_no_turn_is_waited_for(monkeypatch):
+    """On a busy machine a valid file would be refused; what it may use is processor time."""
+    read_in_child(f"{HERE}:arrays", count=1)
+    monkeypatch.setattr(child, "WALL_PER_CPU", 0.05)
+    limits = ReadLimits(seconds=4.0)
+    assert read_in_child(f"{HERE}:compute", limits, seconds=1.0).values == {"done": True}
+    with pytest.raises(ReaderError, match="did not come to an end"):
+        read_in_child(f"{HERE}:sleep", limits)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks at processes on Linux")
+def test_a_child_that_keeps_memory_is_replaced(monkeypatch):
+    """Libraries that leak at damaged files would take all of it, file by file."""
+    monkeypatch.setattr(child, "MOST_HELD", 2**29)
+    assert read_in_child(f"{HERE}:keep", size=2**20).values == {"kept": 1}
+    assert read_in_child(f"{HERE}:keep", size=2**20).values == {"kept": 2}
+    assert read_in_child(f"{HERE}:keep", size=2**29).values == {"kept": 3}
+    assert read_in_child(f"{HERE}:keep", size=2**20).values == {"kept": 1}
+
+
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="limits memory on Linux")
 def test_a_reader_that_asks_for_all_memory_is_stopped():
     with pytest.raises(ReaderError, match="memory"):

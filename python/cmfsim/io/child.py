@@ -15,6 +15,7 @@ import struct
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
@@ -35,6 +36,10 @@ PROGRAM = (
 # Wall time that a request may take, in units of its processor time: on a busy machine a process
 # waits, and one that sleeps for ever is found as well.
 WALL_PER_CPU = 6.0
+# Looks at a process that is late, and the time between them, s: it may wait for the disk just then.
+LOOKS, LOOK_EVERY = 5, 0.02
+# A child that holds more than this between two files is replaced, bytes.
+MOST_HELD = 2**30
 # Lengths of answers: unsigned, 64 bits, little-endian.
 LENGTH = struct.Struct("<Q")
 # Python's own errors that mean the same in the parent; those of the package do as well.
@@ -55,7 +60,7 @@ class ReadLimits:
     Attributes
     ----------
     seconds : float
-        Processor time; six times as much on the clock.
+        Processor time; six times as much on the clock, more where others keep the processor busy.
     memory : int
         Bytes beyond what the child holds when the request begins; on Linux only.
     """
@@ -127,15 +132,18 @@ class _Child:
         return self.parent == os.getpid() and self.process.poll() is None
 
     def answer(self, task: str, limits: ReadLimits, arguments: Mapping[str, Any]) -> Answer:
-        late = threading.Event()
+        late, done = threading.Event(), threading.Event()
 
-        def stop() -> None:
-            late.set()
-            self.process.kill()
+        def watch() -> None:
+            while not done.wait(WALL_PER_CPU * limits.seconds):
+                # One that is ready to run and gets no turn is not late: the system limits its
+                # processor time.
+                if not _is_running(self.process.pid) and not done.is_set():
+                    late.set()
+                    self.process.kill()
+                    return
 
-        timer = threading.Timer(WALL_PER_CPU * limits.seconds, stop)
-        timer.daemon = True
-        timer.start()
+        threading.Thread(target=watch, daemon=True).start()
         try:
             request = {"task": task, "arguments": dict(arguments)}
             self._send({**request, "seconds": limits.seconds, "memory": limits.memory})
@@ -147,8 +155,11 @@ class _Child:
             self.end()
             raise
         finally:
-            timer.cancel()
-        # An error of the task is a whole answer: the process goes on to the next file.
+            done.set()
+        # An error of the task is a whole answer: the process goes on to the next file, unless its
+        # libraries did not give memory back, as GDCM after damaged files.
+        if _held_by(self.process.pid) > MOST_HELD:
+            self.end()
         if isinstance(answer, Exception):
             raise answer
         return answer
@@ -221,6 +232,29 @@ def _fill(stream: Any, array: NDArray[Any]) -> None:
         if not count:
             raise EOFError
         done += count
+
+
+def _is_running(pid: int) -> bool:
+    """Whether a process runs or waits for its turn alone; False where the system does not tell."""
+    for _ in range(LOOKS):
+        try:
+            with open(f"/proc/{pid}/stat", encoding="latin-1") as file:  # noqa: PTH123
+                state = file.read().rpartition(")")[2].split()[0]
+        except (OSError, IndexError):
+            return False
+        if state == "R":
+            return True
+        time.sleep(LOOK_EVERY)
+    return False
+
+
+def _held_by(pid: int) -> int:
+    """Bytes of memory that a process holds; 0 where the system does not tell."""
+    try:
+        with open(f"/proc/{pid}/statm", encoding="ascii") as file:  # noqa: PTH123
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, IndexError, ValueError, AttributeError):
+        return 0
 
 
 _LOCK = threading.RLock()
