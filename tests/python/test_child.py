@@ -64,6 +64,15 @@ def test_a_reader_that_gets_no_turn_is_waited_for(monkeypatch):
         read_in_child(f"{HERE}:sleep", limits)
 
 
+def test_the_start_of_libraries_is_no_part_of_the_time_of_a_file(monkeypatch):
+    """Neither is one that is missing an error of its own: the task reports it."""
+    monkeypatch.setenv("CMFSIM_SLOW_LIBRARY", "1")
+    while child._children:
+        child._children.pop().end()
+    limits = ReadLimits(seconds=0.5)
+    assert read_in_child(f"{HERE}:with_library", limits).values == {"read": True}
+
+
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks at processes on Linux")
 def test_a_child_that_keeps_memory_is_replaced(monkeypatch):
     """Libraries that leak at damaged files would take all of it, file by file."""
