@@ -10,10 +10,11 @@ import io
 import json
 import math
 import os
+import re
 import shutil
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -152,14 +153,21 @@ def _difference(result: Any, wanted: Any) -> str | None:
     return None
 
 
-def _image_difference(image: Any, wanted: tuple[tuple[int, ...], int]) -> str | None:
-    """An image against what its header and length say: the voxels of each axis, and their bytes."""
-    shape, more = wanted
+def _image_difference(image: Any, wanted: tuple[tuple[int, ...], int, bool]) -> str | None:
+    """An image against what its header and length say: the voxels of each axis, and their bytes.
+
+    One whose axes run obliquely comes on another grid.
+    """
+    shape, more, upright = wanted
     # Bytes after the last voxel change nothing, unless the header lost voxels to them.
     if more < 0 or (more > 0 and math.prod(shape) < math.prod(SHAPE)):
         return f"the file has {abs(more)} bytes {'fewer' if more < 0 else 'more'} than its header"
     found = tuple(sorted(image.values.shape))
-    return None if found == tuple(sorted(shape)) else f"voxels {found}, by its header {shape}"
+    return (
+        None
+        if found == tuple(sorted(shape)) or not upright
+        else f"voxels {found}, by its header {shape}"
+    )
 
 
 # Seeds: a tetrahedron, a ball of 20 triangles, a box of 5 tets, a grid of 6 × 7 × 8 voxels.
@@ -744,21 +752,32 @@ def _dicom(folder: Path, number: int) -> bool:
 BYTES = {"short": 2, "int16": 2, "signed short": 2, "MET_SHORT": 2}
 
 
-def _nrrd(data: bytes) -> tuple[tuple[int, ...], int]:
+def _is_upright(axes: Sequence[Sequence[float]]) -> bool:
+    """Whether the axes of an image run along the patient's: others come on another grid."""
+    return all(sum(n != 0.0 for n in axis) <= 1 for axis in axes)
+
+
+def _nrrd(data: bytes) -> tuple[tuple[int, ...], int, bool]:
     head, found, body = data.partition(b"\n\n")
-    fields = dict(
-        line.split(": ", 1) for line in head.decode("latin-1").split("\n")[1:] if ": " in line
-    )
+    # Names of fields are read in any case, as Teem reads them.
+    fields = {
+        key.lower(): value
+        for line in head.decode("latin-1").split("\n")[1:]
+        for key, colon, value in (line.partition(": "),)
+        if colon
+    }
+    rows = re.findall(r"\(([^()]*)\)", fields.get("space directions", ""))
+    upright = _is_upright([[float(n) for n in row.split(",")] for row in rows])
     if not found or "data file" in fields or fields.get("encoding") not in {"raw", "gzip"}:
         raise oracles.UndecidedError
     if fields.get("type") not in BYTES or "byte skip" in fields or "line skip" in fields:
         raise oracles.UndecidedError
     shape = tuple(int(n) for n in fields["sizes"].split())
     body = gzip.decompress(body) if fields["encoding"] == "gzip" else body
-    return shape, len(body) - 2 * math.prod(shape)
+    return shape, len(body) - 2 * math.prod(shape), upright
 
 
-def _nifti(data: bytes) -> tuple[tuple[int, ...], int]:
+def _nifti(data: bytes) -> tuple[tuple[int, ...], int, bool]:
     data = gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
     if struct.unpack("<i", data[:4])[0] != 348 or data[344:348] != b"n+1\0":
         raise oracles.UndecidedError
@@ -766,20 +785,31 @@ def _nifti(data: bytes) -> tuple[tuple[int, ...], int]:
     bits, (start,) = struct.unpack("<h", data[72:74])[0], struct.unpack("<f", data[108:112])
     if dims[0] != 3 or bits != 16 or start != 352:
         raise oracles.UndecidedError
-    return dims[1:4], len(data) - 352 - 2 * math.prod(dims[1:4])
+    turn = struct.unpack("<3f", data[256:268])
+    rows = struct.unpack("<12f", data[280:328])
+    upright = _is_upright([rows[0:3], rows[4:7], rows[8:11]])
+    # A half turn about one axis, as the patient's axes have it.
+    upright &= turn in {(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)}
+    return dims[1:4], len(data) - 352 - 2 * math.prod(dims[1:4]), upright
 
 
-def _meta(data: bytes) -> tuple[tuple[int, ...], int]:
+def _meta(data: bytes) -> tuple[tuple[int, ...], int, bool]:
     head, found, body = data.partition(b"ElementDataFile = LOCAL\n")
-    fields = dict(
-        line.split(" = ", 1) for line in head.decode("latin-1").split("\n") if " = " in line
-    )
+    # Blanks around the sign are free.
+    fields = {
+        key.strip(): value.strip()
+        for line in head.decode("latin-1").split("\n")
+        for key, equals, value in (line.partition("="),)
+        if equals
+    }
+    turn = [float(n) for n in fields.get("TransformMatrix", "1 0 0 0 1 0 0 0 1").split()]
+    upright = _is_upright([turn[:3], turn[3:6], turn[6:]])
     if not found or fields.get("ElementType") not in BYTES:
         raise oracles.UndecidedError
     if fields.get("CompressedData") != "False" or "HeaderSize" in fields:
         raise oracles.UndecidedError
     shape = tuple(int(n) for n in fields["DimSize"].split())
-    return shape, len(body) - 2 * math.prod(shape)
+    return shape, len(body) - 2 * math.prod(shape), upright
 
 
 def _read_tets(path: Path) -> Any:

@@ -160,7 +160,13 @@ class _Worker:
         number = -1
         while True:
             # Seeds may take a while to make; a mutant may not.
-            if not pipe.poll(LONGEST if number >= 0 else 600.0):
+            used = None
+            while not (answered := pipe.poll(LONGEST if number >= 0 else 600.0)):
+                # On a busy machine it may have had no turn.
+                used = _used_by(process.pid) if used is None else used
+                if not _waits_for_its_turn(process.pid) or _used_by(process.pid) - used > LONGEST:
+                    break
+            if not answered:
                 self.end()
                 yield number, "hang", f"no end after {LONGEST:g} s", LONGEST
                 return
@@ -192,6 +198,26 @@ class _Worker:
         if self.pipe is not None:
             self.pipe.close()
         self.process = self.pipe = None
+
+
+def _stat_of(pid: int | None) -> list[tuple[str, float]]:
+    """State and processor time, s, of a process and its children; nothing where unknown."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            words = path.read_text(encoding="latin-1").rpartition(")")[2].split()
+            if pid in {int(path.parent.name), int(words[1])}:
+                ticks = int(words[11]) + int(words[12])
+                found.append((words[0], ticks / os.sysconf("SC_CLK_TCK")))
+    return found
+
+
+def _waits_for_its_turn(pid: int | None) -> bool:
+    return any(state == "R" for state, _ in _stat_of(pid))
+
+
+def _used_by(pid: int | None) -> float:
+    return sum(seconds for _, seconds in _stat_of(pid))
 
 
 def _serve(pipe: Connection, folder: str) -> None:

@@ -1,6 +1,7 @@
 """What the child process is asked to do in `test_child.py`."""
 
 import builtins
+import importlib
 import os
 import sys
 import time
@@ -37,6 +38,30 @@ def sleep():
 
 def allocate(size):
     return Answer({}, {"all": np.ones(size, np.uint8)})
+
+
+# The first may take seconds to import, and the second is not there.
+LIBRARIES = ("slow_library", "no_such_library")
+
+
+def with_library():
+    importlib.import_module("slow_library")
+    return Answer({"read": True}, {})
+
+
+KEPT = []
+
+
+def keep(size):
+    KEPT.append(np.ones(size, np.uint8))
+    return Answer({"kept": len(KEPT)}, {})
+
+
+def compute(seconds):
+    begun = time.process_time()
+    while time.process_time() - begun < seconds:
+        pass
+    return Answer({"done": True}, {})
 
 
 def chatter():

@@ -53,6 +53,36 @@ def test_a_reader_that_never_ends_is_stopped():
     assert time.monotonic() - begun < 30.0
 
 
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes on Linux")
+def test_a_reader_that_gets_no_turn_is_waited_for(monkeypatch):
+    """On a busy machine a valid file would be refused; what it may use is processor time."""
+    read_in_child(f"{HERE}:arrays", count=1)
+    monkeypatch.setattr(child, "WALL_PER_CPU", 0.05)
+    limits = ReadLimits(seconds=4.0)
+    assert read_in_child(f"{HERE}:compute", limits, seconds=1.0).values == {"done": True}
+    with pytest.raises(ReaderError, match="did not come to an end"):
+        read_in_child(f"{HERE}:sleep", limits)
+
+
+def test_the_start_of_libraries_is_no_part_of_the_time_of_a_file(monkeypatch):
+    """Neither is one that is missing an error of its own: the task reports it."""
+    monkeypatch.setenv("CMFSIM_SLOW_LIBRARY", "1")
+    while child._children:
+        child._children.pop().end()
+    limits = ReadLimits(seconds=0.5)
+    assert read_in_child(f"{HERE}:with_library", limits).values == {"read": True}
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="looks at processes on Linux")
+def test_a_child_that_keeps_memory_is_replaced(monkeypatch):
+    """Libraries that leak at damaged files would take all of it, file by file."""
+    monkeypatch.setattr(child, "MOST_HELD", 2**29)
+    assert read_in_child(f"{HERE}:keep", size=2**20).values == {"kept": 1}
+    assert read_in_child(f"{HERE}:keep", size=2**20).values == {"kept": 2}
+    assert read_in_child(f"{HERE}:keep", size=2**29).values == {"kept": 3}
+    assert read_in_child(f"{HERE}:keep", size=2**20).values == {"kept": 1}
+
+
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="limits memory on Linux")
 def test_a_reader_that_asks_for_all_memory_is_stopped():
     with pytest.raises(ReaderError, match="memory"):

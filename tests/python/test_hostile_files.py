@@ -338,6 +338,41 @@ def test_no_reader_fails_on_a_strange_name(scene, tmp_path):
             read(tmp_path / f"absent{suffix}")
 
 
+NAMELESS = "a" * 5000
+
+
+def test_names_that_no_file_can_have_are_refused_by_every_reader(tmp_path):
+    """Python's own Path.exists raises an OSError for them."""
+    pytest.importorskip("SimpleITK")
+    for read, name in (
+        (cmfsim.read_image, NAMELESS),
+        (cmfsim.read_transform, NAMELESS + ".tfm"),
+        (cmfsim.Case.load, NAMELESS),
+        (cmfsim.Cohort.load, NAMELESS),
+        (cmfsim.MuscleTemplate.load, NAMELESS),
+        (cmfsim.io.read_parts, NAMELESS),
+    ):
+        refused(lambda read=read, name=name: read(tmp_path / name), "cannot be opened")
+    refused(lambda: cmfsim.MuscleTemplate.load(NAMELESS), "cannot be opened")
+
+
+@pytest.mark.parametrize("key", ["image", "output", "landmarks", "cohort"])
+def test_names_in_a_case_that_no_file_can_have_are_refused_with_their_line(key, tmp_path):
+    image = f'file = "{NAMELESS if key == "image" else "ct.nrrd"}"'
+    lines = ['format = "cmfsim-case"', "version = 1", "[image]", image, "[osteotomies]"]
+    if key == "output":
+        lines += ["[output]", f'folder = "{NAMELESS}"']
+    if key == "landmarks":
+        lines += ["[landmarks]", f'skin = "{NAMELESS}"']
+    path, load = tmp_path / "case.toml", cmfsim.Case.load
+    if key == "cohort":
+        lines = ['format = "cmfsim-cohort"', "version = 1", "[[cases]]", f'file = "{NAMELESS}"']
+        path, load = tmp_path / "cohort.toml", cmfsim.Cohort.load
+    path.write_text("\n".join(lines))
+    line = len(lines) if key != "image" else 4
+    refused(lambda: load(path), rf"{path.name}:{line}: .*names aaa.*cannot be opened")
+
+
 @pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
 def test_a_plan_reads_nothing_outside_its_folder(scene, tmp_path):
     """Not by a link either, nor one that leads round in a circle."""

@@ -58,6 +58,31 @@ def test_a_fault_of_each_kind_is_found():
         oracles.obj(text.replace(b"f 1 2 4", b"f 1 2 9"))
 
 
+def test_the_rules_of_images_are_those_of_their_formats(tmp_path):
+    """NRRD's names in any case, MetaImage's blanks, and oblique axes on another grid."""
+    by_name = {reader.name: reader for reader in READERS}
+    image = cmfsim.ImageData(np.zeros((6, 7, 8), dtype=np.int16), (0.5, 0.75, 1.5))
+    other = cmfsim.ImageData(np.zeros((6, 7, 9), dtype=np.int16), (0.5, 0.75, 1.5))
+    for name, old, new in (
+        ("NRRD", b"sizes:", b"sizEs:"),
+        ("MetaImage", b"DimSize =", b"DimSize="),
+    ):
+        reader = by_name[name]
+        assert reader.make(tmp_path, 0)
+        data = (tmp_path / reader.target).read_bytes()
+        assert old in data
+        for text in (data, data.replace(old, new)):
+            assert changed_in_silence(reader, text, image) is None
+            assert "by its header" in changed_in_silence(reader, text, other)
+            assert "fewer" in changed_in_silence(reader, text[:-1], image)
+    reader = by_name["NRRD"]
+    assert reader.make(tmp_path, 0)
+    data = (tmp_path / reader.target).read_bytes()
+    sheared = data.replace(b"(0,0.75,0)", b"(0,0.75,0.1)")
+    assert sheared != data
+    assert changed_in_silence(reader, sheared, other) is None
+
+
 def test_packed_files_are_changed_inside(tmp_path):
     """The checksums of most are right, so that readers see the change."""
     archive = next(reader for reader in READERS if reader.name == "scene .npz")

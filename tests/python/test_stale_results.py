@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import cmfsim
+from cmfsim.build import case_key, input_hashes
 from cmfsim.cli import main
 from cmfsim.cli.results import write_case_report, write_results
 from cmfsim.io import finish_writing, read_parts
@@ -452,3 +453,26 @@ def test_no_stage_is_named_twice(tmp_path, prediction, evaluation):
         Path(tmp_path), [prediction], 1, stage=stages.append, evaluation=lambda: evaluation
     )
     assert stages == ["writing H", "writing the comparison", "writing the report"]
+
+
+def test_files_of_one_name_in_two_folders_both_count(tmp_path):
+    """One replaced the other: a change of it was not noticed, nor an exchange of the two."""
+    for name, content in (("pre", b"1"), ("post", b"2")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "head.ply").write_bytes(content)
+    (tmp_path / "case").mkdir()
+    path = tmp_path / "case" / "case.toml"
+    path.write_text(
+        'format = "cmfsim-case"\nversion = 1\nosteotomies = []\n'
+        f"[surfaces]\nskin = {str(tmp_path / 'pre' / 'head.ply')!r}\n"
+        f"[surfaces.bones]\ncranium = {str(tmp_path / 'post' / 'head.ply')!r}\n"
+    )
+    case = cmfsim.Case.load(path)
+    before = case_key(case)
+    assert len(input_hashes(case)) == 3
+    keys = {before}
+    for name, content in (("pre", b"3"), ("post", b"4"), ("pre", b"2"), ("post", b"1")):
+        (tmp_path / name / "head.ply").write_bytes(content)
+        keys.add(case_key(case))
+    # The last is the first with the two exchanged.
+    assert len(keys) == 5

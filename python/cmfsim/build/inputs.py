@@ -147,10 +147,20 @@ def motion_source(motion: CaseMotion) -> str:
 def input_hashes(case: Case) -> dict[str, str]:
     """The SHA-256 of every file that a case names, by its path from the case's folder.
 
-    That of a folder is of the files in it.
+    A file elsewhere counts by its name, the second of one name as "name (2)". The hash of a folder
+    is of the files in it.
     """
     folder = case.file.parent
-    return {_path_from(path, folder): _sha256(path) for path in sorted(set(_files(case)))}
+    found: dict[str, str] = {}
+    # In the order of their parts in the case, so that two files of one name are not exchanged.
+    for path in dict.fromkeys(_files(case)):
+        name = key = _path_from(path, folder)
+        number = 1
+        while key in found:
+            number += 1
+            key = f"{name} ({number})"
+        found[key] = _sha256(path)
+    return dict(sorted(found.items()))
 
 
 def case_key(case: Case, hashes: Mapping[str, str] | None = None) -> str:

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 from cmfsim.checks import as_text
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files import FORMAT_VERSION
+from cmfsim.io.files import FORMAT_VERSION, is_there
 from cmfsim.io.tables import Table, read_tables
 from cmfsim.io.transforms import DIRECTION_CHOICE, is_itk_file, motion_in_lps
 from cmfsim.patient import (
@@ -214,7 +214,7 @@ def as_case(case: CaseOrPath) -> Case:
 
 def _case_file(path: Path) -> Path:
     """The case file that a path leads to: itself, or the one in a folder."""
-    if not path.is_dir():
+    if not is_there(path) or not path.is_dir():
         return path
     file = path / CASE_FILE
     if not file.exists():
@@ -285,6 +285,10 @@ def _output(table: Table, folder: Path) -> Path:
             "folder",
             f"is {name!r}: name a folder below the case's own (another one: cmfsim build -o)",
         )
+    try:
+        is_there(folder / relative)
+    except CaseInputError as error:
+        table.fail("folder", f"names {error}")
     return folder / relative
 
 

@@ -15,10 +15,11 @@ import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,13 @@ PROGRAM = (
 # Wall time that a request may take, in units of its processor time: on a busy machine a process
 # waits, and one that sleeps for ever is found as well.
 WALL_PER_CPU = 6.0
+# Processor time in which a task's libraries start, s, and the sign that they have.
+START = 60.0
+READY = b"+"
+# Looks at a process that is late, and the time between them, s: it may wait for the disk just then.
+LOOKS, LOOK_EVERY = 5, 0.02
+# A child that holds more than this between two files is replaced, bytes.
+MOST_HELD = 2**30
 # Lengths of answers: unsigned, 64 bits, little-endian.
 LENGTH = struct.Struct("<Q")
 # Python's own errors that mean the same in the parent; those of the package do as well.
@@ -55,7 +63,7 @@ class ReadLimits:
     Attributes
     ----------
     seconds : float
-        Processor time; six times as much on the clock.
+        Processor time; six times as much on the clock, more where others keep the processor busy.
     memory : int
         Bytes beyond what the child holds when the request begins; on Linux only.
     """
@@ -85,7 +93,7 @@ def read_in_child(task: str, limits: ReadLimits | None = None, /, **arguments: A
     ----------
     task : str
         "module:function" within cmfsim; the function takes the arguments by name and returns an
-        `Answer`.
+        `Answer`. The module's `LIBRARIES` are imported before its time begins.
     limits : ReadLimits, optional
     **arguments
         Plain values that JSON holds; paths as text, absolute.
@@ -127,31 +135,47 @@ class _Child:
         return self.parent == os.getpid() and self.process.poll() is None
 
     def answer(self, task: str, limits: ReadLimits, arguments: Mapping[str, Any]) -> Answer:
-        late = threading.Event()
-
-        def stop() -> None:
-            late.set()
-            self.process.kill()
-
-        timer = threading.Timer(WALL_PER_CPU * limits.seconds, stop)
-        timer.daemon = True
-        timer.start()
+        request = {"task": task, "arguments": dict(arguments)}
         try:
-            request = {"task": task, "arguments": dict(arguments)}
-            self._send({**request, "seconds": limits.seconds, "memory": limits.memory})
-            answer = self._receive()
-        except (EOFError, BrokenPipeError, ConnectionResetError) as error:
-            raise ReaderError(self._reason(late=late.is_set())) from error
+            # What the task's libraries take to start is no part of what the file may use.
+            with self._watched(START):
+                self._send({**request, "seconds": limits.seconds, "memory": limits.memory})
+                _exactly(self._answers(), len(READY))
+            with self._watched(limits.seconds):
+                answer = self._receive()
         except BaseException:
             # Ctrl-C: what is left of the answer must not become the next one.
             self.end()
             raise
-        finally:
-            timer.cancel()
-        # An error of the task is a whole answer: the process goes on to the next file.
+        # An error of the task is a whole answer: the process goes on to the next file, unless its
+        # libraries did not give memory back, as GDCM after damaged files.
+        if _held_by(self.process.pid) > MOST_HELD:
+            self.end()
         if isinstance(answer, Exception):
             raise answer
         return answer
+
+    @contextlib.contextmanager
+    def _watched(self, seconds: float) -> Iterator[None]:
+        """Ends the process when it is late; the error then tells why there was no answer."""
+        late, done = threading.Event(), threading.Event()
+
+        def watch() -> None:
+            while not done.wait(WALL_PER_CPU * seconds):
+                # One that is ready to run and gets no turn is not late: the system limits its
+                # processor time.
+                if not _is_running(self.process.pid) and not done.is_set():
+                    late.set()
+                    self.process.kill()
+                    return
+
+        threading.Thread(target=watch, daemon=True).start()
+        try:
+            yield
+        except (EOFError, BrokenPipeError, ConnectionResetError) as error:
+            raise ReaderError(self._reason(late=late.is_set())) from error
+        finally:
+            done.set()
 
     def end(self) -> None:
         """Stops the process; another is started when one is needed."""
@@ -178,10 +202,13 @@ class _Child:
         stream.write(json.dumps(message).encode() + b"\n")
         stream.flush()
 
-    def _receive(self) -> Answer | Exception:
-        stream = self.process.stdout
-        if stream is None:
+    def _answers(self) -> IO[bytes]:
+        if self.process.stdout is None:
             raise EOFError
+        return self.process.stdout
+
+    def _receive(self) -> Answer | Exception:
+        stream = self._answers()
         (length,) = LENGTH.unpack(_exactly(stream, LENGTH.size))
         header = json.loads(_exactly(stream, length))
         if "error" in header:
@@ -223,6 +250,29 @@ def _fill(stream: Any, array: NDArray[Any]) -> None:
         done += count
 
 
+def _is_running(pid: int) -> bool:
+    """Whether a process runs or waits for its turn alone; False where the system does not tell."""
+    for _ in range(LOOKS):
+        try:
+            with open(f"/proc/{pid}/stat", encoding="latin-1") as file:  # noqa: PTH123
+                state = file.read().rpartition(")")[2].split()[0]
+        except (OSError, IndexError):
+            return False
+        if state == "R":
+            return True
+        time.sleep(LOOK_EVERY)
+    return False
+
+
+def _held_by(pid: int) -> int:
+    """Bytes of memory that a process holds; 0 where the system does not tell."""
+    try:
+        with open(f"/proc/{pid}/statm", encoding="ascii") as file:  # noqa: PTH123
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, IndexError, ValueError, AttributeError):
+        return 0
+
+
 _LOCK = threading.RLock()
 _children: list[_Child] = []
 
@@ -252,9 +302,16 @@ def serve() -> None:
     os.dup2(2, 1)
     for line in requests:
         request = json.loads(line)
+        module, _, function = request["task"].partition(":")
+        _limit(START, request["memory"])
+        # One that is missing is the task's to report.
+        with contextlib.suppress(ImportError):
+            for name in (module, *getattr(import_module(module), "LIBRARIES", ())):
+                import_module(name)
+        answers.write(READY)
+        answers.flush()
         _limit(request["seconds"], request["memory"])
         try:
-            module, _, function = request["task"].partition(":")
             task: Callable[..., Answer] = getattr(import_module(module), function)
             answer = task(**request["arguments"])
         except Exception as error:  # noqa: BLE001 (its class and text go to the parent)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from cmfsim.checks import as_text, check_one_of
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files import FORMAT_VERSION
+from cmfsim.io.files import FORMAT_VERSION, is_there
 from cmfsim.io.tables import read_tables
 from cmfsim.prediction import MODELS
 
@@ -76,7 +76,7 @@ class Cohort:
             line and key.
         """
         path = Path(path)
-        if path.is_dir():
+        if is_there(path) and path.is_dir():
             if not (path / COHORT_FILE).exists():
                 raise CaseInputError(f"{path.resolve()}: is a folder without a {COHORT_FILE}")
             path = path / COHORT_FILE

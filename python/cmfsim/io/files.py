@@ -29,6 +29,8 @@ __all__ = [
     "check_readable",
     "check_units",
     "check_version",
+    "is_below",
+    "is_there",
     "known_keys",
     "named",
     "parsed_json",
@@ -99,23 +101,45 @@ def check_readable(path: Path, error: type[ValueError] = CaseInputError) -> None
     CaseError, or the error that is given
         (also `ValueError`) A folder, a pipe or device, a name that no file can have, no permission.
     """
-    name = path.name if len(path.name) <= MAX_SHOWN_NAME else f"{path.name[:MAX_SHOWN_NAME]}…"
-    try:
-        mode = path.stat().st_mode
-        if stat.S_ISREG(mode) and not os.access(path, os.R_OK):
-            raise error(f"{name}: may not be read: its owner has to permit it")
-    except (FileNotFoundError, NotADirectoryError) as missing:
-        raise FileNotFoundError(f"{path}: no such file") from missing
-    except OSError as other:
-        raise error(f"{name}: cannot be opened ({other.strerror})") from other
-    except ValueError as other:
-        if isinstance(other, error):
-            raise
-        raise error(f"{name!r}: no file is called so ({other})") from other
+    mode = _mode(path, error)
+    if mode is None:
+        raise FileNotFoundError(f"{path}: no such file")
+    name = _shown(path)
     if stat.S_ISDIR(mode):
         raise error(f"{name}: is a folder, not a file")
     if not stat.S_ISREG(mode):
         raise error(f"{name}: is a pipe or a device, not a file: copy its content to a file")
+    if not os.access(path, os.R_OK):
+        raise error(f"{name}: may not be read: its owner has to permit it")
+
+
+def is_there(path: Path, error: type[ValueError] = CaseInputError) -> bool:
+    """Whether there is a file or folder of this name.
+
+    Raises
+    ------
+    CaseError, or the error that is given
+        (also `ValueError`) A name that no file can have, links in a circle, no permission.
+    """
+    return _mode(path, error) is not None
+
+
+def _mode(path: Path, error: type[ValueError]) -> int | None:
+    """The kind and rights of what has this name; None where nothing has."""
+    try:
+        return path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as other:
+        # Path.exists and Path.is_file raise these too: a name of 300 characters, for one.
+        raise error(f"{_shown(path)}: cannot be opened ({other.strerror})") from other
+    except ValueError as other:
+        raise error(f"{_shown(path)!r}: no file is called so ({other})") from other
+
+
+def _shown(path: Path) -> str:
+    name = path.name
+    return name if len(name) <= MAX_SHOWN_NAME else f"{name[:MAX_SHOWN_NAME]}…"
 
 
 @contextlib.contextmanager
@@ -145,12 +169,13 @@ def beside(folder: Path, where: str, name: object) -> Path:
     path = folder / relative
     leads_out = relative.is_absolute() or ".." in relative.parts or any(c in name for c in "\\:\0")
     # A link may not lead out of the folder either.
-    if leads_out or not _is_below(path, folder):
+    if leads_out or not is_below(path, folder):
         raise CaseInputError(f"{where} is {name!r}: a file in the folder of the scene is needed")
     return path
 
 
-def _is_below(path: Path, folder: Path) -> bool:
+def is_below(path: Path, folder: Path) -> bool:
+    """Whether a path leads into a folder once its links are followed."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError):

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from cmfsim.case import Finding
 from cmfsim.errors import ImageInputError
+from cmfsim.io.files import check_readable, is_below
 
 __all__ = [
     "KNOWN",
@@ -44,6 +45,8 @@ MOST_VOXELS = 2_100_000_000
 MOST_HEADER = 1 << 20
 # Longer numbers stand in no header, characters: ITK's reader crashes at a thousand.
 MOST_DIGITS = 40
+# Characters of a name that an error repeats.
+MOST_SHOWN = 80
 # Sizes, spacings and places beyond these are no head's: voxels along an axis, mm.
 MOST_ALONG = 100_000
 FARTHEST = 1e6
@@ -202,21 +205,25 @@ def data_file(path: Path, name: str) -> Path:
         "a header may name one file beside it or below; save the image as one file (.nrrd, .mha, "
         ".nii.gz)"
     )
+    shown = name if len(name) <= MOST_SHOWN else f"{name[:MOST_SHOWN]}…"
     if name.split(maxsplit=1)[:1] == ["LIST"] or "%" in name or "\0" in name or not name:
-        raise ImageInputError(f"{path.name}: its data file is {name!r}: {how}")
+        raise ImageInputError(f"{path.name}: its data file is {shown!r}: {how}")
     given = Path(name)
-    folder = path.parent.resolve()
     if given.is_absolute() or ".." in given.parts or "\\" in name or ":" in name:
-        raise ImageInputError(f"{path.name}: its data file {name!r} lies elsewhere: {how}")
+        raise ImageInputError(f"{path.name}: its data file {shown!r} lies elsewhere: {how}")
     data = path.parent / given
-    if not data.resolve().is_relative_to(folder):
+    if not is_below(data, path.parent):
         raise ImageInputError(
-            f"{path.name}: its data file {name!r} is a link that leads out of the folder: {how}"
+            f"{path.name}: its data file {shown!r} is a link that leads out of the folder: {how}"
         )
-    if not data.is_file():
+    try:
+        check_readable(data, ImageInputError)
+    except FileNotFoundError as error:
         raise ImageInputError(
-            f"{path.name}: its data file {name!r} does not exist beside it: copy both"
-        )
+            f"{path.name}: its data file {shown!r} does not exist beside it: copy both"
+        ) from error
+    except ImageInputError as error:
+        raise ImageInputError(f"{path.name}: its data file {shown!r}: {error}") from error
     return data
 
 

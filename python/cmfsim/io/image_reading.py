@@ -9,7 +9,10 @@ import numpy as np
 from cmfsim.errors import ImageInputError
 from cmfsim.io.child import Answer
 
-__all__ = ["read_frames", "read_slices", "read_volume"]
+__all__ = ["LIBRARIES", "read_frames", "read_slices", "read_volume"]
+
+# What the child process imports before the time of a file begins.
+LIBRARIES = ("SimpleITK",)
 
 
 def read_volume(path: str, reader: str) -> Answer:

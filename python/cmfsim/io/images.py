@@ -15,6 +15,7 @@ from cmfsim.case import Finding, ImageData
 from cmfsim.errors import ImageError, ImageInputError
 from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
 from cmfsim.io.dicom import read_dicom_file, read_dicom_folder
+from cmfsim.io.files import is_there
 from cmfsim.io.image_grids import aligned, shear_of, turn_of, upright
 from cmfsim.io.image_headers import KNOWN, ImageHeader, apart
 from cmfsim.io.leftovers import abandoned, temporary_folder
@@ -92,7 +93,7 @@ def read_image_file(path: str | os.PathLike[str], *, series: str | None = None) 
     FileNotFoundError
     """
     path = Path(path)
-    if not path.exists():
+    if not is_there(path, ImageInputError):
         raise FileNotFoundError(f"{path}: no such file or folder")
     if path.is_dir():
         _simpleitk()

@@ -19,8 +19,10 @@ __all__ = ["parse_itk_hdf5", "read_itk_hdf5"]
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 # A rigid transform takes some 8 kB; above this a file holds a displacement field, bytes.
 MAX_FILE = 2**26
-# Processor time that reading may take, s: most of it is SimpleITK's own start.
-SECONDS = 4.0
+# Processor time that reading may take, s: a transform needs some thousandths.
+SECONDS = 1.0
+# What the child process imports before this time begins.
+LIBRARIES = ("SimpleITK",)
 # The name of one dataset in the group of each transform. SimpleITK reads the first group and only
 # warns of further ones, so they are counted here; HDF5 stores names of links as plain text.
 TYPE_NAME = b"TransformType"

@@ -30,6 +30,8 @@ __all__ = ["read_mesh", "read_tet_mesh", "read_tets"]
 NAME_OTHERS = frozenset({".xdmf", ".xmf", ".hmf", ".node", ".ele", ".svg"})
 # Processor time, s, and memory, bytes, that meshio may take for a small file.
 SECONDS, MEMORY = 2.0, 2**30
+# What the child process imports before this time begins.
+LIBRARIES = ("meshio",)
 # Cells that lie on or in the tets of a file without being part of the tissue.
 PASSED_OVER = frozenset({"vertex", "line", "triangle", "quad", "tetra"})
 

@@ -100,8 +100,10 @@ def read_summary(path: Path, check: Check, again: str) -> dict[str, Any]:
         plain("", content)
         mapping(text, most=200)("sha256", content.get("sha256"))
         check("", content)
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise FileNotFoundError(f"{path}: no such file") from error
+    except OSError as error:
+        raise CaseInputError(f"{path}: cannot be opened ({error.strerror}); {again}") from error
     except ValueError as error:
         raise CaseInputError(f"{path}: {error}; {again}") from error
     return content

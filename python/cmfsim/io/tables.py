@@ -12,7 +12,14 @@ import numpy as np
 
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io.files import check_numbers, check_plain_toml, check_readable, named, toml_module
+from cmfsim.io.files import (
+    check_numbers,
+    check_plain_toml,
+    check_readable,
+    is_there,
+    named,
+    toml_module,
+)
 from cmfsim.io.toml_lines import KeyPath, line_of, toml_lines
 
 __all__ = ["Table", "nearest", "read_tables"]
@@ -214,9 +221,14 @@ class Table:
         if "\0" in name:
             self.fail(key, "holds a zero character: no file is called so")
         try:
-            return folder / Path(name).expanduser()
+            path = folder / Path(name).expanduser()
         except RuntimeError:
             self.fail(key, f"is {name!r}: there is no home folder of this name; write the path")
+        try:
+            is_there(path)
+        except CaseInputError as error:
+            self.fail(key, f"names {error}")
+        return path
 
     def table(self, key: str) -> "Table":
         """A table below this one; empty where it is absent."""

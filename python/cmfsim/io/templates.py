@@ -18,7 +18,7 @@ from typing import Any
 from cmfsim.case import Finding
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.curves import read_curves, write_curves
-from cmfsim.io.files import FORMAT_VERSION, beside, named
+from cmfsim.io.files import FORMAT_VERSION, beside, is_there, named
 from cmfsim.io.landmarks import read_landmark_file, write_landmarks
 from cmfsim.io.leftovers import abandoned, temporary_folder
 from cmfsim.io.surfaces import read_surface, write_surface
@@ -92,7 +92,7 @@ def survey_template(path: str | os.PathLike[str]) -> TemplateSurvey:
         There is no such folder or archive.
     """
     path = Path(path)
-    if not path.exists():
+    if not is_there(path):
         raise FileNotFoundError(f"{path}: no such template")
     gathered = _Gathered(path.name)
     template: TemplateData | None = None
@@ -248,9 +248,10 @@ def _file(table: Table, key: str, folder: Path) -> Path:
     name = table.text(key)
     try:
         path = beside(folder, key, name)
+        there = is_there(path) and path.is_file()
     except CaseInputError:
         table.fail(key, f"is {name!r}: a file inside the template's folder is needed")
-    if not path.is_file():
+    if not there:
         place = f"{TEMPLATE_FILE}:{table.line(key)}"
         raise FileNotFoundError(f"{place}: {key} names {name!r}: no such file")
     return path

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import Floats, as_floats, check_one_of
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files import MAX_TEXT, named, replacing
+from cmfsim.io.files import MAX_TEXT, check_readable, named, replacing
 from cmfsim.io.itk_hdf5 import read_itk_hdf5
 from cmfsim.patient import DIRECTIONS, FRAMES
 from cmfsim.planning import rigid_matrix
@@ -155,8 +155,7 @@ def read_transform_file(
         raise CaseInputError(
             f"{path.name}: a transform is read from .tfm, .h5, .txt or .mat, not {path.suffix!r}"
         )
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+    check_readable(path)
     with named(path):
         stated: tuple[str | None, str | None] = (None, None)
         if suffix in HDF5_SUFFIXES:

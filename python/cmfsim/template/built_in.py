@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
+from cmfsim.io.files import is_there
+
 __all__ = ["template_names", "template_path"]
 
 # Made by scripts/make_default_template.py.
@@ -32,11 +34,13 @@ def template_path(folder_or_name: str | os.PathLike[str]) -> Path:
     ------
     FileNotFoundError
         Neither a name nor a folder or archive.
+    CaseError
+        (also `ValueError`) A name that no file can have.
     """
     if isinstance(folder_or_name, str) and folder_or_name in BUILT_IN:
         return Path(__file__).with_name(BUILT_IN[folder_or_name])
     path = Path(folder_or_name)
-    if not path.exists():
+    if not is_there(path):
         known = ", ".join(BUILT_IN)
         raise FileNotFoundError(f"{path}: no such template; built in: {known}")
     return path
