@@ -76,11 +76,10 @@ CORE: Mapping[str, frozenset[str]] = {
         "registration": "",
         "boundary": "surface motion mesh",
         "restraint": "mesh",
-        "curvature": "mesh surface triangle",
-        "crease": "curvature mesh motion surface",
-        "contact": "boundary crease mesh motion surface",
-        "acceleration": "mesh",
-        "settling": "acceleration boundary contact crease mesh",
+        "contact/field": "mesh surface",
+        "contact": "boundary mesh surface contact/field",
+        "contact/seat": "boundary contact mesh motion surface contact/field",
+        "contact/newton": "boundary contact mesh triangle contact/seat",
         "constraints": "blocks mesh",
         "cholesky/workspace": "",
         "cholesky/structure": "blocks ordering cholesky/workspace",
@@ -132,9 +131,9 @@ CORE: Mapping[str, frozenset[str]] = {
         "iterative": (
             "blocks constraints contact krylov mesh method multigrid projected_product relaxation"
         ),
-        "reaction": "cholesky contact crease mesh",
+        "reaction": "cholesky contact mesh",
         "system": (
-            "blocks boundary cholesky constraints contact crease iterative mesh method reaction "
+            "blocks boundary cholesky constraints contact iterative mesh method reaction "
             "restraint row_sums solution"
         ),
         "equilibrium": (
@@ -149,7 +148,7 @@ CORE: Mapping[str, frozenset[str]] = {
             "blocks boundary contact equilibrium iterative kinematics mesh method reduction "
             "restraint solution system tensors"
         ),
-        "replan": "boundary crease kinematics mesh method motion reduction statics system",
+        "replan": "boundary contact kinematics mesh method motion reduction statics system",
     }.items()
 }
 # The one place, below crates/, that may name each outside crate.
@@ -196,7 +195,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "osteotomy": "case checks errors planning scene _core",
         "node_kinds": "case checks errors scene _core",
         "inversion": "case checks _core",
-        "simulation": "errors inversion scene _core",
+        "simulation": "case errors inversion scene _core",
         "patient_prediction": (
             "checks clinical_plan errors model planning prediction scene simulation _core"
         ),

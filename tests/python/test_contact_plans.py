@@ -39,7 +39,7 @@ def test_random_plans_converge_in_few_steps(scene, plans):
     tally = contact_plans.Tally("phantom", "H+S", scene.n_tets, 0)
     contact_plans.run(tally, scene, plans, "auto")
     assert not tally.failures
-    assert max(tally.steps) <= 20
+    assert max(tally.steps) <= 30
     assert np.median(tally.steps) <= 10
     assert max(tally.gaps) <= scene.options.contact_tolerance
 

@@ -171,8 +171,16 @@ pub(crate) struct Answers<'a> {
     made: Option<NormalFactor>,
     /// Rows of the last answer, ascending, with their forces.
     last: Vec<(RowKey, f64)>,
-    /// Loads that unstable springs bring, and what they add to the displacements, mm.
-    carried: Option<(Vec<[f64; 3]>, Vec<[f64; 3]>)>,
+    /// Loads that unstable springs bring.
+    carried: Option<Carried>,
+}
+
+/// Loads on the sliding nodes.
+struct Carried {
+    /// N.
+    loads: Vec<[f64; 3]>,
+    /// What they add to the displacements, mm.
+    moved: Vec<[f64; 3]>,
 }
 
 /// What sliding nodes do under contact conditions.
@@ -257,7 +265,7 @@ impl<'a> Answers<'a> {
             found = self.forces_under(&unstable, &z, &rows, c.share, exact)?;
         }
         let mut forces = self.pushed.clone();
-        if let Some((loads, _)) = &self.carried {
+        if let Some(Carried { loads, .. }) = &self.carried {
             for (f, load) in forces.iter_mut().zip(loads) {
                 *f = add(*f, *load);
             }
@@ -278,8 +286,8 @@ impl<'a> Answers<'a> {
         for (s, z) in unstable.iter().zip(z) {
             loads[s.node] = add(loads[s.node], scaled(s.axis, *z));
         }
-        let added = self.response_to(&loads);
-        self.carried = Some((loads, added));
+        let moved = self.response_to(&loads);
+        self.carried = Some(Carried { loads, moved });
         self.forces(rows, share, exact)
     }
 
@@ -291,7 +299,9 @@ impl<'a> Answers<'a> {
     /// Displacements without the forces of the rows, mm.
     fn unpushed(&self) -> Vec<[f64; 3]> {
         match &self.carried {
-            Some((_, added)) => self.free.iter().zip(added).map(|(f, a)| add(*f, *a)).collect(),
+            Some(Carried { moved, .. }) => {
+                self.free.iter().zip(moved).map(|(f, a)| add(*f, *a)).collect()
+            }
             None => self.free.clone(),
         }
     }

@@ -9,13 +9,14 @@
 //! and gap together (primal-dual active set; Hintermüller, Ito & Kunisch 2002).
 
 use crate::boundary::Motion;
+use crate::contact::seat::{Seats, Touch};
+use crate::contact::{
+    Body, Constraints, ContactMode, ContactOptions, ContactRow, ContactState, Response, Sliding,
+    Spring,
+};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::mesh::{add, dot, norm, scaled, sub};
 use crate::triangle::Vec3;
-
-use super::seat::{Seats, Touch};
-use super::{Body, Constraints, ContactMode, ContactOptions, ContactRow, ContactState, Response};
-use super::{Sliding, Spring};
 
 /// Most nodes an error names.
 const NAMED_NODES: usize = 10;
@@ -135,7 +136,8 @@ impl Sliding {
                 && unbalanced <= NEAR * problem.balance();
             let done = near && response.solved && unbalanced <= problem.balance();
             if done || iteration == options.max_iterations || stalls > MOST_STALLS {
-                if !done && !(response.solved && gap.max(unbalanced) <= problem.unseen()) {
+                let will_do = response.solved && gap.max(unbalanced) <= problem.unseen();
+                if !(done || will_do) {
                     return Err(problem.far(&state, &active, iteration, gap));
                 }
                 return problem.end(state, &active, (gap, unbalanced), done, iteration);
