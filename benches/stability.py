@@ -84,7 +84,7 @@ may be refused (`SolverError`) by Cholesky where {CONDITION_FACTOR:g} ε κ > {W
 where a held node belongs, over the triangles of the moved surface, one by one; **tangential** the
 largest force across the normals over the largest contact force; **true residual** that of the
 tangential equilibrium in 32 digits, and **error** the distance from the displacements in that
-equilibrium with the same walls and normals (`benches/extreme/contact.py`), whose κ is that of the
+equilibrium with the same places and normals (`benches/extreme/contact.py`), whose κ is that of the
 tangential unknowns. *ok* is a distance within {DISTANCE:.0e} mm (twice the contact tolerance where
 that is wider), a tangential force within {TANGENTIAL:.0e}, an error within {CONTACT_ERROR:.0e},
 normals that are the wall's, and with lift-off no pull.
@@ -116,7 +116,7 @@ rest.
   inverts, so it may come to rest with tets turned over; `hyperelastic` resists longer, or is
   refused. `solve_scene` and `predict` warn of it (`inverted-tets`: how many, which is worst) and
   count them in the summary; after `StaticSolver.solve` look for `tensors.volume_change(u) <= -1`.
-- **contact** in a gutter of 10° across which the body is pushed may find no rest: `ContactError`
+- **contact** in a gutter of 10° across which the body is pushed may not converge: `ContactError`
   with the nodes. A body that only walls hold is refused where they leave a motion free.
 - **relaxation** and **plan_operator** with `corotational` or `hyperelastic`: they are of the linear
   model, and raise `SolverError`. So does a plan that Newton's method does not bring to rest in 64

@@ -34,7 +34,8 @@ def test_the_demo_reports_every_model(folder):
     for model in ("H", "M", "M+S"):
         summary = json.loads((folder / "out" / model / "prediction.json").read_text("utf-8"))
         assert summary["model"] == model
-        assert summary["solution"]["residual"] < 1e-12
+        # Contact ends at its tolerance in mm; linear systems are solved to rounding.
+        assert summary["solution"]["residual"] < (1e-5 if "S" in model else 1e-12)
     drawn = len(re.findall(r'<img src="data:image/png', page))
     # Prediction, plan, muscles; errors of every model, and their chart.
     assert drawn == 7 or "Without pictures" in page

@@ -237,14 +237,14 @@ pub enum MtmError {
         /// What is wrong, where, and the mend.
         problem: String,
     },
-    /// The contact loop came back to an earlier state without settling.
+    /// The steps of the contact solver ran out, or led nowhere.
     #[error(
-        "contact does not settle: after {iterations} iterations nodes {nodes:?} still change their contact triangle or state (gap {gap:.3e} mm); smooth the contact surface there or refine the tissue"
+        "contact did not converge: after {iterations} steps nodes {nodes:?} are off their surfaces or out of balance (largest gap {gap:.3e} mm); smooth the contact surface there, refine the tissue, or check that bones do not pass through each other"
     )]
-    ContactCycle {
-        /// Outer iterations done.
+    ContactNotConverged {
+        /// Steps done.
         iterations: usize,
-        /// The cycling nodes (the first ten).
+        /// The nodes that are farthest from a solution (ten of them).
         nodes: Vec<usize>,
         /// Largest gap reached, mm.
         gap: f64,
@@ -460,7 +460,7 @@ impl MtmError {
             | Self::Segment { .. }
             | Self::Plan { .. }
             | Self::Unconstrained { .. } => ErrorKind::Boundary,
-            Self::ContactSurface { .. } | Self::ContactCycle { .. } => ErrorKind::Contact,
+            Self::ContactSurface { .. } | Self::ContactNotConverged { .. } => ErrorKind::Contact,
             Self::NotPositiveDefinite { .. }
             | Self::NotConverged { .. }
             | Self::NoThreads { .. }
@@ -478,7 +478,7 @@ impl MtmError {
     pub fn is_input(&self) -> bool {
         !matches!(
             self,
-            Self::ContactCycle { .. }
+            Self::ContactNotConverged { .. }
                 | Self::NotPositiveDefinite { .. }
                 | Self::NotConverged { .. }
                 | Self::IcpNotConverged { .. }

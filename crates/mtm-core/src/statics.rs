@@ -177,7 +177,7 @@ impl StaticSolver {
     /// Depends on its arguments alone: nothing is left over from earlier plans.
     ///
     /// # Errors
-    /// A plan or loads that do not fit, contact that does not settle, an iteration that does not
+    /// A plan or loads that do not fit, contact that does not converge, an iteration that does not
     /// converge, interruption.
     pub fn solve(
         &self,

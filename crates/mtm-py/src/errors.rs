@@ -12,7 +12,7 @@ const FAMILY: [(&str, &str); 10] = [
     ("MeshError", "Nodes, tets or surfaces cannot be used."),
     ("MaterialError", "Tissue constants or stiffness cannot be used."),
     ("BoundaryError", "Node kinds, segments or plans do not fit."),
-    ("ContactError", "A contact surface cannot serve, or contact does not settle."),
+    ("ContactError", "A contact surface cannot serve, or contact does not converge."),
     ("SolverError", "Solver options are out of range, or a solve failed."),
     ("RegistrationError", "A registration failed."),
     ("LandmarkError", "Landmarks are missing, doubled or misplaced."),

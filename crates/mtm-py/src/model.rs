@@ -395,7 +395,7 @@ impl PyStaticSolver {
     /// BoundaryError
     ///     A plan that does not fit.
     /// ContactError
-    ///     Contact that does not settle, a node that slides past the border of an open surface.
+    ///     Contact that does not converge, a node that slides past the border of an open surface.
     /// SolverError
     ///     An iteration that does not converge.
     #[pyo3(signature = (plan, *, loads = None))]

@@ -79,7 +79,7 @@ impl Sliding {
     /// they clung to their segment if none.
     ///
     /// # Errors
-    /// `ContactCycle` where the steps run out far from a solution, `ContactSurface` where a node ends past the
+    /// `ContactNotConverged` where the steps run out far from a solution, `ContactSurface` where a node ends past the
     /// border of its surface, whatever the body reports.
     pub fn solve(
         &self,
@@ -526,7 +526,7 @@ impl Problem<'_> {
         order.sort_by(|&a, &b| badness(b).total_cmp(&badness(a)).then(a.cmp(&b)));
         let nodes = order.iter().take(NAMED_NODES);
         let nodes = nodes.map(|&i| self.sliding.nodes[i].node as usize).collect();
-        MtmError::ContactCycle { iterations, nodes, gap }
+        MtmError::ContactNotConverged { iterations, nodes, gap }
     }
 }
 

@@ -118,7 +118,9 @@ impl<'a> Seats<'a> {
             let near = AT_REST * out.spacing(sliding.nodes[i].segment);
             out.seats[i].level = match *gap {
                 None => touch.level(),
-                Some(gap) if (sliding.rest_distance(i) - gap).abs() <= near => touch.level(),
+                Some(gap) if (sliding.rest_distance(i) - gap).abs() <= near => {
+                    touch.level() + gap - sliding.rest_distance(i)
+                }
                 Some(gap) => gap,
             };
         }

@@ -239,7 +239,7 @@ impl Equilibrium {
             Err(
                 MtmError::NotConverged { .. }
                 | MtmError::NotPositiveDefinite { .. }
-                | MtmError::ContactCycle { .. },
+                | MtmError::ContactNotConverged { .. },
             ) => {}
             Err(error) => return Err(error),
         }
