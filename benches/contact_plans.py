@@ -156,7 +156,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--angle", type=float, default=8.0, help="degrees")
     parser.add_argument("--overlap", type=float, default=2.0, help="of bones, mm")
     parser.add_argument("--method", default="auto")
-    parser.add_argument("--fill", type=Path, help="page whose table is written anew")
+    parser.add_argument("--fill", type=Path, help="page whose table is rewritten")
     options = parser.parse_args(words)
     tallies = []
     for path in options.cases:

@@ -27,7 +27,7 @@ CORE: Mapping[str, frozenset[str]] = {
         "winding": "surface mesh triangle",
         "stuffing/level": "",
         "stuffing/distance": "stuffing/level",
-        "stuffing/lattice": "",
+        "stuffing/lattice": "keys",
         "stuffing/cut": "mesh stuffing/lattice stuffing/level",
         "stuffing/improve": "mesh stuffing/cut stuffing/level",
         "stuffing/parts": "mesh stuffing/cut",
@@ -57,6 +57,7 @@ CORE: Mapping[str, frozenset[str]] = {
         "equivalent/stiffness": "equivalent/shares material",
         "equivalent": "fibre material mesh surface triangle winding",
         "element": "mesh",
+        "keys": "",
         "kinematics": "",
         "quadratic": "blocks element",
         "nodal_pressure": "blocks material mesh",
@@ -76,7 +77,7 @@ CORE: Mapping[str, frozenset[str]] = {
         "registration": "",
         "boundary": "surface motion mesh",
         "restraint": "mesh",
-        "contact/field": "mesh surface",
+        "contact/field": "keys mesh surface",
         "contact": "boundary mesh surface contact/field",
         "contact/seat": "boundary contact mesh motion surface contact/field",
         "contact/newton": "boundary contact mesh triangle contact/seat",
@@ -172,11 +173,11 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "patient": "checks errors pickling",
         "model": "case checks musculature osteotomy pickling scene",
         "io": (
-            "case checks errors landmark_sites model musculature patient planning prediction scene "
-            "template_data"
+            "case checks errors extras landmark_sites model musculature patient planning "
+            "prediction scene template_data"
         ),
-        "imaging": "case checks errors scene _core",
-        "meshing": "case checks errors scene _core",
+        "imaging": "case checks errors extras scene _core",
+        "meshing": "case checks errors extras scene _core",
         "musculature": "case checks errors pickling scene _core",
         "registration": "case checks errors landmark_sites scene _core",
         "equivalent": "case checks errors musculature scene _core",
@@ -191,16 +192,19 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "planning": "errors _core",
         "clinical_plan": "checks errors planning scene _core",
         "achieved": ("bone_motion case checks errors pickling planning registration scene _core"),
-        "bone_motion": "checks errors scene surface_checks topology _core",
-        "osteotomy": "case checks errors planning scene _core",
-        "node_kinds": "case checks errors scene _core",
+        "bone_motion": "checks errors extras scene surface_checks topology _core",
+        "osteotomy": "case checks errors extras planning scene _core",
+        "node_kinds": "case checks errors extras scene _core",
         "inversion": "case checks _core",
         "simulation": "case errors inversion scene _core",
         "patient_prediction": (
             "checks clinical_plan errors model planning prediction scene simulation _core"
         ),
         "deferred": "",
-        "evaluation": "case checks errors landmark_sites registration scene topology _core",
+        "extras": "errors",
+        "evaluation": (
+            "case checks errors extras landmark_sites registration scene topology _core"
+        ),
         "build": (
             "achieved bone_motion case checks deferred doctor equivalent errors imaging io "
             "meshing model "
@@ -210,13 +214,13 @@ PYTHON: Mapping[str, frozenset[str]] = {
         ),
         "demo": "case checks errors io osteotomy phantom scene",
         "study": (
-            "build case checks deferred errors evaluation finding_groups io model musculature "
-            "patient patient_prediction prediction scene template _core"
+            "build case checks deferred errors evaluation extras finding_groups io model "
+            "musculature patient patient_prediction prediction scene template _core"
         ),
         "pictures": "case checks clinical_plan errors musculature prediction scene _core",
-        "report": "case clinical_plan errors finding_groups io scene",
+        "report": "case clinical_plan errors extras finding_groups io scene",
         "finding_groups": "case",
-        "insilico": "build case checks errors io phantom planning scene topology _core",
+        "insilico": "build case checks errors extras io phantom planning scene topology _core",
         "bench": (
             "build checks errors evaluation io model patient patient_prediction pictures "
             "prediction scene simulation _core"

@@ -10,8 +10,6 @@ bone is gone. `without_removed` lets them follow the rest of the piece.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +17,7 @@ from numpy.typing import NDArray
 from cmfsim._core import Surface, SurfaceMotion, rigid_fit
 from cmfsim.checks import Floats
 from cmfsim.errors import BoundaryInputError, RegistrationError
+from cmfsim.extras import third_party
 from cmfsim.scene import MovedSurface, SurfaceData
 from cmfsim.surface_checks import duplicate_triangles, has_three_corners, thin_triangles
 from cmfsim.topology import connected_labels, edges_of
@@ -323,7 +322,9 @@ def _rest_of(here: Floats, there: Floats) -> tuple[Floats, Callable[[Floats], Fl
 
 def _averaged(points: Floats, values: Floats) -> Floats:
     """The values averaged over neighbours in space, each point with its own among them."""
-    tree = _module("scipy.spatial").cKDTree(points)
+    tree = third_party(
+        "scipy.spatial", "noise of a moved surface is averaged", "imaging", BoundaryInputError
+    ).cKDTree(points)
     pairs = tree.query_pairs(REACH * AVERAGED, output_type="ndarray")
     size = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     weight = np.exp(-0.5 * (size / AVERAGED) ** 2)
@@ -375,12 +376,3 @@ def _part(motion: MovedSurface, triangles: Integers) -> MovedSurface:
         motion.surface.crease_angle,
     )
     return MovedSurface(surface, np.asarray(motion.moved_vertices)[used])
-
-
-def _module(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as error:
-        raise BoundaryInputError(
-            "noise of a moved surface is averaged with scipy: pip install 'cmfsim[imaging]'"
-        ) from error

@@ -11,6 +11,8 @@ import pytest
 
 import cmfsim
 import meshes
+from cmfsim.errors import MeshInputError
+from cmfsim.extras import third_party
 from head_case import HeadCase
 
 PACKAGE = Path(cmfsim.__file__).parent
@@ -159,3 +161,9 @@ def test_a_name_that_is_not_there_is_an_attribute_error():
         cmfsim.solve  # noqa: B018
     assert set(cmfsim.__all__) <= set(dir(cmfsim))
     assert cmfsim.meshing.mesh_report is cmfsim.mesh_report
+
+
+def test_a_missing_dependency_is_named_with_the_line_that_installs_it():
+    with pytest.raises(cmfsim.MeshError, match=r"^teeth are counted with nosuch, .*'cmfsim\[x\]'$"):
+        third_party("nosuch.part", "teeth are counted", "x", MeshInputError)
+    assert third_party("json.decoder", "nothing", "x").JSONDecoder

@@ -1,8 +1,8 @@
-//! Normal constraints n·u = g on rows of the system, one to three a row, by projection: the pattern
-//! stays, and the constraints hold to rounding.
+//! Normal constraints n·u = g on rows of the system by projection: the pattern stays, and the constraints
+//! hold to rounding.
 
 use crate::blocks::BlockMatrix;
-use crate::mesh::{dot, norm, scaled, sub};
+use crate::mesh::{dot, scaled, sub};
 
 /// n·u = offset on one row.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -13,32 +13,6 @@ pub struct Constraint {
     pub normal: [f64; 3],
     /// Prescribed component along it, mm.
     pub offset: f64,
-}
-
-/// The same constraints with normals orthonormal on each row, which the projection needs.
-///
-/// Constraints of one row follow each other and have independent normals (a row with one constraint
-/// keeps its bits). Gram and Schmidt: q = (n − Σ r q_k) / s, and the offset alike.
-pub fn orthonormal(constraints: &[Constraint]) -> Vec<Constraint> {
-    let mut out: Vec<Constraint> = Vec::with_capacity(constraints.len());
-    for chunk in constraints.chunk_by(|a, b| a.row == b.row) {
-        let first = out.len();
-        for (k, c) in chunk.iter().enumerate() {
-            let mut q = *c;
-            if k > 0 {
-                for earlier in &out[first..] {
-                    let share = dot(earlier.normal, q.normal);
-                    q.normal = sub(q.normal, scaled(earlier.normal, share));
-                    q.offset -= share * earlier.offset;
-                }
-                let length = norm(q.normal);
-                q.normal = scaled(q.normal, 1.0 / length);
-                q.offset /= length;
-            }
-            out.push(q);
-        }
-    }
-    out
 }
 
 /// P A P + k (I − P) with P = I − Σ n⊗n on the constrained rows, k the mean diagonal of each.

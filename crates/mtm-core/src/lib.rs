@@ -63,6 +63,7 @@ pub mod error;
 mod error_estimate;
 pub mod fibre;
 mod iterative;
+mod keys;
 pub mod kinematics;
 pub mod krylov;
 pub mod material;

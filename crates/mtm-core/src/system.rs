@@ -4,14 +4,14 @@
 use crate::blocks::BlockMatrix;
 use crate::boundary::Motion;
 use crate::cholesky::{Factor, Symbolic};
-use crate::constraints::{Constraint, add_offsets, orthonormal, projected, projected_rhs};
+use crate::constraints::{Constraint, add_offsets, projected, projected_rhs};
 use crate::contact::{Body, Constraints, ContactRow, ContactState, Response, Sliding, Spring};
 use crate::error::{MtmError, Result};
 use crate::iterative::{Effort, Extremes, Iterative, Trail};
-use crate::mesh::{add, dot, norm, scaled, sub};
+use crate::mesh::{add, between, dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
 use crate::reaction::{Answer, Answers, ContactFactor};
-use crate::restraint::Held as Restraint;
+use crate::restraint::Held;
 use crate::row_sums::in_pool;
 use crate::solution::Clock;
 
@@ -84,7 +84,7 @@ impl System {
         matrix: BlockMatrix,
         positions: &[[f64; 3]],
         sliding: Option<&Sliding>,
-        held: Restraint,
+        held: Held,
         tissue: Extremes,
         options: &StaticOptions,
         clock: &mut Clock,
@@ -97,7 +97,7 @@ impl System {
                 sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
             // Where sliding nodes alone hold a part, there is no flexibility without them.
             let kept = !slide_rows.is_empty()
-                && held == Restraint::ByPrescribed
+                && held == Held::ByPrescribed
                 && slide_rows.len() <= MAX_KEPT_SLIDING;
             let dense = kept && slide_rows.len() <= MAX_DENSE_SLIDING;
             let symbolic = Symbolic::new(&matrix, if dense { &slide_rows } else { &[] })?;
@@ -203,9 +203,10 @@ impl System {
         }
         let trail = Trail::starting(rows.to_vec());
         let mut body =
-            Held { system: self, b, sliding, scale, trail, effort, interrupted, last: None };
+            Projected { system: self, b, sliding, scale, trail, effort, interrupted, last: None };
         let state = sliding.solve(motions, first, &contact, interrupted, &mut body)?;
-        let rows = body.trail.rows;
+        // No state without a step.
+        let rows = body.last.map_or_else(Vec::new, |last| last.to);
         effort.error_estimate = effort.error_estimate.max(left_by(&state));
         Ok((rows, state, clock.total()))
     }
@@ -282,13 +283,12 @@ impl System {
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, bool)> {
         let row = |node: usize| sliding.nodes()[node].row as usize;
-        let asked: Vec<Constraint> = c
+        let constraints: Vec<Constraint> = c
             .rows
             .iter()
             .zip(c.offsets)
             .map(|(r, &offset)| Constraint { row: row(r.node), normal: r.normal, offset })
             .collect();
-        let constraints = orthonormal(&asked);
         let springs: Vec<(usize, Spring)> = c.springs.iter().map(|&s| (row(s.node), s)).collect();
         let pushed = |matrix: &BlockMatrix| {
             let mut rhs = projected_rhs(matrix, b, &constraints);
@@ -366,12 +366,8 @@ impl Step {
 
     /// The step to `share` of the way; energy is quadratic, forces are linear.
     fn shorten(&mut self, share: f64) {
-        for (ends, starts) in [(&mut self.to, &self.from), (&mut self.forces_to, &self.forces_from)]
-        {
-            for (end, start) in ends.iter_mut().zip(starts) {
-                *end = add(*start, scaled(sub(*end, *start), share));
-            }
-        }
+        self.to = between(&self.from, &self.to, share);
+        self.forces_to = between(&self.forces_from, &self.forces_to, share);
     }
 }
 
@@ -399,7 +395,7 @@ impl Body for Flexible<'_> {
 }
 
 /// The body by all its rows, those of held nodes projected.
-struct Held<'a> {
+struct Projected<'a> {
     system: &'a System,
     b: &'a [[f64; 3]],
     sliding: &'a Sliding,
@@ -410,7 +406,7 @@ struct Held<'a> {
     last: Option<Step>,
 }
 
-impl Held<'_> {
+impl Projected<'_> {
     /// Forces out of balance of all rows, A x − b.
     fn forces(&self, x: &[[f64; 3]]) -> Vec<[f64; 3]> {
         let mut out = self.system.matrix().multiply(x);
@@ -421,7 +417,7 @@ impl Held<'_> {
     }
 }
 
-impl Body for Held<'_> {
+impl Body for Projected<'_> {
     fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
         let (from, forces_from) = match self.last.take() {
             Some(last) => (last.to, last.forces_to),
@@ -461,7 +457,6 @@ impl Body for Held<'_> {
         let (displacements, reactions) = (of(&x), of(&forces));
         let step = Step { from, to: x, forces_from, forces_to: forces };
         let slopes = Some(step.slopes());
-        self.trail.rows.clone_from(&step.to);
         self.last = Some(step);
         Ok(Response { displacements, reactions, slopes, solved })
     }
@@ -469,7 +464,6 @@ impl Body for Held<'_> {
     fn shorten(&mut self, share: f64) {
         if let Some(step) = &mut self.last {
             step.shorten(share);
-            self.trail.rows.clone_from(&step.to);
         }
     }
 }

@@ -34,7 +34,7 @@ class Choice:
     tolerance : float
         Relative error bound of iterative methods.
     contact_tolerance : float
-        Largest gap over the diagonal of the mesh.
+        Largest gap of a node in contact, mm.
     samples : int
         Points in a tet that a muscle's surface crosses.
     mixing : str
@@ -60,7 +60,7 @@ class Choice:
     method: str = "auto"
     tolerance: float = 1e-8
     contact: str = "bilateral"
-    contact_tolerance: float = 1e-9
+    contact_tolerance: float = 1e-4
     samples: int = 64
     mixing: str = "moduli"
     model: str = "M+S"

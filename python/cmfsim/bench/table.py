@@ -76,8 +76,7 @@ def row_label(choice: Choice) -> str:
     return (
         f"{choice.model}, {choice.element} {choice.kinematics} at {choice.edge_length:g} mm, "
         f"{choice.method}, tolerance {choice.tolerance:g}, {choice.contact} contact to "
-        f"{choice.contact_tolerance:g} of the mesh's diagonal, {choice.samples} samples, "
-        f"{choice.mixing}"
+        f"{choice.contact_tolerance:g} mm, {choice.samples} samples, {choice.mixing}"
     )
 
 

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim.checks import as_floats, check_one_of
 from cmfsim.errors import CaseInputError
+from cmfsim.extras import third_party
 
 __all__ = ["PAIRED_BY", "PairedTest", "wilcoxon_test"]
 
@@ -122,7 +122,7 @@ def wilcoxon_test(first: ArrayLike, second: ArrayLike, *, by: str = "vertex") ->
         caveat = f"{n_used} pairs cannot give p below {min(least, 1.0):g}, whatever the models do"
     statistic, p, effect = 0.0, 1.0, 0.0
     if n_used:
-        stats = _scipy_stats()
+        stats = third_party("scipy.stats", "the signed-rank test is made", "report")
         used = difference[difference != 0.0]
         found = stats.wilcoxon(used, alternative="two-sided", method="auto")
         statistic, p = float(found.statistic), float(found.pvalue)
@@ -133,12 +133,3 @@ def wilcoxon_test(first: ArrayLike, second: ArrayLike, *, by: str = "vertex") ->
     return PairedTest(
         by, len(a), len(a) - n_used, statistic, p, float(np.median(difference)), effect, caveat
     )
-
-
-def _scipy_stats() -> Any:
-    try:
-        return import_module("scipy.stats")
-    except ImportError as error:
-        raise CaseInputError(
-            "the signed-rank test is scipy's, which is missing: pip install 'cmfsim[report]'"
-        ) from error

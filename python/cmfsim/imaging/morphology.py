@@ -5,7 +5,6 @@ the same bytes, and element-wise work runs straight through memory.
 """
 
 from collections.abc import Callable
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from cmfsim import _core
 from cmfsim.errors import ImageError
+from cmfsim.extras import third_party
 
 __all__ = [
     "Block",
@@ -57,12 +57,7 @@ def ndimage() -> Any:
 
 
 def _package(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as error:
-        raise ImageError(
-            f"CTs are segmented with {name}, which is missing: pip install 'cmfsim[imaging]'"
-        ) from error
+    return third_party(name, "CTs are segmented", "imaging", ImageError)
 
 
 def watershed(height: Volume, seeds: NDArray[Any], mask: Mask) -> NDArray[Any]:

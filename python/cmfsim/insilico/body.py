@@ -1,6 +1,5 @@
 """The true tissue as finite elements: energy and forces by scikit-fem, stiffness in blocks."""
 
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -8,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim.checks import Floats, as_index_rows, as_rows
 from cmfsim.errors import CaseInputError
+from cmfsim.extras import third_party
 from cmfsim.insilico.hyperelastic import HyperelasticTissue, cofactor
 
 __all__ = ["HyperelasticBody"]
@@ -161,9 +161,4 @@ def _virtual_work(v: Any, w: Any) -> Any:
 
 
 def _module(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as error:
-        raise CaseInputError(
-            f"virtual patients are solved with {name}: pip install 'cmfsim[study]'"
-        ) from error
+    return third_party(name, "virtual patients are solved", "study")

@@ -6,7 +6,6 @@ active sets of the tested models.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from cmfsim.case import ImageData
 from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError
+from cmfsim.extras import third_party
 
 __all__ = ["BoneContact", "SmoothDistance"]
 
@@ -41,7 +41,7 @@ class SmoothDistance:
     """
 
     def __init__(self, level: ImageData, relief: float = RELIEF) -> None:
-        ndimage = _module("scipy.ndimage")
+        ndimage = third_party("scipy.ndimage", "contact of virtual patients is found", "study")
         spacing = np.asarray(level.spacing)
         blurred = ndimage.gaussian_filter(
             np.asarray(level.values, dtype=np.float64), as_positive("relief", relief) / spacing
@@ -161,12 +161,3 @@ class BoneContact:
             values, axes = np.linalg.eigh(-(weight * pressing)[:, None, None] * bend)
             blocks[at] += (axes * np.maximum(values, 0.0)[:, None]) @ axes.transpose(0, 2, 1)
         return force, blocks
-
-
-def _module(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as error:
-        raise CaseInputError(
-            "contact of virtual patients is found with scipy: pip install 'cmfsim[study]'"
-        ) from error

@@ -1,6 +1,5 @@
 """The skin as a scanner sees it after the operation: carried by the tissue, with noise."""
 
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -8,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import Floats, as_index_rows, as_number, as_rows
 from cmfsim.errors import CaseInputError
+from cmfsim.extras import third_party
 from cmfsim.scene import SurfaceData
 
 __all__ = ["carried", "scanned"]
@@ -122,9 +122,4 @@ def _normals(vertices: Floats, triangles: NDArray[Any]) -> Floats:
 
 
 def _module(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as error:
-        raise CaseInputError(
-            "skins of virtual patients are made with scipy: pip install 'cmfsim[study]'"
-        ) from error
+    return third_party(name, "skins of virtual patients are made", "study")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, SolverError
+from cmfsim.extras import third_party
 from cmfsim.insilico.body import HyperelasticBody
 
 __all__ = ["Contact", "Equilibrium", "EquilibriumOptions", "NoContact", "find_equilibrium"]
@@ -312,12 +313,7 @@ class _LinearSolver:
         A new one each time: that of the matrix before takes several times the iterations, as tets
         that are squeezed near bone stiffen by orders of magnitude.
         """
-        try:
-            pyamg = import_module("pyamg")
-        except ModuleNotFoundError as error:
-            raise CaseInputError(
-                "virtual patients are solved with pyamg: pip install 'cmfsim[study]'"
-            ) from error
+        pyamg = third_party("pyamg", "virtual patients are solved", "study")
         self._matrix = matrix
         # PyAMG draws the start of its power iterations from numpy's global generator.
         state = np.random.get_state()  # noqa: NPY002

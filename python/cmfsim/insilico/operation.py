@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from itertools import combinations
 from typing import Any
 
@@ -13,6 +12,7 @@ from cmfsim._core import Surface, signed_distance_image
 from cmfsim.case import BoneSegment, ImageData, NodeKinds
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
+from cmfsim.extras import third_party
 from cmfsim.insilico.bone_contact import BoneContact, SmoothDistance
 from cmfsim.planning import decompose_motion, rigid_motion
 
@@ -244,7 +244,7 @@ def operate(
 
 def _near_cuts(nodes: Floats, held: NDArray[np.bool_], targets: Floats) -> NDArray[np.bool_]:
     """Which held nodes lie so near to held nodes of another motion that tissue is stripped."""
-    spatial = _module("scipy.spatial")
+    spatial = third_party("scipy.spatial", "virtual patients are made", "study")
     ids = np.flatnonzero(held)
     tree = spatial.cKDTree(nodes[ids])
     # Largest shift between any two parts bounds the search.
@@ -291,12 +291,3 @@ def _node_areas(nodes: Floats, triangles: NDArray[Any]) -> Floats:
     area = np.linalg.norm(cross, axis=1) / 6.0
     ends = triangles.T.ravel()
     return np.bincount(ends, np.tile(area, 3), len(nodes)).astype(np.float64)
-
-
-def _module(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as error:
-        raise CaseInputError(
-            "virtual patients are made with scipy: pip install 'cmfsim[study]'"
-        ) from error

@@ -4,7 +4,6 @@ import glob
 import os
 import shutil
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from cmfsim.case import Finding, ImageData
 from cmfsim.errors import ImageError, ImageInputError
+from cmfsim.extras import third_party
 from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
 from cmfsim.io.dicom import read_dicom_file, read_dicom_folder
 from cmfsim.io.files import is_there
@@ -168,10 +168,7 @@ def write_image(image: ImageData, path: str | os.PathLike[str]) -> None:
 
 
 def _simpleitk() -> Any:
-    try:
-        return import_module("SimpleITK")
-    except ModuleNotFoundError as error:
-        raise ImageError("images are read with SimpleITK: pip install 'cmfsim[imaging]'") from error
+    return third_party("SimpleITK", "images are read", "imaging", ImageError)
 
 
 def _last_line(error: Exception) -> str:

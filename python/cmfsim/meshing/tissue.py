@@ -2,8 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +10,7 @@ from cmfsim import _core
 from cmfsim.case import Anatomy, Finding, ImageData
 from cmfsim.checks import as_number, as_positive, as_rows
 from cmfsim.errors import MeshInputError
+from cmfsim.extras import third_party
 
 __all__ = ["TissueRegion", "near_skin", "tissue_level"]
 
@@ -136,7 +135,7 @@ def _without_hollows(
     level: Levels, bone: Levels, grid: ImageData, region: TissueRegion
 ) -> Iterator[Finding]:
     """Takes from `level` what only openings narrower than a foramen join to the outer tissue."""
-    ndimage = _ndimage()
+    ndimage = third_party("scipy.ndimage", "tissue is told from hollows", "imaging", MeshInputError)
     sx, sy, sz = (float(s) for s in np.asarray(grid.spacing))
     spacing = (sx, sy, sz)
     tissue: Mask = level > 0.0
@@ -174,12 +173,3 @@ def _without_hollows(
         "the cranial cavity and closed sinuses do not deform with the face",
         "none is needed; lower foramen_radius if tissue of the face is missing",
     )
-
-
-def _ndimage() -> Any:
-    try:
-        return import_module("scipy.ndimage")
-    except ModuleNotFoundError as error:
-        raise MeshInputError(
-            "tissue is told from hollows with scipy: pip install 'cmfsim[imaging]'"
-        ) from error

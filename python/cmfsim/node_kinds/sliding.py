@@ -1,8 +1,6 @@
 """Where tissue slides: on teeth and mucosa of the two dental arches, or in given regions."""
 
 from collections.abc import Mapping, Sequence
-from importlib import import_module
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +8,7 @@ from numpy.typing import NDArray
 from cmfsim._core import Surface
 from cmfsim.case import SHEET_DEPTH, Anatomy, BoneSegment, DentalArch, Finding
 from cmfsim.checks import Floats
-from cmfsim.errors import CaseInputError
+from cmfsim.extras import third_party
 from cmfsim.node_kinds.arches import DentalArches
 from cmfsim.node_kinds.options import KindOptions
 from cmfsim.scene import SurfaceData
@@ -118,17 +116,8 @@ def _near_teeth(points: Floats, anatomy: Anatomy, options: KindOptions) -> NDArr
     """Which points lie near the teeth; all, where the teeth are not known apart from bone."""
     if anatomy.teeth is None or not (anatomy.teeth.values > 0.0).any():
         return np.ones(len(points), dtype=bool)
-    ndimage = _ndimage()
+    ndimage = third_party("scipy.ndimage", "distances from the teeth are found", "imaging")
     distance = ndimage.distance_transform_edt(
         ~(anatomy.teeth.values > 0.0), sampling=np.asarray(anatomy.teeth.spacing).tolist()
     )
     return anatomy.teeth.with_values(distance).sample(points) <= options.teeth_distance
-
-
-def _ndimage() -> Any:
-    try:
-        return import_module("scipy.ndimage")
-    except ModuleNotFoundError as error:
-        raise CaseInputError(
-            "distances from the teeth are found with scipy: pip install 'cmfsim[imaging]'"
-        ) from error

@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from importlib import import_module
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.case import BoneSegment, Finding, ImageData
 from cmfsim.checks import as_number, check_instance
 from cmfsim.errors import CaseInputError
+from cmfsim.extras import third_party
 from cmfsim.osteotomy.planes import Cut, Procedure
 from cmfsim.osteotomy.procedures import PROCEDURES, place_procedure
 from cmfsim.osteotomy.segment_checks import check_segments
@@ -318,7 +318,7 @@ def _join_crumbs(
     `bound` is the greatest size of a level, `most` the voxels of a small part.
     Only parts that hang on the rest are given: what lay apart in the bone already stays.
     """
-    ndimage = _ndimage()
+    ndimage = third_party("scipy.ndimage", "bones are cut", "imaging")
     block = np.ones((3, 3, 3), dtype=np.int8)
     labels, count = ndimage.label(piece > 0.0, block)
     if count < 2:
@@ -353,10 +353,3 @@ def _join_crumbs(
         outside = -np.abs(bone[around]).clip(min=np.float32(bound * 1e-3))
         piece[around] = np.where(rim, np.minimum(piece[around], outside), piece[around])
     return moved, kept
-
-
-def _ndimage() -> Any:
-    try:
-        return import_module("scipy.ndimage")
-    except ModuleNotFoundError as error:
-        raise CaseInputError("bones are cut with scipy: pip install 'cmfsim[imaging]'") from error

@@ -6,7 +6,6 @@ past the edge in the direction in which the labial face leads, so that no node s
 """
 
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any, cast
 
 import numpy as np
@@ -16,6 +15,7 @@ from cmfsim import _core
 from cmfsim.case import SHEET_DEPTH, DentalArch, ImageData
 from cmfsim.checks import Floats, as_positive, as_rows
 from cmfsim.errors import CaseInputError
+from cmfsim.extras import third_party
 from cmfsim.osteotomy.surfaces import SurfaceOptions, surface_of_level
 from cmfsim.scene import SurfaceData
 
@@ -426,9 +426,4 @@ def _smallest_radius(level: NDArray[Any], zone: Mask) -> float:
 
 
 def _ndimage() -> Any:
-    try:
-        return import_module("scipy.ndimage")
-    except ModuleNotFoundError as error:
-        raise CaseInputError(
-            "contact sheets are made with scipy: pip install 'cmfsim[imaging]'"
-        ) from error
+    return third_party("scipy.ndimage", "contact sheets are made", "imaging")

@@ -3,8 +3,7 @@
 import os
 import threading
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from cmfsim import _core
 from cmfsim.case import BoneSegment, ImageData
 from cmfsim.checks import Floats, Indices, as_number, as_positive
 from cmfsim.errors import CaseInputError
+from cmfsim.extras import third_party
 from cmfsim.scene import SurfaceData
 
 __all__ = ["SurfaceOptions", "block_of", "contact_surface", "surface_of_level"]
@@ -103,7 +103,7 @@ def surface_of_level(
     low, high = block_of(values > 0.0)
     if not (high > low).all():
         raise CaseInputError(f"{name!r} has no voxel inside: its surface would be empty")
-    measure = _module("skimage.measure", "imaging", "surfaces of levels are made with scikit-image")
+    measure = third_party("skimage.measure", "surfaces of levels are made", "imaging")
     # Only the block that holds the piece, with a border of outside, so that the surface closes.
     low = np.maximum(low - 1, 0)
     high = np.minimum(high + 1, values.shape)
@@ -151,7 +151,7 @@ def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> 
     >>> cmfsim.contact_surface(segments["maxilla"], relief=2.0)  # doctest: +SKIP
     """
     sigma = as_positive("relief", relief) / np.asarray(segment.level.spacing)
-    ndimage = _module("scipy.ndimage", "imaging", "contact surfaces are smoothed with scipy")
+    ndimage = third_party("scipy.ndimage", "contact surfaces are smoothed", "imaging")
     inside = np.asarray(segment.level.values) > 0.0
     first, past = block_of(inside)
     if not (past > first).all():
@@ -176,13 +176,6 @@ def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> 
     origin = segment.level.lowest + low * np.asarray(spacing)
     level = ImageData(depth.astype(np.float32, copy=False), spacing, origin)
     return surface_of_level(f"contact of {segment.name}", level)
-
-
-def _module(name: str, extra: str, purpose: str) -> Any:
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as error:
-        raise CaseInputError(f"{purpose}: pip install 'cmfsim[{extra}]'") from error
 
 
 def block_of(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -218,7 +211,7 @@ def _without_slits(
 def _smoothed(points: Floats, triangles: NDArray[np.int64], rounds: int) -> Floats:
     if not rounds:
         return points
-    sparse = _module("scipy.sparse", "imaging", "surfaces are smoothed with scipy")
+    sparse = third_party("scipy.sparse", "surfaces are smoothed", "imaging")
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     n = len(points)
     near = sparse.coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
@@ -234,11 +227,11 @@ def _smoothed(points: Floats, triangles: NDArray[np.int64], rounds: int) -> Floa
 def _decimated(
     name: str, points: Floats, triangles: NDArray[np.int64], wanted: int
 ) -> tuple[Floats, NDArray[np.int64]]:
-    quadrics = _module(
+    quadrics = third_party(
         "fast_simplification",
+        f"the surface of {name!r} ({len(triangles)} triangles; or raise max_triangles to keep "
+        f"them) is decimated to {wanted}",
         "imaging",
-        f"the surface of {name!r} has {len(triangles)} triangles and is decimated to {wanted} "
-        "with fast-simplification (or raise max_triangles)",
     )
     # Quadric decimation stays within a tenth of a voxel, but here and there it folds a sheet.
     with _DECIMATING.lock:

@@ -2,11 +2,10 @@
 
 import base64
 import os
-from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 
-from cmfsim.errors import CaseInputError
+from cmfsim.extras import third_party
 from cmfsim.io.files import replacing
 from cmfsim.report.document import Document, Figure, Note, Table
 
@@ -31,13 +30,7 @@ def render_page(document: Document) -> str:
     CaseError
         (also `ValueError`) Jinja2, of the extra `report`, is not installed.
     """
-    try:
-        jinja2 = import_module("jinja2")
-    except ImportError as error:
-        raise CaseInputError(
-            f"reports are made with Jinja2, which cannot be imported ({error}): "
-            "pip install 'cmfsim[report]'"
-        ) from error
+    jinja2 = third_party("jinja2", "reports are made", "report")
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

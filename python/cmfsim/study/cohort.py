@@ -10,12 +10,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
-from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Any, BinaryIO
 
 from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.extras import third_party
 from cmfsim.io import Case, Cohort, finish_writing
 from cmfsim.io.folders import check_below, check_writable
 from cmfsim.io.metrics import EVALUATION_FILE, read_evaluation
@@ -267,12 +267,7 @@ def _ended_by_signal() -> Iterator[None]:
 
 
 def _on_dask(jobs: list[CaseJob], scheduler: str) -> Iterator[CaseOutcome]:
-    try:
-        distributed = import_module("distributed")
-    except ImportError as error:
-        raise CaseInputError(
-            f"a study on a cluster needs Dask ({error}): pip install 'cmfsim[study]'"
-        ) from error
+    distributed = third_party("distributed", "a study on a cluster is run", "study")
     try:
         client = distributed.Client(scheduler, timeout=ANSWER_TIME)
     except (OSError, ValueError) as error:

@@ -10,11 +10,12 @@
 //! which thread it was asked for.
 
 use std::collections::{HashMap, HashSet};
-use std::hash::{BuildHasherDefault, Hasher};
+use std::hash::BuildHasherDefault;
 use std::sync::{Arc, RwLock, RwLockReadGuard};
 
 use rayon::prelude::*;
 
+use crate::keys::KeyHasher;
 use crate::mesh::{add, dot, scaled, sub};
 use crate::surface::Surface;
 
@@ -30,7 +31,8 @@ const SAMPLES_PER_TASK: usize = 64;
 type Place = [i32; 3];
 /// Spline coefficients round a cell: those of x first, four along each axis.
 type Cell = [f64; 64];
-type PlaceMap<T> = HashMap<Place, T, BuildHasherDefault<PlaceHasher>>;
+type PlaceMap<T> = HashMap<Place, T, BuildHasherDefault<KeyHasher>>;
+type PlaceSet = HashSet<Place, BuildHasherDefault<KeyHasher>>;
 
 /// The field at a point.
 #[derive(Debug, Clone, Copy)]
@@ -92,8 +94,7 @@ impl Field {
     pub fn at(&self, points: &[[f64; 3]]) -> ReadyField<'_> {
         let mut missing: Vec<Place> = {
             let lattice = self.read();
-            let asked: HashSet<Place, BuildHasherDefault<PlaceHasher>> =
-                points.iter().map(|&p| self.cell_of(p).0).collect();
+            let asked: PlaceSet = points.iter().map(|&p| self.cell_of(p).0).collect();
             asked.into_iter().filter(|cell| !lattice.cells.contains_key(cell)).collect()
         };
         if !missing.is_empty() {
@@ -105,7 +106,7 @@ impl Field {
 
     /// Samples and coefficients of `cells`.
     fn fill(&self, cells: &[Place]) {
-        let mut wanted: HashSet<Place, BuildHasherDefault<PlaceHasher>> = HashSet::default();
+        let mut wanted = PlaceSet::default();
         {
             let lattice = self.read();
             for cell in cells {
@@ -257,36 +258,6 @@ fn coefficients(samples: &PlaceMap<f64>, cell: Place) -> Box<Cell> {
         *value = 2.0 * own - around.iter().sum::<f64>() / 6.0;
     }
     out
-}
-
-/// Multiplies and mixes: lattice places are few and close together, and nobody chooses them to collide.
-#[derive(Debug, Default, Clone, Copy)]
-struct PlaceHasher(u64);
-
-impl Hasher for PlaceHasher {
-    fn finish(&self) -> u64 {
-        self.0
-    }
-
-    fn write(&mut self, bytes: &[u8]) {
-        for chunk in bytes.chunks(4) {
-            let word = chunk.iter().fold(0, |word, &byte| word << 8 | u64::from(byte));
-            self.write_u64(word);
-        }
-    }
-
-    fn write_i32(&mut self, value: i32) {
-        self.write_u64(u64::from(value as u32));
-    }
-
-    fn write_usize(&mut self, value: usize) {
-        self.write_u64(value as u64);
-    }
-
-    fn write_u64(&mut self, value: u64) {
-        let mixed = (self.0 ^ value).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-        self.0 = mixed ^ (mixed >> 29);
-    }
 }
 
 #[cfg(test)]

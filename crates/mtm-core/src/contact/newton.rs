@@ -15,7 +15,7 @@ use crate::contact::{
     Spring,
 };
 use crate::error::{ErrorKind, MtmError, Result};
-use crate::mesh::{add, dot, norm, scaled, sub};
+use crate::mesh::{add, between, dot, norm, scaled, sub};
 use crate::triangle::Vec3;
 
 /// Most nodes an error names.
@@ -79,8 +79,8 @@ impl Sliding {
     /// they clung to their segment if none.
     ///
     /// # Errors
-    /// `ContactNotConverged` where the steps run out far from a solution, `ContactSurface` where a node ends past the
-    /// border of its surface, whatever the body reports.
+    /// `ContactNotConverged` where the steps run out far from a solution, `ContactSurface` where a node ends
+    /// past the border of its surface, whatever the body reports.
     pub fn solve(
         &self,
         motions: &[&Motion],
@@ -140,7 +140,7 @@ impl Sliding {
                 if !(done || will_do) {
                     return Err(problem.far(&state, &active, iteration, gap));
                 }
-                return problem.end(state, &active, (gap, unbalanced), done, iteration);
+                return problem.end(state, &active, unbalanced, done, iteration);
             }
             active = held;
         }
@@ -336,7 +336,7 @@ impl Problem<'_> {
         while share >= SHORTEST {
             let displacements = between(&state.displacements, &response.displacements, share);
             let touches = self.seats.touches(&self.places(&displacements));
-            let near = farthest(&touches, active) <= reach;
+            let within = farthest(&touches, active) <= reach;
             let falls = || match response.slopes {
                 Some(slopes) if !is_tiny => {
                     let rise = self.rise(state, &forces, &touches, slopes, share, *penalty);
@@ -344,7 +344,7 @@ impl Problem<'_> {
                 }
                 _ => true,
             };
-            if near && falls() {
+            if within && falls() {
                 let reactions = between(&state.reactions, &response.reactions, share);
                 return Some((self.reached(displacements, touches, reactions, active), share));
             }
@@ -453,25 +453,31 @@ impl Problem<'_> {
     /// Largest gap of a held node, and largest way, mm, that the force along the surface would move one.
     fn left(&self, state: &State, active: &[bool]) -> (f64, f64) {
         let (mut gap, mut unbalanced) = (0.0_f64, 0.0_f64);
-        for i in 0..self.count() {
-            let touch = &state.touches[i];
-            let along = if active[i] {
-                gap = gap.max(touch.gap.abs());
-                sub(state.reactions[i], scaled(touch.normal, dot(state.reactions[i], touch.normal)))
-            } else {
-                gap = gap.max(-touch.gap);
-                state.reactions[i]
-            };
-            unbalanced = unbalanced.max(norm(along) / self.sliding.stiffness[i]);
+        for (i, &held) in active.iter().enumerate() {
+            let (own_gap, own_way) = self.left_of(state, i, held);
+            gap = gap.max(own_gap);
+            unbalanced = unbalanced.max(own_way);
         }
         (gap, unbalanced)
+    }
+
+    /// The same of node `i`: a node in the air may be above its surface, and feels no force at all.
+    fn left_of(&self, state: &State, i: usize, held: bool) -> (f64, f64) {
+        let (touch, reaction) = (&state.touches[i], state.reactions[i]);
+        let (gap, left) = if held {
+            let across = sub(reaction, scaled(touch.normal, dot(reaction, touch.normal)));
+            (touch.gap.abs(), across)
+        } else {
+            ((-touch.gap).max(0.0), reaction)
+        };
+        (gap, norm(left) / self.sliding.stiffness[i])
     }
 
     fn end(
         &self,
         state: State,
         active: &[bool],
-        (_, unbalanced): (f64, f64),
+        unbalanced: f64,
         converged: bool,
         iterations: usize,
     ) -> Result<ContactState> {
@@ -514,13 +520,8 @@ impl Problem<'_> {
     /// That the steps ran out far from a solution, with the nodes that are farthest.
     fn far(&self, state: &State, active: &[bool], iterations: usize, gap: f64) -> MtmError {
         let badness = |i: usize| {
-            let touch = &state.touches[i];
-            let across = sub(
-                state.reactions[i],
-                scaled(touch.normal, dot(state.reactions[i], touch.normal)),
-            );
-            let gap = if active[i] { touch.gap.abs() } else { (-touch.gap).max(0.0) };
-            gap + norm(across) / self.sliding.stiffness[i]
+            let (gap, way) = self.left_of(state, i, active[i]);
+            gap + way
         };
         let mut order: Vec<usize> = (0..self.count()).collect();
         order.sort_by(|&a, &b| badness(b).total_cmp(&badness(a)).then(a.cmp(&b)));
@@ -539,14 +540,6 @@ fn farthest(touches: &[Touch], active: &[bool]) -> f64 {
 /// Component of each reaction along the normal of its node.
 fn along(reactions: &[[f64; 3]], touches: &[Touch]) -> Vec<f64> {
     reactions.iter().zip(touches).map(|(r, t)| dot(*r, t.normal)).collect()
-}
-
-/// a + s (b − a), and b itself for s = 1.
-fn between(a: &[[f64; 3]], b: &[[f64; 3]], share: f64) -> Vec<[f64; 3]> {
-    if share == 1.0 {
-        return b.to_vec();
-    }
-    a.iter().zip(b).map(|(a, b)| add(*a, scaled(sub(*b, *a), share))).collect()
 }
 
 /// Principal curvatures of the level through a node, 1/mm, with their unit directions across the normal.

@@ -10,12 +10,12 @@ use std::sync::{Arc, OnceLock};
 
 use crate::blocks::BlockMatrix;
 use crate::cholesky::Symbolic;
-use crate::constraints::{Constraint, add_offsets, orthonormal, projected, projected_rhs};
+use crate::constraints::{Constraint, add_offsets, projected, projected_rhs};
 use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, Shortfall};
 use crate::iterative::{Confirmed, Effort, Extremes, is_doubtful};
 use crate::krylov::{PcgOptions, Preconditioner, Spectrum};
-use crate::mesh::{add, dot, norm, scaled, sub};
+use crate::mesh::{add, between, dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
 use crate::multigrid::{Multigrid, MultigridOptions};
 use crate::reduction::Reduction;
@@ -73,15 +73,15 @@ struct Followed<'a> {
     target: Target<'a>,
     sliding: &'a Sliding,
     u: Vec<[f64; 3]>,
+    /// Displacements before the last step.
+    before: Vec<[f64; 3]>,
     effort: &'a mut Effort,
     interrupted: Interrupt<'a>,
 }
 
 impl Body for Followed<'_> {
     fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
-        let (asked, springs) = on_rows(self.sliding, c);
-        self.target.constraints = orthonormal(&asked);
-        self.target.springs = springs;
+        (self.target.constraints, self.target.springs) = on_rows(self.sliding, c);
         let u = self.equilibrium.follow(
             self.reduction,
             self.u.clone(),
@@ -98,12 +98,12 @@ impl Body for Followed<'_> {
         let nodes = self.sliding.nodes();
         let displacements = nodes.iter().map(|n| u[n.node as usize]).collect();
         let reactions = nodes.iter().map(|n| reaction(n.node)).collect();
-        self.u = u;
+        self.before = std::mem::replace(&mut self.u, u);
         Ok(Response { displacements, reactions, slopes: None, solved: true })
     }
 
-    fn shorten(&mut self, _share: f64) {
-        // Its steps have no slopes, and are taken whole.
+    fn shorten(&mut self, share: f64) {
+        self.u = between(&self.before, &self.u, share);
     }
 }
 
@@ -249,6 +249,7 @@ impl Equilibrium {
             reduction,
             target: target(vec![], vec![]),
             sliding,
+            before: u.clone(),
             u,
             effort,
             interrupted,

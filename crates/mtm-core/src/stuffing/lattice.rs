@@ -7,9 +7,11 @@
 //! Coordinates are whole numbers in units of half the finest cube, so that equal places are equal bits.
 
 use std::collections::HashMap;
-use std::hash::{BuildHasherDefault, Hasher};
+use std::hash::BuildHasherDefault;
 
 use rayon::prelude::*;
+
+use crate::keys::KeyHasher;
 
 /// A place of the lattice, in units.
 pub type Place = [i32; 3];
@@ -295,28 +297,6 @@ fn key(place: Place) -> u64 {
 fn unpacked(key: u64) -> Place {
     let mask = (1_u64 << BITS) - 1;
     [key >> (2 * BITS), key >> BITS & mask, key & mask].map(|c| c as i32)
-}
-
-/// Hash of packed places: they are no stranger's choice, so speed decides.
-#[derive(Default)]
-struct KeyHasher(u64);
-
-impl Hasher for KeyHasher {
-    fn finish(&self) -> u64 {
-        self.0
-    }
-
-    fn write(&mut self, bytes: &[u8]) {
-        for &byte in bytes {
-            self.write_u64(u64::from(byte));
-        }
-    }
-
-    fn write_u64(&mut self, key: u64) {
-        // Knuth's multiplicative hash with the golden ratio; the table takes its index from both ends.
-        let product = (self.0 ^ key).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-        self.0 = product ^ product >> 32;
-    }
 }
 
 #[cfg(test)]
