@@ -8,12 +8,12 @@ use std::sync::OnceLock;
 
 use crate::blocks::BlockMatrix;
 use crate::constraints::{Constraint, projected};
-use crate::contact::{Sliding, Spring};
+use crate::contact::{LEFT_SHARE, Sliding, Spring, way_along};
 use crate::error::{MtmError, Result, Shortfall};
 use crate::krylov::{
     Operator, PcgOptions, Preconditioner, Reached, Spectrum, Trial, pcg_near, trial,
 };
-use crate::mesh::{dot, norm, scaled, sub};
+use crate::mesh::{add, dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
 use crate::multigrid::{Multigrid, MultigridOptions};
 use crate::projected_product::ProjectedProduct;
@@ -98,11 +98,21 @@ impl Confirmed<'_> {
             error = Some(known(seen)?);
         }
         let mut reached = near(start, seen)?;
-        if error.is_none() && seen.is_wide() {
-            error = Some(known(seen)?);
-            reached = near(&reached.outcome().solution, seen)?;
+        if share.is_some() && seen.is_wide() {
+            // What is only a step needs no trial, but does not pass for a solution.
+            return Ok(match reached {
+                Reached::Solution(found) => Reached::Step(found),
+                other => other,
+            });
         }
-        let (Reached::Solution(found) | Reached::Step(found)) = &mut reached;
+        if let (true, None, Reached::Solution(found)) = (seen.is_wide(), error, &reached) {
+            let start = found.solution.clone();
+            error = Some(known(seen)?);
+            reached = near(&start, seen)?;
+        }
+        let (Reached::Solution(found) | Reached::Step(found)) = &mut reached else {
+            return Ok(reached);
+        };
         found.error_estimate_mm *= REPORT_SAFETY;
         if let Some(error) = error {
             let size = found.solution.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
@@ -157,6 +167,16 @@ impl Trail {
     pub fn starting(rows: Vec<[f64; 3]>) -> Self {
         Self { rows, ..Self::default() }
     }
+}
+
+/// What rows do under contact conditions.
+pub(crate) struct Advance {
+    /// Displacements, mm.
+    pub rows: Vec<[f64; 3]>,
+    /// Whether they are within the tolerance.
+    pub solved: bool,
+    /// Whether springs would have carried nodes on for ever.
+    pub is_carried: bool,
 }
 
 /// A system without a factor: the matrix and a multigrid hierarchy for it.
@@ -252,61 +272,93 @@ impl Iterative {
         let found = self
             .confirmed(&self.matrix, &self.trial)
             .solve(b, &start, &options, None, &mut Spectrum::default(), interrupted)?
-            .into_outcome();
+            .into_outcome()?;
         effort.error_estimate = found.error_estimate_mm;
         effort.iterations += found.iterations;
         effort.history.extend(found.residual_history);
         Ok(found.solution)
     }
 
-    /// Components across the normals of w in P A P w = `b`, with springs, and whether they are within the
-    /// tolerance.
+    /// Components across the normals of w in P A P w = `b`, with springs.
     ///
     /// `b`: see [`projected_rhs`](crate::constraints::projected_rhs), with the pull of the springs.
-    /// `constraints`: orthonormal on each row. `share`: of the error at the start, which suffices as long
-    /// as it is more than the tolerance; see [`pcg_near`].
+    /// `reach`: see [`Constraints`](crate::contact::Constraints). `share`: of the error at the start, which
+    /// suffices as long as it is more than the tolerance; see [`pcg_near`].
+    ///
+    /// Where springs carry nodes on by more than the body holds, those at fault are left out, and the
+    /// solution goes on to their reach along the direction that is not held, downhill.
     pub fn solve_projected(
         &self,
-        b: &[[f64; 3]],
+        mut b: Vec<[f64; 3]>,
         constraints: &[Constraint],
-        springs: &[(usize, Spring)],
+        mut springs: Vec<(usize, Spring)>,
+        reach: f64,
         scale: f64,
         share: Option<f64>,
         trail: &mut Trail,
         effort: &mut Effort,
         interrupted: Interrupt<'_>,
-    ) -> Result<(Vec<[f64; 3]>, bool)> {
-        if is_zero(b) {
-            return Ok((vec![[0.0; 3]; b.len()], true));
+    ) -> Result<Advance> {
+        if is_zero(&b) {
+            let rows = vec![[0.0; 3]; b.len()];
+            return Ok(Advance { rows, solved: true, is_carried: false });
         }
-        let reach = *trail.reach.get_or_insert_with(|| self.reach(b, scale));
-        let reach = constraints.iter().fold(reach, |m, c| m.max(c.offset.abs()));
-        let tolerance = self.tolerance * reach;
+        let length = *trail.reach.get_or_insert_with(|| self.reach(&b, scale));
+        let length = constraints.iter().fold(length, |m, c| m.max(c.offset.abs()));
+        let tolerance = self.tolerance * length;
         if self.sweeps {
             let mut system = projected(&self.matrix, constraints);
-            for (row, spring) in springs {
+            for (row, spring) in &springs {
                 system.add_to_diagonal(*row, spring.axis, spring.stiffness);
             }
-            let x = self.relax_to_bound(&system, b, tolerance, effort, interrupted)?;
-            return Ok((x, true));
+            let rows = self.relax_to_bound(&system, &b, tolerance, effort, interrupted)?;
+            return Ok(Advance { rows, solved: true, is_carried: false });
         }
         let mut start = trail.rows.clone();
         start.resize(b.len(), [0.0; 3]);
         for k in constraints {
             start[k.row] = sub(start[k.row], scaled(k.normal, dot(k.normal, start[k.row])));
         }
-        let product = ProjectedProduct::new(&self.matrix, constraints, springs);
         let options = self.options(tolerance);
-        let confirmed = self.confirmed(&product, &trail.trial);
-        let reached = confirmed.solve(b, &start, &options, share, &mut trail.seen, interrupted)?;
-        let (found, solved) = match reached {
-            Reached::Solution(found) => (found, true),
-            Reached::Step(found) => (found, false),
+        let mut unheld = Vec::new();
+        let mut left_out = Vec::new();
+        let (found, solved) = loop {
+            let product = ProjectedProduct::new(&self.matrix, constraints, &springs);
+            let confirmed = self.confirmed(&product, &trail.trial);
+            let seen = &mut trail.seen;
+            match confirmed.solve(&b, &start, &options, share, seen, interrupted)? {
+                Reached::Solution(found) => break (found, true),
+                Reached::Step(found) => break (found, false),
+                Reached::Indefinite(met) => {
+                    let out = at_fault(&self.matrix, &mut springs, &met.direction);
+                    if out.is_empty() || reach.is_infinite() {
+                        return Err(met.error);
+                    }
+                    for (row, s) in &out {
+                        b[*row] = sub(b[*row], scaled(s.axis, s.stiffness * s.goal));
+                    }
+                    left_out.extend(out);
+                    effort.iterations += met.iterations;
+                    effort.history.extend(met.residual_history);
+                    start = met.solution;
+                    unheld.push(met.direction);
+                }
+            }
         };
         effort.error_estimate = found.error_estimate_mm;
         effort.iterations += found.iterations;
         effort.history.extend(found.residual_history);
-        Ok((found.solution, solved))
+        let mut rows = found.solution;
+        let mut is_carried = false;
+        if !unheld.is_empty() {
+            for (row, s) in &left_out {
+                b[*row] = add(b[*row], scaled(s.axis, s.stiffness * s.goal));
+            }
+            springs.extend(left_out);
+            let product = ProjectedProduct::new(&self.matrix, constraints, &springs);
+            is_carried = carry_on(&product, &b, &unheld, reach, &mut rows);
+        }
+        Ok(Advance { rows, solved, is_carried })
     }
 
     /// Length that the tolerance refers to, mm. Loads move the body where bone does not: one cycle tells
@@ -360,8 +412,8 @@ impl Iterative {
             let trial = OnceLock::new();
             let left = Confirmed { relative: MEASURED_SHARE, ..self.confirmed(matrix, &trial) }
                 .solve(&rest, &start, &options, None, &mut Spectrum::default(), interrupted)
-                .map_err(|e| gave_up(e, sweeps))?
-                .into_outcome();
+                .and_then(Reached::into_outcome)
+                .map_err(|e| gave_up(e, sweeps))?;
             let largest = left.solution.iter().fold(0.0_f64, |m, e| m.max(norm(*e)));
             let error = largest + left.error_estimate_mm;
             if error <= tolerance {
@@ -426,7 +478,110 @@ fn gave_up(error: MtmError, sweeps: usize) -> MtmError {
     }
 }
 
+/// Takes out of `springs` those that let the body give way along `direction`: the strongest, until what is left
+/// takes no more than half of what the body holds.
+fn at_fault(
+    matrix: &BlockMatrix,
+    springs: &mut Vec<(usize, Spring)>,
+    direction: &[[f64; 3]],
+) -> Vec<(usize, Spring)> {
+    let work = |(row, s): &(usize, Spring)| s.stiffness * dot(s.axis, direction[*row]).powi(2);
+    let mut product = vec![[0.0; 3]; direction.len()];
+    matrix.multiply_into(direction, &mut product);
+    let mut held: f64 = direction.iter().zip(&product).map(|(d, p)| dot(*d, *p)).sum();
+    held += springs.iter().map(|s| work(s).max(0.0)).sum::<f64>();
+    let mut order: Vec<usize> =
+        (0..springs.len()).filter(|&k| springs[k].1.stiffness < 0.0).collect();
+    order.sort_by(|&a, &b| work(&springs[a]).total_cmp(&work(&springs[b])));
+    let mut carried: f64 = -order.iter().map(|&k| work(&springs[k])).sum::<f64>();
+    let mut out = vec![false; springs.len()];
+    for k in order {
+        if carried <= LEFT_SHARE * held && out.contains(&true) {
+            break;
+        }
+        carried += work(&springs[k]);
+        out[k] = true;
+    }
+    let mut kept = out.iter().map(|out| !out);
+    let taken = springs.iter().zip(&out).filter(|(_, out)| **out).map(|(s, _)| *s).collect();
+    springs.retain(|_| kept.next().unwrap_or(true));
+    taken
+}
+
+/// Adds to x as much of each of `directions` as brings ½ xᵀ A x − bᵀ x down, `reach` at most; whether it has no
+/// minimum along one of them.
+fn carry_on(
+    a: &dyn Operator,
+    b: &[[f64; 3]],
+    directions: &[Vec<[f64; 3]>],
+    reach: f64,
+    x: &mut [[f64; 3]],
+) -> bool {
+    let work =
+        |u: &[[f64; 3]], f: &[[f64; 3]]| -> f64 { u.iter().zip(f).map(|(u, f)| dot(*u, *f)).sum() };
+    let mut product = vec![[0.0; 3]; b.len()];
+    let mut is_carried = false;
+    for direction in directions {
+        a.multiply_into(x, &mut product);
+        let slope = work(direction, &product) - work(direction, b);
+        a.multiply_into(direction, &mut product);
+        let curvature = work(direction, &product);
+        let largest = direction.iter().fold(0.0_f64, |m, d| m.max(norm(*d)));
+        let way = way_along(slope, curvature, reach / largest);
+        is_carried |= curvature <= 0.0;
+        for (x, d) in x.iter_mut().zip(direction) {
+            *x = add(*x, scaled(*d, way));
+        }
+    }
+    is_carried
+}
+
 /// Whether nothing pulls: any iteration would only divide by it.
 fn is_zero(b: &[[f64; 3]]) -> bool {
     b.iter().flatten().all(|&v| v == 0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn spring(row: usize, stiffness: f64) -> (usize, Spring) {
+        (row, Spring { node: row, axis: [1.0, 0.0, 0.0], stiffness, goal: 0.0 })
+    }
+
+    /// Three rows that hold themselves by 1 N/mm each.
+    fn unit() -> BlockMatrix {
+        let mut matrix = BlockMatrix::from_pattern(vec![0, 1, 2, 3], vec![0, 1, 2]);
+        for block in &mut matrix.blocks {
+            *block = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
+        }
+        matrix
+    }
+
+    #[test]
+    fn the_strongest_springs_are_left_out_of_a_direction_that_gives_way() {
+        let mut springs = vec![spring(0, -0.3), spring(1, -2.5), spring(2, 0.5), spring(2, -0.1)];
+        let out = at_fault(&unit(), &mut springs, &[[1.0, 0.0, 0.0]; 3]);
+        assert_eq!(out.iter().map(|(row, _)| *row).collect::<Vec<_>>(), [1]);
+        assert_eq!(springs.len(), 3);
+    }
+
+    #[test]
+    fn a_body_is_carried_on_to_its_minimum_or_as_far_as_springs_reach() {
+        let (matrix, along_x) = (unit(), vec![[1.0, 0.0, 0.0], [0.0; 3], [0.0; 3]]);
+        let b = vec![[0.3, 0.0, 0.0], [0.0; 3], [0.0; 3]];
+        let mut x = vec![[0.0; 3]; 3];
+        let held = [spring(0, -0.4)];
+        let product = ProjectedProduct::new(&matrix, &[], &held);
+        assert!(!carry_on(&product, &b, std::slice::from_ref(&along_x), 2.0, &mut x));
+        assert!((x[0][0] - 0.5).abs() < 1e-14, "{x:?}");
+        // From beyond the top of a hill the way down is ahead, from before it back.
+        let unheld = [spring(0, -1.4)];
+        let product = ProjectedProduct::new(&matrix, &[], &unheld);
+        for (start, end) in [(-0.7, 1.3), (-0.8, -2.8)] {
+            x[0][0] = start;
+            assert!(carry_on(&product, &b, std::slice::from_ref(&along_x), 2.0, &mut x));
+            assert!((x[0][0] - end).abs() < 1e-14, "{x:?}");
+        }
+    }
 }

@@ -41,6 +41,11 @@ pub trait Operator: Sync {
         dot(x, y)
     }
 
+    /// Least pᵀ A p of a direction that counts as held.
+    fn least_curvature(&self, _p: &[[f64; 3]]) -> f64 {
+        0.0
+    }
+
     /// Replaces `x` by its nearest vector of the subspace; nothing where that is the whole space.
     fn project(&self, _x: &mut [[f64; 3]]) {}
 }
@@ -156,7 +161,7 @@ pub fn pcg(
 ) -> Result<PcgOutcome> {
     let mut seen = Spectrum::default();
     let reached = pcg_near(a, b, x0, preconditioner, options, None, &mut seen, interrupted)?;
-    Ok(reached.into_outcome())
+    reached.into_outcome()
 }
 
 /// Where [`pcg_near`] ended.
@@ -165,20 +170,27 @@ pub(crate) enum Reached {
     Solution(PcgOutcome),
     /// Near enough for a step; its estimate is that of the recurrence.
     Step(PcgOutcome),
+    /// The matrix is indefinite, or nearly so.
+    Indefinite(Box<Indefinite>),
+}
+
+/// Where an iteration met a direction that does not count as held.
+pub(crate) struct Indefinite {
+    /// The solution as far as it came.
+    pub solution: Vec<[f64; 3]>,
+    pub direction: Vec<[f64; 3]>,
+    /// What to report where no indefinite matrix was to be expected.
+    pub error: MtmError,
+    pub iterations: usize,
+    pub residual_history: Vec<f64>,
 }
 
 impl Reached {
-    /// What was reached.
-    pub(crate) fn outcome(&self) -> &PcgOutcome {
+    /// What was reached, where the matrix is definite.
+    pub(crate) fn into_outcome(self) -> Result<PcgOutcome> {
         match self {
-            Self::Solution(outcome) | Self::Step(outcome) => outcome,
-        }
-    }
-
-    /// What was reached.
-    pub(crate) fn into_outcome(self) -> PcgOutcome {
-        match self {
-            Self::Solution(outcome) | Self::Step(outcome) => outcome,
+            Self::Solution(outcome) | Self::Step(outcome) => Ok(outcome),
+            Self::Indefinite(met) => Err(met.error),
         }
     }
 }
@@ -237,7 +249,18 @@ pub(crate) fn pcg_near(
         }
         let exact = state.rz == 0.0 && state.largest_z == 0.0;
         if !exact {
-            in_pool(|| state.step())?;
+            if let Err(error) = in_pool(|| state.step()) {
+                if !state.is_indefinite() {
+                    return Err(error);
+                }
+                return Ok(Reached::Indefinite(Box::new(Indefinite {
+                    solution: state.x,
+                    direction: state.p,
+                    error,
+                    iterations,
+                    residual_history: history,
+                })));
+            }
             iterations += 1;
             history.push(state.r_norm / b_norm);
         }
@@ -448,7 +471,8 @@ impl<'a> State<'a> {
     /// One iteration.
     fn step(&mut self) -> Result<()> {
         let pq = self.a.multiply_and_dot(&self.p, &mut self.q);
-        if !(pq > 0.0 && self.rz > 0.0 && pq.is_finite() && self.rz.is_finite()) {
+        let is_held = pq > self.a.least_curvature(&self.p);
+        if !(is_held && self.rz > 0.0 && pq.is_finite() && self.rz.is_finite()) {
             return Err(self.breakdown(pq));
         }
         let alpha = self.rz / pq;
@@ -469,6 +493,16 @@ impl<'a> State<'a> {
             }
         });
         Ok(())
+    }
+
+    /// Whether the last step broke down at a direction of negative curvature, with finite numbers.
+    fn is_indefinite(&self) -> bool {
+        let finite = |v: &Vec<[f64; 3]>| v.iter().flatten().all(|x| x.is_finite());
+        self.rz > 0.0
+            && self.rz.is_finite()
+            && finite(&self.p)
+            && finite(&self.q)
+            && dot(&self.p, &self.q) <= self.a.least_curvature(&self.p)
     }
 
     fn breakdown(&self, pq: f64) -> MtmError {

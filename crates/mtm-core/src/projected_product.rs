@@ -10,6 +10,9 @@ use crate::mesh::{add, dot, norm, scaled, sub};
 /// Length, relative to what it was, below which nothing but rounding is left of a projected vector.
 const PROJECTION_ROUNDING: f64 = 16.0 * f64::EPSILON;
 
+/// Share of what the body holds along a direction that springs have to leave.
+const LEAST_HOLD: f64 = 0.05;
+
 /// P (A + Σ k a⊗a) P on the vectors without a component along the normals of held rows.
 ///
 /// The springs k, a lie across the normals of their rows.
@@ -44,6 +47,13 @@ impl Operator for ProjectedProduct<'_> {
             y[*row] = add(y[*row], scaled(spring.axis, pull));
         }
         self.project(y);
+    }
+
+    /// Springs may take off most of what the body holds, not all.
+    fn least_curvature(&self, p: &[[f64; 3]]) -> f64 {
+        let taken = |(row, s): &(usize, Spring)| -s.stiffness * dot(s.axis, p[*row]).powi(2);
+        let unstable = self.springs.iter().filter(|(_, s)| s.stiffness < 0.0);
+        LEAST_HOLD / (1.0 - LEAST_HOLD) * unstable.map(taken).sum::<f64>()
     }
 
     fn project(&self, x: &mut [[f64; 3]]) {

@@ -9,6 +9,8 @@
 //! sweeps through the part of the factor that they reach: less to make and to keep, but springs and second
 //! walls, which the matrix at rest knows nothing of, can take a hundred of them.
 
+use nalgebra::{DMatrix, DVector, SymmetricEigen};
+
 use crate::cholesky::{
     Begun, DenseSymmetric, Factor, Moved, NormalFactor, NormalForces, Precision, Preconditioner,
     Progress, ROUGH, Reach, RowKey, Symbolic, TailFlexibility, Wanted, conjugate_gradients,
@@ -16,7 +18,7 @@ use crate::cholesky::{
 };
 use crate::contact::{Constraints, ContactRow, Sliding, Spring};
 use crate::error::{MtmError, Result, Shortfall};
-use crate::mesh::{add, dot, scaled, sub};
+use crate::mesh::{add, dot, norm, scaled, sub};
 
 /// Steps of sweeps after which contact gives up: ten on smooth bone, a hundred on teeth.
 const MOST_SWEEPS: usize = 1000;
@@ -24,10 +26,14 @@ const MOST_SWEEPS: usize = 1000;
 const DOUBT_SHARE: f64 = 0.1;
 /// Share of the loads of unstable springs to which they are solved at the least.
 const LOAD_SHARE: f64 = 1e-5;
-/// Steps of conjugate gradients after which they count as too much for the body.
-const MOST_LOAD_STEPS: usize = 40;
-/// Share of a direction's load that the body has to hold by itself: with less, steps go anywhere.
-const LEAST_HOLD: f64 = 0.05;
+/// Steps of conjugate gradients after which the loads stay as they are.
+const MOST_LOAD_STEPS: usize = 60;
+/// Softness of unstable springs above which they are as good as none.
+const MOST_SOFTNESS: f64 = 1e6;
+/// Halvings in the search for it.
+const SOFTENINGS: usize = 30;
+/// Loads by which directions are tried, over the contact forces: what they move is far above rounding.
+const PROBE_SHARE: f64 = 1e-2;
 /// Relative error of contact forces, in the energy norm, at which only rounding is left.
 const ROUNDING: f64 = 1e-14;
 /// Share of the contact tolerance that the forces of settled contact may be off, relative to all of them.
@@ -67,6 +73,7 @@ impl ContactFactor {
             springs: &[],
             about: &[],
             share: 0.0,
+            reach: f64::INFINITY,
         });
         let rest = rows.factor(&tail)?.inverse();
         Ok(Self { flexibility: Flexibility::Dense(tail), rest })
@@ -129,6 +136,7 @@ impl ContactFactor {
             moved,
             precision: Precision::Exact,
             doubt: 0.0,
+            enough: 0.0,
             work,
             frozen: None,
             made: None,
@@ -142,7 +150,14 @@ impl ContactFactor {
     pub fn frozen(&self, rows: &[ContactRow], springs: &[Spring]) -> Result<Option<NormalFactor>> {
         let Flexibility::Dense(tail) = &self.flexibility else { return Ok(None) };
         let offsets = vec![0.0; rows.len()];
-        let c = Constraints { rows, offsets: &offsets, springs, about: &[], share: 0.0 };
+        let c = Constraints {
+            rows,
+            offsets: &offsets,
+            springs,
+            about: &[],
+            share: 0.0,
+            reach: f64::INFINITY,
+        };
         Rows::new(&c).factor(tail).map(Some)
     }
 }
@@ -163,6 +178,8 @@ pub(crate) struct Answers<'a> {
     precision: Precision,
     /// What rough products may have left open, in the measure of the preconditioner.
     doubt: f64,
+    /// Measure that the last answer had to come within.
+    enough: f64,
     /// Zeros for the sweeps.
     work: Vec<f64>,
     /// The factor for conditions that stay the same.
@@ -191,6 +208,8 @@ pub(crate) struct Answer {
     pub forces: Vec<[f64; 3]>,
     /// Whether they are within the tolerance.
     pub solved: bool,
+    /// Whether unstable springs would have carried nodes past their reach.
+    pub is_carried: bool,
 }
 
 impl<'a> Answers<'a> {
@@ -199,70 +218,23 @@ impl<'a> Answers<'a> {
     ///
     /// Springs that hold a node back stand among the rows. Those that carry it on, of stiffness −k along the axes
     /// A, are loads z = k (Aᵀ u − goal): (1/k − Aᵀ F A) z = Aᵀ u₀ − goal with F the flexibility of the body
-    /// under the rows, by conjugate gradients, which also show where the loads are more than the body holds.
+    /// under the rows, solved by [`Krylov`], which softens springs that the body does not hold.
     ///
     /// # Errors
-    /// `NotPositiveDefinite` where the body does not hold the loads.
+    /// `NotPositiveDefinite` where the body does not hold the loads and their reach has no end.
     pub fn respond(&mut self, c: &Constraints<'_>, tolerance: f64) -> Result<Answer> {
         let unstable: Vec<Spring> =
             c.springs.iter().filter(|s| s.stiffness < 0.0).copied().collect();
         let rows = Rows::new(c);
         let exact = ROUNDING.max(EXACT_SHARE * tolerance);
         self.carried = None;
-        let mut found = self.forces(&rows, c.share, exact)?;
-        let mut here = self.displacements();
+        let mut found = self.forces(&rows, Aim::Share(c.share), exact)?;
+        let mut is_carried = false;
         if !unstable.is_empty() {
-            let share = c.share.max(LOAD_SHARE);
-            let stretch = |u: &[[f64; 3]]| -> Vec<f64> {
-                unstable.iter().map(|s| dot(s.axis, u[s.node]) - s.goal).collect()
-            };
-            let mut z = vec![0.0; unstable.len()];
-            // Scaled by √k: the matrix is I − √k Aᵀ F A √k.
-            let root: Vec<f64> = unstable.iter().map(|s| (-s.stiffness).sqrt()).collect();
-            let scaled_by_root = |v: Vec<f64>| -> Vec<f64> {
-                v.into_iter().zip(&root).map(|(v, r)| v * r).collect()
-            };
-            let mut r = scaled_by_root(stretch(&here));
-            let mut p = r.clone();
-            let mut size: f64 = r.iter().map(|v| v * v).sum();
-            let first = size;
-            for step in 0.. {
-                if size <= share * share * first {
-                    break;
-                }
-                if step == MOST_LOAD_STEPS {
-                    return Err(unheld());
-                }
-                let ahead: Vec<f64> = (0..z.len()).map(|i| z[i] + root[i] * p[i]).collect();
-                self.forces_under(&unstable, &ahead, &rows, c.share, exact)?;
-                let there = self.displacements();
-                let moved: Vec<[f64; 3]> =
-                    there.iter().zip(&here).map(|(a, b)| sub(*a, *b)).collect();
-                let along = unstable.iter().map(|s| dot(s.axis, moved[s.node])).collect();
-                let along = scaled_by_root(along);
-                let held: Vec<f64> = p.iter().zip(&along).map(|(p, a)| p - a).collect();
-                let curvature: f64 = p.iter().zip(&held).map(|(p, h)| p * h).sum();
-                // Also false for NaN.
-                let is_held = curvature > LEAST_HOLD * p.iter().map(|v| v * v).sum::<f64>();
-                if !is_held {
-                    return Err(unheld());
-                }
-                let alpha = size / curvature;
-                for i in 0..z.len() {
-                    z[i] += alpha * root[i] * p[i];
-                    r[i] -= alpha * held[i];
-                }
-                for (u, v) in here.iter_mut().zip(&moved) {
-                    *u = add(*u, scaled(*v, alpha));
-                }
-                let next: f64 = r.iter().map(|v| v * v).sum();
-                let beta = next / size;
-                size = next;
-                for (p, r) in p.iter_mut().zip(&r) {
-                    *p = r + beta * *p;
-                }
-            }
-            found = self.forces_under(&unstable, &z, &rows, c.share, exact)?;
+            let enough = Aim::Measure(self.enough);
+            let loads;
+            (loads, is_carried) = self.loads(&unstable, c, &rows, exact)?;
+            found = self.forces_under(&unstable, &loads, &rows, enough, exact)?;
         }
         let mut forces = self.pushed.clone();
         if let Some(Carried { loads, .. }) = &self.carried {
@@ -270,7 +242,67 @@ impl<'a> Answers<'a> {
                 *f = add(*f, *load);
             }
         }
-        Ok(Answer { displacements: self.displacements(), forces, solved: found.solved })
+        Ok(Answer { displacements: self.displacements(), forces, solved: found.solved, is_carried })
+    }
+
+    /// Loads along `unstable` springs, N, and whether these had to be softened.
+    fn loads(
+        &mut self,
+        unstable: &[Spring],
+        c: &Constraints<'_>,
+        rows: &Rows,
+        exact: f64,
+    ) -> Result<(Vec<f64>, bool)> {
+        let share = c.share.max(LOAD_SHARE);
+        let root: Vec<f64> = unstable.iter().map(|s| (-s.stiffness).sqrt()).collect();
+        let here = self.displacements();
+        let stretch = unstable.iter().map(|s| dot(s.axis, here[s.node]) - s.goal);
+        let open: Vec<f64> = stretch.zip(&root).map(|(v, r)| v * r).collect();
+        let size = length(&open);
+        let most = self.pushed.iter().map(|f| dot(*f, *f)).sum::<f64>().sqrt();
+        let (base, mut answered) = (self.pose(), Vec::new());
+        let mut krylov = Krylov::new(size);
+        let mut next: Vec<f64> = open.iter().map(|v| v / size).collect();
+        while size > 0.0 && krylov.basis.len() < MOST_LOAD_STEPS.min(unstable.len()) {
+            let q: Vec<f64> = next.iter().zip(&root).map(|(v, r)| v * r).collect();
+            // As large as what is known of the answers to it.
+            let up = PROBE_SHARE * most / length(&q);
+            let loads: Vec<f64> = q.iter().map(|q| q * up).collect();
+            self.take(base.clone());
+            self.forces_under(unstable, &loads, rows, Aim::Share(c.share), exact)?;
+            answered.push((up, self.pose()));
+            let there = self.displacements();
+            let moved: Vec<[f64; 3]> =
+                there.iter().zip(&here).map(|(a, b)| scaled(sub(*a, *b), 1.0 / up)).collect();
+            let answer = unstable.iter().zip(&root).map(|(s, r)| r * dot(s.axis, moved[s.node]));
+            let answer = answer.collect();
+            next = krylov.push(next, answer, moved);
+            krylov.soften(c.reach);
+            if krylov.left <= share * size {
+                break;
+            }
+        }
+        if c.reach.is_infinite() && (krylov.softness > 0.0 || krylov.left > share * size) {
+            return Err(MtmError::NotPositiveDefinite {
+                node: 0,
+                detail: "contact forces carry sliding nodes on by more than the tissue holds"
+                    .into(),
+            });
+        }
+        // Answers add up: from there the last one is near.
+        let mut sum = base.clone();
+        for (y, (up, pose)) in krylov.solution.iter().zip(&answered) {
+            sum.add(y / up, pose, &base);
+        }
+        self.take(sum);
+        self.doubt = f64::INFINITY;
+        let mut loads = vec![0.0; unstable.len()];
+        for (y, q) in krylov.solution.iter().zip(&krylov.basis) {
+            for ((z, q), root) in loads.iter_mut().zip(q).zip(&root) {
+                *z += y * q * root;
+            }
+        }
+        Ok((loads, krylov.softness > 0.0))
     }
 
     /// As `forces`, under loads z along unstable springs as well.
@@ -279,7 +311,7 @@ impl<'a> Answers<'a> {
         unstable: &[Spring],
         z: &[f64],
         rows: &Rows,
-        share: f64,
+        aim: Aim,
         exact: f64,
     ) -> Result<NormalForces> {
         let mut loads = vec![[0.0; 3]; self.free.len()];
@@ -288,7 +320,7 @@ impl<'a> Answers<'a> {
         }
         let moved = self.response_to(&loads);
         self.carried = Some(Carried { loads, moved });
-        self.forces(rows, share, exact)
+        self.forces(rows, aim, exact)
     }
 
     /// The same answers by a factor for their conditions.
@@ -321,9 +353,18 @@ impl<'a> Answers<'a> {
         }
     }
 
-    /// Contact forces along `rows`, and what they add to the displacements: to `share` of what the rows change,
-    /// or to `exact` of all.
-    fn forces(&mut self, rows: &Rows, share: f64, exact: f64) -> Result<NormalForces> {
+    /// Contact forces and what they do, to begin from.
+    fn pose(&self) -> Pose {
+        Pose { last: self.last.clone(), pushed: self.pushed.clone(), moved: self.moved.clone() }
+    }
+
+    fn take(&mut self, pose: Pose) {
+        (self.last, self.pushed, self.moved) = (pose.last, pose.pushed, pose.moved);
+    }
+
+    /// Contact forces along `rows`, and what they add to the displacements: as near as `aim` says, or to `exact`
+    /// of all.
+    fn forces(&mut self, rows: &Rows, aim: Aim, exact: f64) -> Result<NormalForces> {
         let kept = self.made.as_ref().or(self.frozen).unwrap_or(&self.contact.rest);
         let preconditioner = Preconditioner::new(self.diagonal(rows), &rows.keys, kept);
         let before = |key: &RowKey| {
@@ -367,7 +408,12 @@ impl<'a> Answers<'a> {
             let (nodes, precision) = respond(&pushes(n, &rows.rows, x), precision);
             Moved { along: rows.along(&nodes, x), nodes, precision }
         };
-        let wanted = Wanted { exact, enough: share * measure };
+        let enough = match aim {
+            Aim::Share(share) => share * measure,
+            Aim::Measure(enough) => enough,
+        };
+        self.enough = enough;
+        let wanted = Wanted { exact, enough };
         let found = match &self.contact.flexibility {
             Flexibility::Dense(tail) => {
                 let near =
@@ -440,6 +486,39 @@ impl<'a> Answers<'a> {
     }
 }
 
+/// How near forces have to come.
+#[derive(Clone, Copy)]
+enum Aim {
+    /// To a share of what the rows change.
+    Share(f64),
+    /// Within so much, in the measure of the preconditioner.
+    Measure(f64),
+}
+
+/// Contact forces of some answer, and what they do.
+#[derive(Clone)]
+struct Pose {
+    last: Vec<(RowKey, f64)>,
+    pushed: Vec<[f64; 3]>,
+    moved: Vec<[f64; 3]>,
+}
+
+impl Pose {
+    /// Adds `share` of what `to` has more than `from`, for the same rows.
+    fn add(&mut self, share: f64, to: &Self, from: &Self) {
+        for (own, (to, from)) in self.last.iter_mut().zip(to.last.iter().zip(&from.last)) {
+            own.1 += share * (to.1 - from.1);
+        }
+        let more = |own: &mut Vec<[f64; 3]>, to: &[[f64; 3]], from: &[[f64; 3]]| {
+            for (own, (to, from)) in own.iter_mut().zip(to.iter().zip(from)) {
+                *own = add(*own, scaled(sub(*to, *from), share));
+            }
+        };
+        more(&mut self.pushed, &to.pushed, &from.pushed);
+        more(&mut self.moved, &to.moved, &from.moved);
+    }
+}
+
 /// Constraint rows, and after them one for each spring: a spring of stiffness k adds a column along its
 /// axis, with 1/k on the diagonal.
 struct Rows {
@@ -499,12 +578,110 @@ impl Rows {
     }
 }
 
-/// That contact forces carry nodes on by more than the body holds.
-fn unheld() -> MtmError {
-    MtmError::NotPositiveDefinite {
-        node: 0,
-        detail: "contact forces carry sliding nodes on by more than the tissue holds".into(),
+/// Loads y of unstable springs in the space that their products span: ((1 + μ) I − G) y = b, G the flexibility
+/// between the springs, each by the root of its stiffness; μ softens all springs alike, so that the body holds
+/// them and no node goes farther than they reach (a trust region; Gould, Lucidi, Roma & Toint 1999).
+struct Krylov {
+    /// Length of b.
+    size: f64,
+    /// Orthonormal directions, the first along b.
+    basis: Vec<Vec<f64>>,
+    /// What loads along them add to the displacements of the sliding nodes, mm.
+    moved: Vec<Vec<[f64; 3]>>,
+    /// G between them.
+    flexibility: DMatrix<f64>,
+    /// Part of the last product that lies outside them.
+    rest: f64,
+    /// y along each.
+    solution: DVector<f64>,
+    /// μ.
+    softness: f64,
+    /// Length of b − ((1 + μ) I − G) y.
+    left: f64,
+}
+
+impl Krylov {
+    fn new(size: f64) -> Self {
+        Self {
+            size,
+            basis: Vec::new(),
+            moved: Vec::new(),
+            flexibility: DMatrix::zeros(0, 0),
+            rest: 0.0,
+            solution: DVector::zeros(0),
+            softness: 0.0,
+            left: size,
+        }
     }
+
+    /// Adds a direction with its product and what it moves; the next one.
+    fn push(&mut self, direction: Vec<f64>, answer: Vec<f64>, moved: Vec<[f64; 3]>) -> Vec<f64> {
+        let m = self.basis.len();
+        self.basis.push(direction);
+        self.moved.push(moved);
+        let mut flexibility = std::mem::take(&mut self.flexibility).resize(m + 1, m + 1, 0.0);
+        let mut next = answer;
+        // Twice is enough against rounding (Parlett 1980).
+        for _ in 0..2 {
+            for (k, q) in self.basis.iter().enumerate() {
+                let along: f64 = q.iter().zip(&next).map(|(a, b)| a * b).sum();
+                flexibility[(k, m)] += along;
+                for (n, q) in next.iter_mut().zip(q) {
+                    *n -= along * q;
+                }
+            }
+        }
+        for k in 0..m {
+            flexibility[(m, k)] = flexibility[(k, m)];
+        }
+        self.flexibility = flexibility;
+        self.rest = length(&next);
+        next.iter().map(|v| v / self.rest.max(f64::MIN_POSITIVE)).collect()
+    }
+
+    /// The solution with the least softness with which no node goes farther than `reach`, mm.
+    fn soften(&mut self, reach: f64) {
+        let m = self.basis.len();
+        let eigen = SymmetricEigen::new(self.flexibility.clone());
+        let start = eigen.eigenvectors.row(0).transpose() * self.size;
+        let solution = |softness: f64| -> DVector<f64> {
+            let held = eigen.eigenvalues.map(|g| 1.0 + softness - g);
+            &eigen.eigenvectors * start.component_div(&held)
+        };
+        let farthest = |y: &DVector<f64>| {
+            let moved = (0..self.moved[0].len()).map(|i| {
+                let sum = (0..m).fold([0.0; 3], |sum, k| add(sum, scaled(self.moved[k][i], y[k])));
+                norm(sum)
+            });
+            moved.fold(0.0, f64::max)
+        };
+        let most = eigen.eigenvalues.max();
+        self.softness = 0.0;
+        self.solution = solution(0.0);
+        if most >= 1.0 || farthest(&self.solution) > reach {
+            // From just held on, the way falls as the softness grows.
+            let least = (most - 1.0).max(0.0);
+            let (mut low, mut high) = (least, least + 1.0);
+            while farthest(&solution(high)) > reach && high < MOST_SOFTNESS {
+                high = least + 4.0 * (high - least);
+            }
+            for _ in 0..SOFTENINGS {
+                let middle = 0.5 * (low + high);
+                if farthest(&solution(middle)) > reach {
+                    low = middle;
+                } else {
+                    high = middle;
+                }
+            }
+            self.softness = high;
+            self.solution = solution(high);
+        }
+        self.left = self.rest * self.solution[m - 1].abs();
+    }
+}
+
+fn length(v: &[f64]) -> f64 {
+    v.iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
 /// That the flexibility has no positive pivot at a row of the system.
@@ -522,4 +699,57 @@ fn pushes(n: usize, rows: &[ContactRow], forces: &[f64]) -> Vec<[f64; 3]> {
         out[r.node] = add(out[r.node], scaled(r.normal, force));
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Loads of springs on three nodes that move along x, y and z alone: G is diagonal in the basis.
+    fn solved(flexibility: [f64; 3], b: [f64; 3], reach: f64) -> (Krylov, [f64; 3]) {
+        let size = length(&b);
+        let mut krylov = Krylov::new(size);
+        let mut next: Vec<f64> = b.iter().map(|v| v / size).collect();
+        for _ in 0..3 {
+            let answer: Vec<f64> = next.iter().zip(flexibility).map(|(v, g)| v * g).collect();
+            let moved = (0..3).map(|i| [0, 1, 2].map(|j| if i == j { answer[i] } else { 0.0 }));
+            next = krylov.push(next.clone(), answer.clone(), moved.collect());
+            krylov.soften(reach);
+        }
+        let mut y = [0.0; 3];
+        for (share, q) in krylov.solution.iter().zip(&krylov.basis) {
+            for (y, q) in y.iter_mut().zip(q) {
+                *y += share * q;
+            }
+        }
+        (krylov, y)
+    }
+
+    #[test]
+    fn springs_that_the_body_holds_are_not_softened() {
+        let (flexibility, b) = ([0.2, 0.5, 0.9], [1.0, -2.0, 0.5]);
+        let (krylov, y) = solved(flexibility, b, f64::INFINITY);
+        assert_eq!(krylov.softness, 0.0);
+        assert!(krylov.left < 1e-13, "{}", krylov.left);
+        for i in 0..3 {
+            assert!((y[i] * (1.0 - flexibility[i]) - b[i]).abs() < 1e-13, "{y:?}");
+        }
+    }
+
+    #[test]
+    fn springs_that_the_body_does_not_hold_carry_nodes_as_far_as_they_reach() {
+        // The last one takes more than the body holds, or nearly as much.
+        for last in [1.3, 0.999] {
+            let (flexibility, b) = ([0.2, 0.5, last], [1.0, -2.0, 0.5]);
+            let (krylov, y) = solved(flexibility, b, 3.0);
+            assert!(krylov.softness > last - 1.0 && krylov.softness > 0.0);
+            let mu = krylov.softness;
+            let mut farthest = 0.0_f64;
+            for i in 0..3 {
+                assert!((y[i] * (1.0 + mu - flexibility[i]) - b[i]).abs() < 1e-12, "{y:?}");
+                farthest = farthest.max((y[i] * flexibility[i]).abs());
+            }
+            assert!((farthest - 3.0).abs() < 1e-6, "{farthest}");
+        }
+    }
 }

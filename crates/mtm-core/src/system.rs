@@ -7,7 +7,7 @@ use crate::cholesky::{Factor, Symbolic};
 use crate::constraints::{Constraint, add_offsets, projected, projected_rhs};
 use crate::contact::{Body, Constraints, ContactRow, ContactState, Response, Sliding, Spring};
 use crate::error::{MtmError, Result};
-use crate::iterative::{Effort, Extremes, Iterative, Trail};
+use crate::iterative::{Advance, Effort, Extremes, Iterative, Trail};
 use crate::mesh::{add, between, dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
 use crate::reaction::{Answer, Answers, ContactFactor};
@@ -235,7 +235,15 @@ impl System {
             }
             let (rows, offsets) = (frozen.rows, &frozen.offsets[k][..]);
             let springs = frozen.springs(k);
-            solve(&Constraints { rows, offsets, springs: &springs, about: &still, share: 0.0 })
+            let reach = f64::INFINITY;
+            solve(&Constraints {
+                rows,
+                offsets,
+                springs: &springs,
+                about: &still,
+                share: 0.0,
+                reach,
+            })
         };
         if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
             let kept = contact.frozen(frozen.rows, frozen.springs)?;
@@ -261,14 +269,13 @@ impl System {
                     &mut effort,
                     interrupted,
                 );
-                found.map(|(x, _)| x)
+                found.map(|found| found.rows)
             })
         };
         columns.iter().enumerate().zip(scales).map(&mut solve).collect()
     }
 
-    /// Rows of the projected system, P A P + k (I − P), P = I − n⊗n on held nodes, and whether they are within
-    /// the tolerance.
+    /// Rows of the projected system, P A P + k (I − P), P = I − n⊗n on held nodes.
     ///
     /// `share`: see [`Iterative::solve_projected`].
     fn solve_projected(
@@ -281,7 +288,7 @@ impl System {
         trail: &mut Trail,
         effort: &mut Effort,
         interrupted: Interrupt<'_>,
-    ) -> Result<(Vec<[f64; 3]>, bool)> {
+    ) -> Result<Advance> {
         let row = |node: usize| sliding.nodes()[node].row as usize;
         let constraints: Vec<Constraint> = c
             .rows
@@ -290,18 +297,16 @@ impl System {
             .map(|(r, &offset)| Constraint { row: row(r.node), normal: r.normal, offset })
             .collect();
         let springs: Vec<(usize, Spring)> = c.springs.iter().map(|&s| (row(s.node), s)).collect();
-        let pushed = |matrix: &BlockMatrix| {
-            let mut rhs = projected_rhs(matrix, b, &constraints);
-            for (row, s) in &springs {
-                rhs[*row] = add(rhs[*row], scaled(s.axis, s.stiffness * s.goal));
-            }
-            rhs
-        };
-        let (mut x, solved) = match &self.kept {
+        let mut rhs = projected_rhs(self.matrix(), b, &constraints);
+        for (row, s) in &springs {
+            rhs[*row] = add(rhs[*row], scaled(s.axis, s.stiffness * s.goal));
+        }
+        let mut found = match &self.kept {
             Kept::Iterative(iterative) => iterative.solve_projected(
-                &pushed(iterative.matrix()),
+                rhs,
                 &constraints,
-                &springs,
+                springs,
+                c.reach,
                 scale,
                 share,
                 trail,
@@ -314,14 +319,14 @@ impl System {
                     system.add_to_diagonal(*row, s.axis, s.stiffness);
                 }
                 let factor = symbolic.factor(&system)?;
-                let x = symbolic.solve(&factor, &pushed(matrix));
-                effort.error_estimate = direct_error(&factor, &x);
-                (x, true)
+                let rows = symbolic.solve(&factor, &rhs);
+                effort.error_estimate = direct_error(&factor, &rows);
+                Advance { rows, solved: true, is_carried: false }
             }
             Kept::Direct { .. } => unreachable!("the factor without contact serves there"),
         };
-        add_offsets(&mut x, &constraints);
-        Ok((x, solved))
+        add_offsets(&mut found.rows, &constraints);
+        Ok(found)
     }
 
     /// The matrix without constraints, where it is kept.
@@ -374,14 +379,15 @@ impl Step {
 impl Body for Flexible<'_> {
     fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
         let Self { answers, tolerance, .. } = self;
-        let Answer { displacements, forces, solved } = in_pool(|| answers.respond(c, *tolerance))?;
+        let Answer { displacements, forces, solved, is_carried } =
+            in_pool(|| answers.respond(c, *tolerance))?;
         let before = self.last.take().map(|last| (last.to, last.forces_to));
         self.is_known = before.is_some();
         let (from, forces_from) = before.unwrap_or_else(|| (displacements.clone(), forces.clone()));
         let step = Step { from, to: displacements.clone(), forces_from, forces_to: forces.clone() };
         let slopes = self.is_known.then(|| step.slopes());
         self.last = Some(step);
-        Ok(Response { displacements, reactions: forces, slopes, solved })
+        Ok(Response { displacements, reactions: forces, slopes, solved, is_carried })
     }
 
     fn shorten(&mut self, share: f64) {
@@ -391,6 +397,10 @@ impl Body for Flexible<'_> {
         } else if let Some(step) = &mut self.last {
             step.shorten(share);
         }
+    }
+
+    fn restart(&mut self) {
+        self.last = None;
     }
 }
 
@@ -442,7 +452,7 @@ impl Body for Projected<'_> {
             self.effort,
             self.interrupted,
         );
-        let (x, solved) = match found {
+        let Advance { rows: x, solved, is_carried } = match found {
             Ok(found) => found,
             Err(error) => {
                 let (to, forces_to) = (from.clone(), forces_from.clone());
@@ -458,12 +468,18 @@ impl Body for Projected<'_> {
         let step = Step { from, to: x, forces_from, forces_to: forces };
         let slopes = Some(step.slopes());
         self.last = Some(step);
-        Ok(Response { displacements, reactions, slopes, solved })
+        Ok(Response { displacements, reactions, slopes, solved, is_carried })
     }
 
     fn shorten(&mut self, share: f64) {
         if let Some(step) = &mut self.last {
             step.shorten(share);
+        }
+    }
+
+    fn restart(&mut self) {
+        if let Some(last) = self.last.take() {
+            self.trail.rows = last.to;
         }
     }
 }

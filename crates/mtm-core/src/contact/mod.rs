@@ -23,6 +23,10 @@ const FACING_ROUNDING: f64 = 1e-12;
 /// nodes cannot follow.
 const LATTICE_SHARE: f64 = 0.5;
 
+/// Share of what a body holds along a direction that springs may take off: of those that take more, some are
+/// left out of a step.
+pub(crate) const LEFT_SHARE: f64 = 0.5;
+
 /// Whether nodes may lift off.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ContactMode {
@@ -150,6 +154,8 @@ pub struct Constraints<'a> {
     /// Share of what the conditions change to which the answer may be off; 0 for one as good as the solver's
     /// tolerance asks.
     pub share: f64,
+    /// How far, mm, springs that carry nodes on may carry any node from where the body is without them.
+    pub reach: f64,
 }
 
 /// A spring on one sliding node along an axis of its tangent plane.
@@ -176,6 +182,8 @@ pub struct Response {
     pub slopes: Option<(f64, f64)>,
     /// Whether they are within the tolerance of the solver: contact cannot end before that.
     pub solved: bool,
+    /// Whether springs would have carried nodes on past their reach, or for ever: contact cannot end there.
+    pub is_carried: bool,
 }
 
 /// An elastic body in contact: what the contact solver asks of it.
@@ -183,11 +191,15 @@ pub trait Body {
     /// The body under `conditions`, from its state before.
     ///
     /// # Errors
-    /// `NotPositiveDefinite` where the springs make it unstable; those of its solver.
+    /// `NotPositiveDefinite` where the springs make it unstable and it does not know how far to go; those of
+    /// its solver.
     fn respond(&mut self, conditions: &Constraints<'_>) -> Result<Response>;
 
     /// Goes back to `share` of the way from the state before to the last one.
     fn shorten(&mut self, share: f64);
+
+    /// Forgets the last step: the next one starts where its conditions are linearised about.
+    fn restart(&mut self);
 }
 
 impl Sliding {
@@ -301,6 +313,15 @@ impl Sliding {
         let moved = clinging.iter().zip(&self.positions).map(|(c, x)| norm(sub(*c, *x)));
         moved.fold(0.0, f64::max)
     }
+}
+
+/// How far to go along a direction of an energy with `slope` and `curvature` at its start: to the minimum, or
+/// by `most` downhill where there is none.
+pub(crate) fn way_along(slope: f64, curvature: f64, most: f64) -> f64 {
+    if curvature > 0.0 {
+        return (-slope / curvature).clamp(-most, most);
+    }
+    if slope > 0.0 { -most } else { most }
 }
 
 /// A point of the lattice of a contact field, and its spacing, mm.

@@ -7,6 +7,11 @@
 //! (Rockafellar 1973; for inequalities the terms of nodes in the air are −λ²/2ρ), whose minimum the solution is
 //! for any large enough ρ; ρ only grows, so that no state comes twice. Which nodes are held follows from force
 //! and gap together (primal-dual active set; Hintermüller, Ito & Kunisch 2002).
+//!
+//! Contact forces on convex bone carry nodes on as they slide, now and then by more than the tissue holds: a node
+//! slips over an edge. The body then says how far to go, within a carry that grows and shrinks with how far steps could be taken
+//! (a trust region). The first steps of a large plan take nodes far off their surfaces along the tangents at
+//! rest; they are put back on them, and the next step is linearised there.
 
 use crate::boundary::Motion;
 use crate::contact::seat::{Seats, Touch};
@@ -24,15 +29,19 @@ const NAMED_NODES: usize = 10;
 /// what a plan operator keeps.
 const SPRING_SHARE: f64 = 1e-2;
 const FROZEN_SPRING_SHARE: f64 = 1e-3;
-/// Share of a node's own stiffness up to which a contact force may carry it on, less and less: a body holds
-/// nodes one by one more firmly than many at once.
-const BOLDNESS: [f64; 4] = [f64::INFINITY, 0.4, 0.2, 0.0];
-/// Gap over the diagonal of the mesh above which the next conditions differ so much that a rough step will do.
-const COARSE: f64 = 5e-4;
-/// Share to which a rough step, a finer one, and one with nodes that may lift off is solved.
-const COARSE_SHARE: f64 = 0.1;
-const FINE_SHARE: f64 = 1e-2;
-const LIFTING_SHARE: f64 = 1e-4;
+/// How far contact forces may carry nodes on in the first step and in any, over the reach of the surfaces.
+const FIRST_CARRY: f64 = 1.0;
+const MOST_CARRY: f64 = 4.0;
+/// Share to which a step is solved: what the last one left, over the spacing of the surfaces, within bounds. As
+/// much as that the next conditions differ.
+const ROUGH_SHARE: f64 = 0.1;
+const FINE_SHARE: f64 = 1e-4;
+/// Steps at the beginning after which nodes far off their surfaces may be put back on them.
+const MOST_APPROACHES: usize = 8;
+/// Times that nodes are moved along their normals to be back on their surfaces.
+const RETRACTIONS: usize = 8;
+/// Distance from which nodes are put back, over the reach of the surfaces: from farther they may find others.
+const MOST_RETRACTION: f64 = 10.0;
 /// Penalty of the merit at the start over the own stiffness of each node.
 const FIRST_PENALTY: f64 = 10.0;
 /// Largest penalty over the own stiffness: from there on steps would follow the surface alone.
@@ -103,24 +112,36 @@ impl Sliding {
         let mut state = problem.start(begin);
         let mut active = problem.held(&state, None);
         let mut penalty = FIRST_PENALTY;
-        let (mut stalls, mut caution, mut near) = (0, 0, false);
-        let mut gap = f64::INFINITY;
+        let (mut stalls, mut near) = (0, false);
+        let mut carry = FIRST_CARRY * seats.reach();
+        let (mut left, mut approaches) = (f64::INFINITY, 0);
         let mut iteration = 0;
         loop {
             iteration += 1;
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
-            let share = problem.share(gap, near);
-            let response = problem.step(&state, &active, &mut caution, share, body)?;
+            let share = problem.share(left, near);
+            let response = problem.step(&state, &active, carry, share, body)?;
+            let is_first = approaches == iteration - 1 && approaches < MOST_APPROACHES;
+            let next = (is_first && iteration < options.max_iterations)
+                .then(|| problem.put_back(&response, &active))
+                .flatten();
+            if let Some(next) = next {
+                body.restart();
+                (state, approaches) = (next, iteration);
+                active = problem.held(&state, Some(&active));
+                continue;
+            }
             let found = problem.search(&state, &active, &response, near, &mut penalty);
             let way = found.as_ref().map_or(0.0, |(_, way)| *way);
             if way < 1.0 {
                 body.shorten(way);
-                let steps = if way == 0.0 { BOLDNESS.len() } else { 1 };
-                caution = (caution + steps).min(BOLDNESS.len() - 1);
-            } else {
-                caution = caution.saturating_sub(1);
+                carry *= way;
+            } else if carry == 0.0 {
+                carry = FIRST_CARRY * seats.reach();
+            } else if response.is_carried {
+                carry = (2.0 * carry).min(MOST_CARRY * seats.reach());
             }
             stalls = if way == 0.0 { stalls + 1 } else { 0 };
             if let Some((next, _)) = found {
@@ -128,10 +149,11 @@ impl Sliding {
             }
             let held = problem.held(&state, Some(&active));
             let changed = held != active;
-            let unbalanced;
-            (gap, unbalanced) = problem.left(&state, &active);
+            let (gap, unbalanced) = problem.left(&state, &active);
+            left = gap.max(unbalanced);
             near = way == 1.0
                 && !changed
+                && !response.is_carried
                 && gap <= self.gap_limit(options)
                 && unbalanced <= NEAR * problem.balance();
             let done = near && response.solved && unbalanced <= problem.balance();
@@ -217,12 +239,12 @@ impl Problem<'_> {
             .collect()
     }
 
-    /// The body under the conditions linearised about `state`, as bold as it bears.
+    /// The body under the conditions linearised about `state`.
     fn step(
         &self,
         state: &State,
         active: &[bool],
-        caution: &mut usize,
+        reach: f64,
         share: f64,
         body: &mut dyn Body,
     ) -> Result<Response> {
@@ -232,41 +254,61 @@ impl Problem<'_> {
             .map(|r| dot(r.normal, sub(r.point, self.sliding.positions[r.node])))
             .collect();
         let mut springs = self.springs(state, active, SPRING_SHARE);
+        if reach == 0.0 {
+            springs.retain(|s| s.stiffness > 0.0);
+        }
         loop {
-            for s in &mut springs {
-                s.stiffness = s.stiffness.max(-BOLDNESS[*caution] * self.sliding.stiffness[s.node]);
-            }
-            springs.retain(|s| s.stiffness != 0.0);
             let conditions = Constraints {
                 rows: &rows,
                 offsets: &offsets,
                 springs: &springs,
                 about: &state.displacements,
                 share,
+                reach,
             };
             match body.respond(&conditions) {
-                Ok(response) => return Ok(response),
-                // Forces carry their nodes on by more than the body can hold: with less of that.
+                // Forces carry their nodes on by more than the body can hold: without that.
                 Err(MtmError::NotPositiveDefinite { .. })
-                    if *caution + 1 < BOLDNESS.len()
-                        && springs.iter().any(|s| s.stiffness < 0.0) =>
+                    if springs.iter().any(|s| s.stiffness < 0.0) =>
                 {
-                    *caution += 1;
+                    springs.retain(|s| s.stiffness > 0.0);
                 }
-                Err(error) => return Err(error),
+                answer => return answer,
             }
         }
     }
 
-    /// Share to which the next step is solved: what it leaves is less than what the next conditions change.
-    fn share(&self, gap: f64, near: bool) -> f64 {
-        match self.options.mode {
-            _ if near => 0.0,
-            // Small forces decide which nodes lift off.
-            ContactMode::Unilateral => LIFTING_SHARE,
-            ContactMode::Bilateral if gap > COARSE * self.sliding.diagonal => COARSE_SHARE,
-            ContactMode::Bilateral => FINE_SHARE,
+    /// Share to which the next step is solved, `left` mm from a solution.
+    fn share(&self, left: f64, near: bool) -> f64 {
+        if near {
+            return 0.0;
         }
+        match self.options.mode {
+            // Small forces decide which nodes lift off.
+            ContactMode::Unilateral => FINE_SHARE,
+            ContactMode::Bilateral => (left / self.seats.reach()).clamp(FINE_SHARE, ROUGH_SHARE),
+        }
+    }
+
+    /// The state with nodes that the body took off their surfaces put back on them; none where they are near
+    /// enough, or too far.
+    fn put_back(&self, response: &Response, active: &[bool]) -> Option<State> {
+        let reach = self.seats.reach();
+        let mut displacements = response.displacements.clone();
+        let mut touches = self.seats.touches(&self.places(&displacements));
+        let gap = farthest(&touches, active);
+        if gap <= reach || gap > MOST_RETRACTION * reach {
+            return None;
+        }
+        for _ in 0..RETRACTIONS {
+            for i in (0..self.count()).filter(|&i| active[i]) {
+                let back = scaled(touches[i].normal, touches[i].gap);
+                displacements[i] = sub(displacements[i], back);
+            }
+            touches = self.seats.touches(&self.places(&displacements));
+        }
+        (farthest(&touches, active) <= reach)
+            .then(|| self.reached(displacements, touches, response.reactions.clone(), active))
     }
 
     fn rows(&self, state: &State, active: &[bool]) -> Vec<ContactRow> {

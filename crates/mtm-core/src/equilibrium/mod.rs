@@ -99,12 +99,14 @@ impl Body for Followed<'_> {
         let displacements = nodes.iter().map(|n| u[n.node as usize]).collect();
         let reactions = nodes.iter().map(|n| reaction(n.node)).collect();
         self.before = std::mem::replace(&mut self.u, u);
-        Ok(Response { displacements, reactions, slopes: None, solved: true })
+        Ok(Response { displacements, reactions, slopes: None, solved: true, is_carried: false })
     }
 
     fn shorten(&mut self, share: f64) {
         self.u = between(&self.before, &self.u, share);
     }
+
+    fn restart(&mut self) {}
 }
 
 /// What the boundary asks for.
@@ -554,7 +556,7 @@ impl Equilibrium {
         };
         let seen = &mut Spectrum::default();
         let reached = confirmed.solve(rhs, &start, &options, None, seen, interrupted)?;
-        Ok(reached.into_outcome().solution)
+        Ok(reached.into_outcome()?.solution)
     }
 }
 
