@@ -2,7 +2,9 @@
 
 Each plan moves one or more segments of the case by up to 10 mm along each axis and up to 8° about
 any axis; plans whose bones would pass through each other are drawn again. The table tells how many
-plans converge and in how many Newton steps. Exit code 1 if one does not converge.
+plans converge and in how many Newton steps. With --nearby N, the first N plans of each model are
+also solved with 0.01 mm more motion, and once more from the solution of the plan before: how far
+that moves the tissue. Exit code 1 if a plan does not converge.
 """
 
 import argparse
@@ -30,8 +32,10 @@ MOST_DRAWS = 2000
 SAMPLES = 3000
 HEAD = (
     "| head | model | tets | sliding | plans | converged | steps: median | P95 | most "
-    "| largest gap, µm |"
+    "| largest gap, µm | 0.01 mm more, mm | other start, mm |"
 )
+# More motion of a plan whose tissue should move hardly more, mm.
+NEARBY = 0.01
 
 
 @dataclass
@@ -46,6 +50,8 @@ class Tally:
     gaps: list[float] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
+    nearby: list[float] = field(default_factory=list)
+    restarted: list[float] = field(default_factory=list)
 
     def row(self) -> str:
         """The table's row."""
@@ -54,8 +60,13 @@ class Tally:
         return (
             f"| {self.head} | {self.model} | {self.tets:,} | {self.sliding} | {n} "
             f"| {len(self.steps)} | {np.median(steps):g} | {np.percentile(steps, 95):.0f} "
-            f"| {steps.max()} | {1e3 * max(self.gaps, default=0.0):.1g} |"
+            f"| {steps.max()} | {1e3 * max(self.gaps, default=0.0):.1g} "
+            f"| {_most(self.nearby)} | {_most(self.restarted)} |"
         )
+
+
+def _most(distances: Sequence[float]) -> str:
+    return f"{max(distances):.2g} ({len(distances)})" if distances else "–"
 
 
 class Jaws:
@@ -145,6 +156,29 @@ def run(tally: Tally, scene: cmfsim.Scene, plans: Sequence[Plan], method: str) -
         tally.gaps.append(found.contact_gap)
 
 
+def run_nearby(
+    tally: Tally, scene: cmfsim.Scene, plans: Sequence[Plan], method: str, seed: int
+) -> None:
+    """Solves plans with a little more motion, and from the solution of the plan before."""
+    solver = cmfsim.scene_solver(replace(scene, options=replace(scene.options, method=method)))
+    rng = np.random.default_rng(seed)
+    before = None
+    for plan in plans:
+        here = solver.solve(plan)
+        name = str(rng.choice([n for n, m in plan.items() if not np.allclose(m, np.eye(4))]))
+        way = rng.normal(size=3)
+        more = cmfsim.rigid_motion(tuple(NEARBY * way / np.linalg.norm(way))) @ plan[name]
+        tally.nearby.append(_apart(here, solver.solve({**plan, name: more})))
+        if before is not None:
+            tally.restarted.append(_apart(here, solver.solve(plan, start=before)))
+        before = here
+
+
+def _apart(one: cmfsim.Solution, other: cmfsim.Solution) -> float:
+    """Largest distance of a node in one solution from where it is in another, mm."""
+    return float(np.linalg.norm(one.displacements - other.displacements, axis=1).max())
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """The exit code; prints the table, or fills it into a page."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -156,6 +190,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--angle", type=float, default=8.0, help="degrees")
     parser.add_argument("--overlap", type=float, default=2.0, help="of bones, mm")
     parser.add_argument("--method", default="auto")
+    parser.add_argument("--nearby", type=int, default=0, help="plans of each model to vary")
     parser.add_argument("--fill", type=Path, help="page whose table is rewritten")
     options = parser.parse_args(words)
     tallies = []
@@ -169,10 +204,12 @@ def main(words: Sequence[str] | None = None) -> int:
             scene = cmfsim.model_scene(model, name)
             sliding = sum(len(s.sliding) for s in scene.segments.values())
             tally = Tally(case.name, name, scene.n_tets, sliding)
-            run(tally, scene, plans[k * each : (k + 1) * each], options.method)
+            own = plans[k * each : (k + 1) * each]
+            run(tally, scene, own, options.method)
+            run_nearby(tally, scene, own[: options.nearby], options.method, options.seed)
             tallies.append(tally)
             print(tally.row(), file=sys.stderr, flush=True)
-    lines = [HEAD, "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"]
+    lines = [HEAD, "| --- " * 2 + "| ---: " * 10 + "|"]
     text = "\n".join([*lines, *(tally.row() for tally in tallies)])
     text += (
         f"\n\nPlans of up to {options.distance:g} mm and {options.angle:g}°, seed {options.seed}; "

@@ -55,6 +55,54 @@ def test_the_face_is_a_continuous_function_of_the_plan(model, scene, plans):
         assert np.linalg.norm(there - here, axis=1).max() <= 0.05
 
 
+def test_a_solve_may_begin_at_another_plan(scene, plans):
+    """Fewer steps, the same end; a solution of another solver is refused."""
+    solver = cmfsim.scene_solver(scene)
+    name = next(n for n, m in plans[0].items() if not np.allclose(m, np.eye(4)))
+    near = {**plans[0], name: cmfsim.rigid_motion((0.3, -0.2, 0.1)) @ plans[0][name]}
+    start = solver.solve(near)
+    for plan, other in ((plans[0], start), (plans[1], start)):
+        cold, warm = solver.solve(plan), solver.solve(plan, start=other)
+        assert warm.contact_converged
+        assert np.abs(warm.displacements - cold.displacements).max() <= 1e-3
+        if plan is plans[0]:
+            assert warm.contact_iterations < cold.contact_iterations
+    bare = {n: replace(s, sliding=(), contact=None) for n, s in scene.segments.items()}
+    bound = cmfsim.scene_solver(replace(scene, segments=bare))
+    with pytest.raises(cmfsim.BoundaryError, match="sliding nodes of the start"):
+        bound.solve(plans[0], start=start)
+
+
+def mirrored(scene):
+    """The scene seen in a mirror: x turns round, and so do tets and triangles."""
+    flip = np.array([-1.0, 1.0, 1.0])
+    turned = scene.tets[:, [0, 2, 1, 3]]
+    segments = {
+        name: replace(
+            s,
+            contact=s.contact
+            and cmfsim.SurfaceData(s.contact.vertices * flip, s.contact.triangles[:, ::-1]),
+        )
+        for name, s in scene.segments.items()
+    }
+    plan = {name: seen_in_mirror(m) for name, m in scene.plan.items()}
+    return replace(scene, nodes=scene.nodes * flip, tets=turned, segments=segments, plan=plan)
+
+
+def seen_in_mirror(motion):
+    mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
+    return mirror @ motion @ mirror
+
+
+def test_a_mirrored_head_has_the_mirrored_face(scene, plans):
+    here, there = (cmfsim.scene_solver(s) for s in (scene, mirrored(scene)))
+    for plan in plans[:2]:
+        face = here.solve(plan)
+        seen = there.solve({name: seen_in_mirror(m) for name, m in plan.items()})
+        apart = np.linalg.norm(seen.displacements * [-1, 1, 1] - face.displacements, axis=1)
+        assert apart.max() <= 1e-6, (face.contact_iterations, seen.contact_iterations)
+
+
 def test_the_operator_about_a_plan_is_near_the_solution_beside_it(model, scene, plans):
     """A millimetre from its reference it is off by hundredths."""
     solver = cmfsim.scene_solver(scene)

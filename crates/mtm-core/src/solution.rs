@@ -2,6 +2,8 @@
 
 use std::time::Instant;
 
+use crate::contact::ContactStart;
+
 /// Seconds by stage; a stage that the scene does not need stays at exactly zero.
 pub type Timings = Vec<(&'static str, f64)>;
 
@@ -23,6 +25,8 @@ pub struct ContactResult {
     pub active: Vec<bool>,
     /// Largest way, mm, that the force along the surface would still move a sliding node by itself.
     pub unbalanced: f64,
+    /// The nodes carried back with their segments to where these were at rest; none where one is deformed.
+    pub at_rest: Option<ContactStart>,
     /// Whether gaps and forces are within the tolerance. Where they are not, they are so small that no face
     /// would show it.
     pub converged: bool,
@@ -39,6 +43,7 @@ impl Default for ContactResult {
             gaps: Vec::new(),
             active: Vec::new(),
             unbalanced: 0.0,
+            at_rest: None,
             converged: true,
         }
     }

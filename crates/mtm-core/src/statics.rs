@@ -15,7 +15,7 @@ use crate::method::{Interrupt, Method, StaticOptions};
 use crate::reduction::{NO_ROW, Reduction};
 use crate::restraint::{self, Held};
 use crate::solution::{Clock, ContactResult, Solution, Timings};
-use crate::system::{Frozen, System};
+use crate::system::{Begin, Frozen, System};
 use crate::tensors::MassTensors;
 
 /// Multiple of the correction of a solution by factor that stands for the error of the corrected one.
@@ -185,6 +185,25 @@ impl StaticSolver {
         loads: Option<&[[f64; 3]]>,
         interrupted: Interrupt<'_>,
     ) -> Result<Solution> {
+        self.solve_from(None, plan, loads, interrupted)
+    }
+
+    /// As [`solve`](Self::solve), with contact begun where `start`, a solution of this solver for another plan, has
+    /// the nodes on their segments: fewer steps for a plan that differs little. The end is the same within the
+    /// tolerances wherever there is one equilibrium. Large deformation begins at rest whatever the start.
+    ///
+    /// # Errors
+    /// As [`solve`](Self::solve); a start with other nodes.
+    pub fn solve_from(
+        &self,
+        start: Option<&Solution>,
+        plan: &Plan,
+        loads: Option<&[[f64; 3]]>,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Solution> {
+        if let Some(start) = start {
+            self.check_start(start)?;
+        }
         let mut clock = Clock::new();
         let loads = loads.map(|rows| self.checked_loads(rows)).transpose()?;
         let loads = loads.as_deref();
@@ -201,7 +220,7 @@ impl StaticSolver {
 
         let mut effort = Effort::default();
         let (rows, contact, contact_seconds) =
-            self.solve_rows(&b, &u, loads, &motions, scale, &mut effort, interrupted)?;
+            self.solve_rows(&b, &u, loads, &motions, start, scale, &mut effort, interrupted)?;
         clock.lap("solve", true);
         for (&j, v) in self.reduction.unknowns.iter().zip(&rows) {
             u[j as usize] = *v;
@@ -234,7 +253,7 @@ impl StaticSolver {
             error_estimate: effort.error_estimate,
             iterations: effort.iterations,
             residual_history: effort.history,
-            contact: self.contact_result(contact),
+            contact: self.contact_result(contact, &motions),
             contact_iterations,
             timings,
         })
@@ -328,10 +347,14 @@ impl StaticSolver {
         u: &[[f64; 3]],
         loads: Option<&[[f64; 3]]>,
         motions: &[&Motion],
+        start: Option<&Solution>,
         scale: f64,
         effort: &mut Effort,
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, Option<ContactState>, f64)> {
+        let row_of = |start: &Solution| -> Vec<[f64; 3]> {
+            self.reduction.unknowns.iter().map(|&j| start.displacements[j as usize]).collect()
+        };
         let found = match (&self.mechanics, &self.sliding) {
             (Mechanics::LargeRotation(body), sliding) => {
                 let slide =
@@ -341,18 +364,22 @@ impl StaticSolver {
             (Mechanics::Linear(system), None) => {
                 system.solve(b, scale, effort, interrupted).map(|u| (u, None, 0.0))
             }
-            (Mechanics::Linear(system), Some(sliding)) => system
-                .solve_with_contact(
+            (Mechanics::Linear(system), Some(sliding)) => {
+                let rows = start.map_or_else(Vec::new, row_of);
+                let rest = start.and_then(|start| start.contact.at_rest.as_ref());
+                let contact = rest.and_then(|rest| sliding.carried(motions, rest));
+                let found = system.solve_with_contact(
                     b,
                     sliding,
                     motions,
-                    None,
+                    contact.map(|contact| Begin { rows: &rows, contact }),
                     &self.options,
                     scale,
                     effort,
                     interrupted,
-                )
-                .map(|(u, state, seconds)| (u, Some(state), seconds)),
+                );
+                found.map(|(u, state, seconds)| (u, Some(state), seconds))
+            }
         };
         found.map_err(|e| by_node(e, &self.reduction.unknowns))
     }
@@ -395,10 +422,33 @@ impl StaticSolver {
         if sum == 0.0 { 0.0 } else { (sum / scale.max(f64::MIN_POSITIVE)).sqrt() }
     }
 
-    fn contact_result(&self, state: Option<ContactState>) -> ContactResult {
+    /// Refuses a solution of another mesh or boundary to start from.
+    fn check_start(&self, start: &Solution) -> Result<()> {
+        let n = self.tensors.element_nodes().n_nodes();
+        let nodes = self.sliding.as_ref().map_or(0, |s| s.nodes().len());
+        let counts = [
+            ("displacements of the start", start.displacements.len(), n),
+            ("sliding nodes of the start", start.contact.nodes.len(), nodes),
+        ];
+        for (what, found, expected) in counts {
+            if found != expected {
+                return Err(MtmError::Length {
+                    what: what.into(),
+                    found,
+                    expected,
+                    why: "the start is a solution of the same solver",
+                    kind: ErrorKind::Boundary,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    fn contact_result(&self, state: Option<ContactState>, motions: &[&Motion]) -> ContactResult {
         let (Some(sliding), Some(state)) = (&self.sliding, state) else {
             return ContactResult::default();
         };
+        let at_rest = sliding.carried_back(motions, &state);
         ContactResult {
             nodes: sliding.nodes().iter().map(|n| n.node).collect(),
             points: state.points,
@@ -406,6 +456,7 @@ impl StaticSolver {
             forces: state.forces,
             gaps: state.gaps,
             unbalanced: state.unbalanced,
+            at_rest,
             converged: state.converged,
             active: state.active,
         }
@@ -425,7 +476,7 @@ impl StaticSolver {
         let scale = u.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
         let b = self.coupled(&u);
         let mut effort = Effort::default();
-        Ok(self.solve_rows(&b, &u, None, &motions, scale, &mut effort, interrupted)?.1)
+        Ok(self.solve_rows(&b, &u, None, &motions, None, scale, &mut effort, interrupted)?.1)
     }
 
     /// Unknown rows for several right-hand sides, with contact frozen where there is any.

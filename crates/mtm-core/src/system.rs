@@ -5,7 +5,9 @@ use crate::blocks::BlockMatrix;
 use crate::boundary::Motion;
 use crate::cholesky::{Factor, Symbolic};
 use crate::constraints::{Constraint, add_offsets, projected, projected_rhs};
-use crate::contact::{Body, Constraints, ContactRow, ContactState, Response, Sliding, Spring};
+use crate::contact::{
+    Body, Constraints, ContactRow, ContactStart, ContactState, Response, Sliding, Spring,
+};
 use crate::error::{MtmError, Result};
 use crate::iterative::{Advance, Effort, Extremes, Iterative, Trail};
 use crate::mesh::{add, between, dot, norm, scaled, sub};
@@ -49,11 +51,11 @@ pub(crate) struct System {
     kept: Kept,
 }
 
-/// Where a solve with contact starts: the end of one for the same motions and a body a little different.
+/// Where a solve with contact starts: the end of one for a plan or a body a little different.
 pub(crate) struct Begin<'a> {
     /// Displacements of the rows.
     pub rows: &'a [[f64; 3]],
-    pub contact: &'a ContactState,
+    pub contact: ContactStart,
 }
 
 /// Contact constraints that do not change, for several right-hand sides.
@@ -183,7 +185,8 @@ impl System {
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, ContactState, f64)> {
         let clock = Clock::new();
-        let (first, rows) = begin.map_or((None, &[][..]), |b| (Some(b.contact), b.rows));
+        let rows = begin.as_ref().map_or(&[][..], |b| b.rows);
+        let first = begin.as_ref().map(|b| &b.contact);
         if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
             // Each on a thread of the pool, so that loops inside begin without a hand-over; not all at once:
             // interrupts are of the calling thread.

@@ -130,6 +130,15 @@ impl ContactState {
     }
 }
 
+/// Sliding nodes to begin a solve from.
+#[derive(Debug, Clone)]
+pub struct ContactStart {
+    /// Place of each sliding node, mm.
+    pub places: Vec<[f64; 3]>,
+    /// Force that the bone exerts on each, N.
+    pub reactions: Vec<[f64; 3]>,
+}
+
 /// Linearised constraint of one sliding node: n·(x + u − p) = 0.
 #[derive(Debug, Clone, Copy)]
 pub struct ContactRow {
@@ -296,6 +305,39 @@ impl Sliding {
             }
         }
         out
+    }
+
+    /// The sliding nodes as `state` under `motions` has them, carried back with their segments to where these were
+    /// at rest; none where a segment is deformed.
+    pub(crate) fn carried_back(
+        &self,
+        motions: &[&Motion],
+        state: &ContactState,
+    ) -> Option<ContactStart> {
+        let (mut places, mut reactions) = (Vec::new(), Vec::new());
+        for (i, node) in self.nodes.iter().enumerate() {
+            let Motion::Rigid(rigid) = motions[node.segment] else { return None };
+            places.push(rigid.apply_inverse(add(self.positions[i], state.displacements[i])));
+            reactions.push(rigid.rotate_inverse(state.reactions[i]));
+        }
+        Some(ContactStart { places, reactions })
+    }
+
+    /// What was carried back, carried with the segments under other `motions`; none where a segment is deformed.
+    pub(crate) fn carried(&self, motions: &[&Motion], rest: &ContactStart) -> Option<ContactStart> {
+        let (mut places, mut reactions) = (Vec::new(), Vec::new());
+        for (i, node) in self.nodes.iter().enumerate() {
+            let Motion::Rigid(rigid) = motions[node.segment] else { return None };
+            places.push(rigid.apply(rest.places[i]));
+            reactions.push(rigid.rotate(rest.reactions[i]));
+        }
+        Some(ContactStart { places, reactions })
+    }
+
+    /// Where `state` has the sliding nodes.
+    pub(crate) fn start_of(&self, state: &ContactState) -> ContactStart {
+        let places = self.positions.iter().zip(&state.displacements).map(|(x, u)| add(*x, *u));
+        ContactStart { places: places.collect(), reactions: state.reactions.clone() }
     }
 
     /// Distance of node `i` from its contact surface at rest, mm; past a border, from the tangent plane there.

@@ -16,8 +16,8 @@
 use crate::boundary::Motion;
 use crate::contact::seat::{Seats, Touch};
 use crate::contact::{
-    Body, Constraints, ContactMode, ContactOptions, ContactRow, ContactState, Response, Sliding,
-    Spring,
+    Body, Constraints, ContactMode, ContactOptions, ContactRow, ContactStart, ContactState,
+    Response, Sliding, Spring,
 };
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::mesh::{add, between, dot, norm, scaled, sub};
@@ -93,7 +93,7 @@ impl Sliding {
     pub fn solve(
         &self,
         motions: &[&Motion],
-        begin: Option<&ContactState>,
+        begin: Option<&ContactStart>,
         options: &ContactOptions,
         interrupted: &(dyn Fn() -> bool + Sync),
         body: &mut dyn Body,
@@ -206,15 +206,13 @@ impl Problem<'_> {
         self.sliding.positions.iter().zip(displacements).map(|(x, u)| add(*x, *u)).collect()
     }
 
-    fn start(&self, begin: Option<&ContactState>) -> State {
-        let (displacements, reactions) = match begin {
-            Some(begin) => (begin.displacements.clone(), begin.reactions.clone()),
-            None => {
-                let clinging = self.seats.clinging.iter().zip(&self.sliding.positions);
-                let displacements = clinging.map(|(c, x)| sub(*c, *x)).collect();
-                (displacements, vec![[0.0; 3]; self.count()])
-            }
+    fn start(&self, begin: Option<&ContactStart>) -> State {
+        let (places, reactions) = match begin {
+            Some(begin) => (&begin.places, begin.reactions.clone()),
+            None => (&self.seats.clinging, vec![[0.0; 3]; self.count()]),
         };
+        let displacements: Vec<[f64; 3]> =
+            places.iter().zip(&self.sliding.positions).map(|(p, x)| sub(*p, *x)).collect();
         let touches = self.seats.touches(&self.places(&displacements));
         let forces = along(&reactions, &touches);
         State { displacements, touches, reactions, forces }

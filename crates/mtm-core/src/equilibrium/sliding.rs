@@ -111,7 +111,8 @@ impl Equilibrium {
             &mut Clock::new(),
             interrupted,
         )?;
-        let begin = begin.map(|contact| Begin { rows: &here, contact });
+        let begin =
+            begin.map(|state| Begin { rows: &here, contact: slide.sliding.start_of(state) });
         let (x, state, _) = system.solve_with_contact(
             &b,
             slide.sliding,
