@@ -32,6 +32,8 @@ const MOST_LOAD_STEPS: usize = 60;
 const MOST_SOFTNESS: f64 = 1e6;
 /// Halvings in the search for it.
 const SOFTENINGS: usize = 30;
+/// Share of what a direction moves that may be wrong in a step.
+const PROBE_ERROR: f64 = 1e-3;
 /// Loads by which directions are tried, over the contact forces: what they move is far above rounding.
 const PROBE_SHARE: f64 = 1e-2;
 /// Relative error of contact forces, in the energy norm, at which only rounding is left.
@@ -234,7 +236,8 @@ impl<'a> Answers<'a> {
             let enough = Aim::Measure(self.enough);
             let loads;
             (loads, is_carried) = self.loads(&unstable, c, &rows, exact)?;
-            found = self.forces_under(&unstable, &loads, &rows, enough, exact)?;
+            self.carry(&unstable, &loads, Precision::Exact);
+            found = self.forces(&rows, enough, exact)?;
         }
         let mut forces = self.pushed.clone();
         if let Some(Carried { loads, .. }) = &self.carried {
@@ -253,7 +256,14 @@ impl<'a> Answers<'a> {
         rows: &Rows,
         exact: f64,
     ) -> Result<(Vec<f64>, bool)> {
-        let share = c.share.max(LOAD_SHARE);
+        // For a step, the next one corrects what is left; an operator has no next one.
+        let is_step = c.reach.is_finite();
+        let share = if is_step { c.share.max(PROBE_ERROR) } else { LOAD_SHARE };
+        let (aim, precision) = if is_step {
+            (Aim::Share(share), Precision::Rough)
+        } else {
+            (Aim::Share(0.0), Precision::Exact)
+        };
         let root: Vec<f64> = unstable.iter().map(|s| (-s.stiffness).sqrt()).collect();
         let here = self.displacements();
         let stretch = unstable.iter().map(|s| dot(s.axis, here[s.node]) - s.goal);
@@ -269,7 +279,8 @@ impl<'a> Answers<'a> {
             let up = PROBE_SHARE * most / length(&q);
             let loads: Vec<f64> = q.iter().map(|q| q * up).collect();
             self.take(base.clone());
-            self.forces_under(unstable, &loads, rows, Aim::Share(c.share), exact)?;
+            self.carry(unstable, &loads, precision);
+            self.forces(rows, aim, exact)?;
             answered.push((up, self.pose()));
             let there = self.displacements();
             let moved: Vec<[f64; 3]> =
@@ -305,22 +316,20 @@ impl<'a> Answers<'a> {
         Ok((loads, krylov.softness > 0.0))
     }
 
-    /// As `forces`, under loads z along unstable springs as well.
-    fn forces_under(
-        &mut self,
-        unstable: &[Spring],
-        z: &[f64],
-        rows: &Rows,
-        aim: Aim,
-        exact: f64,
-    ) -> Result<NormalForces> {
+    /// Puts loads z along unstable springs on the body.
+    fn carry(&mut self, unstable: &[Spring], z: &[f64], precision: Precision) {
         let mut loads = vec![[0.0; 3]; self.free.len()];
         for (s, z) in unstable.iter().zip(z) {
             loads[s.node] = add(loads[s.node], scaled(s.axis, *z));
         }
-        let moved = self.response_to(&loads);
+        let moved = match (&self.contact.flexibility, precision) {
+            (Flexibility::Dense(tail), Precision::Rough) => tail.respond_roughly(&loads),
+            (Flexibility::Dense(tail), Precision::Exact) => tail.respond(&loads),
+            (Flexibility::Sweeps { reach, .. }, _) => {
+                self.symbolic.respond(self.factor, reach, &loads, &mut self.work)
+            }
+        };
         self.carried = Some(Carried { loads, moved });
-        self.forces(rows, aim, exact)
     }
 
     /// The same answers by a factor for their conditions.
@@ -341,16 +350,6 @@ impl<'a> Answers<'a> {
     /// Displacements after the last answer, mm.
     fn displacements(&self) -> Vec<[f64; 3]> {
         self.unpushed().iter().zip(&self.moved).map(|(f, m)| add(*f, *m)).collect()
-    }
-
-    /// What forces on the sliding nodes add to their displacements, mm.
-    fn response_to(&mut self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        match &self.contact.flexibility {
-            Flexibility::Dense(tail) => tail.respond(forces),
-            Flexibility::Sweeps { reach, .. } => {
-                self.symbolic.respond(self.factor, reach, forces, &mut self.work)
-            }
-        }
     }
 
     /// Contact forces and what they do, to begin from.
