@@ -170,7 +170,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "scene": "checks errors pickling planning",
         "case": "checks errors pickling scene",
         "patient": "checks errors pickling",
-        "model": "case checks musculature osteotomy pickling scene",
+        "model": "case checks errors musculature osteotomy pickling scene",
         "io": (
             "case checks errors landmark_sites model musculature patient planning prediction scene "
             "template_data"
@@ -182,7 +182,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "equivalent": "case checks errors musculature scene _core",
         "landmark_sites": "",
         "template_data": "case checks errors musculature pickling scene",
-        "prediction": "case checks model musculature pickling scene _core",
+        "prediction": "case checks errors model musculature pickling scene _core",
         "template": (
             "case checks errors io landmark_sites musculature phantom registration scene "
             "surface_checks surface_repair template_data _core"
@@ -196,6 +196,14 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "node_kinds": "case checks errors scene _core",
         "inversion": "case checks _core",
         "simulation": "case errors inversion scene _core",
+        "face_measures": ("case checks errors landmark_sites model prediction scene"),
+        "replanning": (
+            "checks errors model patient_prediction planning prediction scene simulation _core"
+        ),
+        "planning_page": (
+            "case checks clinical_plan errors face_measures io model node_kinds osteotomy "
+            "prediction replanning scene _core"
+        ),
         "patient_prediction": (
             "checks clinical_plan errors model planning prediction scene simulation _core"
         ),
@@ -232,8 +240,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
         ),
         "cli": (
             "bench build case checks clinical_plan cmfsim demo doctor errors evaluation "
-            "finding_groups insilico io meshing musculature phantom pictures prediction report "
-            "scene simulation study template"
+            "finding_groups insilico io meshing musculature phantom pictures planning_page "
+            "prediction replanning report scene simulation study template"
         ),
         "__main__": "cli",
         "__init__": (

@@ -11,6 +11,7 @@ from cmfsim.cli import (
     case_commands,
     demo_command,
     phantom_command,
+    plan_command,
     scene_commands,
     study_commands,
     template_commands,
@@ -161,7 +162,27 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         help="H, M, H+S or M+S: homogeneous or with muscles, without or with sliding; or all; may "
         "be repeated (default M+S)",
     )
+    predict.add_argument(
+        "--plan", metavar="PLAN", type=Path, help="plan.toml of the planning page, not the case's"
+    )
     predict.set_defaults(run=study_commands.predict)
+
+    plan = commands.add_parser(
+        "plan",
+        parents=[changed],
+        help="write a page in which bones are moved and the face follows",
+        epilog="The page is one file: it needs neither a server nor a network.",
+    )
+    plan.add_argument("--model", choices=MODELS, default="M+S", help="(default M+S)")
+    plan.add_argument(
+        "--trials",
+        metavar="N",
+        type=int,
+        default=plan_command.TRIALS,
+        help=f"exact solutions that measure the page's error (default {plan_command.TRIALS})",
+    )
+    plan.add_argument("--no-open", action="store_true", help="do not open the page")
+    plan.set_defaults(run=plan_command.plan)
 
     evaluate = commands.add_parser(
         "evaluate", parents=[changed], help="predict, and compare with the face after it"
