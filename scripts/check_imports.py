@@ -246,9 +246,10 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "__main__": "cli",
         "__init__": (
             "achieved bench build case clinical_plan deferred doctor equivalent errors evaluation "
-            "imaging insilico io landmark_sites meshing model musculature node_kinds osteotomy "
-            "patient patient_prediction phantom planning prediction registration scene simulation "
-            "study surface_checks surface_repair template _core"
+            "face_measures imaging insilico io landmark_sites meshing model musculature "
+            "node_kinds osteotomy patient patient_prediction phantom planning planning_page "
+            "prediction registration replanning scene simulation study surface_checks "
+            "surface_repair template _core"
         ),
     }.items()
 }

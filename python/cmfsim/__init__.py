@@ -66,6 +66,7 @@ __getattr__, __dir__, __all__ = deferred(
         "clinical_plan": (
             "ClinicalMotion",
             "clinical_motion",
+            "planned_motion",
         ),
         "doctor": (
             "Examination",
@@ -102,6 +103,15 @@ __getattr__, __dir__, __all__ = deferred(
             "error_table",
             "skin_regions",
             "wilcoxon_test",
+        ),
+        "face_measures": (
+            "MEASURES",
+            "BoneSite",
+            "FaceSites",
+            "Measure",
+            "face_sites",
+            "measure_face",
+            "measure_sites",
         ),
         "imaging": (
             "AlignmentOptions",
@@ -199,6 +209,12 @@ __getattr__, __dir__, __all__ = deferred(
             "rigid_matrix",
             "rigid_motion",
         ),
+        "planning_page": (
+            "PageContent",
+            "page_content",
+            "page_text",
+            "write_planning_page",
+        ),
         "prediction": (
             "MODELS",
             "Prediction",
@@ -211,6 +227,13 @@ __getattr__, __dir__, __all__ = deferred(
             "icp",
             "leave_one_out",
             "match_landmarks",
+        ),
+        "replanning": (
+            "ExpectedError",
+            "PlanTrial",
+            "PlanningModel",
+            "expected_error",
+            "planning_model",
         ),
         "scene": (
             "MovedSurface",

@@ -39,7 +39,7 @@ from cmfsim.bench import (
 )
 from cmfsim.build import build_case, build_model, with_muscles, write_phantom_case
 from cmfsim.case import Anatomy, BoneSegment, DentalArch, Finding, ImageData, NodeKinds
-from cmfsim.clinical_plan import ClinicalMotion, clinical_motion
+from cmfsim.clinical_plan import ClinicalMotion, clinical_motion, planned_motion
 from cmfsim.doctor import Examination, diagnose, examine
 from cmfsim.equivalent import Mixture, MuscleVolume, equivalent_material
 from cmfsim.errors import (
@@ -67,6 +67,15 @@ from cmfsim.evaluation import (
     error_table,
     skin_regions,
     wilcoxon_test,
+)
+from cmfsim.face_measures import (
+    MEASURES,
+    BoneSite,
+    FaceSites,
+    Measure,
+    face_sites,
+    measure_face,
+    measure_sites,
 )
 from cmfsim.imaging import (
     AlignmentOptions,
@@ -145,6 +154,7 @@ from cmfsim.patient import CaseMuscles
 from cmfsim.patient_prediction import model_scene, predict_patient
 from cmfsim.phantom import HeadParameters, Muscle, PhantomHead, make_head
 from cmfsim.planning import RigidMotion, decompose_motion, rigid_matrix, rigid_motion
+from cmfsim.planning_page import PageContent, page_content, page_text, write_planning_page
 from cmfsim.prediction import MODELS, Prediction
 from cmfsim.registration import (
     FoldReport,
@@ -154,6 +164,13 @@ from cmfsim.registration import (
     icp,
     leave_one_out,
     match_landmarks,
+)
+from cmfsim.replanning import (
+    ExpectedError,
+    PlanningModel,
+    PlanTrial,
+    expected_error,
+    planning_model,
 )
 from cmfsim.scene import (
     MovedSurface,
@@ -190,6 +207,7 @@ __all__ = [
     "ELEMENTS",
     "KINEMATICS",
     "LAWS",
+    "MEASURES",
     "METHODS",
     "MODELS",
     "PRESETS",
@@ -199,6 +217,7 @@ __all__ = [
     "AlignmentOptions",
     "Anatomy",
     "BoneSegment",
+    "BoneSite",
     "Boundary",
     "BoundaryError",
     "Case",
@@ -219,6 +238,8 @@ __all__ = [
     "DistanceStatistics",
     "ErrorTable",
     "Examination",
+    "ExpectedError",
+    "FaceSites",
     "Finding",
     "FoldReport",
     "Folds",
@@ -236,6 +257,7 @@ __all__ = [
     "MassTensors",
     "MatchOptions",
     "MaterialError",
+    "Measure",
     "MeshError",
     "MeshOptions",
     "MeshQuality",
@@ -251,10 +273,13 @@ __all__ = [
     "MuscleVolume",
     "Musculature",
     "NodeKinds",
+    "PageContent",
     "PairedTest",
     "PatientModel",
     "PhantomHead",
     "PlanOperator",
+    "PlanTrial",
+    "PlanningModel",
     "Prediction",
     "Procedure",
     "RegistrationError",
@@ -309,6 +334,8 @@ __all__ = [
     "error_table",
     "evaluate",
     "examine",
+    "expected_error",
+    "face_sites",
     "fold_report",
     "free_cut",
     "frontier",
@@ -319,14 +346,20 @@ __all__ = [
     "leave_one_out",
     "make_head",
     "match_landmarks",
+    "measure_face",
     "measure_motion",
+    "measure_sites",
     "mesh_from_labels",
     "mesh_from_level",
     "mesh_report",
     "mesh_with_tetwild",
     "model_scene",
+    "page_content",
+    "page_text",
     "part_mesh",
     "place_procedure",
+    "planned_motion",
+    "planning_model",
     "predict",
     "predict_models",
     "predict_patient",
@@ -367,6 +400,7 @@ __all__ = [
     "write_metrics",
     "write_model",
     "write_phantom_case",
+    "write_planning_page",
     "write_prediction",
     "write_result",
     "write_scene",

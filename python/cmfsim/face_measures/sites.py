@@ -76,10 +76,14 @@ class FaceSites:
 
     def why_absent(self, sites: tuple[str, ...]) -> str:
         """Why a measure of these sites cannot be taken; empty where it can."""
-        reasons = {
-            name.replace("_", " "): self.absent[name] for name in sites if name in self.absent
-        }
-        return "; ".join(f"{name} is absent: {why}" for name, why in reasons.items())
+        reasons: dict[str, list[str]] = {}
+        for name in sites:
+            if name in self.absent:
+                reasons.setdefault(self.absent[name], []).append(name.replace("_", " "))
+        return "; ".join(
+            f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} absent: {why}"
+            for why, names in reasons.items()
+        )
 
 
 def face_sites(patient: PatientModel) -> FaceSites:

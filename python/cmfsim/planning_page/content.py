@@ -29,6 +29,8 @@ MOST_NODES = 60_000
 STILL = 4e-4
 # Motions that decide whether a node moves: entries of R − I, and shifts in mm.
 LARGE_TURN, LARGE_SHIFT = 0.5, 30.0
+# How far behind its foremost point the profile is drawn, mm.
+PROFILE_DEPTH = 60.0
 # How much of the height of the face a picture shows, and the least, mm.
 SPAN_SHARE, LEAST_SPAN = 1.15, 60.0
 
@@ -280,8 +282,10 @@ def _profile(
         arrays["profile_ends"] = np.zeros((0, 2), dtype=np.uint32)
         arrays["profile_share"] = np.zeros(0, dtype=np.float32)
         return {"has_profile": False, "profile_absent": str(error)}
-    arrays["profile_ends"] = _indices(profile.ends)
-    arrays["profile_share"] = _singles(profile.share)
+    # Without scalp and neck, which would make the drawing small.
+    shown = profile.points[:, 1] <= profile.points[:, 1].min() + PROFILE_DEPTH
+    arrays["profile_ends"] = _indices(profile.ends[shown])
+    arrays["profile_share"] = _singles(profile.share[shown])
     return {"has_profile": True, "profile_absent": ""}
 
 

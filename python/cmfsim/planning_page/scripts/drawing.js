@@ -53,7 +53,7 @@ export function vertexNormals(out, places, triangles) {
 
 export class Drawing {
   constructor(canvas, mapColours) {
-    const gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
+    const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true });
     if (!gl) {
       throw new Error("this browser gives no WebGL 2: allow hardware graphics, or use another one");
     }

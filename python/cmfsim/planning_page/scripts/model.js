@@ -5,6 +5,9 @@ import { measure } from "./measures.js";
 import { displace, planNumbers } from "./operator.js";
 import { moved } from "./rigid.js";
 
+// Points of the profile further apart than this, mm, before, have skin between them that is left out.
+const GAP = 15;
+
 export class PatientFace {
   /** page: the values of the page; arrays: its unpacked numbers. */
   constructor(page, arrays) {
@@ -74,7 +77,10 @@ export class PatientFace {
       const [a, b] = [3 * ends[2 * i] + axis, 3 * ends[2 * i + 1] + axis];
       return places[a] + share[i] * (places[b] - places[a]);
     };
-    return Array.from(share, (_, i) => [at(i, 1), at(i, 2)]);
+    const rows = Array.from(share, (_, i) => [at(i, 1), at(i, 2)]);
+    // Where the profile was cut off it is not joined.
+    this.joined ??= rows.map((row, i) => i > 0 && Math.hypot(row[0] - rows[i - 1][0], row[1] - rows[i - 1][1]) < GAP);
+    return rows.map((row, i) => [...row, this.joined[i]]);
   }
 
   /** How far a plan is from the case's own, mm: at the corners of the boxes around segments. */

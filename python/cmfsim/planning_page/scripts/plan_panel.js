@@ -55,7 +55,7 @@ export class PlanPanel {
     const id = `number-${key}`;
     const field = element("input", {
       type: "number", id, step: STEP, min: -limit, max: limit,
-      onchange: (e) => this.typed(key, e.target), onkeydown: (e) => { if (e.key === "Enter") this.typed(key, e.target); },
+      onchange: (e) => this.typed(key, e.target),
     });
     const slider = element("input", {
       type: "range", step: STEP, min: -SLIDER, max: SLIDER, "aria-label": `${label}, ${unit}`,
