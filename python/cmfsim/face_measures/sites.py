@@ -33,6 +33,9 @@ THROAT_BELOW = 45.0
 LEAST_THROAT = 20.0
 # How far from supradentale the edge of an incisor lies, mm: to the side, in depth, and below.
 INCISOR_SIDE, INCISOR_DEPTH, INCISOR_BELOW = 5.0, 9.0, 14.0
+# The edge of a lip is its furthest point towards the other lip; what lies deeper counts for less by
+# this share of its depth, so that it is not sought inside the mouth.
+LIP_DEPTH = 0.5
 # Lips whose edges are nearer than this, mm, are closed: the skin is one there, and cannot open.
 LEAST_GAP = 0.3
 # An incisor whose edge is not this far below the bone's edge is none, mm.
@@ -211,12 +214,12 @@ def _lips(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]
 
 def _stomion_superius(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     upper, _ = _lips(profile, known)
-    return np.asarray(upper[np.argmin(upper[:, 2])])
+    return np.asarray(upper[np.argmin(upper[:, 2] + LIP_DEPTH * upper[:, 1])])
 
 
 def _stomion_inferius(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     _, lower = _lips(profile, known)
-    return np.asarray(lower[np.argmax(lower[:, 2])])
+    return np.asarray(lower[np.argmax(lower[:, 2] - LIP_DEPTH * lower[:, 1])])
 
 
 def _open(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]:

@@ -2,5 +2,14 @@
 
 from cmfsim.planning_page.content import PageContent, page_content
 from cmfsim.planning_page.page import PAGE_FILE, page_text, write_planning_page
+from cmfsim.planning_page.tooth_rows import ToothRows, tooth_rows
 
-__all__ = ["PAGE_FILE", "PageContent", "page_content", "page_text", "write_planning_page"]
+__all__ = [
+    "PAGE_FILE",
+    "PageContent",
+    "ToothRows",
+    "page_content",
+    "page_text",
+    "tooth_rows",
+    "write_planning_page",
+]

@@ -34,7 +34,8 @@ class App {
     this.plans = new Plans(this.face.reference);
     this.pending = null;
     this.settled = true;
-    this.timing = { compute: 0 };
+    // Milliseconds of the last face, and of its normals.
+    this.timing = { compute: 0, normals: 0 };
     const { before, triangles } = this.face;
     this.shift = new Float32Array(before.length);
     this.after = Float32Array.from(before);
@@ -102,6 +103,12 @@ class App {
     this.changed();
   }
 
+  /** The case's own plan as the only variant; undo brings the others back. */
+  reset() {
+    this.plans.take({ active: 0, variants: [{ name: "A", motions: this.plans.reference }] });
+    this.changed();
+  }
+
   undo() { if (this.plans.undo()) this.changed(); }
   redo() { if (this.plans.redo()) this.changed(); }
 
@@ -162,7 +169,7 @@ class App {
     const { before } = this.face;
     this.face.faceShift(this.shift, this.motions);
     for (let i = 0; i < before.length; i++) this.after[i] = before[i] + this.shift[i];
-    this.timing = { compute: performance.now() - begun };
+    this.timing.compute = performance.now() - begun;
     this.panel.show();
     this.measuring.show();
     this.exporting.show();
@@ -177,7 +184,9 @@ class App {
     const { before, triangles } = this.face;
     const { share, map } = this.view.values;
     for (let i = 0; i < before.length; i++) this.shownPlaces[i] = before[i] + share * this.shift[i];
+    const begun = performance.now();
     vertexNormals(this.normals, this.shownPlaces, triangles);
+    this.timing.normals = performance.now() - begun;
     this.most = 1;
     if (map) {
       const { shift, amounts } = this;

@@ -55,7 +55,9 @@ export class PlanPanel {
     const id = `number-${key}`;
     const field = element("input", {
       type: "number", id, step: STEP, min: -limit, max: limit,
+      oninput: () => { this.typing = key; },
       onchange: (e) => this.typed(key, e.target),
+      onblur: () => { this.typing = null; },
     });
     const slider = element("input", {
       type: "range", step: STEP, min: -SLIDER, max: SLIDER, "aria-label": `${label}, ${unit}`,
@@ -96,11 +98,12 @@ export class PlanPanel {
   }
 
   typed(key, input) {
+    this.typing = null;
     // An empty or half-typed field is no zero.
     const value = input.value.trim() === "" ? NaN : input.valueAsNumber;
     if (!Number.isFinite(value)) {
       this.app.refuse("Type a number; the plan is as it was.");
-      this.show();
+      this.app.changed();
       return;
     }
     this.change(key, value, true);
@@ -112,8 +115,9 @@ export class PlanPanel {
     const motion = withNumber(was, this.place, this.turnsAbout, key, value);
     const why = beyondLimits(motion, was, this.place, NUMBERS);
     if (why) {
-      this.app.refuse(`${why}. The plan is as it was.`);
-      this.app.preview(null);
+      this.app.refuse(`${why}. ${keep ? "The plan is as it was." : ""}`);
+      // A field must not show what the plan does not have.
+      if (keep) this.app.changed();
       return;
     }
     this.app.preview({ segment: this.segment, motion });
@@ -130,7 +134,8 @@ export class PlanPanel {
     for (const { key } of NUMBERS) {
       const { field, slider } = this.fields[key];
       const text = (numbers[key] + 0).toFixed(2).replace(/^-(0\.0+)$/, "$1");
-      if (document.activeElement !== field || this.app.settled) field.value = text;
+      // What is being typed is left alone, until it is a number or is given up.
+      if (this.typing !== key) field.value = text;
       slider.value = String(numbers[key]);
       slider.setAttribute("aria-valuetext", text);
     }

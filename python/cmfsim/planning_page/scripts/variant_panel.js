@@ -22,7 +22,8 @@ export class VariantPanel {
         button("Copy to a new variant", () => this.add(app.plans.active.motions)),
         button("New from the case's plan", () => this.add(app.plans.reference)),
         button("New without a move", () => this.add(app.plans.reference.map(() => STAYS))),
-        this.removal = button("Remove", () => { app.plans.remove(); app.changed(); })),
+        this.removal = button("Remove", () => { app.plans.remove(); app.changed(); }),
+        button("Reset all", () => app.reset(), { title: "The case's plan alone; undo brings the variants back" })),
       this.differences);
   }
 
