@@ -51,7 +51,11 @@ def errors(planning):
 
 @pytest.fixture(scope="module")
 def content(planning, reference, errors):
-    return cmfsim.page_content(planning, reference, errors)
+    """Drawn with few triangles: browsers here draw by software."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cmfsim.planning_page.content, "FACE_TRIANGLES", 10_000)
+        patch.setattr(cmfsim.planning_page.content, "BONE_TRIANGLES", 6_000)
+        return cmfsim.page_content(planning, reference, errors)
 
 
 @pytest.fixture(scope="module")
@@ -235,9 +239,9 @@ def test_a_skin_too_fine_for_a_page_is_refused_and_a_fine_face_simplified(
     planning, reference, errors, monkeypatch
 ):
     fine = cmfsim.planning_page.content
-    monkeypatch.setattr(fine, "FACE_TRIANGLES", 10_000)
+    monkeypatch.setattr(fine, "FACE_TRIANGLES", 8_000)
     found = cmfsim.page_content(planning, reference, errors)
-    assert len(found.arrays["face_triangles"]) <= 10_100
+    assert len(found.arrays["face_triangles"]) <= 8_100
     text = next(f.what for f in found.findings if f.where == "face")
     away = float(re.search(r"at most ([0-9.]+) mm away", text)[1])
     assert away < 2.0
@@ -280,7 +284,7 @@ def opened(page):
 
 def open_page(browser, path):
     # Small: pictures are drawn by software here.
-    context = browser.new_context(viewport={"width": 1000, "height": 500}, accept_downloads=True)
+    context = browser.new_context(viewport={"width": 920, "height": 420}, accept_downloads=True)
     page = context.new_page()
     page.set_default_timeout(20_000)
     troubles, asked = [], []
@@ -637,7 +641,8 @@ def test_a_large_page_computes_a_face_within_a_frame(browser, content, tmp_path)
         arrays[name] = arrays[name][rows]
     for name in ("face", *(f"face_{p}" for p in ("triangle", "barycentric", "offset", "share"))):
         arrays[name] = arrays[name][picked]
-    arrays["face_triangles"] = np.tile(arrays["face_triangles"], (2, 1))[: 2 * count]
+    arrays["face_triangles"] = np.tile(arrays["face_triangles"], (5, 1))[: 2 * count]
+    assert len(arrays["face_triangles"]) == 2 * count
     assert arrays["columns"].shape == (count, 3, 48)
     path = tmp_path / "large.html"
     size = cmfsim.write_planning_page(path, dataclasses.replace(content, arrays=arrays))

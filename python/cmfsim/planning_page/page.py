@@ -19,7 +19,7 @@ from cmfsim.io import replacing
 from cmfsim.planning_page.content import PageContent
 from cmfsim.planning_page.packing import packed_arrays
 
-__all__ = ["PAGE_FILE", "page_text", "write_planning_page"]
+__all__ = ["PAGE_FILE", "page_state", "page_text", "write_planning_page"]
 
 PAGE_FILE = "plan.html"
 MAIN = "main.js"
@@ -29,6 +29,9 @@ EXPORT = re.compile(r"^export (?=(?:async )?(?:function|const|class)\b)", re.MUL
 # A name that a module defines at its top.
 DEFINED = re.compile(r"^(?:export )?(?:async )?(?:function|const|let|class) (\w+)", re.MULTILINE)
 FIELD = re.compile(r"@([a-z]+)@")
+STATE = re.compile(rb'<meta name="cmfsim-made-for" content="([0-9a-f]{64})">')
+# The state stands before the style and scripts.
+HEAD_BYTES = 2048
 EXACT_NOTE = (
     "Contact of soft tissue with teeth and gums is continued from the case's plan, not solved "
     "again. Save the plan next to the case file and run:"
@@ -72,6 +75,7 @@ def page_text(content: PageContent, *, case_file: str = "case.toml") -> str:
     case, model, version = (str(content.values[key]) for key in ("case", "model", "version"))
     fields = {
         "policy": _policy(script, style),
+        "state": html.escape(str(content.values["built_for"])),
         "title": html.escape(f"{case}: planning page"),
         "facts": html.escape(
             f"Model {model}. Forwards is −P, up +S, left is the patient's left; mm and degrees."
@@ -107,6 +111,21 @@ def write_planning_page(
     with replacing(Path(path)) as file:
         file.write(data)
     return len(data)
+
+
+def page_state(path: str | os.PathLike[str]) -> str | None:
+    """What the planning page at a path was made for (`plan_key`); None where there is no page.
+
+    Raises
+    ------
+    OSError
+        The file is there and cannot be read.
+    """
+    if not Path(path).is_file():
+        return None
+    with Path(path).open("rb") as file:
+        found = STATE.search(file.read(HEAD_BYTES))
+    return None if found is None else found[1].decode()
 
 
 def joined_scripts(modules: Mapping[str, str]) -> str:
