@@ -200,6 +200,9 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "replanning": (
             "checks errors model patient_prediction planning prediction scene simulation _core"
         ),
+        "face_planning": (
+            "checks clinical_plan errors face_measures prediction replanning scene _core"
+        ),
         "planning_page": (
             "case checks clinical_plan errors face_measures io model node_kinds osteotomy "
             "prediction replanning scene _core"
@@ -246,9 +249,9 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "__main__": "cli",
         "__init__": (
             "achieved bench build case clinical_plan deferred doctor equivalent errors evaluation "
-            "face_measures imaging insilico io landmark_sites meshing model musculature "
-            "node_kinds osteotomy patient patient_prediction phantom planning planning_page "
-            "prediction registration replanning scene simulation study surface_checks "
+            "face_measures face_planning imaging insilico io landmark_sites meshing model "
+            "musculature node_kinds osteotomy patient patient_prediction phantom planning "
+            "planning_page prediction registration replanning scene simulation study surface_checks "
             "surface_repair template _core"
         ),
     }.items()

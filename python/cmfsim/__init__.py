@@ -113,6 +113,14 @@ __getattr__, __dir__, __all__ = deferred(
             "measure_face",
             "measure_sites",
         ),
+        "face_planning": (
+            "FacePlan",
+            "FaceSearch",
+            "MeasureTarget",
+            "PointTarget",
+            "SurfaceTarget",
+            "plan_for_face",
+        ),
         "imaging": (
             "AlignmentOptions",
             "SegmentOptions",

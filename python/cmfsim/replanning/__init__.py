@@ -7,10 +7,11 @@ from cmfsim.replanning.expected_error import (
     plan_distance,
     segment_boxes,
 )
-from cmfsim.replanning.model import PlanningModel, planning_model
+from cmfsim.replanning.model import Motions, PlanningModel, planning_model
 
 __all__ = [
     "ExpectedError",
+    "Motions",
     "PlanTrial",
     "PlanningModel",
     "expected_error",
