@@ -251,8 +251,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
             "achieved bench build case clinical_plan deferred doctor equivalent errors evaluation "
             "face_measures face_planning imaging insilico io landmark_sites meshing model "
             "musculature node_kinds osteotomy patient patient_prediction phantom planning "
-            "planning_page prediction registration replanning scene simulation study surface_checks "
-            "surface_repair template _core"
+            "planning_page prediction registration replanning scene simulation study "
+            "surface_checks surface_repair template _core"
         ),
     }.items()
 }

@@ -34,6 +34,12 @@ class Measure:
         What the formula takes, in its order.
     about : str
         What is measured, in words.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> [measure.label for measure in cmfsim.MEASURES if measure.unit == "°"]
+    ['Nasolabial angle', 'Mentolabial angle', 'Facial convexity']
     """
 
     key: str

@@ -47,6 +47,18 @@ class FaceSearch:
         Standard deviations of a prior about no movement; None for no prior.
     steps : int
         At most so many steps.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A bound, deviation or count that is not above 0.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> search = cmfsim.FaceSearch(follows={"mandible_body": "maxilla"}, shift=10.0)
+    >>> search.prior_turn
+    20.0
     """
 
     segments: Sequence[str] | None = None

@@ -48,6 +48,18 @@ class PointTarget:
     directions : (n, 3) float64 or None
         Where given, only the way along these unit vectors counts: (0, 1, 0) and (0, 0, 1) for
         points of a profile photograph.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) No point, another count of goals or directions, NaN, a direction of 0.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> chin = cmfsim.PointTarget([[0, -100, -80]], [[0, -96, -80]], std=0.3)
+    >>> chin.goals.tolist()
+    [[0.0, -96.0, -80.0]]
     """
 
     points: ArrayLike
@@ -84,6 +96,17 @@ class MeasureTarget:
     value : float, mm or degrees
     std : float, mm or degrees
         How much it may be off.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Another measure; a value that is not finite.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.MeasureTarget("nasolabial_angle", 105.0, std=2.0).key
+    'nasolabial_angle'
     """
 
     key: str
@@ -113,6 +136,11 @@ class SurfaceTarget:
     std : float, mm
     points : int
         Points of the face that are drawn.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> wish = cmfsim.SurfaceTarget(cmfsim.read_surface("wished.stl"))  # doctest: +SKIP
     """
 
     surface: SurfaceData

@@ -75,6 +75,13 @@ def page_content(
     CaseError
         (also `ValueError`) More nodes on the skin than a page can hold; fast-simplification is
         missing where a surface has to be simplified.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> exact = planning.solve(planning.reference)  # doctest: +SKIP
+    >>> errors = cmfsim.expected_error(planning)  # doctest: +SKIP
+    >>> content = cmfsim.page_content(planning, exact, errors)  # doctest: +SKIP
     """
     patient = planning.patient
     findings: list[Finding] = []

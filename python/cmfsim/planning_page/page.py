@@ -55,6 +55,11 @@ def page_text(content: PageContent, *, case_file: str = "case.toml") -> str:
     ------
     CaseError
         (also `ValueError`) Numbers that are not finite.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> text = cmfsim.page_text(content)  # doctest: +SKIP
     """
     package = files("cmfsim.planning_page")
     numbers, table = packed_arrays(content.arrays)
@@ -106,6 +111,12 @@ def write_planning_page(
         (also `ValueError`) Numbers that are not finite.
     OSError
         The folder cannot be written to.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.write_planning_page("plan.html", content)  # doctest: +SKIP
+    5550695
     """
     data = page_text(content, case_file=case_file).encode()
     with replacing(Path(path)) as file:
