@@ -203,6 +203,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "face_planning": (
             "checks clinical_plan errors face_measures prediction replanning scene _core"
         ),
+        "planning_server": "checks errors planning_page replanning",
         "planning_page": (
             "case checks clinical_plan errors face_measures io model node_kinds osteotomy "
             "prediction replanning scene _core"
@@ -244,15 +245,15 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "cli": (
             "bench build case checks clinical_plan cmfsim demo doctor errors evaluation "
             "finding_groups insilico io meshing musculature phantom pictures planning_page "
-            "prediction replanning report scene simulation study template"
+            "planning_server prediction replanning report scene simulation study template"
         ),
         "__main__": "cli",
         "__init__": (
             "achieved bench build case clinical_plan deferred doctor equivalent errors evaluation "
             "face_measures face_planning imaging insilico io landmark_sites meshing model "
             "musculature node_kinds osteotomy patient patient_prediction phantom planning "
-            "planning_page prediction registration replanning scene simulation study "
-            "surface_checks surface_repair template _core"
+            "planning_page planning_server prediction registration replanning scene simulation "
+            "study surface_checks surface_repair template _core"
         ),
     }.items()
 }

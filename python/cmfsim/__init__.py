@@ -223,6 +223,7 @@ __getattr__, __dir__, __all__ = deferred(
             "page_text",
             "write_planning_page",
         ),
+        "planning_server": ("serve_planning",),
         "prediction": (
             "MODELS",
             "Prediction",

@@ -163,6 +163,7 @@ from cmfsim.patient_prediction import model_scene, predict_patient
 from cmfsim.phantom import HeadParameters, Muscle, PhantomHead, make_head
 from cmfsim.planning import RigidMotion, decompose_motion, rigid_matrix, rigid_motion
 from cmfsim.planning_page import PageContent, page_content, page_text, write_planning_page
+from cmfsim.planning_server import serve_planning
 from cmfsim.prediction import MODELS, Prediction
 from cmfsim.registration import (
     FoldReport,
@@ -399,6 +400,7 @@ __all__ = [
     "segment_head",
     "segments_from_surfaces",
     "sensitivity",
+    "serve_planning",
     "signed_level",
     "skin_regions",
     "solve_scene",

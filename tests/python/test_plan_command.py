@@ -5,6 +5,10 @@ import contextlib
 import io
 import json
 import re
+import signal
+import subprocess
+import sys
+import urllib.request
 
 import numpy as np
 import pytest
@@ -50,6 +54,17 @@ def test_plan_writes_the_page_of_the_case(case, answer):
     # Nothing slides in model H: the page is exact, as one solution shows.
     assert not answer["expected_error"]["slides"]
     assert answer["expected_error"]["trials"][0]["largest_mm"] < 1e-6
+
+
+def test_a_served_page_ends_with_ctrl_c(case):
+    pytest.importorskip("uvicorn")
+    words = ["-m", "cmfsim", "plan", str(case), "--serve", "--json", "--no-open", *MODEL]
+    with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, text=True) as running:
+        url = json.loads(running.stdout.readline())["url"]
+        with urllib.request.urlopen(url, timeout=30) as answer:  # noqa: S310 (our own address)
+            assert b"connect-src 'self'" in answer.read().replace(b"&#x27;", b"'")
+        running.send_signal(signal.SIGINT)
+        assert running.wait(timeout=30) == 0
 
 
 def test_predict_takes_the_plan_of_a_page(case, answer, capsys):

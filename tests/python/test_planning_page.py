@@ -7,16 +7,20 @@ import base64
 import dataclasses
 import gzip
 import hashlib
+import http.client
 import json
 import re
 import shutil
+import threading
 import time
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 
 import cmfsim
 from cmfsim.planning_page.page import joined_scripts
+from cmfsim.planning_server import PlanningServer
 from cmfsim.replanning import plan_distance
 
 pytest.importorskip("skimage")
@@ -658,3 +662,129 @@ def test_a_large_page_computes_a_face_within_a_frame(browser, content, tmp_path)
     # The best of thirty: other programs run on the machine of a test.
     assert min(times) < 16.0, sorted(times)
     assert next(pages, None) is None
+
+
+# Served ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def server(planning, content):
+    pytest.importorskip("starlette")
+    pytest.importorskip("uvicorn")
+    running = PlanningServer(planning, content)
+    thread = threading.Thread(target=running.run)
+    thread.start()
+    yield running
+    running.stop()
+    thread.join(timeout=20)
+    assert not thread.is_alive()
+
+
+def asked(url, body=None, method=None, **headers):
+    """Status, body and headers of an answer; names of headers with _ for -."""
+    parts = urlsplit(url)
+    connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=30)
+    own = {"Host": parts.netloc, **{n.replace("_", "-"): v for n, v in headers.items()}}
+    try:
+        connection.request(method or ("GET" if body is None else "POST"), parts.path, body, own)
+        answer = connection.getresponse()
+        return answer.status, answer.read(), answer.headers
+    finally:
+        connection.close()
+
+
+def origin_of(url):
+    return f"http://{urlsplit(url).netloc}"
+
+
+def plan_body(planning, plan):
+    rows = [np.asarray(plan[name]).ravel().tolist() for name in planning.segments]
+    return json.dumps({"motions": rows})
+
+
+def test_a_served_plan_is_solved_exactly(server, planning):
+    status, page, headers = asked(server.url)
+    assert status == 200
+    assert b"connect-src &#x27;self&#x27;" in page or b"connect-src 'self'" in page
+    assert headers["X-Frame-Options"] == "DENY"
+    assert headers["Cache-Control"] == "no-store"
+    plan = other_plan(planning)
+    status, body, headers = asked(
+        f"{server.url}solve",
+        plan_body(planning, plan),
+        Origin=origin_of(server.url),
+        Content_Type="application/json",
+    )
+    assert status == 200
+    shift = np.frombuffer(body, "<f4").reshape(-1, 3)
+    exact = planning.solve(plan).skin_displacements
+    np.testing.assert_allclose(shift, exact, atol=1e-4)
+    assert json.loads(headers["X-Solution"])["contact_converged"]
+
+
+def test_requests_that_are_not_the_pages_own_are_refused(server, planning):
+    good = plan_body(planning, planning.reference)
+    url, origin = server.url, origin_of(server.url)
+    host = urlsplit(url).netloc
+    sent = {"Origin": origin, "Content_Type": "application/json"}
+    port = host.rsplit(":", 1)[1]
+    assert host == f"127.0.0.1:{port}"
+    token = urlsplit(url).path.strip("/")
+    assert len(token) >= 43
+    for path in ("/", "/x/", f"/{token[:-1]}/", f"/{token}x/", "/%00/", f"/{token}/../x"):
+        assert asked(f"{origin}{path}")[0] in {404, 405, 307}, path
+    for other in ("evil.example", f"localhost:{port}", f"evil.example:{port}", "127.0.0.1"):
+        assert asked(url, Host=other)[0] == 403
+    assert asked(url, Origin="http://evil.example")[0] == 403
+    solve = f"{url}solve"
+    wrong = token[:-1] + ("A" if token[-1] != "A" else "B")
+    cases = {
+        404: (f"{origin}/{wrong}/solve", good, sent),
+        403: (solve, good, {**sent, "Origin": "http://evil.example"}),
+        415: (solve, good, {**sent, "Content_Type": "text/plain"}),
+        413: (solve, good + " " * 70_000, sent),
+    }
+    for status, (where, body, headers) in cases.items():
+        assert asked(where, body, **headers)[0] == status
+    assert asked(solve, good, Content_Type="application/json")[0] == 403
+    assert asked(solve, good, **{**sent, "Origin": "null"})[0] == 403
+    assert asked(solve, method="GET")[0] == 405
+
+
+def test_plans_that_are_none_get_an_error_and_no_solution(server, planning):
+    sent = {"Origin": origin_of(server.url), "Content_Type": "application/json"}
+    far = dict(planning.reference) | {"maxilla": cmfsim.rigid_motion((0, 0, 2000))}
+    mirror = dict(planning.reference) | {"maxilla": np.diag([-1.0, 1, 1, 1])}
+    for body, said in (
+        ("[]", b"needed as JSON"),
+        ("{" * 1000, b"needed as JSON"),
+        ('{"motions": [[1, 2]]}', b"16 finite numbers"),
+        (plan_body(planning, planning.reference).replace("1.0", "NaN", 1), b"16 finite"),
+        (plan_body(planning, planning.reference).replace("1.0", "1e999", 1), b"16 finite"),
+        (plan_body(planning, far), b"more than 1000 mm"),
+        (plan_body(planning, mirror), b"maxilla"),
+    ):
+        status, text, _ = asked(f"{server.url}solve", body, **sent)
+        assert status == 400
+        assert said in text, text
+
+
+def test_the_served_page_swaps_in_the_exact_face(browser, server, planning):
+    context = browser.new_context(viewport={"width": 920, "height": 420})
+    page = context.new_page()
+    troubles = []
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    page.goto(server.url)
+    until(page, READY)
+    type_number(page, "forwards", -5.5)
+    until(page, "document.getElementById('error-state').textContent.startsWith('Solved exactly')")
+    settle(page)
+    exact = planning.solve(motions_of(page, planning))
+    before = np.array(page.evaluate("[...cmfsimPage.face.before]")).reshape(-1, 3)
+    after = np.array(page.evaluate("[...cmfsimPage.after]")).reshape(-1, 3)
+    np.testing.assert_allclose(after - before, exact.carried(before), atol=0.01)
+    # Another plan is the operator's again until it is solved.
+    page.get_by_role("button", name="Undo").click()
+    until(page, "document.getElementById('error-state').textContent.includes('case\\'s plan')")
+    assert not troubles
+    context.close()

@@ -181,6 +181,14 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         default=plan_command.TRIALS,
         help=f"exact solutions that measure the page's error (default {plan_command.TRIALS})",
     )
+    plan.add_argument(
+        "--serve",
+        action="store_true",
+        help="solve plans exactly while the page is open, on this machine alone, until Ctrl-C",
+    )
+    plan.add_argument(
+        "--port", metavar="N", type=int, default=0, help="of --serve (default one that is free)"
+    )
     plan.add_argument("--no-open", action="store_true", help="do not open the page")
     plan.set_defaults(run=plan_command.plan)
 

@@ -13,8 +13,9 @@ from cmfsim.cli.notices import Notices
 from cmfsim.cli.preparation import prepare
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.pictures import has_screen
-from cmfsim.planning_page import PAGE_FILE, page_content, write_planning_page
-from cmfsim.replanning import ExpectedError, expected_error, planning_model
+from cmfsim.planning_page import PAGE_FILE, PageContent, page_content, write_planning_page
+from cmfsim.planning_server import check_serving, serve_planning
+from cmfsim.replanning import ExpectedError, PlanningModel, expected_error, planning_model
 from cmfsim.study.prediction import build_patient
 
 __all__ = ["TRIALS", "plan"]
@@ -27,6 +28,8 @@ def plan(options: argparse.Namespace) -> int:
     """Builds a case and writes its planning page."""
     case = case_of(options)
     prepare(case, PAGE_FILE.__eq__)
+    if options.serve:
+        check_serving()
     begun = time.perf_counter()
     notices = Notices(quiet=options.quiet)
     findings = (
@@ -53,6 +56,9 @@ def plan(options: argparse.Namespace) -> int:
         path = case.output / PAGE_FILE
         size = write_planning_page(path, content, case_file=case.file.name)
     seconds = time.perf_counter() - begun
+    if options.serve:
+        _serve(options, planning, content)
+        return DONE
     if options.json:
         answer = {
             "case": case.name,
@@ -71,6 +77,22 @@ def plan(options: argparse.Namespace) -> int:
     if not options.no_open and sys.stdout.isatty() and not os.environ.get("CI") and has_screen():
         webbrowser.open(path.resolve().as_uri())
     return DONE
+
+
+def _serve(options: argparse.Namespace, planning: PlanningModel, content: PageContent) -> None:
+    """Serves the page until it is interrupted; its address is printed first."""
+
+    def started(url: str) -> None:
+        if options.json:
+            print(json.dumps({"url": url}), flush=True)
+        else:
+            print(f"page   {url}\nOn this machine alone; Ctrl-C ends it.", flush=True)
+        if not options.no_open and has_screen() and sys.stdout.isatty():
+            webbrowser.open(url)
+
+    serve_planning(
+        planning, content, case_file=options.case.name, port=options.port, on_start=started
+    )
 
 
 def _error_text(errors: ExpectedError) -> str:

@@ -38,7 +38,9 @@ EXACT_NOTE = (
 )
 
 
-def page_text(content: PageContent, *, case_file: str = "case.toml") -> str:
+def page_text(
+    content: PageContent, *, case_file: str = "case.toml", is_served: bool = False
+) -> str:
     """The text of a planning page.
 
     Parameters
@@ -46,6 +48,9 @@ def page_text(content: PageContent, *, case_file: str = "case.toml") -> str:
     content : PageContent
     case_file : str
         The name of the case file in the command that solves a plan exactly.
+    is_served : bool
+        Whether the page asks the program that served it for exact solutions; else it connects to
+        nothing.
 
     Returns
     -------
@@ -68,6 +73,7 @@ def page_text(content: PageContent, *, case_file: str = "case.toml") -> str:
         "arrays": table,
         "case_file": _argument(case_file),
         "exact_note": EXACT_NOTE,
+        "is_served": is_served,
     }
     style = package.joinpath("page.css").read_text(encoding="utf-8")
     script = joined_scripts(
@@ -79,7 +85,7 @@ def page_text(content: PageContent, *, case_file: str = "case.toml") -> str:
     )
     case, model, version = (str(content.values[key]) for key in ("case", "model", "version"))
     fields = {
-        "policy": _policy(script, style),
+        "policy": _policy(script, style, is_served=is_served),
         "state": html.escape(str(content.values["built_for"])),
         "title": html.escape(f"{case}: planning page"),
         "facts": html.escape(
@@ -171,8 +177,8 @@ def joined_scripts(modules: Mapping[str, str]) -> str:
     return "\n".join(EXPORT.sub("", IMPORT.sub("", modules[name])) for name in order)
 
 
-def _policy(script: str, style: str) -> str:
-    """What the page may do: run this script, apply this style, save files; nothing else."""
+def _policy(script: str, style: str, *, is_served: bool) -> str:
+    """What the page may do: run this script, apply this style, save files; ask its own server."""
     allowed = {
         "default-src": "'none'",
         "script-src": f"'sha256-{_digest(script)}'",
@@ -181,6 +187,8 @@ def _policy(script: str, style: str) -> str:
         "base-uri": "'none'",
         "form-action": "'none'",
     }
+    if is_served:
+        allowed["connect-src"] = "'self'"
     return "; ".join(f"{name} {value}" for name, value in allowed.items())
 
 

@@ -9,6 +9,7 @@ import { fileName, save } from "./exporting.js";
 import { Handles } from "./handles.js";
 import { MeasurePanel } from "./measure_panel.js";
 import { PatientFace } from "./model.js";
+import { ExactSolver } from "./serving.js";
 import { PlanPanel } from "./plan_panel.js";
 import { NUMBERS, clinicalNumbers } from "./clinical.js";
 import { Plans, beyondLimits } from "./plans.js";
@@ -53,6 +54,7 @@ class App {
       surface: this.drawing.surface(arrays[`bone_${i}`].values, arrays[`bone_${i}_triangles`].values),
       colour: segment === null ? STILL_BONE : rgb(DISTINCT[segment % DISTINCT.length]).map((v) => 0.45 + 0.55 * v),
     }));
+    this.solver = new ExactSolver(this);
     this.build();
   }
 
@@ -116,6 +118,7 @@ class App {
     this.pending = null;
     this.settled = true;
     this.schedule("plan");
+    this.solver.ask();
   }
 
   grabbed() {
@@ -233,7 +236,11 @@ class App {
     const distance = this.face.distance(this.motions);
     const found = this.face.expectedError(this.motions);
     let warned = false;
-    if (distance <= SAME_PLAN) box.textContent = "The case's plan: this face was solved exactly.";
+    if (this.face.isExact(this.motions)) {
+      const { seconds, contact_converged: converged } = this.face.exact.figures;
+      box.textContent = `Solved exactly on this machine in ${seconds.toFixed(1)} s${converged ? "" : "; contact stopped above its tolerance"}.`;
+      warned = !converged;
+    } else if (distance <= SAME_PLAN) box.textContent = "The case's plan: this face was solved exactly.";
     else if (!slides) box.textContent = "No tissue slides in this model: the face is that of an exact solution (rounding 0.01 mm).";
     else if (!found) {
       box.textContent = `This plan is ${distance.toFixed(1)} mm from the case's own, further than any that was tried (${reach.toFixed(1)} mm): the face may be wrong. Solve it exactly.`;
@@ -243,6 +250,7 @@ class App {
       box.textContent = `Expected error of the face: ${found.mean.toFixed(2)} mm on average, ${found.largest.toFixed(2)} mm at most (an estimate from ${count} exact solutions; this plan is ${distance.toFixed(1)} mm from the case's own, where contact was solved).`;
       warned = found.largest > WARNED_ERROR;
     }
+    if (this.solver.state) box.textContent += ` ${this.solver.state}`;
     box.classList.toggle("warning", warned);
   }
 

@@ -40,12 +40,34 @@ export class PatientFace {
     this.face.carry(out, this.shift);
   }
 
-  /** The displacements of the nodes of the skin, kept until the next plan. */
+  /** The displacements of the nodes of the skin, kept until the next plan; exact where known. */
   skinShift(motions) {
+    if (this.isExact(motions)) {
+      this.shift.set(this.exact.shift);
+      return this.shift;
+    }
+    // Nodes that the operator leaves out do not move; an exact solution may have moved them.
+    if (this.exact) this.shift.fill(0);
     const numbers = planNumbers(motions, this.centres);
     for (let i = 0; i < numbers.length; i++) numbers[i] -= this.numbersOfReference[i];
     displace(this.shift, this.columns, this.active, this.referenceShift, numbers);
     return this.shift;
+  }
+
+  /** Takes an exact solution: the displacements of all nodes under the motions, mm. */
+  takeExact(motions, shift, figures) {
+    if (shift.length !== this.shift.length || !shift.every(Number.isFinite)) {
+      throw new Error("the solution does not belong to this page");
+    }
+    this.exact = { motions, shift, figures };
+  }
+
+  isExact(motions) {
+    return Boolean(this.exact) && sameMotions(this.exact.motions, motions);
+  }
+
+  isReference(motions) {
+    return sameMotions(this.reference, motions);
   }
 
   /** The places of all sites under the motions, or before them where none are given. */
@@ -123,6 +145,8 @@ export class PatientFace {
     return worst;
   }
 }
+
+const sameMotions = (a, b) => a === b || a.every((m, s) => m.every((v, i) => v === b[s][i]));
 
 /** The point that a rigid motion takes to `p`. */
 function backwards(m, p) {
