@@ -244,7 +244,8 @@ PYTHON: Mapping[str, frozenset[str]] = {
         ),
         "cli": (
             "bench build case checks clinical_plan cmfsim demo doctor errors evaluation "
-            "finding_groups insilico io meshing musculature phantom pictures planning_page "
+            "face_planning finding_groups insilico io landmark_sites meshing musculature phantom "
+            "pictures planning_page "
             "planning_server prediction replanning report scene simulation study template"
         ),
         "__main__": "cli",

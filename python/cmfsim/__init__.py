@@ -149,6 +149,7 @@ __getattr__, __dir__, __all__ = deferred(
             "write_landmarks",
             "write_metrics",
             "write_model",
+            "write_plan",
             "write_prediction",
             "write_result",
             "write_scene",

@@ -182,6 +182,17 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         help=f"exact solutions that measure the page's error (default {plan_command.TRIALS})",
     )
     plan.add_argument(
+        "--towards",
+        metavar="FILE",
+        type=Path,
+        help="find the plan whose face comes nearest to a surface, or to skin landmarks by name",
+    )
+    plan.add_argument(
+        "--keep-bite",
+        action="store_true",
+        help="with --towards: the mandible keeps its place to the maxilla, as the case plans it",
+    )
+    plan.add_argument(
         "--serve",
         action="store_true",
         help="solve plans exactly while the page is open, on this machine alone, until Ctrl-C",

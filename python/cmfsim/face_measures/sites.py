@@ -206,10 +206,17 @@ def _columella(profile: Floats, known: Mapping[str, Floats]) -> Floats:
 def _lips(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]:
     """The profile of the upper and of the lower lip, divided where it lies deepest between them."""
     part = _between(profile, known, "labiale_superius", "labiale_inferius")
-    deepest = int(np.argmax(part[:, 1]))
+    deepest = _deepest(part)
     if not 0 < deepest < len(part) - 1:
         raise LandmarkInputError("the profile shows no cleft between the lips")
     return part[: deepest + 1], part[deepest:]
+
+
+def _deepest(part: Floats) -> int:
+    """The point of a stretch that lies furthest behind, or above, the line between its ends."""
+    (dy, dz) = (part[-1] - part[0])[1:]
+    away = part - part[0]
+    return int(np.argmax(away[:, 2] * dy - away[:, 1] * dz))
 
 
 def _stomion_superius(profile: Floats, known: Mapping[str, Floats]) -> Floats:
@@ -241,10 +248,7 @@ def _lower_lip_edge(profile: Floats, known: Mapping[str, Floats]) -> Floats:
 def _sublabiale(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     """The point between lower lip and chin that lies furthest behind the line between them."""
     part = _between(profile, known, "labiale_inferius", "pogonion")
-    (dy, dz) = (part[-1] - part[0])[1:]
-    away = part - part[0]
-    behind = away[:, 2] * dy - away[:, 1] * dz
-    deepest = int(np.argmax(behind))
+    deepest = _deepest(part)
     if not 0 < deepest < len(part) - 1:
         raise LandmarkInputError("the profile has no fold between lower lip and chin")
     return np.asarray(part[deepest])
@@ -276,10 +280,7 @@ def _cervical_point(profile: Floats, known: Mapping[str, Floats]) -> Floats:
         raise LandmarkInputError(
             f"the skin is not shown {LEAST_THROAT:g} mm below menton, down the neck"
         )
-    (dy, dz) = (throat[-1] - throat[0])[1:]
-    away = throat - throat[0]
-    above = away[:, 2] * dy - away[:, 1] * dz
-    corner = int(np.argmax(above))
+    corner = _deepest(throat)
     if not 0 < corner < len(throat) - 1:
         raise LandmarkInputError("chin and neck have no angle between them")
     return np.asarray(throat[corner])

@@ -16,7 +16,7 @@ from cmfsim.osteotomy import simplified_surface
 from cmfsim.planning_page.segment_points import segment_points
 from cmfsim.planning_page.tooth_rows import tooth_rows
 from cmfsim.prediction import Prediction, carried_share
-from cmfsim.replanning import ExpectedError, PlanningModel, segment_boxes
+from cmfsim.replanning import ExpectedError, Motions, PlanningModel, segment_boxes
 from cmfsim.scene import SurfaceData
 
 __all__ = ["PageContent", "page_content"]
@@ -55,7 +55,11 @@ class PageContent:
 
 
 def page_content(
-    planning: PlanningModel, reference: Prediction, errors: ExpectedError
+    planning: PlanningModel,
+    reference: Prediction,
+    errors: ExpectedError,
+    *,
+    variants: Mapping[str, Motions] | None = None,
 ) -> PageContent:
     """What the page of a planning model holds.
 
@@ -65,6 +69,8 @@ def page_content(
     reference : Prediction
         The exact solution of its reference plan.
     errors : ExpectedError
+    variants : mapping of str to plan, optional
+        Plans by name that the page begins with, besides the reference.
 
     Returns
     -------
@@ -115,6 +121,13 @@ def page_content(
         "segments": _segments(planning),
         "bones": bones,
         **_measured(planning, sites),
+        "variants": [
+            {
+                "name": name,
+                "motions": [m.ravel().tolist() for m in planning.whole(plan).values()],
+            }
+            for name, plan in (variants or {}).items()
+        ],
         **profile,
         **teeth,
         "expected_error": errors.as_dict(),

@@ -32,7 +32,7 @@ class App {
   constructor(page, arrays) {
     this.page = page;
     this.face = new PatientFace(page, arrays);
-    this.plans = new Plans(this.face.reference);
+    this.plans = new Plans(this.face.reference, page.variants);
     this.pending = null;
     this.settled = true;
     // Milliseconds of the last face, and of its normals.
@@ -247,7 +247,9 @@ class App {
       warned = true;
     } else {
       const count = trials.filter((t) => !t.failed).length;
+      const failed = trials.length - count;
       box.textContent = `Expected error of the face: ${found.mean.toFixed(2)} mm on average, ${found.largest.toFixed(2)} mm at most (an estimate from ${count} exact solutions; this plan is ${distance.toFixed(1)} mm from the case's own, where contact was solved).`;
+      if (failed) box.textContent += ` ${failed} more could not be solved.`;
       warned = found.largest > WARNED_ERROR;
     }
     if (this.solver.state) box.textContent += ` ${this.solver.state}`;

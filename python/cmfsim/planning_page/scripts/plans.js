@@ -8,12 +8,12 @@ const MOST_STEPS = 200;
 const LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ";
 
 export class Plans {
-  /** reference: the motions of the case's own plan, in the order of the segments. */
-  constructor(reference) {
+  /** reference: the motions of the case's own plan, in the order of the segments; more variants. */
+  constructor(reference, more = []) {
     this.reference = reference.map((m) => [...m]);
     this.past = [];
     this.future = [];
-    this.now = { active: 0, variants: [{ name: "A", motions: this.reference }] };
+    this.now = { active: 0, variants: [{ name: "A", motions: this.reference }, ...more] };
   }
 
   get active() {
