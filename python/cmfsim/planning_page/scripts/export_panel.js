@@ -21,7 +21,7 @@ export class ExportPanel {
       this.command,
       element("div", { className: "row" },
         button("Save the plan", () => this.savePlan(), { id: "save-plan" }),
-        button("Copy the command", async () => app.refuse((await copied(this.command.textContent)) ? "Copied." : "Not copied: the browser does not allow it; select the text instead."))),
+        button("Copy the command", async () => app.report((await copied(this.command.textContent)) ? "Copied." : "Not copied: the browser does not allow it; select the text instead."))),
       element("h2", { textContent: "Files" }),
       element("div", { className: "row" }, element("label", { for: "plan-file", textContent: "Load a plan" }), this.file),
       element("div", { className: "row" }, element("label", { for: "direction", textContent: "Direction" }), this.direction,
@@ -63,7 +63,7 @@ export class ExportPanel {
       const { motions, warning } = planOf(this.app.page, await file.text());
       this.app.load(motions, warning);
     } catch (error) {
-      this.app.refuse(`${file.name}: ${error.message}. No plan was loaded.`);
+      this.app.report(`${file.name}: ${error.message}. No plan was loaded.`);
     }
     input.value = "";
   }

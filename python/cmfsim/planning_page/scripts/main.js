@@ -137,13 +137,13 @@ class App {
       if (why) throw new Error(`${this.page.segments[s].label}: ${why}`);
     });
     this.plans.add(motions);
-    this.refuse(warning || "Loaded as a new variant.");
+    this.report(warning || "Loaded as a new variant.");
     this.changed();
   }
 
   // What is shown -------------------------------------------------------------------------------
 
-  refuse(text) {
+  report(text) {
     const box = document.getElementById("message");
     box.textContent = text;
     clearTimeout(this.messageTimer);

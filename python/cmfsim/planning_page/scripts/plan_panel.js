@@ -10,7 +10,7 @@ const STEP = 0.1;
 const SLIDER = 15;
 
 export class PlanPanel {
-  /** app gives: page, plans, preview(motion), commit(), refuse(text), changed(). */
+  /** app gives: page, plans, preview(motion), commit(), report(text), changed(). */
   constructor(app) {
     this.app = app;
     this.segment = Math.max(0, app.page.segments.findIndex((s) => s.reference.join() !== STAYS.join()));
@@ -102,7 +102,7 @@ export class PlanPanel {
     // An empty or half-typed field is no zero.
     const value = input.value.trim() === "" ? NaN : input.valueAsNumber;
     if (!Number.isFinite(value)) {
-      this.app.refuse("Type a number; the plan is as it was.");
+      this.app.report("Type a number; the plan is as it was.");
       this.app.changed();
       return;
     }
@@ -115,7 +115,7 @@ export class PlanPanel {
     const motion = withNumber(was, this.place, this.turnsAbout, key, value);
     const why = beyondLimits(motion, was, this.place, NUMBERS);
     if (why) {
-      this.app.refuse(`${why}. ${keep ? "The plan is as it was." : ""}`);
+      this.app.report(`${why}. ${keep ? "The plan is as it was." : ""}`);
       // A field must not show what the plan does not have.
       if (keep) this.app.changed();
       return;

@@ -34,7 +34,7 @@ export class VariantPanel {
 
   rename(name) {
     const taken = this.app.plans.now.variants.some((v, i) => v.name === name && i !== this.app.plans.now.active);
-    if (!name || taken) this.app.refuse(name ? `Another variant is called ${name}.` : "A variant needs a name.");
+    if (!name || taken) this.app.report(name ? `Another variant is called ${name}.` : "A variant needs a name.");
     else this.app.plans.rename(name);
     this.app.changed();
   }
