@@ -42,6 +42,8 @@ export class PatientFace {
 
   /** The displacements of the nodes of the skin, kept until the next plan; exact where known. */
   skinShift(motions) {
+    if (this.last && sameMotions(this.last, motions)) return this.shift;
+    this.last = motions.map((m) => [...m]);
     if (this.isExact(motions)) {
       this.shift.set(this.exact.shift);
       return this.shift;
@@ -60,6 +62,7 @@ export class PatientFace {
       throw new Error("the solution does not belong to this page");
     }
     this.exact = { motions, shift, figures };
+    this.last = null;
   }
 
   isExact(motions) {
