@@ -127,7 +127,7 @@ CORE: Mapping[str, frozenset[str]] = {
         "relaxation": "blocks",
         "method": "contact kinematics",
         "reduction": "blocks boundary",
-        "solution": "",
+        "solution": "contact",
         "projected_product": "blocks constraints contact krylov mesh",
         "iterative": (
             "blocks constraints contact krylov mesh method multigrid projected_product relaxation"
@@ -171,7 +171,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "scene": "checks errors pickling planning",
         "case": "checks errors pickling scene",
         "patient": "checks errors pickling",
-        "model": "case checks musculature osteotomy pickling scene",
+        "model": "case checks errors musculature osteotomy pickling scene",
         "io": (
             "case checks errors extras landmark_sites model musculature patient planning "
             "prediction scene template_data"
@@ -183,7 +183,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "equivalent": "case checks errors musculature scene _core",
         "landmark_sites": "",
         "template_data": "case checks errors musculature pickling scene",
-        "prediction": "case checks model musculature pickling scene _core",
+        "prediction": "case checks errors model musculature pickling scene _core",
         "template": (
             "case checks errors io landmark_sites musculature phantom registration scene "
             "surface_checks surface_repair template_data _core"
@@ -197,6 +197,18 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "node_kinds": "case checks errors extras scene _core",
         "inversion": "case checks _core",
         "simulation": "case errors inversion scene _core",
+        "face_measures": ("case checks errors landmark_sites model prediction scene"),
+        "replanning": (
+            "checks errors model patient_prediction planning prediction scene simulation _core"
+        ),
+        "face_planning": (
+            "checks clinical_plan errors face_measures prediction replanning scene _core"
+        ),
+        "planning_server": "checks errors planning_page replanning",
+        "planning_page": (
+            "case checks clinical_plan errors face_measures io model node_kinds osteotomy "
+            "prediction replanning scene _core"
+        ),
         "patient_prediction": (
             "checks clinical_plan errors model planning prediction scene simulation _core"
         ),
@@ -236,14 +248,16 @@ PYTHON: Mapping[str, frozenset[str]] = {
         ),
         "cli": (
             "bench build case checks clinical_plan cmfsim demo doctor errors evaluation "
-            "finding_groups insilico io meshing musculature phantom pictures prediction report "
-            "scene simulation study template"
+            "face_planning finding_groups insilico io landmark_sites meshing musculature phantom "
+            "pictures planning_page "
+            "planning_server prediction replanning report scene simulation study template"
         ),
         "__main__": "cli",
         "__init__": (
             "achieved bench build case clinical_plan deferred doctor equivalent errors evaluation "
-            "imaging insilico io landmark_sites meshing model musculature node_kinds osteotomy "
-            "patient patient_prediction phantom planning prediction registration scene simulation "
+            "face_measures face_planning imaging insilico io landmark_sites meshing model "
+            "musculature node_kinds osteotomy patient patient_prediction phantom planning "
+            "planning_page planning_server prediction registration replanning scene simulation "
             "study surface_checks surface_repair template _core"
         ),
     }.items()

@@ -66,6 +66,7 @@ __getattr__, __dir__, __all__ = deferred(
         "clinical_plan": (
             "ClinicalMotion",
             "clinical_motion",
+            "planned_motion",
         ),
         "doctor": (
             "Examination",
@@ -103,6 +104,23 @@ __getattr__, __dir__, __all__ = deferred(
             "skin_regions",
             "wilcoxon_test",
         ),
+        "face_measures": (
+            "MEASURES",
+            "BoneSite",
+            "FaceSites",
+            "Measure",
+            "face_sites",
+            "measure_face",
+            "measure_sites",
+        ),
+        "face_planning": (
+            "FacePlan",
+            "FaceSearch",
+            "MeasureTarget",
+            "PointTarget",
+            "SurfaceTarget",
+            "plan_for_face",
+        ),
         "imaging": (
             "AlignmentOptions",
             "SegmentOptions",
@@ -131,6 +149,7 @@ __getattr__, __dir__, __all__ = deferred(
             "write_landmarks",
             "write_metrics",
             "write_model",
+            "write_plan",
             "write_prediction",
             "write_result",
             "write_scene",
@@ -199,6 +218,13 @@ __getattr__, __dir__, __all__ = deferred(
             "rigid_matrix",
             "rigid_motion",
         ),
+        "planning_page": (
+            "PageContent",
+            "page_content",
+            "page_text",
+            "write_planning_page",
+        ),
+        "planning_server": ("serve_planning",),
         "prediction": (
             "MODELS",
             "Prediction",
@@ -211,6 +237,13 @@ __getattr__, __dir__, __all__ = deferred(
             "icp",
             "leave_one_out",
             "match_landmarks",
+        ),
+        "replanning": (
+            "ExpectedError",
+            "PlanTrial",
+            "PlanningModel",
+            "expected_error",
+            "planning_model",
         ),
         "scene": (
             "MovedSurface",

@@ -39,7 +39,7 @@ from cmfsim.bench import (
 )
 from cmfsim.build import build_case, build_model, with_muscles, write_phantom_case
 from cmfsim.case import Anatomy, BoneSegment, DentalArch, Finding, ImageData, NodeKinds
-from cmfsim.clinical_plan import ClinicalMotion, clinical_motion
+from cmfsim.clinical_plan import ClinicalMotion, clinical_motion, planned_motion
 from cmfsim.doctor import Examination, diagnose, examine
 from cmfsim.equivalent import Mixture, MuscleVolume, equivalent_material
 from cmfsim.errors import (
@@ -68,6 +68,23 @@ from cmfsim.evaluation import (
     skin_regions,
     wilcoxon_test,
 )
+from cmfsim.face_measures import (
+    MEASURES,
+    BoneSite,
+    FaceSites,
+    Measure,
+    face_sites,
+    measure_face,
+    measure_sites,
+)
+from cmfsim.face_planning import (
+    FacePlan,
+    FaceSearch,
+    MeasureTarget,
+    PointTarget,
+    SurfaceTarget,
+    plan_for_face,
+)
 from cmfsim.imaging import (
     AlignmentOptions,
     SegmentOptions,
@@ -93,6 +110,7 @@ from cmfsim.io import (
     write_landmarks,
     write_metrics,
     write_model,
+    write_plan,
     write_prediction,
     write_result,
     write_scene,
@@ -145,6 +163,8 @@ from cmfsim.patient import CaseMuscles
 from cmfsim.patient_prediction import model_scene, predict_patient
 from cmfsim.phantom import HeadParameters, Muscle, PhantomHead, make_head
 from cmfsim.planning import RigidMotion, decompose_motion, rigid_matrix, rigid_motion
+from cmfsim.planning_page import PageContent, page_content, page_text, write_planning_page
+from cmfsim.planning_server import serve_planning
 from cmfsim.prediction import MODELS, Prediction
 from cmfsim.registration import (
     FoldReport,
@@ -154,6 +174,13 @@ from cmfsim.registration import (
     icp,
     leave_one_out,
     match_landmarks,
+)
+from cmfsim.replanning import (
+    ExpectedError,
+    PlanningModel,
+    PlanTrial,
+    expected_error,
+    planning_model,
 )
 from cmfsim.scene import (
     MovedSurface,
@@ -190,6 +217,7 @@ __all__ = [
     "ELEMENTS",
     "KINEMATICS",
     "LAWS",
+    "MEASURES",
     "METHODS",
     "MODELS",
     "PRESETS",
@@ -199,6 +227,7 @@ __all__ = [
     "AlignmentOptions",
     "Anatomy",
     "BoneSegment",
+    "BoneSite",
     "Boundary",
     "BoundaryError",
     "Case",
@@ -219,6 +248,10 @@ __all__ = [
     "DistanceStatistics",
     "ErrorTable",
     "Examination",
+    "ExpectedError",
+    "FacePlan",
+    "FaceSearch",
+    "FaceSites",
     "Finding",
     "FoldReport",
     "Folds",
@@ -236,6 +269,8 @@ __all__ = [
     "MassTensors",
     "MatchOptions",
     "MaterialError",
+    "Measure",
+    "MeasureTarget",
     "MeshError",
     "MeshOptions",
     "MeshQuality",
@@ -251,10 +286,14 @@ __all__ = [
     "MuscleVolume",
     "Musculature",
     "NodeKinds",
+    "PageContent",
     "PairedTest",
     "PatientModel",
     "PhantomHead",
     "PlanOperator",
+    "PlanTrial",
+    "PlanningModel",
+    "PointTarget",
     "Prediction",
     "Procedure",
     "RegistrationError",
@@ -279,6 +318,7 @@ __all__ = [
     "SurfaceData",
     "SurfaceMotion",
     "SurfaceReport",
+    "SurfaceTarget",
     "TetMesh",
     "ThinPlateSpline",
     "Tissue",
@@ -309,6 +349,8 @@ __all__ = [
     "error_table",
     "evaluate",
     "examine",
+    "expected_error",
+    "face_sites",
     "fold_report",
     "free_cut",
     "frontier",
@@ -319,14 +361,21 @@ __all__ = [
     "leave_one_out",
     "make_head",
     "match_landmarks",
+    "measure_face",
     "measure_motion",
+    "measure_sites",
     "mesh_from_labels",
     "mesh_from_level",
     "mesh_report",
     "mesh_with_tetwild",
     "model_scene",
+    "page_content",
+    "page_text",
     "part_mesh",
     "place_procedure",
+    "plan_for_face",
+    "planned_motion",
+    "planning_model",
     "predict",
     "predict_models",
     "predict_patient",
@@ -352,6 +401,7 @@ __all__ = [
     "segment_head",
     "segments_from_surfaces",
     "sensitivity",
+    "serve_planning",
     "signed_level",
     "skin_regions",
     "solve_scene",
@@ -367,6 +417,8 @@ __all__ = [
     "write_metrics",
     "write_model",
     "write_phantom_case",
+    "write_plan",
+    "write_planning_page",
     "write_prediction",
     "write_result",
     "write_scene",

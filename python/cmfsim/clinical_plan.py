@@ -20,11 +20,11 @@ from numpy.typing import ArrayLike
 
 from cmfsim._core import rigid_fit
 from cmfsim.checks import Floats
-from cmfsim.errors import RegistrationError
-from cmfsim.planning import decompose_motion
+from cmfsim.errors import BoundaryInputError, RegistrationError
+from cmfsim.planning import decompose_motion, rigid_motion
 from cmfsim.scene import MovedSurface
 
-__all__ = ["ClinicalMotion", "clinical_motion", "plan_lines"]
+__all__ = ["ClinicalMotion", "clinical_motion", "plan_lines", "planned_motion"]
 
 # Below this, mm and degrees, a motion is rounding of none.
 NOTHING = 1e-6
@@ -230,6 +230,51 @@ def clinical_motion(
         source=source,
         stays=exact,
     )
+
+
+def planned_motion(
+    point: ArrayLike,
+    *,
+    shift: ArrayLike = (0.0, 0.0, 0.0),
+    turn: ArrayLike = (0.0, 0.0, 0.0),
+) -> Floats:
+    """The rigid motion with a surgeon's numbers at a point: the inverse of `clinical_motion`.
+
+    Parameters
+    ----------
+    point : (3,) float64, mm, LPS
+        Where the shift is measured, before the motion.
+    shift : (3,) float64, mm
+        Of the point: forwards, up, to the patient's left.
+    turn : (3,) float64, degrees
+        Pitch (front up), yaw (front to the left), roll (left side up): the components of the
+        rotation vector, as `ClinicalMotion` states them.
+
+    Returns
+    -------
+    (4, 4) float64, mm
+
+    Raises
+    ------
+    BoundaryError
+        (also `ValueError`) Not three finite numbers.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> motion = cmfsim.planned_motion((0, -90, 20), shift=(5, 0.5, 0), turn=(2, 0, 0))
+    >>> cmfsim.clinical_motion("maxilla", motion, landmarks={"supradentale": (0, -90, 20)}).text
+    '5.0 mm forwards, 0.5 mm up at the upper incisors (supradentale); pitch +2.0° (front up)'
+    """
+    rows = (np.asarray(shift, dtype=np.float64), np.asarray(turn, dtype=np.float64))
+    for name, row in zip(("shift", "turn"), rows, strict=True):
+        if row.shape != (3,) or not np.isfinite(row).all():
+            raise BoundaryInputError(f"{name} is {row.tolist()}: three finite numbers are needed")
+    (forwards, up, left), (pitch, yaw, roll) = rows
+    vector = np.array([-pitch, -roll, yaw])
+    angle = float(np.linalg.norm(vector))
+    axis = vector if angle else (1.0, 0.0, 0.0)
+    return rigid_motion((left, -forwards, up), angle, axis, point)
 
 
 def plan_lines(plan: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.case import Anatomy, BoneSegment, Finding, NodeKinds
 from cmfsim.checks import Floats, Indices
+from cmfsim.errors import CaseInputError
 from cmfsim.osteotomy import surface_of_level
 from cmfsim.pickling import Frozen
-from cmfsim.scene import Scene, SurfaceData, TissueData
+from cmfsim.scene import MovedSurface, Scene, SurfaceData, TissueData
 
 if TYPE_CHECKING:
     from cmfsim.musculature import Musculature
@@ -85,6 +86,36 @@ class PatientModel(Frozen):
         nodes = self.skin_nodes
         triangles = np.searchsorted(nodes, self.skin_triangles)
         return SurfaceData(np.asarray(self.scene.nodes)[nodes], triangles)
+
+    def with_plan(self, plan: Mapping[str, ArrayLike | MovedSurface]) -> PatientModel:
+        """The patient under another plan; segments that are not named stay.
+
+        Neither mesh nor node kinds depend on how far segments move, so nothing is built again.
+
+        Parameters
+        ----------
+        plan : mapping of str to (4, 4) float64, mm, (j, 3) float64, mm, or MovedSurface
+
+        Raises
+        ------
+        CaseError
+            (also `ValueError`) A segment that the patient does not have; a misshapen motion.
+        """
+        unknown = [name for name in plan if name not in self.scene.segments]
+        if unknown:
+            known = ", ".join(self.scene.segments) or "none"
+            raise CaseInputError(f"the plan moves {unknown[0]!r}; segments are: {known}")
+        motions = {name: plan.get(name, np.eye(4)) for name in self.scene.segments}
+        # What is known of the case's own motions says nothing of these.
+        findings = tuple(f for f in self.findings if not f.code.startswith("plan-"))
+        summary = {k: v for k, v in self.summary.items() if k not in {"achieved", "plan_sources"}}
+        summary["findings"] = [
+            entry
+            for entry in summary.get("findings", ())
+            if not str(entry.get("code", "")).startswith("plan-")
+        ]
+        scene = replace(self.scene, plan=motions)
+        return replace(self, scene=scene, findings=findings, summary=summary)
 
     @cached_property
     def face(self) -> SurfaceData | None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim._core import rigid_fit
+from cmfsim._core import StaticSolver, rigid_fit
 from cmfsim.checks import check_one_of
 from cmfsim.clinical_plan import clinical_motion
 from cmfsim.errors import CaseInputError
@@ -66,7 +66,9 @@ def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
     return replace(scene, segments=joined)
 
 
-def predict_patient(patient: PatientModel, model: str = "M+S") -> Prediction:
+def predict_patient(
+    patient: PatientModel, model: str = "M+S", *, solver: StaticSolver | None = None
+) -> Prediction:
     """The face that a model predicts for a patient who is built already.
 
     Parameters
@@ -74,6 +76,9 @@ def predict_patient(patient: PatientModel, model: str = "M+S") -> Prediction:
     patient : PatientModel
     model : str
         "H", "M", "H+S" or "M+S".
+    solver : StaticSolver, optional
+        Of `model_scene(patient, model)`, whatever its plan, where one is made already: a new plan
+        then takes no factorisation.
 
     Returns
     -------
@@ -92,7 +97,7 @@ def predict_patient(patient: PatientModel, model: str = "M+S") -> Prediction:
     """
     scene = model_scene(patient, model)
     begun = time.perf_counter()
-    result = solve_scene(scene)
+    result = solve_scene(scene, solver=solver)
     timings = {**patient.summary.get("timings", {}), "solving": time.perf_counter() - begun}
     moved = np.linalg.norm(np.asarray(result.displacements)[patient.skin_nodes], axis=1)
     summary = {
@@ -110,7 +115,7 @@ def predict_patient(patient: PatientModel, model: str = "M+S") -> Prediction:
         "timings": timings,
         "left_out": _left_out(patient, scene, model),
     }
-    return Prediction(model, patient, scene, result, summary)
+    return Prediction(model, patient, scene, result, summary, predicted_by=predict_patient)
 
 
 def _case_key(patient: PatientModel, scene: Scene) -> str:

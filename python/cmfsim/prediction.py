@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim._core import Surface, SurfaceMotion
 from cmfsim.case import Finding
 from cmfsim.checks import Floats, as_rows, check_one_of
+from cmfsim.errors import CaseInputError
 from cmfsim.model import PatientModel
 from cmfsim.pickling import Frozen
 from cmfsim.scene import MovedSurface, Scene, SceneResult, SurfaceData
@@ -21,7 +22,7 @@ from cmfsim.scene import MovedSurface, Scene, SceneResult, SurfaceData
 if TYPE_CHECKING:
     from cmfsim.musculature import Musculature
 
-__all__ = ["MODELS", "Prediction", "carried_points"]
+__all__ = ["MODELS", "Prediction", "carried_points", "carried_share"]
 
 # Models of the paper (3.2): homogeneous or with muscles, without or with sliding at teeth and
 # mucosa.
@@ -48,12 +49,24 @@ def carried_points(before: SurfaceData, displacements: Floats, points: ArrayLike
     skin = Surface(before.vertices, before.triangles)
     places = as_rows("points", points, 3)
     closest, _, _ = skin.closest(places)
-    away = np.linalg.norm(closest - places, axis=1)
-    ends = skin.vertices[skin.triangles]
-    edge = float(np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).mean())
-    share = np.clip((FADED - away / edge) / (FADED - FOLLOWS), 0.0, 1.0)
+    share = carried_share(skin, np.linalg.norm(closest - places, axis=1))
     carried: Floats = share[:, None] * SurfaceMotion(skin, moved).displacement(places)
     return carried
+
+
+def carried_share(skin: Surface, away: Floats) -> Floats:
+    """The share of the skin's movement that points follow at a distance from it, (k,).
+
+    Parameters
+    ----------
+    skin : Surface
+        The mesh's skin.
+    away : (k,) float64, mm
+        Distances of the points from it.
+    """
+    ends = skin.vertices[skin.triangles]
+    edge = float(np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).mean())
+    return np.clip((FADED - away / edge) / (FADED - FOLLOWS), 0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +84,8 @@ class Prediction(Frozen):
     summary : mapping
         Counts, timings, versions, hashes, and what was left out because the scene did not need it:
         plain values, ready for JSON.
+    predicted_by : callable, optional
+        What predicts a patient's face by a model, as this prediction was made.
     """
 
     model: str
@@ -78,6 +93,7 @@ class Prediction(Frozen):
     scene: Scene
     result: SceneResult
     summary: Mapping[str, Any] = field(default_factory=dict)
+    predicted_by: Callable[[PatientModel, str], Prediction] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         check_one_of("model", self.model, MODELS)
@@ -118,6 +134,41 @@ class Prediction(Frozen):
             Before the operation: landmarks, or the vertices of any surface of the patient's skin.
         """
         return carried_points(self.skin_before, self.skin_displacements, points)
+
+    def replan(self, plan: Mapping[str, ArrayLike | MovedSurface]) -> Prediction:
+        """The prediction of the same model for the same patient under another plan, solved exactly.
+
+        The patient is not built again; the equations are set up and factorised again. For many
+        plans use `planning_model`, which keeps the factorisation.
+
+        Parameters
+        ----------
+        plan : mapping of str to (4, 4) float64, mm, (j, 3) float64, mm, or MovedSurface
+            Segments by name; those that are not named stay.
+
+        Returns
+        -------
+        Prediction
+
+        Raises
+        ------
+        CaseError
+            (also `ValueError`) A segment that the patient does not have; a prediction that was put
+            together by hand, of which nothing says how it was made.
+        BoundaryError, ContactError, SolverError
+            As `solve_scene`.
+
+        Examples
+        --------
+        >>> import cmfsim
+        >>> motion = cmfsim.rigid_motion(translation=(0, -4, 0))
+        >>> other = prediction.replan({"maxilla": motion})  # doctest: +SKIP
+        """
+        if self.predicted_by is None:
+            raise CaseInputError(
+                "this prediction does not record what made it: use predict or predict_patient"
+            )
+        return self.predicted_by(self.patient.with_plan(plan), self.model)
 
     @property
     def face_before(self) -> SurfaceData:

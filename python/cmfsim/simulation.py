@@ -102,12 +102,14 @@ def scene_plan(scene: Scene) -> dict[str, NDArray[np.float64] | SurfaceMotion]:
     return plan
 
 
-def solve_scene(scene: Scene) -> SceneResult:
+def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneResult:
     """The solution of a scene under its own plan, loads and options.
 
     Parameters
     ----------
     scene : Scene
+    solver : StaticSolver, optional
+        Of this scene, whatever its plan, where `scene_solver` has made one already.
 
     Returns
     -------
@@ -137,7 +139,7 @@ def solve_scene(scene: Scene) -> SceneResult:
     >>> float(round(result.forces[3, 2], 9))  # V E g² u = 1/6 · 1 · 1 · 0.1
     0.016666667
     """
-    solver = scene_solver(scene)
+    solver = solver or scene_solver(scene)
     solution = solver.solve(scene_plan(scene), loads=scene.loads)
     _log.info(
         "solved: residual %.2e, error %.2e mm (estimated)",

@@ -217,7 +217,7 @@ def test_what_the_solution_notices_is_a_finding_of_the_prediction(predictions, m
     noticed = cmfsim.Finding("warning", "inverted-tets", "3 of 9 tets rest inverted", "here")
     summary = {**made.result.summary, "findings": [dataclasses.asdict(noticed)]}
     result = dataclasses.replace(made.result, summary=summary)
-    monkeypatch.setattr("cmfsim.patient_prediction.solve_scene", lambda _: result)
+    monkeypatch.setattr("cmfsim.patient_prediction.solve_scene", lambda _, **__: result)
     prediction = cmfsim.predict_patient(made.patient, "H")
     assert prediction.findings == (*made.patient.findings, noticed)
     assert prediction.summary["findings"][-1] == dataclasses.asdict(noticed)

@@ -13,6 +13,7 @@ __getattr__, __dir__, __all__ = deferred(
             "case_key",
             "check_output",
             "input_hashes",
+            "plan_key",
         ),
         "muscles": ("with_muscles",),
         "phantom_case": ("write_phantom_case",),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +27,7 @@ from cmfsim.io.images import read_image_file
 from cmfsim.io.models import is_model_file
 from cmfsim.io.transforms import read_transform_file
 from cmfsim.meshing import anatomy_from_surfaces
-from cmfsim.patient import CaseMotion
+from cmfsim.patient import CaseMesh, CaseMotion
 from cmfsim.scene import MovedSurface
 from cmfsim.surface_repair import repair_surface
 
@@ -39,6 +39,7 @@ __all__ = [
     "check_output",
     "input_hashes",
     "motion_source",
+    "plan_key",
     "read_anatomy",
     "read_case_landmarks",
     "read_motion",
@@ -150,10 +151,13 @@ def input_hashes(case: Case) -> dict[str, str]:
     A file elsewhere counts by its name, the second of one name as "name (2)". The hash of a folder
     is of the files in it.
     """
-    folder = case.file.parent
+    return _hashes(_files(case), case.file.parent)
+
+
+def _hashes(paths: Iterable[Path], folder: Path) -> dict[str, str]:
     found: dict[str, str] = {}
     # In the order of their parts in the case, so that two files of one name are not exchanged.
-    for path in dict.fromkeys(_files(case)):
+    for path in dict.fromkeys(paths):
         name = key = _path_from(path, folder)
         number = 1
         while key in found:
@@ -191,6 +195,27 @@ def case_key(case: Case, hashes: Mapping[str, str] | None = None) -> str:
         },
         "version": __version__,
     }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def plan_key(case: Case) -> str:
+    """The SHA-256 of what the numbers of a plan are about: image or surfaces, landmarks and cuts.
+
+    A plan of one key means the same for every case of that key, whatever its mesh, tissue, muscles
+    or own plan.
+
+    Raises
+    ------
+    OSError
+        A file that the case names cannot be read.
+    """
+    about = replace(
+        case, plan={}, achieved=False, muscles=None, postoperative=None, mesh=CaseMesh()
+    )
+    folder = case.file.parent
+    parts = ("image", "surfaces", "landmarks", "osteotomies")
+    content = {name: _plain(getattr(about, name), folder) for name in parts}
+    content["inputs"] = _hashes((p for p in _files(about) if p != case.file), folder)
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

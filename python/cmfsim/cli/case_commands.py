@@ -3,6 +3,8 @@
 import argparse
 import dataclasses
 import json
+import logging
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -10,6 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
+from cmfsim.build import plan_key
 from cmfsim.case import SEVERITIES, Finding
 from cmfsim.checks import as_positive
 from cmfsim.cli.build_report import WIDTH, build_text
@@ -22,6 +25,10 @@ from cmfsim.doctor import Examination, examine, findings_text
 from cmfsim.io import Case
 from cmfsim.io.models import is_model_file
 from cmfsim.study.prediction import case_for_models
+
+_log = logging.getLogger(__name__)
+# What the planning page states of the case that a plan was made for.
+MADE_FOR = re.compile(r"^# made for: ([0-9a-f]{64})\s*$", re.MULTILINE)
 
 __all__ = ["build", "case_of", "checked", "doctor", "print_findings"]
 
@@ -86,11 +93,25 @@ def case_of(options: argparse.Namespace) -> Case:
         case = dataclasses.replace(
             case, mesh=dataclasses.replace(case.mesh, edge_length=edge_length)
         )
+    if getattr(options, "plan", None) is not None:
+        case = case.with_plan(options.plan)
+        _warn_of_other_state(case, options.plan)
     if options.output is not None:
         # A link that the user names is followed, and the folder it leads to is printed.
         output = options.output.resolve() if options.output.is_symlink() else options.output
         case = dataclasses.replace(case, output=output)
     return case
+
+
+def _warn_of_other_state(case: Case, path: Path) -> None:
+    """Warns of a plan that a planning page saved for another head, or for other cuts."""
+    made_for = MADE_FOR.search(path.read_text(encoding="utf-8"))
+    if made_for is not None and made_for[1] != plan_key(case):
+        _log.warning(
+            "%s: was made for another case, or for other images, landmarks or cuts of this one: "
+            "check the motions below, or make the planning page again",
+            path,
+        )
 
 
 def checked(

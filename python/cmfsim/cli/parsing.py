@@ -11,6 +11,7 @@ from cmfsim.cli import (
     case_commands,
     demo_command,
     phantom_command,
+    plan_command,
     scene_commands,
     study_commands,
     template_commands,
@@ -161,7 +162,46 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         help="H, M, H+S or M+S: homogeneous or with muscles, without or with sliding; or all; may "
         "be repeated (default M+S)",
     )
+    predict.add_argument(
+        "--plan", metavar="PLAN", type=Path, help="plan.toml of the planning page, not the case's"
+    )
     predict.set_defaults(run=study_commands.predict)
+
+    plan = commands.add_parser(
+        "plan",
+        parents=[changed],
+        help="write a page in which bones are moved and the face follows",
+        epilog="The page is one file: it needs neither a server nor a network.",
+    )
+    plan.add_argument("--model", choices=MODELS, default="M+S", help="(default M+S)")
+    plan.add_argument(
+        "--trials",
+        metavar="N",
+        type=int,
+        default=plan_command.TRIALS,
+        help=f"exact solutions that measure the page's error (default {plan_command.TRIALS})",
+    )
+    plan.add_argument(
+        "--towards",
+        metavar="FILE",
+        type=Path,
+        help="find the plan whose face comes nearest to a surface, or to skin landmarks by name",
+    )
+    plan.add_argument(
+        "--keep-bite",
+        action="store_true",
+        help="with --towards: the mandible keeps its place to the maxilla, as the case plans it",
+    )
+    plan.add_argument(
+        "--serve",
+        action="store_true",
+        help="solve plans exactly while the page is open, on this machine alone, until Ctrl-C",
+    )
+    plan.add_argument(
+        "--port", metavar="N", type=int, default=0, help="of --serve (default one that is free)"
+    )
+    plan.add_argument("--no-open", action="store_true", help="do not open the page")
+    plan.set_defaults(run=plan_command.plan)
 
     evaluate = commands.add_parser(
         "evaluate", parents=[changed], help="predict, and compare with the face after it"

@@ -8,7 +8,7 @@ import contextlib
 import json
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ from cmfsim.pictures import (
     picture_plan,
     picture_prediction,
 )
+from cmfsim.planning_page import PAGE_FILE, page_state
 from cmfsim.prediction import MODELS, Prediction
 from cmfsim.report import Figure, case_document, study_document, write_page
 from cmfsim.study import CaseEvaluation, StudyReport
@@ -270,8 +271,9 @@ def _report_of(
     order = {model: number for number, model in enumerate(MODELS)}
     entries = sorted(written.predictions, key=lambda entry: order[entry.summary["model"]])
     found = {fresh / entry.place: read_prediction(fresh / entry.place) for entry in entries}
+    links = _links(output, found)
     if evaluation is None:
-        return _write_report(fresh, _document(found, None, {}))
+        return _write_report(fresh, replace(_document(found, None, {}), links=links))
     new = "sha256" not in evaluation
     figures = {
         name: (fresh / name).read_bytes()
@@ -280,7 +282,15 @@ def _report_of(
         for name in evaluation["files"]
         if name.endswith(".png")
     }
-    return _write_report(fresh, _document(found, evaluation, figures))
+    return _write_report(fresh, replace(_document(found, evaluation, figures), links=links))
+
+
+def _links(folder: Path, found: Mapping[Path, Mapping[str, Any]]) -> dict[str, str]:
+    """The planning page of the folder, if it was made for the head and cuts of the predictions."""
+    state = page_state(folder / PAGE_FILE)
+    # Compared one by one: a file that was changed may hold anything there.
+    fits = state is not None and all(entry.get("plan_key") == state for entry in found.values())
+    return {"Planning page": PAGE_FILE} if fits else {}
 
 
 def write_case_report(folder: Path) -> str | None:
@@ -306,7 +316,8 @@ def write_case_report(folder: Path) -> str | None:
     if evaluation is not None:
         names = [name for name in evaluation["files"] if name.endswith(".png")]
         figures = {name: read_evaluation_picture(folder, evaluation, name) for name in names}
-    return _write_report(folder, _document(found, evaluation, figures, left_out))
+    document = _document(found, evaluation, figures, left_out)
+    return _write_report(folder, replace(document, links=_links(folder, found)))
 
 
 def _document(

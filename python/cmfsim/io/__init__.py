@@ -9,6 +9,7 @@ from cmfsim.io.landmarks import LandmarkFile, read_landmark_file, read_landmarks
 from cmfsim.io.meshes import read_tet_mesh
 from cmfsim.io.metrics import write_metrics
 from cmfsim.io.models import write_model
+from cmfsim.io.plans import write_plan
 from cmfsim.io.predictions import read_parts, write_prediction
 from cmfsim.io.results import read_result, result_suffixes, write_result
 from cmfsim.io.scenes import read_plan, read_scene, write_scene
@@ -40,6 +41,7 @@ __all__ = [
     "write_landmarks",
     "write_metrics",
     "write_model",
+    "write_plan",
     "write_prediction",
     "write_result",
     "write_scene",

@@ -5,7 +5,7 @@ Only the case file itself is read here. Paths that it names are resolved against
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any, TypeAlias
@@ -175,6 +175,28 @@ class Case:
             with file, line and key.
         """
         return _read(_case_file(Path(path)))
+
+    def with_plan(self, path: str | os.PathLike[str]) -> "Case":
+        """The case under the plan in another file, such as one saved by the planning page.
+
+        Parameters
+        ----------
+        path : path
+            TOML with tables `[plan.SEGMENT]`, as in a case, and nothing else. They replace the
+            case's own plan: segments that they do not name stay.
+
+        Raises
+        ------
+        FileNotFoundError
+            The file does not exist.
+        CaseError
+            (also `ValueError`) Not TOML, another table, no motion, or one that is not valid: with
+            file, line and key.
+        """
+        document = read_tables(Path(path)).only("plan")
+        if not list(document.table("plan")):
+            document.fail("plan", "has no motion: tables [plan.SEGMENT] are needed")
+        return replace(self, plan=_plan(document, Path(path).parent), achieved=False)
 
     def where(self, key: str) -> str:
         """File, line and key, as findings name a place in the case file."""

@@ -6,7 +6,12 @@ from cmfsim.osteotomy.planes import Cut, CuttingPlane, Procedure, free_cut
 from cmfsim.osteotomy.procedures import PROCEDURES, place_procedure, procedure_options
 from cmfsim.osteotomy.segment_checks import check_segments
 from cmfsim.osteotomy.sheets import ContactSheet, SheetOptions, contact_sheet, sheet_departure
-from cmfsim.osteotomy.surfaces import SurfaceOptions, contact_surface, surface_of_level
+from cmfsim.osteotomy.surfaces import (
+    SurfaceOptions,
+    contact_surface,
+    simplified_surface,
+    surface_of_level,
+)
 
 __all__ = [
     "PROCEDURES",
@@ -28,5 +33,6 @@ __all__ = [
     "procedure_options",
     "segments_from_surfaces",
     "sheet_departure",
+    "simplified_surface",
     "surface_of_level",
 ]

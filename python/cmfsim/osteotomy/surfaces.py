@@ -15,7 +15,13 @@ from cmfsim.errors import CaseInputError
 from cmfsim.extras import third_party
 from cmfsim.scene import SurfaceData
 
-__all__ = ["SurfaceOptions", "block_of", "contact_surface", "surface_of_level"]
+__all__ = [
+    "SurfaceOptions",
+    "block_of",
+    "contact_surface",
+    "simplified_surface",
+    "surface_of_level",
+]
 
 # Taubin (1995): a shrinking step and a slightly larger growing one, which keep the volume.
 SHRINK, GROW = 0.5, -0.53
@@ -227,16 +233,54 @@ def _smoothed(points: Floats, triangles: NDArray[np.int64], rounds: int) -> Floa
 def _decimated(
     name: str, points: Floats, triangles: NDArray[np.int64], wanted: int
 ) -> tuple[Floats, NDArray[np.int64]]:
+    # Quadric decimation stays within a tenth of a voxel, but here and there it folds a sheet.
+    return _closed(*_simplified(name, points, triangles, wanted))
+
+
+def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> SurfaceData:
+    """The surface with about as many triangles as wanted, open where it was (Garland 1997).
+
+    Parameters
+    ----------
+    name : str
+        For messages.
+    surface : SurfaceData
+    max_triangles : int
+        A surface that has no more is given back as it is.
+
+    Returns
+    -------
+    SurfaceData
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) fast-simplification is missing; nothing is left of the surface.
+    """
+    triangles = np.asarray(surface.triangles).astype(np.int64)
+    if len(triangles) <= max_triangles:
+        return surface
+    points, corners = _simplified(name, np.asarray(surface.vertices), triangles, max_triangles)
+    used, numbers = np.unique(corners, return_inverse=True)
+    if not len(used):
+        raise CaseInputError(f"nothing is left of {name!r} at {max_triangles} triangles")
+    return SurfaceData(points[used], numbers.reshape(corners.shape))
+
+
+def _simplified(
+    name: str, points: Floats, triangles: NDArray[np.int64], wanted: int
+) -> tuple[Floats, NDArray[np.int64]]:
     quadrics = third_party(
         "fast_simplification",
         f"the surface of {name!r} ({len(triangles)} triangles; or raise max_triangles to keep "
         f"them) is decimated to {wanted}",
         "imaging",
     )
-    # Quadric decimation stays within a tenth of a voxel, but here and there it folds a sheet.
+    # A copy: it takes no read-only array.
+    places = np.array(points, dtype=np.float64, order="C")
     with _DECIMATING.lock:
-        fewer, corners = quadrics.simplify(points, triangles.astype(np.int32), target_count=wanted)
-    return _closed(np.asarray(fewer, dtype=np.float64), np.asarray(corners, dtype=np.int64))
+        fewer, corners = quadrics.simplify(places, triangles.astype(np.int32), target_count=wanted)
+    return np.asarray(fewer, dtype=np.float64), np.asarray(corners, dtype=np.int64)
 
 
 def _closed(points: Floats, triangles: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:

@@ -108,6 +108,8 @@ class Document:
         Above everything else.
     facts_title : str
         Whose figures the facts are.
+    links : mapping of str to str
+        Names of files in the same folder that belong to it, by what they are.
     facts : mapping of str to str
         The few figures that a reader looks for first.
     sections : sequence of Section
@@ -121,3 +123,4 @@ class Document:
     footer: str = ""
     alerts: Sequence[Alert] = ()
     facts_title: str = ""
+    links: Mapping[str, str] = field(default_factory=dict)

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from cmfsim.build import Postoperative, build_model, case_key, input_hashes
+from cmfsim.build import Postoperative, build_model, case_key, input_hashes, plan_key
 from cmfsim.case import Anatomy, Finding
 from cmfsim.checks import check_one_of
 from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
@@ -185,7 +185,7 @@ def build_patient(
     case = as_case(case)
     # Before the files are read: the key must be that of what is built.
     hashes = input_hashes(case)
-    key = case_key(case, hashes)
+    key, about = case_key(case, hashes), plan_key(case)
     patient = build_model(
         case_for_models(case, models),
         progress=progress,
@@ -202,4 +202,4 @@ def build_patient(
             raise CaseInputError(
                 f"{name}: changed while the case was worked on; run it again once nothing writes it"
             )
-    return replace(patient, summary={**patient.summary, "inputs_key": key})
+    return replace(patient, summary={**patient.summary, "inputs_key": key, "plan_key": about})

@@ -1,0 +1,190 @@
+"""`cmfsim plan`: the planning page of a case."""
+
+import argparse
+import json
+import os
+import sys
+import time
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cmfsim.cli.case_commands import case_of, checked
+from cmfsim.cli.exit_codes import DONE
+from cmfsim.cli.notices import Notices
+from cmfsim.cli.preparation import prepare
+from cmfsim.cli.terminal import StageProgress, escaped
+from cmfsim.cli.wished_faces import TARGET_STD, read_targets
+from cmfsim.errors import CaseInputError
+from cmfsim.face_planning import FacePlan, FaceSearch, plan_for_face
+from cmfsim.io import Case, write_plan
+from cmfsim.pictures import has_screen
+from cmfsim.planning_page import PAGE_FILE, PageContent, page_content, write_planning_page
+from cmfsim.planning_server import check_serving, serve_planning
+from cmfsim.replanning import ExpectedError, PlanningModel, expected_error, planning_model
+from cmfsim.study.prediction import build_patient
+
+__all__ = ["TRIALS", "plan"]
+
+# What the plan of a wished face is called, and the file that it is saved as.
+TOWARDS, PLAN_FILE = "Towards", "towards.toml"
+# Plans that are solved exactly to measure the error of the page.
+TRIALS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """What the command has computed."""
+
+    planning: PlanningModel
+    content: PageContent
+    errors: ExpectedError
+    found: FacePlan | None
+
+
+def plan(options: argparse.Namespace) -> int:
+    """Builds a case and writes its planning page."""
+    case = case_of(options)
+    prepare(case, {PAGE_FILE, PLAN_FILE}.__contains__)
+    if options.serve:
+        check_serving()
+    begun = time.perf_counter()
+    notices = Notices(quiet=options.quiet)
+    made = _made(options, case, notices)
+    case.output.mkdir(parents=True, exist_ok=True)
+    path = case.output / PAGE_FILE
+    size = write_planning_page(path, made.content, case_file=case.file.name)
+    if made.found is not None:
+        made_for = str(made.planning.patient.summary.get("plan_key", ""))
+        write_plan(case.output / PLAN_FILE, made.found.plan, made_for=made_for)
+    seconds = time.perf_counter() - begun
+    if options.serve:
+        _serve(options, made, case.file.name)
+        return DONE
+    if options.json:
+        answer = {
+            "case": case.name,
+            "page": str(path),
+            "bytes": size,
+            "seconds": seconds,
+            "expected_error": made.errors.as_dict(),
+            "towards": None if made.found is None else _towards_values(made.found),
+            "findings": notices.as_dicts(),
+        }
+        print(json.dumps(answer, allow_nan=False))
+        return DONE
+    print(f"page   {escaped(str(path))} ({size / 1e6:.1f} MB)")
+    print(f"error  {_error_text(made.errors)}")
+    if made.found is not None:
+        print(_towards_text(made.found, case.output / PLAN_FILE))
+    print(f"time   {seconds:.0f} s")
+    notices.summarise(str(path))
+    if not options.no_open and sys.stdout.isatty() and not os.environ.get("CI") and has_screen():
+        webbrowser.open(path.resolve().as_uri())
+    return DONE
+
+
+def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
+    """Everything that the page is written from."""
+    # Before any work: a file that is none would be found a minute later.
+    targets = None if options.towards is None else read_targets(options.towards)
+    models = (options.model,)
+    findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        patient = build_patient(
+            case,
+            models,
+            progress=progress.stage,
+            check=False,
+            findings=findings,
+            on_findings=notices.add,
+        )
+        progress.stage("computing the plan operator")
+        planning = planning_model(patient, options.model)
+        progress.stage("solving the case's plan")
+        reference = planning.solve(planning.reference)
+        errors = expected_error(planning, trials=options.trials, progress=progress.stage)
+        found = None
+        if targets is not None:
+            progress.stage("searching the plan of the face")
+            found = plan_for_face(planning, targets(planning), _search(options, planning))
+        progress.stage("making the page")
+        wished = {} if found is None else {TOWARDS: found.plan}
+        content = page_content(planning, reference, errors, variants=wished)
+    notices.add(content.findings)
+    return _Made(planning, content, errors, found)
+
+
+def _serve(options: argparse.Namespace, made: _Made, case_file: str) -> None:
+    """Serves the page until it is interrupted; its address is printed first."""
+
+    def started(url: str) -> None:
+        if options.json:
+            print(json.dumps({"url": url}), flush=True)
+        else:
+            print(f"page   {url}\nOn this machine alone; Ctrl-C ends it.", flush=True)
+        if not options.no_open and has_screen() and sys.stdout.isatty():
+            webbrowser.open(url)
+
+    serve_planning(
+        made.planning, made.content, case_file=case_file, port=options.port, on_start=started
+    )
+
+
+def _error_text(errors: ExpectedError) -> str:
+    """What exact solutions say about the page, in a line."""
+    if not errors.slides:
+        return "none: no tissue slides, and the page is exact for every plan"
+    solved = [trial for trial in errors.trials if not trial.failed]
+    failed = len(errors.trials) - len(solved)
+    if not solved:
+        return f"not measured: none of {failed} plans nearby could be solved"
+    mean = max(trial.mean or 0.0 for trial in solved)
+    largest = max(trial.largest or 0.0 for trial in solved)
+    text = (
+        f"at most {mean:.3f} mm on average and {largest:.2f} mm anywhere, at {len(solved)} plans "
+        f"up to {errors.reach:.1f} mm from the case's own"
+    )
+    return f"{text}; {failed} could not be solved" if failed else text
+
+
+def _search(options: argparse.Namespace, planning: PlanningModel) -> FaceSearch:
+    """How the plan of a wished face is searched for."""
+    if not options.keep_bite:
+        return FaceSearch()
+    upper = next((n for n in ("maxilla", "midface") if n in planning.segments), None)
+    lower = next((n for n in ("mandible_body", "mandible") if n in planning.segments), None)
+    if upper is None or lower is None:
+        raise CaseInputError(
+            "--keep-bite needs a maxilla and a mandible that move; segments are: "
+            + ", ".join(planning.segments)
+        )
+    return FaceSearch(follows={lower: upper})
+
+
+def _towards_values(found: FacePlan) -> dict[str, Any]:
+    return {
+        "plan": {name: motion.as_dict() for name, motion in found.motions.items()},
+        "std": {name: row.tolist() for name, row in found.std.items()},
+        "undetermined": list(found.undetermined),
+        "at_bounds": list(found.at_bounds),
+        "rms": [float(np.sqrt((row**2).mean())) for row in found.exact_residuals],
+        "converged": found.converged,
+    }
+
+
+def _towards_text(found: FacePlan, path: Path) -> str:
+    """The plan that was found, what it leaves of the wish, and what the wish leaves open."""
+    lines = [f"wish   {name}: {motion.text}" for name, motion in found.motions.items()]
+    rms = [float(np.sqrt((row**2).mean())) for row in found.exact_residuals]
+    lines.append(f"       solved exactly, it is off by {TARGET_STD * max(rms):.2f} mm RMS")
+    if found.at_bounds:
+        lines.append(f"       at its bound: {', '.join(found.at_bounds)}")
+    if found.undetermined:
+        lines.append(f"       the wish leaves open: {', '.join(found.undetermined)}")
+    if not found.converged:
+        lines.append("       the search did not converge: take it as a first guess")
+    return "\n".join(escaped(line) for line in [*lines, f"       saved as {path}"])

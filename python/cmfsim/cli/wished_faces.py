@@ -1,0 +1,53 @@
+"""Wished faces in files: a surface, or skin landmarks with the places where they should be."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from cmfsim.errors import CaseInputError, LandmarkInputError
+from cmfsim.face_planning import PointTarget, SurfaceTarget, Target
+from cmfsim.io import read_landmarks, read_surface
+from cmfsim.landmark_sites import label_key
+from cmfsim.replanning import PlanningModel
+
+__all__ = ["TARGET_STD", "read_targets"]
+
+SURFACES = (".stl", ".ply", ".obj", ".vtp")
+LANDMARKS = (".json", ".fcsv")
+# How much a point of the face may be off what is wished, mm.
+TARGET_STD = 0.5
+
+
+def read_targets(path: Path) -> Callable[[PlanningModel], list[Target]]:
+    """What gives the targets in a file, once the patient is built.
+
+    Raises
+    ------
+    FileNotFoundError
+        The file does not exist.
+    CaseError, LandmarkError
+        (also `ValueError`) Another ending; a file that is not what its ending says.
+    """
+    ending = path.suffix.lower()
+    if ending in SURFACES:
+        wished = read_surface(path)
+        return lambda _: [SurfaceTarget(wished, std=TARGET_STD)]
+    if ending not in LANDMARKS:
+        known = ", ".join((*SURFACES, ".mrk.json", ".fcsv"))
+        raise CaseInputError(f"{path.name}: a wished face ends in {known}")
+    goals = {label_key(name): place for name, place in read_landmarks(path).items()}
+
+    def targets(planning: PlanningModel) -> list[Target]:
+        own = planning.patient.landmarks.get("skin", {})
+        both = [name for name in own if label_key(name) in goals]
+        if not both:
+            raise LandmarkInputError(
+                f"{path.name}: has no landmark of the case's skin, which are: "
+                f"{', '.join(own) or 'none'}"
+            )
+        places = np.array([own[name] for name in both])
+        there = np.array([goals[label_key(name)] for name in both])
+        return [PointTarget(places, there, std=TARGET_STD)]
+
+    return targets

@@ -1,0 +1,46 @@
+// Elements of the document. Texts go in as text, never as markup.
+
+/** An element with properties, `data-` and `aria-` attributes, listeners (`on…`) and children. */
+export function element(tag, properties = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(properties)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (/^(aria|data)-|^(role|for|scope|colspan)$/.test(name)) made.setAttribute(name, value);
+    else made[name] = value;
+  }
+  made.append(...children.filter((c) => c !== null && c !== undefined));
+  return made;
+}
+
+export const button = (text, onclick, more = {}) =>
+  element("button", { type: "button", textContent: text, onclick, ...more });
+
+/** A table of texts: heads, and rows whose first cell is their head. */
+export function table(caption, heads, rows) {
+  return element("div", { className: "wide" }, element("table", {},
+    element("caption", { textContent: caption }),
+    element("thead", {}, element("tr", {}, ...heads.map((h) => element("th", { scope: "col", textContent: h })))),
+    element("tbody", {}, ...rows.map((row) => element("tr", {}, ...row.map((cell, i) =>
+      element(i ? "td" : "th", i ? { textContent: cell } : { scope: "row", textContent: cell }))))),
+  ));
+}
+
+/** A number with its sign, such as "+1.2" or "−0.3"; "0.0" has none. */
+export function signed(value, digits = 1) {
+  const text = Math.abs(value).toFixed(digits);
+  if (Number(text) === 0) return text;
+  return (value < 0 ? "−" : "+") + text;
+}
+
+/** A number as people read it. */
+export const shown = (value, digits = 1) => (value < 0 && Number(value.toFixed(digits)) !== 0 ? "−" : "") + Math.abs(value).toFixed(digits);
+
+/** The kind of text that a copy button needs; says whether it worked. */
+export async function copied(text) {
+  try {
+    await navigator.clipboard.writeText(text);
+    return true;
+  } catch {
+    return false;
+  }
+}

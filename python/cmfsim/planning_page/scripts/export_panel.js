@@ -1,0 +1,70 @@
+// What leaves the page: the plan, its transforms, the face, a picture; and a plan that comes back.
+
+import { button, copied, element } from "./elements.js";
+import { fileName, planOf, planText, save, stlBytes, transformText } from "./exporting.js";
+
+// A plan of a hundred segments has some 30 kB.
+const MOST_BYTES = 1_000_000;
+
+export class ExportPanel {
+  constructor(app) {
+    this.app = app;
+    const { page } = app;
+    this.direction = element("select", { id: "direction" },
+      element("option", { value: "from-parent", textContent: "from-parent: as 3D Slicer saves and shows it" }),
+      element("option", { value: "to-parent", textContent: "to-parent: the motion of the bone itself" }));
+    this.file = element("input", { type: "file", accept: ".toml", id: "plan-file", onchange: (e) => this.load(e.target) });
+    this.command = element("code", { id: "command" });
+    this.root = element("div", {},
+      element("h2", { textContent: "Solve exactly" }),
+      element("p", { className: "note", textContent: page.exact_note }),
+      this.command,
+      element("div", { className: "row" },
+        button("Save the plan", () => this.savePlan(), { id: "save-plan" }),
+        button("Copy the command", async () => app.report((await copied(this.command.textContent)) ? "Copied." : "Not copied: the browser does not allow it; select the text instead."))),
+      element("h2", { textContent: "Files" }),
+      element("div", { className: "row" }, element("label", { for: "plan-file", textContent: "Load a plan" }), this.file),
+      element("div", { className: "row" }, element("label", { for: "direction", textContent: "Direction" }), this.direction,
+        button("Save the segment's transform (.tfm)", () => this.saveTransform(), { id: "save-transform" })),
+      element("div", { className: "row" },
+        button("Save the face (STL)", () => this.saveFace(), { id: "save-face" }),
+        button("Save a picture (PNG)", () => app.savePicture(), { id: "save-picture" })),
+      element("p", { className: "note", textContent: "Coordinates are LPS in mm. The face is that of the plan operator, not solved exactly." }));
+  }
+
+  get stem() {
+    return `${fileName(this.app.page.case)}-${fileName(this.app.plans.active.name)}`;
+  }
+
+  show() {
+    this.command.textContent = `cmfsim predict ${this.app.page.case_file} --plan ${this.stem}.toml --model ${this.app.page.model}`;
+  }
+
+  savePlan() {
+    save(`${this.stem}.toml`, planText(this.app.page, this.app.plans.active), "text/plain");
+  }
+
+  saveTransform() {
+    const { page, panel, plans } = this.app;
+    const direction = this.direction.value;
+    const name = `${this.stem}-${fileName(page.segments[panel.segment].name)}.${direction}.tfm`;
+    save(name, transformText(plans.active.motions[panel.segment], direction), "text/plain");
+  }
+
+  saveFace() {
+    save(`${this.stem}.stl`, stlBytes(this.app.after, this.app.face.triangles), "model/stl");
+  }
+
+  async load(input) {
+    const file = input.files[0];
+    if (!file) return;
+    try {
+      if (file.size > MOST_BYTES) throw new Error(`it has ${file.size} bytes: no plan is so large`);
+      const { motions, warning } = planOf(this.app.page, await file.text());
+      this.app.load(motions, warning);
+    } catch (error) {
+      this.app.report(`${file.name}: ${error.message}. No plan was loaded.`);
+    }
+    input.value = "";
+  }
+}

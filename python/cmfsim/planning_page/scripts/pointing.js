@@ -1,0 +1,94 @@
+// Mouse, pen, touch and keys over the picture: handles first, else the camera.
+
+const TURN_PER_PIXEL = 0.4;
+const KEY_TURN = 5;
+const KEY_ZOOM = 1.1;
+
+/** Connects the overlay with the app; `reset` forgets fingers that were lifted elsewhere. */
+export function connectPointing(app) {
+  const { overlay, camera, handles } = app;
+  const down = new Map();
+  const place = (e) => {
+    const box = overlay.getBoundingClientRect();
+    return [e.clientX - box.left, e.clientY - box.top];
+  };
+  overlay.addEventListener("pointerdown", (e) => {
+    overlay.focus({ preventScroll: true });
+    overlay.setPointerCapture(e.pointerId);
+    down.set(e.pointerId, place(e));
+    const shape = down.size === 1 && e.button === 0 && !e.shiftKey ? handles.at(...place(e)) : null;
+    if (shape) {
+      handles.grab(shape, ...place(e));
+      app.grabbed();
+    } else if (handles.held) {
+      // A second finger: the first one no longer pulls.
+      handles.release();
+      app.commit();
+    }
+  });
+  overlay.addEventListener("pointermove", (e) => {
+    if (!down.has(e.pointerId)) {
+      overlay.style.cursor = handles.at(...place(e)) ? "grab" : "default";
+      return;
+    }
+    const [x, y] = place(e);
+    if (handles.held) {
+      app.pull(handles.held.key, handles.pulled(x, y));
+      return;
+    }
+    const [ox, oy] = down.get(e.pointerId);
+    const height = overlay.clientHeight;
+    if (down.size === 2) {
+      const [other] = [...down.entries()].filter(([id]) => id !== e.pointerId).map(([, p]) => p);
+      camera.zoom(Math.hypot(ox - other[0], oy - other[1]) / Math.max(1, Math.hypot(x - other[0], y - other[1])));
+      camera.pan((x - ox) / height / 2, -(y - oy) / height / 2);
+    } else if (e.buttons === 2 || e.buttons === 4 || e.shiftKey) {
+      camera.pan((x - ox) / height, -(y - oy) / height);
+    } else {
+      camera.turn(-TURN_PER_PIXEL * (x - ox), TURN_PER_PIXEL * (y - oy));
+    }
+    down.set(e.pointerId, [x, y]);
+    app.redraw();
+  });
+  const lifted = (e) => {
+    down.delete(e.pointerId);
+    if (handles.held && !down.size) {
+      handles.release();
+      app.commit();
+    }
+  };
+  overlay.addEventListener("pointerup", lifted);
+  overlay.addEventListener("pointercancel", lifted);
+  overlay.addEventListener("contextmenu", (e) => e.preventDefault());
+  overlay.addEventListener("wheel", (e) => {
+    e.preventDefault();
+    camera.zoom(Math.exp(e.deltaY / 800));
+    app.redraw();
+  }, { passive: false });
+}
+
+export function connectKeys(app) {
+  const { overlay, camera } = app;
+  overlay.addEventListener("keydown", (e) => {
+    if (e.ctrlKey || e.metaKey || e.altKey) return;
+    const actions = {
+      ArrowLeft: () => camera.turn(-KEY_TURN, 0), ArrowRight: () => camera.turn(KEY_TURN, 0),
+      ArrowUp: () => camera.turn(0, KEY_TURN), ArrowDown: () => camera.turn(0, -KEY_TURN),
+      "+": () => camera.zoom(1 / KEY_ZOOM), "-": () => camera.zoom(KEY_ZOOM), 0: () => camera.recentre(),
+    };
+    for (let i = 1; i <= 6; i++) actions[i] = () => app.view.look(i - 1);
+    if (!Object.hasOwn(actions, e.key)) return;
+    actions[e.key]();
+    e.preventDefault();
+    app.redraw();
+  });
+  document.addEventListener("keydown", (e) => {
+    // Texts have an undo of their own.
+    if (!(e.ctrlKey || e.metaKey) || e.target.type === "text") return;
+    const key = e.key.toLowerCase();
+    if (key === "z" && !e.shiftKey) app.undo();
+    else if (key === "y" || key === "z") app.redo();
+    else return;
+    e.preventDefault();
+  });
+}
