@@ -29,15 +29,26 @@ export function planNumbers(motions, centres) {
  */
 export function displace(out, columns, active, reference, difference) {
   const width = difference.length;
-  const numbers = Float32Array.from(difference);
-  let at = 0;
+  // Segments that stand where the reference has them add nothing.
+  const moved = [];
+  for (let s = 0; s < width; s += 12) {
+    if (difference.subarray(s, s + 12).some((v) => v !== 0)) moved.push(s);
+  }
   for (let i = 0; i < active.length; i++) {
-    const node = 3 * active[i];
     for (let axis = 0; axis < 3; axis++) {
-      let sum = reference[3 * i + axis];
-      for (let k = 0; k < width; k++) sum += columns[at + k] * numbers[k];
-      at += width;
-      out[node + axis] = sum;
+      const row = width * (3 * i + axis);
+      // Four sums, so that one need not wait for the other.
+      let a = reference[3 * i + axis], b = 0, c = 0, d = 0;
+      for (let m = 0; m < moved.length; m++) {
+        const s = moved[m], at = row + s;
+        for (let k = 0; k < 12; k += 4) {
+          a += columns[at + k] * difference[s + k];
+          b += columns[at + k + 1] * difference[s + k + 1];
+          c += columns[at + k + 2] * difference[s + k + 2];
+          d += columns[at + k + 3] * difference[s + k + 3];
+        }
+      }
+      out[3 * active[i] + axis] = a + b + c + d;
     }
   }
 }
