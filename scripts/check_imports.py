@@ -133,8 +133,9 @@ CORE: Mapping[str, frozenset[str]] = {
             "blocks constraints contact krylov mesh method multigrid projected_product relaxation"
         ),
         "reaction": "cholesky contact mesh",
+        "frozen": "cholesky contact mesh reaction",
         "system": (
-            "blocks boundary cholesky constraints contact iterative mesh method reaction "
+            "blocks boundary cholesky constraints contact frozen iterative mesh method reaction "
             "restraint row_sums solution"
         ),
         "equilibrium": (

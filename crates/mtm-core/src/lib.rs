@@ -62,6 +62,7 @@ pub mod equivalent;
 pub mod error;
 mod error_estimate;
 pub mod fibre;
+mod frozen;
 mod iterative;
 mod keys;
 pub mod kinematics;

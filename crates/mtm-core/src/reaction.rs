@@ -140,27 +140,18 @@ impl ContactFactor {
             doubt: 0.0,
             enough: 0.0,
             work,
-            frozen: None,
             made: None,
             last: Vec::new(),
             carried: None,
         }
     }
 
-    /// What answers for conditions that stay the same for several right-hand sides, where the flexibility is
-    /// written down.
-    pub fn frozen(&self, rows: &[ContactRow], springs: &[Spring]) -> Result<Option<NormalFactor>> {
-        let Flexibility::Dense(tail) = &self.flexibility else { return Ok(None) };
-        let offsets = vec![0.0; rows.len()];
-        let c = Constraints {
-            rows,
-            offsets: &offsets,
-            springs,
-            about: &[],
-            share: 0.0,
-            reach: f64::INFINITY,
-        };
-        Rows::new(&c).factor(tail).map(Some)
+    /// The whole flexibility of the sliding nodes, where it is written down.
+    pub fn tail(&self) -> Option<&TailFlexibility> {
+        match &self.flexibility {
+            Flexibility::Dense(tail) => Some(tail),
+            Flexibility::Sweeps { .. } => None,
+        }
     }
 }
 
@@ -184,8 +175,6 @@ pub(crate) struct Answers<'a> {
     enough: f64,
     /// Zeros for the sweeps.
     work: Vec<f64>,
-    /// The factor for conditions that stay the same.
-    frozen: Option<&'a NormalFactor>,
     /// The factor made last in this plan, once the one at rest did not serve.
     made: Option<NormalFactor>,
     /// Rows of the last answer, ascending, with their forces.
@@ -294,11 +283,7 @@ impl<'a> Answers<'a> {
             }
         }
         if c.reach.is_infinite() && (krylov.softness > 0.0 || krylov.left > share * size) {
-            return Err(MtmError::NotPositiveDefinite {
-                node: 0,
-                detail: "contact forces carry sliding nodes on by more than the tissue holds"
-                    .into(),
-            });
+            return Err(unheld());
         }
         // Answers add up: from there the last one is near.
         let mut sum = base.clone();
@@ -332,9 +317,9 @@ impl<'a> Answers<'a> {
         self.carried = Some(Carried { loads, moved });
     }
 
-    /// The same answers by a factor for their conditions.
-    pub fn frozen(self, frozen: Option<&'a NormalFactor>) -> Self {
-        Self { frozen, ..self }
+    /// Displacements of the sliding nodes without contact, mm.
+    pub fn free(&self) -> &[[f64; 3]] {
+        &self.free
     }
 
     /// Displacements without the forces of the rows, mm.
@@ -364,7 +349,7 @@ impl<'a> Answers<'a> {
     /// Contact forces along `rows`, and what they add to the displacements: as near as `aim` says, or to `exact`
     /// of all.
     fn forces(&mut self, rows: &Rows, aim: Aim, exact: f64) -> Result<NormalForces> {
-        let kept = self.made.as_ref().or(self.frozen).unwrap_or(&self.contact.rest);
+        let kept = self.made.as_ref().unwrap_or(&self.contact.rest);
         let preconditioner = Preconditioner::new(self.diagonal(rows), &rows.keys, kept);
         let before = |key: &RowKey| {
             self.last.binary_search_by(|(k, _)| k.cmp(key)).map_or(0.0, |at| self.last[at].1)
@@ -520,17 +505,17 @@ impl Pose {
 
 /// Constraint rows, and after them one for each spring: a spring of stiffness k adds a column along its
 /// axis, with 1/k on the diagonal.
-struct Rows {
-    rows: Vec<ContactRow>,
+pub(crate) struct Rows {
+    pub rows: Vec<ContactRow>,
     /// Displacement that each row asks for, mm.
     goals: Vec<f64>,
     /// What is added to the diagonal, mm/N.
-    softness: Vec<f64>,
-    keys: Vec<RowKey>,
+    pub softness: Vec<f64>,
+    pub keys: Vec<RowKey>,
 }
 
 impl Rows {
-    fn new(c: &Constraints<'_>) -> Self {
+    pub fn new(c: &Constraints<'_>) -> Self {
         let (mut rows, mut goals) = (c.rows.to_vec(), c.offsets.to_vec());
         let mut softness = vec![0.0; rows.len()];
         for spring in c.springs.iter().filter(|s| s.stiffness > 0.0) {
@@ -549,7 +534,7 @@ impl Rows {
     }
 
     /// What contact forces have to add to displacements `free`, mm.
-    fn missing(&self, free: &[[f64; 3]]) -> Vec<f64> {
+    pub fn missing(&self, free: &[[f64; 3]]) -> Vec<f64> {
         self.rows.iter().zip(&self.goals).map(|(r, g)| g - dot(r.normal, free[r.node])).collect()
     }
 
@@ -683,8 +668,16 @@ fn length(v: &[f64]) -> f64 {
     v.iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
+/// That contact forces carry nodes on by more than the body holds.
+pub(crate) fn unheld() -> MtmError {
+    MtmError::NotPositiveDefinite {
+        node: 0,
+        detail: "contact forces carry sliding nodes on by more than the tissue holds".into(),
+    }
+}
+
 /// That the flexibility has no positive pivot at a row of the system.
-fn singular(row: u32) -> MtmError {
+pub(crate) fn singular(row: u32) -> MtmError {
     MtmError::NotPositiveDefinite {
         node: row as usize,
         detail: "the flexibility of the sliding nodes is singular".into(),

@@ -9,6 +9,7 @@ use crate::contact::{
     Body, Constraints, ContactRow, ContactStart, ContactState, Response, Sliding, Spring,
 };
 use crate::error::{MtmError, Result};
+use crate::frozen::FrozenContact;
 use crate::iterative::{Advance, Effort, Extremes, Iterative, Trail};
 use crate::mesh::{add, between, dot, norm, scaled, sub};
 use crate::method::{Interrupt, Method, StaticOptions};
@@ -249,12 +250,16 @@ impl System {
             })
         };
         if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
-            let kept = contact.frozen(frozen.rows, frozen.springs)?;
+            let kept = contact.tail().map(|t| FrozenContact::new(t, frozen.rows, frozen.springs));
+            let kept = kept.transpose()?;
             let solve = |(k, b): (usize, &Rows)| {
                 conditions(k, &mut |c| {
-                    let mut answers = contact.answers(symbolic, factor, b).frozen(kept.as_ref());
-                    let found = answers.respond(c, 0.0)?;
-                    Ok(answers.of_all(&found.forces))
+                    let mut answers = contact.answers(symbolic, factor, b);
+                    let forces = match &kept {
+                        Some(kept) => kept.forces(answers.free(), c),
+                        None => answers.respond(c, 0.0)?.forces,
+                    };
+                    Ok(answers.of_all(&forces))
                 })
             };
             return columns.iter().enumerate().map(solve).collect();
