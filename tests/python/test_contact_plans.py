@@ -29,6 +29,11 @@ def scene(model):
 
 
 @pytest.fixture(scope="module")
+def solver(scene):
+    return cmfsim.scene_solver(scene)
+
+
+@pytest.fixture(scope="module")
 def plans(model):
     return contact_plans.draw(model, 8, REACH, 2.0, 5)
 
@@ -44,9 +49,8 @@ def test_random_plans_converge_in_few_steps(scene, plans):
     assert max(tally.gaps) <= scene.options.contact_tolerance
 
 
-def test_the_face_is_a_continuous_function_of_the_plan(model, scene, plans):
+def test_the_face_is_a_continuous_function_of_the_plan(model, solver, plans):
     """0.01 mm more motion moves no point of the skin by more than 0.05 mm."""
-    solver = cmfsim.scene_solver(scene)
     skin = model.skin_nodes
     for plan in plans[:4]:
         name = next(n for n, m in plan.items() if not np.allclose(m, np.eye(4)))
@@ -55,9 +59,8 @@ def test_the_face_is_a_continuous_function_of_the_plan(model, scene, plans):
         assert np.linalg.norm(there - here, axis=1).max() <= 0.05
 
 
-def test_a_solve_may_begin_at_another_plan(scene, plans):
+def test_a_solve_may_begin_at_another_plan(scene, solver, plans):
     """Fewer steps, the same end; a solution of another solver is refused."""
-    solver = cmfsim.scene_solver(scene)
     name = next(n for n, m in plans[0].items() if not np.allclose(m, np.eye(4)))
     near = {**plans[0], name: cmfsim.rigid_motion((0.3, -0.2, 0.1)) @ plans[0][name]}
     start = solver.solve(near)
@@ -94,18 +97,17 @@ def seen_in_mirror(motion):
     return mirror @ motion @ mirror
 
 
-def test_a_mirrored_head_has_the_mirrored_face(scene, plans):
-    here, there = (cmfsim.scene_solver(s) for s in (scene, mirrored(scene)))
+def test_a_mirrored_head_has_the_mirrored_face(scene, solver, plans):
+    there = cmfsim.scene_solver(mirrored(scene))
     for plan in plans[:2]:
-        face = here.solve(plan)
+        face = solver.solve(plan)
         seen = there.solve({name: seen_in_mirror(m) for name, m in plan.items()})
         apart = np.linalg.norm(seen.displacements * [-1, 1, 1] - face.displacements, axis=1)
         assert apart.max() <= 1e-6, (face.contact_iterations, seen.contact_iterations)
 
 
-def test_the_operator_about_a_plan_is_near_the_solution_beside_it(model, scene, plans):
+def test_the_operator_about_a_plan_is_near_the_solution_beside_it(model, solver, plans):
     """A millimetre from its reference it is off by hundredths."""
-    solver = cmfsim.scene_solver(scene)
     plan = plans[0]
     operator = solver.plan_operator(nodes=model.skin_nodes, plan=plan)
     name = next(n for n, m in plan.items() if not np.allclose(m, np.eye(4)))
