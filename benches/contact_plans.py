@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import cmfsim
-from marked import replace_marked
+from marked import publish
 
 Floats = NDArray[np.float64]
 Plan = dict[str, Floats]
@@ -215,10 +215,7 @@ def main(words: Sequence[str] | None = None) -> int:
         f"\n\nPlans of up to {options.distance:g} mm and {options.angle:g}°, seed {options.seed}; "
         f"{platform.machine()}, {os.cpu_count()} cores, cmfsim {cmfsim.__version__}.\n"
     )
-    if options.fill:
-        replace_marked(options.fill, "contact_plans", text)
-    else:
-        print(text)
+    publish(options.fill, "contact_plans", text)
     return 1 if any(tally.failures for tally in tallies) else 0
 
 

@@ -26,6 +26,14 @@ def replace_marked(page: Path, name: str, text: str) -> None:
     page.write_text(f"{before}{begin}\n\n{text.strip()}\n\n{end}{after}", encoding="utf-8")
 
 
+def publish(page: Path | None, name: str, text: str) -> None:
+    """Prints a table, or puts it into a page."""
+    if page is None:
+        print(text)
+    else:
+        replace_marked(page, name, text)
+
+
 def marked(page: Path, name: str) -> str:
     """The text between the comments that begin and end `name` in a page."""
     _, _, rest = page.read_text(encoding="utf-8").partition(BEGIN.format(name))

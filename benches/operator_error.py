@@ -17,7 +17,7 @@ import numpy as np
 
 import cmfsim
 from cmfsim.study.prediction import build_patient
-from marked import replace_marked
+from marked import publish
 
 HEAD = (
     "| head | model | tets | skin nodes | segments | operator, s | plans | exact, s each "
@@ -56,7 +56,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--plans", type=int, default=8, help="of each head and model")
     parser.add_argument("--models", nargs="+", default=["M", "M+S"])
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--fill", type=Path, help="page whose table is written anew")
+    parser.add_argument("--fill", type=Path, help="page whose table is rewritten")
     options = parser.parse_args(words)
     rows = []
     for path in options.cases:
@@ -70,10 +70,7 @@ def main(words: Sequence[str] | None = None) -> int:
         f"RAYON_NUM_THREADS={os.environ.get('RAYON_NUM_THREADS', 'unset')}, "
         f"cmfsim {cmfsim.__version__}.\n"
     )
-    if options.fill:
-        replace_marked(options.fill, "operator_error", text)
-    else:
-        print(text)
+    publish(options.fill, "operator_error", text)
     return 0
 
 
