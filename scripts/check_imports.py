@@ -78,7 +78,7 @@ CORE: Mapping[str, frozenset[str]] = {
         "boundary": "surface motion mesh",
         "restraint": "mesh",
         "contact/field": "keys mesh surface",
-        "contact": "boundary mesh surface contact/field",
+        "contact": "boundary mesh motion surface contact/field",
         "contact/seat": "boundary contact mesh motion surface contact/field",
         "contact/newton": "boundary contact mesh triangle contact/seat",
         "constraints": "blocks mesh",
@@ -205,7 +205,7 @@ PYTHON: Mapping[str, frozenset[str]] = {
         "face_planning": (
             "checks clinical_plan errors face_measures prediction replanning scene _core"
         ),
-        "planning_server": "checks errors planning_page replanning",
+        "planning_server": "checks errors extras planning_page replanning",
         "planning_page": (
             "case checks clinical_plan errors face_measures io model node_kinds osteotomy "
             "prediction replanning scene _core"

@@ -8,7 +8,7 @@ use std::sync::OnceLock;
 
 use crate::blocks::BlockMatrix;
 use crate::constraints::{Constraint, projected};
-use crate::contact::{LEFT_SHARE, Sliding, Spring, way_along};
+use crate::contact::{Sliding, Spring};
 use crate::error::{MtmError, Result, Shortfall};
 use crate::krylov::{
     Operator, PcgOptions, Preconditioner, Reached, Spectrum, Trial, pcg_near, trial,
@@ -39,6 +39,10 @@ const TRIAL_SAFETY: f64 = 10.0;
 /// Multiple of the estimate by which an iteration stops that is reported: in `benches/error_estimate.rs` one in
 /// some thousand was up to 2.2 times too small.
 const REPORT_SAFETY: f64 = 4.0;
+
+/// Share of what the body holds along a direction that springs may take off: of those that take more, some are
+/// left out of a step.
+const LEFT_SHARE: f64 = 0.5;
 
 /// Whether estimates for tissue of such `contrast` need a trial.
 pub(crate) fn is_doubtful(contrast: f64) -> bool {
@@ -534,6 +538,15 @@ fn carry_on(
         }
     }
     is_carried
+}
+
+/// How far to go along a direction of an energy with `slope` and `curvature` at its start: to the minimum, or
+/// by `most` downhill where there is none.
+fn way_along(slope: f64, curvature: f64, most: f64) -> f64 {
+    if curvature > 0.0 {
+        return (-slope / curvature).clamp(-most, most);
+    }
+    if slope > 0.0 { -most } else { most }
 }
 
 /// Whether nothing pulls: any iteration would only divide by it.

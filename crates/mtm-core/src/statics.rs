@@ -352,9 +352,6 @@ impl StaticSolver {
         effort: &mut Effort,
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, Option<ContactState>, f64)> {
-        let row_of = |start: &Solution| -> Vec<[f64; 3]> {
-            self.reduction.unknowns.iter().map(|&j| start.displacements[j as usize]).collect()
-        };
         let found = match (&self.mechanics, &self.sliding) {
             (Mechanics::LargeRotation(body), sliding) => {
                 let slide =
@@ -365,7 +362,8 @@ impl StaticSolver {
                 system.solve(b, scale, effort, interrupted).map(|u| (u, None, 0.0))
             }
             (Mechanics::Linear(system), Some(sliding)) => {
-                let rows = start.map_or_else(Vec::new, row_of);
+                let rows =
+                    start.map_or_else(Vec::new, |start| self.reduction.rows(&start.displacements));
                 let rest = start.and_then(|start| start.contact.at_rest.as_ref());
                 let contact = rest.and_then(|rest| sliding.carried(motions, rest));
                 let found = system.solve_with_contact(

@@ -11,6 +11,7 @@ mod seat;
 use crate::boundary::{Boundary, Gap, Motion};
 use crate::error::{MtmError, Result};
 use crate::mesh::{TetMesh, add, dot, norm, scaled, sub};
+use crate::motion::RigidMotion;
 use crate::surface::{Closest, Surface};
 use field::Field;
 
@@ -22,10 +23,6 @@ const FACING_ROUNDING: f64 = 1e-12;
 /// Lattice spacing of a contact field over the mean edge of the tissue at it: what is sharper, the tissue's
 /// nodes cannot follow.
 const LATTICE_SHARE: f64 = 0.5;
-
-/// Share of what a body holds along a direction that springs may take off: of those that take more, some are
-/// left out of a step.
-pub(crate) const LEFT_SHARE: f64 = 0.5;
 
 /// Whether nodes may lift off.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -314,23 +311,29 @@ impl Sliding {
         motions: &[&Motion],
         state: &ContactState,
     ) -> Option<ContactStart> {
-        let (mut places, mut reactions) = (Vec::new(), Vec::new());
-        for (i, node) in self.nodes.iter().enumerate() {
-            let Motion::Rigid(rigid) = motions[node.segment] else { return None };
-            places.push(rigid.apply_inverse(add(self.positions[i], state.displacements[i])));
-            reactions.push(rigid.rotate_inverse(state.reactions[i]));
-        }
-        Some(ContactStart { places, reactions })
+        self.moved(motions, &self.start_of(state), |rigid, place, force| {
+            (rigid.apply_inverse(place), rigid.rotate_inverse(force))
+        })
     }
 
     /// What was carried back, carried with the segments under other `motions`; none where a segment is deformed.
     pub(crate) fn carried(&self, motions: &[&Motion], rest: &ContactStart) -> Option<ContactStart> {
-        let (mut places, mut reactions) = (Vec::new(), Vec::new());
-        for (i, node) in self.nodes.iter().enumerate() {
-            let Motion::Rigid(rigid) = motions[node.segment] else { return None };
-            places.push(rigid.apply(rest.places[i]));
-            reactions.push(rigid.rotate(rest.reactions[i]));
-        }
+        self.moved(motions, rest, |rigid, place, force| (rigid.apply(place), rigid.rotate(force)))
+    }
+
+    /// Each place and reaction as `way` takes it by the motion of its segment; none where one is not rigid.
+    fn moved(
+        &self,
+        motions: &[&Motion],
+        start: &ContactStart,
+        way: impl Fn(&RigidMotion, [f64; 3], [f64; 3]) -> ([f64; 3], [f64; 3]),
+    ) -> Option<ContactStart> {
+        let each = self.nodes.iter().zip(start.places.iter().zip(&start.reactions));
+        let moved = each.map(|(node, (&place, &force))| match motions[node.segment] {
+            Motion::Rigid(rigid) => Some(way(rigid, place, force)),
+            _ => None,
+        });
+        let (places, reactions) = moved.collect::<Option<Vec<_>>>()?.into_iter().unzip();
         Some(ContactStart { places, reactions })
     }
 
@@ -355,15 +358,6 @@ impl Sliding {
         let moved = clinging.iter().zip(&self.positions).map(|(c, x)| norm(sub(*c, *x)));
         moved.fold(0.0, f64::max)
     }
-}
-
-/// How far to go along a direction of an energy with `slope` and `curvature` at its start: to the minimum, or
-/// by `most` downhill where there is none.
-pub(crate) fn way_along(slope: f64, curvature: f64, most: f64) -> f64 {
-    if curvature > 0.0 {
-        return (-slope / curvature).clamp(-most, most);
-    }
-    if slope > 0.0 { -most } else { most }
 }
 
 /// A point of the lattice of a contact field, and its spacing, mm.
