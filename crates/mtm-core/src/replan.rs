@@ -165,6 +165,11 @@ impl PlanOperator {
         &self.segments
     }
 
+    /// Point of each segment that its columns are taken about, mm.
+    pub fn centres(&self) -> &[[f64; 3]] {
+        &self.centres
+    }
+
     /// The twelve columns of each segment, (3k, 12·segments) row by row.
     pub fn matrix(&self) -> &[f64] {
         self.rows.as_flattened()

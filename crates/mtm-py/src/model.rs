@@ -688,6 +688,12 @@ impl PyPlanOperator {
         self.core.segments().to_vec()
     }
 
+    /// Point of each segment that its columns are taken about, (segments, 3) float64, mm.
+    #[getter]
+    fn centres<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+        arrays::rows(py, self.core.centres().to_vec())
+    }
+
     /// The columns, (3k, 12 * segments) float64: R - I row by row, then the shift of the centre.
     #[getter]
     fn matrix<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {

@@ -7,12 +7,12 @@ import secrets
 import socket
 import time
 from collections.abc import Callable
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.errors import CmfsimError
+from cmfsim.extras import third_party
 from cmfsim.planning_page import PageContent, page_text
 from cmfsim.planning_server.requests import (
     MOST_BYTES,
@@ -236,10 +236,4 @@ def check_serving() -> None:
 
 
 def _module(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise CaseInputError(
-            f"{name.partition('.')[0]} serves planning pages, and cannot be imported "
-            f"({error}): pip install 'cmfsim[serve]'"
-        ) from error
+    return third_party(name, "planning pages are served", "serve")

@@ -1,8 +1,8 @@
 """The columns of a plan operator with the centres that they are taken about.
 
 The displacement of the operator's nodes is u(q) = u₀ + Σ_s A_s q_s, with twelve numbers of each
-segment: q_s = (R − I row by row, t + (R − I) c_s) for the motion x ↦ R x + t. The core gives A;
-c_s and u₀ follow from what it answers to chosen plans.
+segment: q_s = (R − I row by row, t + (R − I) c_s) for the motion x ↦ R x + t. The core gives A and
+c_s; u₀ is its answer to the plan in which nothing moves.
 """
 
 from collections.abc import Mapping
@@ -80,21 +80,7 @@ def plan_columns(operator: PlanOperator) -> PlanColumns:
     rest = {name: np.eye(4) for name in names}
     offset = operator(rest)
     matrix = np.asarray(operator.matrix).reshape(len(offset), 3, -1)
-    centres = np.zeros((len(names), 3))
-    for number, name in enumerate(names):
-        turning = matrix[..., COLUMNS * number : COLUMNS * number + 9]
-        shifting = matrix[..., COLUMNS * number + 9 : COLUMNS * (number + 1)]
-        # A turn about the origin has the shift (R − I) c: three quarter turns determine c.
-        normal, right = np.zeros((3, 3)), np.zeros(3)
-        for axis in np.eye(3):
-            motion = rigid_motion(angle=90.0, axis=axis)
-            turn = motion[:3, :3] - np.eye(3)
-            left = np.asarray(operator({**rest, name: motion})) - offset - turning @ turn.ravel()
-            along = (shifting @ turn).reshape(-1, 3)
-            normal += along.T @ along
-            right += along.T @ left.ravel()
-        # A segment that moves no node has columns of zeros, and any centre will do.
-        centres[number] = np.linalg.lstsq(normal, right, rcond=None)[0]
+    centres = np.asarray(operator.centres)
     columns = PlanColumns(names, frozen(centres), frozen(matrix), frozen(np.asarray(offset)))
     _check(columns, operator)
     return columns
