@@ -5,16 +5,16 @@
 #![allow(missing_docs)] // criterion's macros make public items without any
 
 #[global_allocator]
-static MEMORY: mtm_core::memory::HugePages = mtm_core::memory::HugePages;
+static MEMORY: mtm_core::algebra::memory::HugePages = mtm_core::algebra::memory::HugePages;
 
 use std::hint::black_box;
 use std::sync::Arc;
 use std::time::Instant;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use mtm_core::equivalent::{InsideTest, Muscle, SamplingOptions, sample_muscles};
-use mtm_core::fibre::{MuscleFibres, OrientedBox};
-use mtm_core::winding::WindingTree;
+use mtm_core::geometry::winding::WindingTree;
+use mtm_core::muscles::equivalent::{InsideTest, Muscle, SamplingOptions, sample_muscles};
+use mtm_core::muscles::fibre::{MuscleFibres, OrientedBox};
 use mtm_core::{Mixing, Preset, Surface, TetMesh};
 
 /// Cubes along the axes of the block of tets, of edge 3 mm: 300 000 tets.

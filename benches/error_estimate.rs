@@ -17,7 +17,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use mtm_core::error::MtmError;
-use mtm_core::method::Method;
+use mtm_core::statics::options::Method;
 use rayon::prelude::*;
 
 use random_scenes::{Scene, farthest, largest, refusal};

@@ -10,7 +10,7 @@
 #![allow(missing_docs)]
 
 #[global_allocator]
-static MEMORY: mtm_core::memory::HugePages = mtm_core::memory::HugePages;
+static MEMORY: mtm_core::algebra::memory::HugePages = mtm_core::algebra::memory::HugePages;
 
 #[path = "scene.rs"]
 mod scene;
@@ -21,11 +21,11 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use mtm_core::MassTensors;
-use mtm_core::blocks::BlockMatrix;
-use mtm_core::cholesky::Symbolic;
-use mtm_core::krylov::Preconditioner;
-use mtm_core::multigrid::{Multigrid, MultigridOptions};
-use mtm_core::tensors::tet_tensor;
+use mtm_core::algebra::blocks::BlockMatrix;
+use mtm_core::algebra::cholesky::Symbolic;
+use mtm_core::algebra::krylov::Preconditioner;
+use mtm_core::algebra::multigrid::{Multigrid, MultigridOptions};
+use mtm_core::mechanics::tensors::tet_tensor;
 use rayon::prelude::*;
 use shell::Shell;
 

@@ -1,17 +1,17 @@
 //! Random scenes with stiff and soft tissue mixed, and their solutions to 32 digits: what the error
-//! estimates are measured against. Shared by `benches/error_estimate.rs` and `tests/rust/error_estimate.rs`,
+//! estimates are measured against. Shared by `benches/error_estimate.rs` and `tests/rust/statics/error_estimate.rs`,
 //! whose crates hold the module `meshes`.
 
 use std::sync::Arc;
 
 use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, NodeKind, Plan, Segment};
-use mtm_core::element::Element;
 use mtm_core::error::{MtmError, Result};
-use mtm_core::material::{Elastic, FibreElastic, FibreLaw, Tissue};
-use mtm_core::method::{Method, StaticOptions};
-use mtm_core::motion::RigidMotion;
-use mtm_core::statics::StaticSolver;
-use mtm_core::tensors::MassTensors;
+use mtm_core::geometry::motion::RigidMotion;
+use mtm_core::mechanics::element::Element;
+use mtm_core::mechanics::material::{Elastic, FibreElastic, FibreLaw, Tissue};
+use mtm_core::mechanics::tensors::MassTensors;
+use mtm_core::statics::options::{Method, StaticOptions};
+use mtm_core::statics::solver::StaticSolver;
 
 use crate::meshes::{BoxShape, GO_ON, Numbers, checked, plane, rigid, surface};
 
@@ -104,7 +104,7 @@ impl Scene {
     }
 
     /// What `method` makes of the scene.
-    pub fn solve(&self, method: Method) -> Result<mtm_core::solution::Solution> {
+    pub fn solve(&self, method: Method) -> Result<mtm_core::statics::solution::Solution> {
         let options =
             StaticOptions { method, tolerance: self.tolerance, ..StaticOptions::default() };
         let solver =
@@ -518,7 +518,7 @@ struct BandFactor {
 }
 
 impl BandFactor {
-    fn new(matrix: &mtm_core::blocks::BlockMatrix, free: &[[bool; 3]]) -> Option<Self> {
+    fn new(matrix: &mtm_core::algebra::blocks::BlockMatrix, free: &[[bool; 3]]) -> Option<Self> {
         let mut number = vec![[usize::MAX; 3]; free.len()];
         let mut unknowns = Vec::new();
         for (j, free) in free.iter().enumerate() {

@@ -5,7 +5,7 @@
 #![allow(missing_docs)] // criterion's macros make public items without any
 
 #[global_allocator]
-static MEMORY: mtm_core::memory::HugePages = mtm_core::memory::HugePages;
+static MEMORY: mtm_core::algebra::memory::HugePages = mtm_core::algebra::memory::HugePages;
 
 use std::hint::black_box;
 

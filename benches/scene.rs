@@ -4,7 +4,7 @@
 
 use std::sync::Arc;
 
-use mtm_core::blocks::BlockMatrix;
+use mtm_core::algebra::blocks::BlockMatrix;
 use mtm_core::{
     Boundary, Conflicts, FibreElastic, FibreLaw, Gap, MassTensors, Motion, Plan, RigidMotion,
     Segment, Surface, TetMesh, Tissue,

@@ -10,14 +10,14 @@ use std::sync::Arc;
 use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, Plan, Segment};
 use mtm_core::contact::{ContactMode, ContactOptions};
 use mtm_core::error::MtmError;
-use mtm_core::material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
+use mtm_core::geometry::motion::{RigidMotion, SurfaceMotion};
+use mtm_core::geometry::surface::Surface;
+use mtm_core::geometry::winding::WindingTree;
+use mtm_core::mechanics::material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
+use mtm_core::mechanics::tensors::MassTensors;
 use mtm_core::mesh::TetMesh;
-use mtm_core::method::{Method, StaticOptions};
-use mtm_core::motion::{RigidMotion, SurfaceMotion};
-use mtm_core::statics::StaticSolver;
-use mtm_core::surface::Surface;
-use mtm_core::tensors::MassTensors;
-use mtm_core::winding::WindingTree;
+use mtm_core::statics::options::{Method, StaticOptions};
+use mtm_core::statics::solver::StaticSolver;
 
 /// Most iterations of a method: an input that converges slowly is an error, not a hang.
 const ITERATIONS: usize = 400;

@@ -155,10 +155,10 @@ CORE: Mapping[str, frozenset[str]] = {
 }
 # The one place, below crates/, that may name each outside crate.
 CRATES: Mapping[str, str] = {
-    "parry3d_f64": "mtm-core/src/surface.rs",
-    "faer": "mtm-core/src/cholesky/",
-    "pulp": "mtm-core/src/simd.rs",
-    "libc": "mtm-core/src/memory.rs",
+    "parry3d_f64": "mtm-core/src/geometry/surface.rs",
+    "faer": "mtm-core/src/algebra/cholesky/",
+    "pulp": "mtm-core/src/algebra/simd.rs",
+    "libc": "mtm-core/src/algebra/memory.rs",
     "pyo3": "mtm-py/",
     "numpy": "mtm-py/",
 }

@@ -13,14 +13,14 @@ use meshes::{
 use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, Segment};
 use mtm_core::contact::ContactOptions;
 use mtm_core::error::{ErrorKind, MtmError, Result};
-use mtm_core::material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
+use mtm_core::geometry::motion::{RigidMotion, SurfaceMotion};
+use mtm_core::geometry::surface::Surface;
+use mtm_core::geometry::winding::{WindingOptions, WindingTree};
+use mtm_core::mechanics::material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
+use mtm_core::mechanics::tensors::MassTensors;
 use mtm_core::mesh::TetMesh;
-use mtm_core::method::{Method, StaticOptions};
-use mtm_core::motion::{RigidMotion, SurfaceMotion};
-use mtm_core::statics::StaticSolver;
-use mtm_core::surface::Surface;
-use mtm_core::tensors::MassTensors;
-use mtm_core::winding::{WindingOptions, WindingTree};
+use mtm_core::statics::options::{Method, StaticOptions};
+use mtm_core::statics::solver::StaticSolver;
 
 const BAD: [f64; 3] = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY];
 

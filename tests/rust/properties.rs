@@ -12,12 +12,12 @@ use meshes::{
     plan, rigid, solve, solver, tensors, with_method,
 };
 use mtm_core::boundary::{Boundary, Motion};
-use mtm_core::material::{Elastic, FibreElastic, FibreLaw, Spencer, Tissue};
+use mtm_core::geometry::motion::RigidMotion;
+use mtm_core::geometry::surface::Surface;
+use mtm_core::mechanics::material::{Elastic, FibreElastic, FibreLaw, Spencer, Tissue};
+use mtm_core::mechanics::tensors::MassTensors;
 use mtm_core::mesh::TetMesh;
-use mtm_core::method::Method;
-use mtm_core::motion::RigidMotion;
-use mtm_core::surface::Surface;
-use mtm_core::tensors::MassTensors;
+use mtm_core::statics::options::Method;
 use nalgebra::Matrix3;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;

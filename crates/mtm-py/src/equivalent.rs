@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use mtm_core::equivalent::{
+use mtm_core::error::ErrorKind;
+use mtm_core::mechanics::material::{Mixing, Preset};
+use mtm_core::muscles::equivalent::{
     InsideTest, MOST_SAMPLES, Muscle, MuscleShares, SamplingOptions, Share, sample_muscles,
 };
-use mtm_core::error::ErrorKind;
-use mtm_core::material::{Mixing, Preset};
 use numpy::{IntoPyArray, PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;

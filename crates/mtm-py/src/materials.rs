@@ -2,13 +2,13 @@
 
 use std::sync::Arc;
 
-use mtm_core::blocks::BlockMatrix;
-use mtm_core::element::Element;
+use mtm_core::algebra::blocks::BlockMatrix;
 use mtm_core::error::{ErrorKind, MtmError};
-use mtm_core::kinematics::Kinematics;
-use mtm_core::material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
-use mtm_core::strain_energy::{StrainEnergy, TangentKind};
-use mtm_core::tensors::{EdgeTensors, MassTensors};
+use mtm_core::mechanics::element::Element;
+use mtm_core::mechanics::kinematics::Kinematics;
+use mtm_core::mechanics::material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
+use mtm_core::mechanics::strain_energy::{StrainEnergy, TangentKind};
+use mtm_core::mechanics::tensors::{EdgeTensors, MassTensors};
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;

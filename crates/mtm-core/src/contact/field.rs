@@ -15,9 +15,9 @@ use std::sync::{Arc, RwLock, RwLockReadGuard};
 
 use rayon::prelude::*;
 
-use crate::keys::KeyHasher;
+use crate::geometry::lattice_hash::KeyHasher;
+use crate::geometry::surface::Surface;
 use crate::mesh::{add, dot, scaled, sub};
-use crate::surface::Surface;
 
 /// Distance relative to the lattice spacing below which the way to the surface has no direction.
 const ON_SURFACE: f64 = 1e-9;

@@ -10,9 +10,9 @@ mod seat;
 
 use crate::boundary::{Boundary, Gap, Motion};
 use crate::error::{MtmError, Result};
+use crate::geometry::motion::RigidMotion;
+use crate::geometry::surface::{Closest, Surface};
 use crate::mesh::{TetMesh, add, dot, norm, scaled, sub};
-use crate::motion::RigidMotion;
-use crate::surface::{Closest, Surface};
 use field::Field;
 
 /// Share of sliding nodes that may face away from the contact surface before it counts as inverted.

@@ -20,8 +20,8 @@ use crate::contact::{
     Response, Sliding, Spring,
 };
 use crate::error::{ErrorKind, MtmError, Result};
+use crate::geometry::triangle::Vec3;
 use crate::mesh::{add, between, dot, norm, scaled, sub};
-use crate::triangle::Vec3;
 
 /// Most nodes an error names.
 const NAMED_NODES: usize = 10;

@@ -1,0 +1,341 @@
+//! Sparse Cholesky factorisation of the block system, and the dense factorisations of sliding contact.
+//! The only folder that names faer.
+
+mod dense;
+#[cfg(test)]
+mod grid;
+mod normal;
+mod numeric;
+mod reach;
+mod structure;
+mod sweep;
+mod symmetric;
+mod workspace;
+
+use faer::dyn_stack::{MemBuffer, MemStack};
+use faer::sparse::linalg::cholesky::supernodal;
+use faer::{Conj, MatMut};
+
+pub use dense::TailFlexibility;
+pub use normal::{
+    Begun, Moved, NormalFactor, NormalForces, Precision, Preconditioner, Progress, ROUGH, RowKey,
+    Wanted, conjugate_gradients, hopeless,
+};
+pub use reach::Reach;
+use structure::{minimum_degree, supernodal_structure};
+use sweep::Sweep;
+pub use symmetric::{DenseFactor, DenseSymmetric};
+use workspace::{out_of_memory, parallelism};
+
+use crate::algebra::blocks::BlockMatrix;
+use crate::algebra::ordering::{NodeGraph, elimination_tree, nested_dissection, postorder};
+use crate::error::{MtmError, Result};
+
+/// Relative error of a known solution above which the system counts as singular to working precision.
+const TRIAL_ERROR: f64 = 1e-5;
+/// Which rows are eliminated last, so that their Schur complement is the end of the factor.
+pub type Tail<'a> = &'a [u32];
+
+/// Elimination order and structure of the factor: depends on the pattern alone.
+pub struct Symbolic {
+    /// Row of the system at each position.
+    order: Vec<u32>,
+    /// Number of rows kept last.
+    n_tail: usize,
+    structure: supernodal::SymbolicSupernodalCholesky<usize>,
+    tree: numeric::Tree,
+}
+
+/// L of P A Pᵀ = L Lᵀ.
+pub struct Factor {
+    values: Vec<f64>,
+    /// Relative error with which a known solution came back.
+    trial_error: f64,
+}
+
+impl Factor {
+    /// Relative error, in the largest component, with which the factor recovered a known solution: an
+    /// estimate of the digits that the condition of the system leaves.
+    pub fn trial_error(&self) -> f64 {
+        self.trial_error
+    }
+}
+
+impl Symbolic {
+    /// The structure of the factor of `matrix`, with the rows `tail` eliminated last.
+    ///
+    /// The order is nested dissection on the node graph (METIS, or approximate minimum degree without
+    /// it), postordered along the elimination tree, expanded to the three unknowns of each node.
+    pub fn new(matrix: &BlockMatrix, tail: Tail<'_>) -> Result<Self> {
+        let n = matrix.n_rows();
+        let mut in_tail = vec![false; n];
+        for &j in tail {
+            in_tail[j as usize] = true;
+        }
+        let (graph, rows) = NodeGraph::of_rows(matrix, |j| !in_tail[j]);
+        let inner = match nested_dissection(&graph)? {
+            Some(order) => order,
+            None => minimum_degree(&graph)?,
+        };
+        let mut order: Vec<u32> = inner.iter().map(|&i| rows[i as usize]).collect();
+        order.extend_from_slice(tail);
+
+        // Postorder the rows before the tail; a row whose parent lies in the tail is a root there.
+        let n_inner = n - tail.len();
+        let mut parents = elimination_tree(matrix, &order);
+        parents.truncate(n_inner);
+        for parent in &mut parents {
+            if *parent >= n_inner {
+                *parent = usize::MAX;
+            }
+        }
+        let inner: Vec<u32> = postorder(&parents).iter().map(|&p| order[p as usize]).collect();
+        order[..n_inner].copy_from_slice(&inner);
+
+        let structure = supernodal_structure(matrix, &order)?;
+        let tree = numeric::Tree::new(&structure, 3 * n_inner);
+        Ok(Self { order, n_tail: tail.len(), structure, tree })
+    }
+
+    /// Bytes that a factor takes.
+    pub fn factor_bytes(&self) -> usize {
+        8 * self.structure.len_val()
+    }
+
+    /// The factor of `matrix`, which must have the pattern this structure was made for.
+    ///
+    /// # Errors
+    /// `NotPositiveDefinite` where a pivot is not positive or a known solution is not recovered.
+    pub fn factor(&self, matrix: &BlockMatrix) -> Result<Factor> {
+        let bytes = self.factor_bytes();
+        // Asked for first, so that too little memory is an error and not an abort; then taken zeroed
+        // from the system, which touches each page once.
+        Vec::<f64>::new()
+            .try_reserve_exact(self.structure.len_val())
+            .map_err(|_| out_of_memory("the Cholesky factor", bytes))?;
+        let mut values = vec![0.0; self.structure.len_val()];
+        numeric::factor(&self.structure, &self.tree, matrix, &self.order, &mut values).map_err(
+            |index| MtmError::NotPositiveDefinite {
+                node: self.order[index / 3] as usize,
+                detail:
+                    "a pivot of the factorisation is not positive; a part of the body may be a \
+                         mechanism, or the material contrast too large for f64"
+                        .into(),
+            },
+        )?;
+        self.tried(matrix, Factor { values, trial_error: 0.0 })
+    }
+
+    /// `factor` after it recovered a known solution.
+    ///
+    /// The residual of a solve does not tell its error; a solution that is known does, at the price of
+    /// one product and one solve per factor.
+    fn tried(&self, matrix: &BlockMatrix, factor: Factor) -> Result<Factor> {
+        let known: Vec<[f64; 3]> = (0..self.order.len())
+            .map(|j| [0, 1, 2].map(|i| 1.0 + 0.5 * ((3 * j + i) as f64 * 0.7).sin()))
+            .collect();
+        let found = self.solve(&factor, &matrix.multiply(&known));
+        let trial_error = known
+            .iter()
+            .zip(&found)
+            .flat_map(|(a, b)| (0..3).map(move |i| (a[i] - b[i]).abs()))
+            .fold(0.0_f64, |m, e| if e.is_nan() { f64::INFINITY } else { m.max(e) });
+        if trial_error <= TRIAL_ERROR {
+            return Ok(Factor { trial_error, ..factor });
+        }
+        let (worst, at) = self.smallest_pivot(matrix, &factor);
+        Err(MtmError::NotPositiveDefinite {
+            node: at,
+            detail: format!(
+                "the smallest pivot keeps {worst:.1e} of its diagonal and a known solution comes back \
+                 with relative error {trial_error:.1e}; a part of the body is almost a mechanism, or \
+                 the material contrast is too large for f64"
+            ),
+        })
+    }
+
+    /// Smallest share of its diagonal entry that a pivot keeps, and its row.
+    fn smallest_pivot(&self, matrix: &BlockMatrix, factor: &Factor) -> (f64, usize) {
+        let l = supernodal::SupernodalLltRef::new(&self.structure, &factor.values);
+        let (mut worst, mut at) = (f64::INFINITY, 0);
+        for s in 0..self.structure.n_supernodes() {
+            let node = l.supernode(s);
+            let (first, val) = (node.start(), node.val());
+            for i in 0..val.ncols() {
+                let row = self.order[(first + i) / 3] as usize;
+                let diagonal = matrix.diagonal_block(row)[4 * ((first + i) % 3)];
+                let pivot = val[(i, i)] * val[(i, i)] / diagonal;
+                if pivot.is_nan() || pivot < worst {
+                    (worst, at) = (if pivot.is_nan() { 0.0 } else { pivot }, row);
+                }
+            }
+        }
+        (worst, at)
+    }
+
+    /// A⁻¹ b.
+    pub fn solve(&self, factor: &Factor, b: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let mut x = self.permuted(b);
+        self.forward(factor, &mut x);
+        self.backward(factor, &mut x);
+        self.unpermuted(&x)
+    }
+
+    /// A⁻¹ B for several right-hand sides, each given as rows of three, in place.
+    pub fn solve_many(&self, factor: &Factor, columns: &mut [Vec<[f64; 3]>]) {
+        if self.order.is_empty() {
+            return;
+        }
+        let mut x: Vec<f64> = columns.iter().flat_map(|b| self.permuted(b)).collect();
+        let (n, k) = (3 * self.order.len(), columns.len());
+        let par = parallelism(n);
+        let mut memory = MemBuffer::new(self.structure.solve_in_place_scratch::<f64>(k, par));
+        supernodal::SupernodalLltRef::new(&self.structure, &factor.values)
+            .solve_in_place_with_conj(
+                Conj::No,
+                MatMut::from_column_major_slice_mut(&mut x, n, k),
+                par,
+                MemStack::new(&mut memory),
+            );
+        for (column, x) in columns.iter_mut().zip(x.chunks_exact(3 * self.order.len())) {
+            *column = self.unpermuted(x);
+        }
+    }
+
+    /// `b` in elimination order.
+    pub fn permuted(&self, b: &[[f64; 3]]) -> Vec<f64> {
+        self.order.iter().flat_map(|&j| b[j as usize]).collect()
+    }
+
+    /// `x` back in the order of the system.
+    pub fn unpermuted(&self, x: &[f64]) -> Vec<[f64; 3]> {
+        let mut out = vec![[0.0; 3]; self.order.len()];
+        for (&j, v) in self.order.iter().zip(x.chunks_exact(3)) {
+            out[j as usize] = [v[0], v[1], v[2]];
+        }
+        out
+    }
+
+    /// x ← L⁻¹ x in elimination order.
+    pub fn forward(&self, factor: &Factor, x: &mut [f64]) {
+        self.sweep(factor).forward(x);
+    }
+
+    /// x ← L⁻ᵀ x in elimination order.
+    pub fn backward(&self, factor: &Factor, x: &mut [f64]) {
+        self.sweep(factor).backward(x);
+    }
+
+    fn sweep<'a>(&'a self, factor: &'a Factor) -> Sweep<'a> {
+        Sweep::new((&self.structure, &factor.values), &self.tree)
+    }
+
+    /// Forces on the tail rows that `b` is to them once all others are eliminated, and what is left of the
+    /// elimination for [`Self::above_tail`].
+    pub fn on_tail(&self, factor: &Factor, b: &[[f64; 3]]) -> (Vec<[f64; 3]>, Vec<f64>) {
+        let (mut x, first) = (self.permuted(b), self.first_of_tail());
+        self.sweep(factor).forward_to(first, &mut x);
+        (x[first..].chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect(), x)
+    }
+
+    /// Displacements of all rows, given those of the tail rows.
+    pub fn above_tail(&self, factor: &Factor, mut x: Vec<f64>, tail: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let first = self.first_of_tail();
+        x[first..].copy_from_slice(tail.as_flattened());
+        self.sweep(factor).backward_from(first, &mut x);
+        self.unpermuted(&x)
+    }
+
+    /// First unknown of the tail.
+    fn first_of_tail(&self) -> usize {
+        3 * (self.order.len() - self.n_tail)
+    }
+
+    /// What the given rows of the system reach in the factor.
+    pub fn reach(&self, rows: &[u32]) -> Reach {
+        let position = structure::positions(&self.order);
+        let places = rows.iter().map(|&row| 3 * position[row as usize] as usize).collect();
+        Reach::new(&self.structure, places)
+    }
+
+    /// Displacements of the rows of `reach` under forces on them alone; `x`, as long as the unknowns, is
+    /// zero before and after.
+    pub fn respond(
+        &self,
+        factor: &Factor,
+        reach: &Reach,
+        forces: &[[f64; 3]],
+        x: &mut [f64],
+    ) -> Vec<[f64; 3]> {
+        let columns = (&self.structure, factor.values.as_slice());
+        reach.scatter(forces, x);
+        reach.forward(columns, x);
+        reach.backward(columns, x);
+        let found = reach.gather(x);
+        reach.clear(&self.structure, x);
+        found
+    }
+
+    /// Displacements of the rows of `reach` from x = L⁻¹ P b; x stays as it is elsewhere.
+    pub fn reach_displacements(
+        &self,
+        factor: &Factor,
+        reach: &Reach,
+        x: &mut [f64],
+    ) -> Vec<[f64; 3]> {
+        reach.backward((&self.structure, &factor.values), x);
+        reach.gather(x)
+    }
+
+    /// Adds L⁻¹ P f for forces on the rows of `reach` to x = L⁻¹ P b; `work`, as long, is zero before and
+    /// after.
+    pub fn add_reach_forces(
+        &self,
+        factor: &Factor,
+        reach: &Reach,
+        forces: &[[f64; 3]],
+        work: &mut [f64],
+        x: &mut [f64],
+    ) {
+        reach.scatter(forces, work);
+        reach.forward((&self.structure, &factor.values), work);
+        for (x, v) in x.iter_mut().zip(work.iter()) {
+            *x += v;
+        }
+        reach.clear(&self.structure, work);
+    }
+
+    /// Flexibility of the rows of `reach` along a unit normal each, mm/N, and the row of the set that each
+    /// of its rows is.
+    pub fn reach_flexibility(
+        &self,
+        factor: &Factor,
+        reach: &Reach,
+        normals: &[[f64; 3]],
+    ) -> (DenseSymmetric, Vec<usize>) {
+        reach.normal_flexibility((&self.structure, &factor.values), normals)
+    }
+
+    /// Flexibility S⁻¹ of the tail rows, S = L_SS L_SSᵀ their Schur complement, order 3·n_tail, mm/N.
+    pub fn tail_flexibility(&self, factor: &Factor) -> TailFlexibility {
+        let (size, first) = (3 * self.n_tail, self.first_of_tail());
+        let mut lower = vec![0.0; size * size];
+        let l = supernodal::SupernodalLltRef::new(&self.structure, &factor.values);
+        for s in 0..self.structure.n_supernodes() {
+            let node = l.supernode(s);
+            let (start, val, pattern) = (node.start(), node.val(), node.pattern());
+            let width = val.ncols();
+            for c in (0..width).filter(|c| start + c >= first) {
+                let column = start + c - first;
+                for r in c..width {
+                    lower[column * size + start + r - first] = val[(r, c)];
+                }
+                for (r, &row) in pattern.iter().enumerate() {
+                    lower[column * size + row - first] = val[(width + r, c)];
+                }
+            }
+        }
+        let rows = self.order[self.order.len() - self.n_tail..].to_vec();
+        TailFlexibility::new(&DenseFactor::from_lower(size, lower), rows)
+    }
+}

@@ -1,0 +1,415 @@
+//! Dense symmetric matrices by their lower triangle: product with a vector, and Cholesky factor.
+
+use std::iter::Sum;
+use std::ops::{AddAssign, Mul, Range};
+
+use faer::dyn_stack::{MemBuffer, MemStack};
+use faer::linalg::cholesky::llt;
+use faer::linalg::matmul::triangular::{self, BlockStructure};
+use faer::linalg::triangular_inverse::invert_lower_triangular;
+use faer::{Accum, Mat, MatMut, MatRef};
+use rayon::prelude::*;
+
+use super::workspace::parallelism;
+use crate::algebra::simd::{Kernel, LANES, widest};
+
+/// Parts of a product that threads may share: fixed, so that the bits do not depend on the threads.
+const PARTS: usize = 16;
+/// Rows below which a product is not worth sharing.
+const ROWS_TO_SHARE: usize = 512;
+/// Columns that a product takes at once: one by one it would wait for its own vectors more than for the matrix.
+const COLUMNS_AT_ONCE: usize = 4;
+/// Sums that run side by side in a scalar product: the width of two vector registers.
+const SUMS: usize = 8;
+
+/// Numbers of a product: doubles, or floats where reading half as much counts for more.
+pub trait Number: Copy + Default + Send + Sync + AddAssign + Mul<Output = Self> + Sum {
+    /// Runs [`DotsAndAdd`] in as many lanes as a register has.
+    fn dots_and_add(pass: DotsAndAdd<'_, Self>) -> [Self; COLUMNS_AT_ONCE];
+}
+
+impl Number for f64 {
+    fn dots_and_add(pass: DotsAndAdd<'_, Self>) -> [Self; COLUMNS_AT_ONCE] {
+        pass.in_lanes::<LANES>()
+    }
+}
+
+impl Number for f32 {
+    fn dots_and_add(pass: DotsAndAdd<'_, Self>) -> [Self; COLUMNS_AT_ONCE] {
+        pass.in_lanes::<{ 2 * LANES }>()
+    }
+}
+
+/// Dense symmetric matrix, lower triangle by columns.
+pub struct DenseSymmetric<T = f64> {
+    size: usize,
+    /// Column by column, `size` each; what stands above the diagonal is not read.
+    values: Vec<T>,
+}
+
+/// L of A = L Lᵀ.
+pub struct DenseFactor {
+    size: usize,
+    values: Vec<f64>,
+}
+
+impl DenseSymmetric {
+    /// The matrix of `size` rows whose columns `fill` writes from the diagonal down, in parallel: it gets
+    /// the column's number and its zeros.
+    pub fn from_columns(size: usize, fill: impl Fn(usize, &mut [f64]) + Sync) -> Self {
+        let mut values = vec![0.0; size * size];
+        values
+            .par_chunks_mut(size.max(1))
+            .enumerate()
+            .for_each(|(c, column)| fill(c, &mut column[c..]));
+        Self { size, values }
+    }
+
+    /// The lower triangle of `values`, `size` columns of `size` entries.
+    pub(super) fn from_lower(size: usize, values: Vec<f64>) -> Self {
+        Self { size, values }
+    }
+
+    /// Number of rows.
+    pub fn size(&self) -> usize {
+        self.size
+    }
+
+    /// The Cholesky factor; the row of the first pivot that is not positive on failure.
+    pub fn factor(self) -> Result<DenseFactor, usize> {
+        let Self { size: n, mut values } = self;
+        if n == 0 {
+            return Ok(DenseFactor { size: n, values });
+        }
+        let par = parallelism(4 * n);
+        let need = llt::factor::cholesky_in_place_scratch::<f64>(n, par, Default::default());
+        let mut memory = MemBuffer::new(need);
+        llt::factor::cholesky_in_place(
+            MatMut::from_column_major_slice_mut(&mut values, n, n),
+            Default::default(),
+            par,
+            MemStack::new(&mut memory),
+            Default::default(),
+        )
+        .map_err(|llt::factor::LltError::NonPositivePivot { index }| index)?;
+        Ok(DenseFactor { size: n, values })
+    }
+}
+
+impl<T: Number> DenseSymmetric<T> {
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        size_of_val(&self.values[..])
+    }
+
+    /// Column `c` from the diagonal down.
+    #[inline(always)]
+    pub fn column(&self, c: usize) -> &[T] {
+        &self.values[c * self.size + c..(c + 1) * self.size]
+    }
+
+    /// A x: each entry below the diagonal is read once and used twice.
+    pub fn multiply(&self, x: &[T]) -> Vec<T> {
+        let n = self.size;
+        if n < ROWS_TO_SHARE {
+            let mut y = vec![T::default(); n];
+            self.add_columns(0..n, x, &mut y);
+            return y;
+        }
+        // Column c holds n − c entries: parts of equal area end where (n − c)² falls evenly.
+        let end = |part: usize| {
+            let left = (PARTS - part) as f64 / PARTS as f64;
+            n - (n as f64 * left.sqrt()).round() as usize
+        };
+        let parts: Vec<(usize, Vec<T>)> = (0..PARTS)
+            .into_par_iter()
+            .map(|part| {
+                let (first, last) = (end(part), end(part + 1));
+                let mut y = vec![T::default(); n - first];
+                self.add_columns(first..last, &x[first..], &mut y);
+                (first, y)
+            })
+            .collect();
+        let mut y = vec![T::default(); n];
+        for (first, part) in parts {
+            for (y, v) in y[first..].iter_mut().zip(part) {
+                *y += v;
+            }
+        }
+        y
+    }
+
+    /// Adds what `columns` bring to A x; `x` and `y` begin at the first of them.
+    fn add_columns(&self, columns: Range<usize>, x: &[T], y: &mut [T]) {
+        let (first, mut c) = (columns.start, columns.start);
+        while c + COLUMNS_AT_ONCE <= columns.end {
+            let (x, y) = (&x[c - first..], &mut y[c - first..]);
+            // The triangle at the top of the columns, then the rows that all of them have.
+            for k in 0..COLUMNS_AT_ONCE {
+                let top = &self.column(c + k)[..COLUMNS_AT_ONCE - k];
+                y[k] += top[0] * x[k];
+                for (r, &a) in (k + 1..).zip(&top[1..]) {
+                    y[k] += a * x[r];
+                    y[r] += a * x[k];
+                }
+            }
+            let a = std::array::from_fn(|k| &self.column(c + k)[COLUMNS_AT_ONCE - k..]);
+            let weights = std::array::from_fn(|k| x[k]);
+            let (own, y) = y.split_at_mut(COLUMNS_AT_ONCE);
+            let sums = T::dots_and_add(DotsAndAdd { a, x: &x[COLUMNS_AT_ONCE..], weights, y });
+            for (y, sum) in own.iter_mut().zip(sums) {
+                *y += sum;
+            }
+            c += COLUMNS_AT_ONCE;
+        }
+        for c in c..columns.end {
+            let column = self.column(c);
+            let (x, y) = (&x[c - first..], &mut y[c - first..]);
+            y[0] += column[0] * x[0];
+            for (r, &a) in (1..).zip(&column[1..]) {
+                y[0] += a * x[r];
+                y[r] += a * x[0];
+            }
+        }
+    }
+}
+
+/// A positive definite matrix in single precision: half as much to read.
+pub struct Rough {
+    /// With ones on the diagonal: its numbers fit whatever the units.
+    matrix: DenseSymmetric<f32>,
+    /// Square root of each diagonal entry.
+    scale: Vec<f64>,
+}
+
+impl Rough {
+    /// `matrix` to seven digits.
+    pub fn of(matrix: &DenseSymmetric) -> Self {
+        let n = matrix.size;
+        let scale: Vec<f64> = (0..n).map(|c| matrix.column(c)[0].sqrt()).collect();
+        let mut values = vec![0.0; n * n];
+        values.par_chunks_mut(n.max(1)).enumerate().for_each(|(c, column)| {
+            let entries = column[c..].iter_mut().zip(matrix.column(c)).zip(&scale[c..]);
+            for ((to, v), s) in entries {
+                *to = (v / (s * scale[c])) as f32;
+            }
+        });
+        Self { matrix: DenseSymmetric { size: n, values }, scale }
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        self.matrix.bytes() + size_of_val(&self.scale[..])
+    }
+
+    /// A x to six or seven digits of what the largest entries bring.
+    pub fn multiply(&self, x: &[f64]) -> Vec<f64> {
+        let scaled = || x.iter().zip(&self.scale).map(|(x, s)| x * s);
+        let largest = scaled().fold(f64::MIN_POSITIVE, |m, v| m.max(v.abs()));
+        let x: Vec<f32> = scaled().map(|v| (v / largest) as f32).collect();
+        let y = self.matrix.multiply(&x);
+        y.iter().zip(&self.scale).map(|(&y, s)| f64::from(y) * (s * largest)).collect()
+    }
+}
+
+impl DenseFactor {
+    /// The lower triangle of `values`, `size` columns of `size` entries.
+    pub(super) fn from_lower(size: usize, values: Vec<f64>) -> Self {
+        Self { size, values }
+    }
+
+    /// A⁻¹ = L⁻ᵀ L⁻¹: for many products, each of which reads it once where a solution reads L twice.
+    pub fn inverse(&self) -> DenseSymmetric {
+        let size = self.size;
+        let par = parallelism(size);
+        let lower = MatRef::from_column_major_slice(&self.values, size, size);
+        let mut inverse = Mat::<f64>::zeros(size, size);
+        invert_lower_triangular(inverse.as_mut(), lower, par);
+        let mut values = vec![0.0; size * size];
+        triangular::matmul(
+            MatMut::from_column_major_slice_mut(&mut values, size, size),
+            BlockStructure::TriangularLower,
+            Accum::Replace,
+            inverse.as_ref().transpose(),
+            BlockStructure::TriangularUpper,
+            inverse.as_ref(),
+            BlockStructure::TriangularLower,
+            1.0,
+            par,
+        );
+        DenseSymmetric { size, values }
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        8 * self.values.len()
+    }
+
+    /// A⁻¹ b, in place. One column is bound by reading L, which plain sweeps do at full speed.
+    pub fn solve(&self, b: &mut [f64]) {
+        let n = self.size;
+        let column = |c: usize| &self.values[c * n + c..(c + 1) * n];
+        for c in 0..n {
+            let column = column(c);
+            b[c] /= column[0];
+            let weight = -b[c];
+            add_scaled(&column[1..], weight, &mut b[c + 1..]);
+        }
+        for c in (0..n).rev() {
+            let column = column(c);
+            b[c] = (b[c] - dot(&column[1..], &b[c + 1..])) / column[0];
+        }
+    }
+}
+
+/// aᵀx.
+#[inline(always)]
+pub(super) fn dot(a: &[f64], x: &[f64]) -> f64 {
+    let mut sums = [0.0; SUMS];
+    let (a_lanes, a_rest) = a.as_chunks::<SUMS>();
+    let (x_lanes, x_rest) = x.as_chunks::<SUMS>();
+    for (a, x) in a_lanes.iter().zip(x_lanes) {
+        for i in 0..SUMS {
+            sums[i] += a[i] * x[i];
+        }
+    }
+    let rest: f64 = a_rest.iter().zip(x_rest).map(|(a, x)| a * x).sum();
+    sums.iter().sum::<f64>() + rest
+}
+
+/// Adds `weight · a` to `y`.
+#[inline(always)]
+pub(super) fn add_scaled(a: &[f64], weight: f64, y: &mut [f64]) {
+    for (y, a) in y.iter_mut().zip(a) {
+        *y += weight * a;
+    }
+}
+
+/// Adds Σ `weights` · `a` to `y` and gives each aᵀx, in one pass over all: x and y are read once for the four.
+pub struct DotsAndAdd<'a, T> {
+    a: [&'a [T]; COLUMNS_AT_ONCE],
+    x: &'a [T],
+    weights: [T; COLUMNS_AT_ONCE],
+    y: &'a mut [T],
+}
+
+impl<T: Number> DotsAndAdd<'_, T> {
+    fn in_lanes<const LANES: usize>(self) -> [T; COLUMNS_AT_ONCE] {
+        let Self { a, x, weights, y } = self;
+        let whole = x.len() / LANES * LANES;
+        let (y_lanes, y_rest) = y.as_chunks_mut::<LANES>();
+        let lanes =
+            InLanes { a: a.map(|a| a.as_chunks().0), x: x.as_chunks().0, weights, y: y_lanes };
+        let mut sums = widest(lanes).map(|lanes| lanes.into_iter().sum());
+        for (i, y) in (whole..).zip(y_rest) {
+            for k in 0..COLUMNS_AT_ONCE {
+                sums[k] += a[k][i] * x[i];
+                *y += weights[k] * a[k][i];
+            }
+        }
+        sums
+    }
+}
+
+/// The rows of a pass that fill registers.
+///
+/// What it reads is copied before what it writes, and the lanes are summed outside: both keep the sums in
+/// registers, which makes it three times as fast.
+struct InLanes<'a, T, const LANES: usize> {
+    a: [&'a [[T; LANES]]; COLUMNS_AT_ONCE],
+    x: &'a [[T; LANES]],
+    weights: [T; COLUMNS_AT_ONCE],
+    y: &'a mut [[T; LANES]],
+}
+
+impl<T: Number, const LANES: usize> Kernel for InLanes<'_, T, LANES> {
+    type Output = [[T; LANES]; COLUMNS_AT_ONCE];
+    #[inline(always)]
+    fn run(self) -> Self::Output {
+        let Self { a: [a0, a1, a2, a3], x, weights, y } = self;
+        let mut sums = [[T::default(); LANES]; COLUMNS_AT_ONCE];
+        for (((((x, y), a0), a1), a2), a3) in x.iter().zip(y).zip(a0).zip(a1).zip(a2).zip(a3) {
+            let (x, a, mut there) = (*x, [*a0, *a1, *a2, *a3], *y);
+            for k in 0..COLUMNS_AT_ONCE {
+                for lane in 0..LANES {
+                    sums[k][lane] += a[k][lane] * x[lane];
+                }
+            }
+            for k in 0..COLUMNS_AT_ONCE {
+                for lane in 0..LANES {
+                    there[lane] += weights[k] * a[k][lane];
+                }
+            }
+            *y = there;
+        }
+        sums
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use nalgebra::{DMatrix, DVector};
+
+    /// A diagonally dominant matrix of no special structure, its triangle and a right-hand side.
+    fn example(n: usize) -> (DMatrix<f64>, DenseSymmetric, DVector<f64>) {
+        let wave = |i: usize, j: usize| ((1 + i * j + i + j) as f64 * 0.37).sin();
+        let dense = DMatrix::from_fn(n, n, |i, j| if i == j { n as f64 } else { wave(i, j) });
+        let lower = DenseSymmetric::from_columns(n, |c, column| {
+            for (r, v) in column.iter_mut().enumerate() {
+                *v = dense[(c + r, c)];
+            }
+        });
+        (dense, lower, DVector::from_fn(n, |i, _| wave(i, i)))
+    }
+
+    #[test]
+    fn product_and_solution_equal_the_dense_ones() {
+        for n in [1, 2, 7, 9, 100, ROWS_TO_SHARE + 13] {
+            let (dense, lower, x) = example(n);
+            let product = DVector::from_vec(lower.multiply(x.as_slice()));
+            let exact = &dense * &x;
+            assert!((product - &exact).amax() <= 1e-13 * exact.amax(), "{n}");
+            let mut found = exact.as_slice().to_vec();
+            lower.factor().unwrap().solve(&mut found);
+            assert!((DVector::from_vec(found) - &x).amax() <= 1e-12, "{n}");
+        }
+    }
+
+    /// Six digits, also where the rows are of very different size.
+    #[test]
+    fn rough_product_equals_the_dense_one_to_single_precision() {
+        let (dense, ..) = example(ROWS_TO_SHARE + 13);
+        let size = |i: usize| 10.0_f64.powi(17 * (i % 5) as i32 - 40);
+        let lower = DenseSymmetric::from_columns(dense.nrows(), |c, column| {
+            for (r, v) in (c..).zip(column.iter_mut()) {
+                *v = dense[(r, c)] * size(r) * size(c);
+            }
+        });
+        let x: Vec<f64> = (0..dense.nrows()).map(|i| (i as f64).cos() / size(i)).collect();
+        let (exact, rough) = (lower.multiply(&x), Rough::of(&lower).multiply(&x));
+        let own = |i: usize| dense[(i, i)] * size(i);
+        for (i, (a, b)) in exact.iter().zip(&rough).enumerate() {
+            assert!((a - b).abs() <= 1e-6 * own(i), "{a:e} {b:e}");
+        }
+    }
+
+    #[test]
+    fn product_has_the_same_bits_for_any_number_of_threads() {
+        let (_, lower, x) = example(ROWS_TO_SHARE + 13);
+        let answers = [1, 2, 3].map(|threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| lower.multiply(x.as_slice()))
+        });
+        assert!(answers[0] == answers[1] && answers[0] == answers[2]);
+    }
+
+    #[test]
+    fn pivot_that_is_not_positive_is_named() {
+        let lower = DenseSymmetric::from_columns(3, |c, column| {
+            column[0] = if c == 1 { -1.0 } else { 1.0 };
+        });
+        assert_eq!(lower.factor().err(), Some(1));
+    }
+}

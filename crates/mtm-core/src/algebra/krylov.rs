@@ -1,0 +1,565 @@
+//! Preconditioned conjugate gradients that stop on an estimate of the error, not on the residual.
+//!
+//! At a material contrast of 1e6 a relative residual of 1e-6 can leave centimetres of error: a stiff
+//! muscle dominates the norm while the fat beside it is still wrong. The iteration here ends when
+//! both the estimated error in millimetres and that in energy are small enough, and both are checked once
+//! more with the true residual `b − A x` before a solution is handed out. Where the estimates have reason
+//! to miss a slow motion, [`trial`] measures them on a known solution first.
+
+use rayon::prelude::*;
+
+use crate::algebra::blocks::{Block, BlockMatrix};
+use crate::algebra::error_bound::{
+    Due, FLOOR_PROGRESS, STAGNATION_ITERATIONS, StoppingRule, Verdict,
+};
+use crate::algebra::row_sums::{
+    ROWS_PER_SUM, advance, dot, dot_and_largest, farthest, in_pool, multiply_and_dot,
+};
+use crate::error::{ErrorKind, MtmError, Result, Shortfall, check_finite_rows};
+
+pub use crate::algebra::error_bound::PcgOptions;
+pub(crate) use crate::algebra::error_bound::Spectrum;
+
+/// Fall of the error of a trial after which its true residual is looked at again.
+const TRIAL_FALL: f64 = 0.1;
+/// Growth of the iterations of a trial after which it is looked at at the latest.
+const TRIAL_PAUSE: f64 = 1.3;
+/// True rᵀz over that of the recurrence above which the recurrence has drifted: the round-off floor.
+const DRIFT: f64 = 4.0;
+
+/// A symmetric positive definite matrix, as conjugate gradients see it.
+///
+/// It may be one on a subspace alone: [`Operator::project`] then says which.
+pub trait Operator: Sync {
+    /// Number of block rows.
+    fn n_rows(&self) -> usize;
+
+    /// Writes `y = A x` for an `x` of the subspace; `y` lies in it too.
+    fn multiply_into(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]);
+
+    /// Writes `y = A x` and returns `xᵀ y`. The bits must not depend on the threads.
+    fn multiply_and_dot(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) -> f64 {
+        self.multiply_into(x, y);
+        dot(x, y)
+    }
+
+    /// Least pᵀ A p of a direction that counts as held.
+    fn least_curvature(&self, _p: &[[f64; 3]]) -> f64 {
+        0.0
+    }
+
+    /// Replaces `x` by its nearest vector of the subspace; nothing where that is the whole space.
+    fn project(&self, _x: &mut [[f64; 3]]) {}
+}
+
+impl Operator for BlockMatrix {
+    fn n_rows(&self) -> usize {
+        self.n_rows()
+    }
+
+    fn multiply_into(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
+        self.multiply_into(x, y);
+    }
+
+    fn multiply_and_dot(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) -> f64 {
+        multiply_and_dot(self, x, y)
+    }
+}
+
+/// A symmetric positive definite approximation of `A⁻¹`.
+pub trait Preconditioner: Sync {
+    /// Writes `z = M⁻¹ r`.
+    ///
+    /// `r`, `z`: one row of three per block row. The bits of `z` must not depend on the threads.
+    fn apply(&self, r: &[[f64; 3]], z: &mut [[f64; 3]]);
+}
+
+/// The inverse diagonal blocks as a preconditioner: for tiny systems and for comparison.
+#[derive(Debug, Clone)]
+pub struct BlockJacobi {
+    inverses: Vec<Block>,
+}
+
+impl BlockJacobi {
+    /// The inverted diagonal blocks of `a`.
+    ///
+    /// # Errors
+    /// [`MtmError::NotPositiveDefinite`] with the first row whose diagonal block is not.
+    pub fn new(a: &BlockMatrix) -> Result<Self> {
+        let inverses = (0..a.n_rows())
+            .map(|j| {
+                let b = a.diagonal_block(j);
+                let m = nalgebra::Matrix3::from_row_slice(b);
+                let inverse = nalgebra::Cholesky::new(m).map(|c| c.inverse()).ok_or_else(|| {
+                    MtmError::NotPositiveDefinite {
+                        node: j,
+                        detail: format!("its diagonal block {b:?} is not positive definite"),
+                    }
+                })?;
+                let mut out = [0.0; 9];
+                out.copy_from_slice(inverse.as_slice());
+                Ok(out)
+            })
+            .collect::<Result<_>>()?;
+        Ok(Self { inverses })
+    }
+}
+
+impl Preconditioner for BlockJacobi {
+    fn apply(&self, r: &[[f64; 3]], z: &mut [[f64; 3]]) {
+        z.par_chunks_mut(ROWS_PER_SUM)
+            .zip(r.par_chunks(ROWS_PER_SUM).zip(self.inverses.par_chunks(ROWS_PER_SUM)))
+            .for_each(|(z, (r, inverses))| {
+                for ((z, r), m) in z.iter_mut().zip(r).zip(inverses) {
+                    for i in 0..3 {
+                        z[i] = m[3 * i] * r[0] + m[3 * i + 1] * r[1] + m[3 * i + 2] * r[2];
+                    }
+                }
+            });
+    }
+}
+
+/// The solution of [`pcg`] and how good it is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PcgOutcome {
+    /// The solution, one row of three per block row, mm.
+    pub solution: Vec<[f64; 3]>,
+    /// Iterations done, over all restarts.
+    pub iterations: usize,
+    /// Estimate of the largest nodal error, mm: `max_j |z_j| / θ_min` with the true residual, `θ_min` half
+    /// the smallest Ritz value of `M⁻¹ A`. No bound: Ritz values lie above the spectrum.
+    pub error_estimate_mm: f64,
+    /// Estimate of the error in the energy norm, relative to the energy norm of the solution.
+    pub energy_error: f64,
+    /// `‖b − A x‖ / ‖b‖`, computed afresh. Says little at high contrast.
+    pub residual: f64,
+    /// Relative residual after each iteration, as the recurrence carries it.
+    pub residual_history: Vec<f64>,
+    /// Smallest and largest Ritz values of `M⁻¹ A` seen: their ratio is the condition number that
+    /// the preconditioner left.
+    pub ritz: [f64; 2],
+}
+
+/// Solves `A x = b` by preconditioned conjugate gradients (Hestenes & Stiefel 1952).
+///
+/// `b`, `x0`: one row of three per block row, N and mm. `interrupted` is asked once per iteration, on
+/// the calling thread. The bits of the result do not depend on the number of threads.
+///
+/// Stops when `max_j |z_j| / θ_min ≤ tolerance` and when the Gauss–Radau estimate of the energy error
+/// (Meurant & Tichý 2013, with the smallest Ritz value less a safety margin as lower end of the
+/// spectrum) is within `energy_tolerance`; both must then hold for the true residual as well.
+///
+/// # Errors
+/// [`MtmError::Length`] and [`MtmError::NotFinite`] for input that does not fit,
+/// [`MtmError::NotPositiveDefinite`] for a breakdown, [`MtmError::NotConverged`] and
+/// [`MtmError::Interrupted`].
+pub fn pcg(
+    a: &dyn Operator,
+    b: &[[f64; 3]],
+    x0: &[[f64; 3]],
+    preconditioner: &dyn Preconditioner,
+    options: &PcgOptions,
+    interrupted: &(dyn Fn() -> bool + Sync),
+) -> Result<PcgOutcome> {
+    let mut seen = Spectrum::default();
+    let reached = pcg_near(a, b, x0, preconditioner, options, None, &mut seen, interrupted)?;
+    reached.into_outcome()
+}
+
+/// Where [`pcg_near`] ended.
+pub(crate) enum Reached {
+    /// Within the tolerances, checked with the true residual.
+    Solution(PcgOutcome),
+    /// Near enough for a step; its estimate is that of the recurrence.
+    Step(PcgOutcome),
+    /// The matrix is indefinite, or nearly so.
+    Indefinite(Box<Indefinite>),
+}
+
+/// Where an iteration met a direction that does not count as held.
+pub(crate) struct Indefinite {
+    /// The solution as far as it came.
+    pub solution: Vec<[f64; 3]>,
+    pub direction: Vec<[f64; 3]>,
+    /// What to report where no indefinite matrix was to be expected.
+    pub error: MtmError,
+    pub iterations: usize,
+    pub residual_history: Vec<f64>,
+}
+
+impl Reached {
+    /// What was reached, where the matrix is definite.
+    pub(crate) fn into_outcome(self) -> Result<PcgOutcome> {
+        match self {
+            Self::Solution(outcome) | Self::Step(outcome) => Ok(outcome),
+            Self::Indefinite(met) => Err(met.error),
+        }
+    }
+}
+
+/// [`pcg`] for one of several systems that differ little, with the same preconditioner.
+///
+/// `seen`: what earlier systems showed of the spectrum. With `share`, the solution is only a step on the
+/// way to another system: the iteration ends as soon as the estimate has fallen to that share of the one at
+/// `x0` (the estimate of the step is then as good as what was seen), unless that lies within the tolerances.
+pub(crate) fn pcg_near(
+    a: &dyn Operator,
+    b: &[[f64; 3]],
+    x0: &[[f64; 3]],
+    preconditioner: &dyn Preconditioner,
+    options: &PcgOptions,
+    share: Option<f64>,
+    seen: &mut Spectrum,
+    interrupted: &(dyn Fn() -> bool + Sync),
+) -> Result<Reached> {
+    let n = a.n_rows();
+    for (what, rows) in [("right-hand side", b), ("start vector", x0)] {
+        if rows.len() != n {
+            return Err(MtmError::Length {
+                what: what.to_owned(),
+                found: rows.len(),
+                expected: n,
+                why: "one row per block row of the matrix",
+                kind: ErrorKind::Solver,
+            });
+        }
+        check_finite_rows(what, rows, ErrorKind::Solver)?;
+    }
+    let b_norm = dot(b, b).sqrt();
+    if b_norm == 0.0 {
+        return Ok(Reached::Solution(PcgOutcome {
+            solution: vec![[0.0; 3]; n],
+            iterations: 0,
+            error_estimate_mm: 0.0,
+            energy_error: 0.0,
+            residual: 0.0,
+            residual_history: Vec::new(),
+            ritz: [1.0; 2],
+        }));
+    }
+
+    let mut state = State::new(a, b, x0, preconditioner, seen);
+    in_pool(|| state.replace_residual());
+    state.restart();
+    let step = share.map(|share| share * state.error_mm()).filter(|&e| e > options.tolerance);
+    let mut rule = StoppingRule::new(options, state.rz);
+    let mut iterations = 0;
+    let mut history = Vec::new();
+    loop {
+        if interrupted() {
+            return Err(MtmError::Interrupted);
+        }
+        let exact = state.rz == 0.0 && state.largest_z == 0.0;
+        if !exact {
+            if let Err(error) = in_pool(|| state.step()) {
+                if !state.is_indefinite() {
+                    return Err(error);
+                }
+                return Ok(Reached::Indefinite(Box::new(Indefinite {
+                    solution: state.x,
+                    direction: state.p,
+                    error,
+                    iterations,
+                    residual_history: history,
+                })));
+            }
+            iterations += 1;
+            history.push(state.r_norm / b_norm);
+        }
+
+        if step.is_some_and(|goal| state.error_mm() <= goal) {
+            return Ok(Reached::Step(state.outcome(1.0, b_norm, iterations, history)));
+        }
+        let excess = || state.excess(options);
+        let due = rule.due(iterations, state.rz, state.spectrum, state.error_mm(), excess);
+        let Some(due) = due else { continue };
+        // The recurrence drifts from b − A x at the round-off floor: only the true residual counts.
+        in_pool(|| state.replace_residual());
+        match rule.verdict(due, iterations, state.error_mm(), state.excess(options)) {
+            Verdict::Converged => {
+                let doubt = due.doubt;
+                return Ok(Reached::Solution(state.outcome(doubt, b_norm, iterations, history)));
+            }
+            Verdict::GiveUp => {
+                return Err(state.not_converged(due, options, iterations));
+            }
+            Verdict::Restart => state.restart(),
+        }
+    }
+}
+
+/// What conjugate gradients made of a system whose solution is known.
+#[derive(Debug, Clone)]
+pub(crate) struct Trial {
+    /// The spectrum, and how errors follow from residuals.
+    pub seen: Spectrum,
+    /// Largest nodal error that was reached, over the largest displacement.
+    pub error: f64,
+    pub iterations: usize,
+}
+
+/// How well conjugate gradients can solve with `a`: a system with a known solution, on which errors are
+/// measured, not estimated.
+///
+/// In the known field every node goes its own way, so that each slow motion has its share of it and none
+/// of the residual. `goal`: error over the largest displacement at which the trial ends; it ends as well
+/// where rounding lets the error fall no further, and after `max_iterations`.
+pub(crate) fn trial(
+    a: &dyn Operator,
+    preconditioner: &dyn Preconditioner,
+    goal: f64,
+    max_iterations: usize,
+    interrupted: &(dyn Fn() -> bool + Sync),
+) -> Result<Trial> {
+    let n = a.n_rows();
+    let zeros = vec![[0.0; 3]; n];
+    let mut known: Vec<[f64; 3]> =
+        (0..n).map(|j| [0, 1, 2].map(|i| 1.0 + 0.5 * ((3 * j + i) as f64 * 0.7).sin())).collect();
+    a.project(&mut known);
+    let size = farthest(&known, &zeros);
+    let mut seen = Spectrum::default();
+    if size == 0.0 {
+        return Ok(Trial { seen, error: 0.0, iterations: 0 });
+    }
+    let mut b = zeros.clone();
+    a.multiply_into(&known, &mut b);
+    let mut state = State::new(a, &b, &zeros, preconditioner, &mut seen);
+    in_pool(|| state.replace_residual());
+    state.restart();
+    let (mut best, mut best_at) = (1.0_f64, 0);
+    let (mut looked, mut looked_at, mut restarted) = (1.0_f64, 0_usize, f64::INFINITY);
+    let mut iterations = 0;
+    for iteration in 1..=max_iterations {
+        if interrupted() {
+            return Err(MtmError::Interrupted);
+        }
+        if state.rz == 0.0 {
+            break;
+        }
+        in_pool(|| state.step())?;
+        iterations = iteration;
+        let error = farthest(&state.x, &known) / size;
+        if error < best {
+            (best, best_at) = (error, iteration);
+        }
+        let stagnant = iteration - best_at >= STAGNATION_ITERATIONS.max(iteration / 2);
+        let last = error <= goal || stagnant || iteration == max_iterations;
+        let due =
+            error <= TRIAL_FALL * looked || iteration as f64 >= TRIAL_PAUSE * looked_at as f64;
+        if !(last || due) {
+            continue;
+        }
+        (looked, looked_at) = (error.min(looked), iteration);
+        let (rz, largest_z) = in_pool(|| state.true_residual());
+        if largest_z > 0.0 {
+            state.spectrum.amplified(error * size / largest_z);
+        }
+        if last {
+            break;
+        }
+        if rz > DRIFT * state.rz {
+            if error > FLOOR_PROGRESS * restarted {
+                break;
+            }
+            restarted = error;
+            in_pool(|| state.replace_residual());
+            state.restart();
+        }
+    }
+    Ok(Trial { seen, error: best, iterations })
+}
+
+/// The vectors and coefficients of the iteration.
+struct State<'a> {
+    a: &'a dyn Operator,
+    b: &'a [[f64; 3]],
+    preconditioner: &'a dyn Preconditioner,
+    x: Vec<[f64; 3]>,
+    r: Vec<[f64; 3]>,
+    z: Vec<[f64; 3]>,
+    p: Vec<[f64; 3]>,
+    q: Vec<[f64; 3]>,
+    rz: f64,
+    r_norm: f64,
+    largest_z: f64,
+    spectrum: &'a mut Spectrum,
+}
+
+impl<'a> State<'a> {
+    fn new(
+        a: &'a dyn Operator,
+        b: &'a [[f64; 3]],
+        x0: &[[f64; 3]],
+        preconditioner: &'a dyn Preconditioner,
+        spectrum: &'a mut Spectrum,
+    ) -> Self {
+        let zeros = vec![[0.0; 3]; b.len()];
+        Self {
+            a,
+            b,
+            preconditioner,
+            x: x0.to_vec(),
+            r: zeros.clone(),
+            z: zeros.clone(),
+            p: zeros.clone(),
+            q: zeros,
+            rz: 0.0,
+            r_norm: 0.0,
+            largest_z: 0.0,
+            spectrum,
+        }
+    }
+
+    /// Recomputes `r = b − A x` and `z = M⁻¹ r`.
+    fn replace_residual(&mut self) {
+        self.a.multiply_into(&self.x, &mut self.q);
+        let (b, q) = (self.b, &self.q);
+        self.r.par_chunks_mut(ROWS_PER_SUM).enumerate().for_each(|(chunk, r)| {
+            let first = chunk * ROWS_PER_SUM;
+            for (offset, r) in r.iter_mut().enumerate() {
+                let j = first + offset;
+                *r = [b[j][0] - q[j][0], b[j][1] - q[j][1], b[j][2] - q[j][2]];
+            }
+        });
+        self.r_norm = dot(&self.r, &self.r).sqrt();
+        self.precondition();
+        (self.rz, self.largest_z) = dot_and_largest(&self.r, &self.z);
+    }
+
+    /// rᵀz and the largest row of z for the true residual, without a change of the iteration.
+    fn true_residual(&mut self) -> (f64, f64) {
+        let (r, z) = (self.r.clone(), self.z.clone());
+        let (rz, r_norm, largest_z) = (self.rz, self.r_norm, self.largest_z);
+        self.replace_residual();
+        let found = (self.rz, self.largest_z);
+        (self.r, self.z) = (r, z);
+        (self.rz, self.r_norm, self.largest_z) = (rz, r_norm, largest_z);
+        found
+    }
+
+    /// z = P M⁻¹ P r, P the projection of the operator: what rounding leaves outside the subspace may be
+    /// all of a small residual, and there the operator says nothing.
+    fn precondition(&mut self) {
+        self.a.project(&mut self.r);
+        self.preconditioner.apply(&self.r, &mut self.z);
+        self.a.project(&mut self.z);
+    }
+
+    /// `doubt`: see [`Spectrum::doubt`].
+    fn outcome(
+        self,
+        doubt: f64,
+        b_norm: f64,
+        iterations: usize,
+        residual_history: Vec<f64>,
+    ) -> PcgOutcome {
+        PcgOutcome {
+            error_estimate_mm: doubt * self.error_mm(),
+            energy_error: doubt * self.energy_error(),
+            residual: self.r_norm / b_norm,
+            ritz: [self.spectrum.smallest, self.spectrum.largest],
+            solution: self.x,
+            iterations,
+            residual_history,
+        }
+    }
+
+    /// Forgets the search directions: the next step follows z alone.
+    fn restart(&mut self) {
+        self.p.copy_from_slice(&self.z);
+        self.spectrum.restart();
+    }
+
+    /// One iteration.
+    fn step(&mut self) -> Result<()> {
+        let pq = self.a.multiply_and_dot(&self.p, &mut self.q);
+        let is_held = pq > self.a.least_curvature(&self.p);
+        if !(is_held && self.rz > 0.0 && pq.is_finite() && self.rz.is_finite()) {
+            return Err(self.breakdown(pq));
+        }
+        let alpha = self.rz / pq;
+        self.r_norm = advance(alpha, &self.p, &self.q, &mut self.x, &mut self.r).sqrt();
+        self.precondition();
+        let (rz, largest_z) = dot_and_largest(&self.r, &self.z);
+        if !(rz >= 0.0 && rz.is_finite() && self.r_norm.is_finite() && largest_z.is_finite()) {
+            return Err(self.breakdown(pq));
+        }
+        let beta = rz / self.rz;
+        self.rz = rz;
+        self.largest_z = largest_z;
+        self.spectrum.push(alpha, beta);
+        let z = &self.z;
+        self.p.par_chunks_mut(ROWS_PER_SUM).zip(z.par_chunks(ROWS_PER_SUM)).for_each(|(p, z)| {
+            for (p, z) in p.iter_mut().zip(z) {
+                *p = [z[0] + beta * p[0], z[1] + beta * p[1], z[2] + beta * p[2]];
+            }
+        });
+        Ok(())
+    }
+
+    /// Whether the last step broke down at a direction of negative curvature, with finite numbers.
+    fn is_indefinite(&self) -> bool {
+        let finite = |v: &Vec<[f64; 3]>| v.iter().flatten().all(|x| x.is_finite());
+        self.rz > 0.0
+            && self.rz.is_finite()
+            && finite(&self.p)
+            && finite(&self.q)
+            && dot(&self.p, &self.q) <= self.a.least_curvature(&self.p)
+    }
+
+    fn breakdown(&self, pq: f64) -> MtmError {
+        let node = (0..self.r.len())
+            .find(|&j| !self.q[j].iter().chain(&self.z[j]).all(|v| v.is_finite()))
+            .unwrap_or(0);
+        MtmError::NotPositiveDefinite {
+            node,
+            detail: format!(
+                "conjugate gradients met pᵀAp = {pq:.3e} and rᵀM⁻¹r = {:.3e}; is a part not held?",
+                self.rz
+            ),
+        }
+    }
+
+    /// What kept the iteration from converging, of the three that must be met: the one that is furthest
+    /// from it.
+    fn not_converged(&self, due: Due, options: &PcgOptions, iterations: usize) -> MtmError {
+        let (error, energy) = (due.doubt * self.error_mm(), due.doubt * self.energy_error());
+        let by_energy = energy / options.energy_tolerance > error / options.tolerance;
+        let shortfall = if by_energy {
+            Shortfall {
+                quantity: "the estimated error of the energy",
+                value: energy,
+                limit: options.energy_tolerance,
+                unit: " of the whole",
+            }
+        } else {
+            Shortfall {
+                quantity: "the estimated error of a node",
+                value: error,
+                limit: options.tolerance,
+                unit: " mm",
+            }
+        };
+        let advice = if due.exhausted {
+            "allow more iterations (max_iterations) or a larger tolerance, or use method=\"cholesky\""
+        } else {
+            "rounding lets it fall no further: use method=\"cholesky\", or allow a larger tolerance"
+        };
+        MtmError::NotConverged { method: "pcg", iterations, shortfall, advice }
+    }
+
+    /// See [`Spectrum::error_mm`].
+    fn error_mm(&self) -> f64 {
+        self.spectrum.error_mm(self.largest_z)
+    }
+
+    /// See [`Spectrum::energy_error`]. `‖x‖_A² = bᵀx + (error terms of second order)`.
+    fn energy_error(&self) -> f64 {
+        self.spectrum.energy_error(self.rz, dot(self.b, &self.x).abs())
+    }
+
+    /// See [`PcgOptions::excess`].
+    fn excess(&self, options: &PcgOptions) -> f64 {
+        options.excess(self.error_mm(), self.energy_error())
+    }
+}

@@ -1,0 +1,153 @@
+//! A scaled matrix in single precision: its products and its largest eigenvalue.
+
+use rayon::prelude::*;
+
+use crate::algebra::error_bound::tridiagonal_extremes;
+use crate::algebra::row_sums::dot;
+use crate::algebra::simd::{Kernel, widest};
+
+use super::block_rows::{ENTRIES_PER_TASK, SystemRows, split_rows};
+use super::scaling::{Scaling, scaled_block};
+use super::small_blocks::block_row_product;
+
+/// Lanczos steps for the largest eigenvalue of a scaled matrix.
+const LANCZOS_STEPS: usize = 10;
+/// Length of a Lanczos vector, for eigenvalues of order one, at which the space is exhausted.
+const LANCZOS_BREAKDOWN: f64 = 1e-10;
+/// Margin on that eigenvalue: Lanczos approaches it from below.
+const EIGENVALUE_SAFETY: f64 = 1.05;
+
+/// S A Sᵀ in single precision, blocks by columns.
+#[derive(Debug)]
+pub(super) struct ScaledMatrix<const N: usize> {
+    pub(super) row_start: Vec<usize>,
+    pub(super) columns: Vec<u32>,
+    pub(super) blocks: Vec<[[f32; N]; N]>,
+    pub(super) largest_eigenvalue: f64,
+    pub(super) rows_per_task: usize,
+}
+
+impl<const N: usize> ScaledMatrix<N> {
+    pub(super) fn n_rows(&self) -> usize {
+        self.row_start.len() - 1
+    }
+
+    pub(super) fn memory_bytes(&self) -> usize {
+        self.row_start.len() * 8 + self.columns.len() * (4 + 4 * N * N)
+    }
+
+    /// The system `a`, scaled, with its largest eigenvalue.
+    pub(super) fn new(a: &impl SystemRows<N>, scaling: &Scaling<N>) -> Self {
+        let row_start = a.row_start().to_vec();
+        let entries = a.columns().len() * N * N;
+        let rows_per_task = (ENTRIES_PER_TASK * a.n_rows() / entries.max(1)).max(1);
+        let columns = a.columns().to_vec();
+        let mut blocks = vec![[[0.0_f32; N]; N]; columns.len()];
+        let s = &scaling.inverse_factors;
+        split_rows(&mut blocks, &row_start, rows_per_task).into_par_iter().for_each(|part| {
+            for i in part.rows.clone() {
+                for k in row_start[i]..row_start[i + 1] {
+                    let j = columns[k] as usize;
+                    let scaled = scaled_block(&s[i], &a.block(k), &s[j], i <= j);
+                    let out = &mut part.data[k - row_start[part.rows.start]];
+                    for c in 0..N {
+                        for r in 0..N {
+                            out[c][r] = scaled[r][c] as f32;
+                        }
+                    }
+                }
+            }
+        });
+        let mut scaled =
+            Self { row_start, columns, blocks, largest_eigenvalue: 1.0, rows_per_task };
+        scaled.largest_eigenvalue = EIGENVALUE_SAFETY * scaled.estimate_eigenvalue();
+        scaled
+    }
+
+    /// Row `i` of A x.
+    #[inline(always)]
+    pub(super) fn row_product(&self, i: usize, x: &[[f64; N]]) -> [f64; N] {
+        let range = self.row_start[i]..self.row_start[i + 1];
+        block_row_product(&self.columns[range.clone()], &self.blocks[range], x)
+    }
+
+    /// Largest eigenvalue of the scaled matrix by a few Lanczos steps from a fixed start.
+    fn estimate_eigenvalue(&self) -> f64 {
+        let n = self.n_rows();
+        let mut v: Vec<[f64; N]> = (0..n)
+            .map(|j| {
+                let mut row = [0.0; N];
+                for (c, value) in row.iter_mut().enumerate() {
+                    // Golden-ratio sequence: equidistributed, and the same on every machine.
+                    let t = ((j * N + c + 1) as f64 * 0.618_033_988_749_895).fract();
+                    *value = t - 0.5;
+                }
+                row
+            })
+            .collect();
+        let mut previous = vec![[0.0; N]; n];
+        let mut w = vec![[0.0; N]; n];
+        let mut norm = dot(&v, &v).sqrt();
+        let (mut diagonal, mut off_squared) = (Vec::new(), Vec::new());
+        let mut beta = 0.0;
+        for step in 0..LANCZOS_STEPS {
+            let exhausted = norm.is_nan() || norm <= LANCZOS_BREAKDOWN;
+            if exhausted {
+                break;
+            }
+            if step > 0 {
+                off_squared.push(norm * norm);
+                beta = norm;
+            }
+            let scale = 1.0 / norm;
+            v.par_iter_mut().with_min_len(4096).for_each(|v| {
+                for value in v {
+                    *value *= scale;
+                }
+            });
+            let (v_ref, previous_ref) = (&v, &previous);
+            w.par_chunks_mut(self.rows_per_task).enumerate().for_each(|(chunk, out)| {
+                let first = chunk * self.rows_per_task;
+                widest(LanczosRows { a: self, first, v: v_ref, previous: previous_ref, beta, out });
+            });
+            let alpha = dot(&w, &v);
+            diagonal.push(alpha);
+            w.par_iter_mut().zip(&v).with_min_len(4096).for_each(|(w, v)| {
+                for c in 0..N {
+                    w[c] -= alpha * v[c];
+                }
+            });
+            norm = dot(&w, &w).sqrt();
+            std::mem::swap(&mut previous, &mut v);
+            std::mem::swap(&mut v, &mut w);
+        }
+        if diagonal.is_empty() {
+            return 1.0;
+        }
+        tridiagonal_extremes(&diagonal, &off_squared)[1].max(1.0)
+    }
+}
+
+/// Some rows of A v − β v₋₁, v₋₁ the vector before.
+struct LanczosRows<'a, const N: usize> {
+    a: &'a ScaledMatrix<N>,
+    first: usize,
+    v: &'a [[f64; N]],
+    previous: &'a [[f64; N]],
+    beta: f64,
+    out: &'a mut [[f64; N]],
+}
+
+impl<const N: usize> Kernel for LanczosRows<'_, N> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        for (offset, out) in self.out.iter_mut().enumerate() {
+            let j = self.first + offset;
+            let y = self.a.row_product(j, self.v);
+            for c in 0..N {
+                out[c] = y[c] - self.beta * self.previous[j][c];
+            }
+        }
+    }
+}

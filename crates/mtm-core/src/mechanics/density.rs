@@ -1,0 +1,501 @@
+//! Strain energy of a material point under large rotation: value, stress and tangent by the deformation
+//! gradient F. Energies in MPa = N mm/mm³.
+//!
+//! Corotational: W = ½ e : C : e with the stretch e = U − I of F = R U (Biot 1965). For isotropic C its
+//! force is the corotational one, R K (Rᵀ x − X) (Müller & Gross 2004); for a fibre it is the one that an
+//! energy has, and leaves no moment behind.
+//!
+//! Hyperelastic: stable neo-Hookean (Smith, de Goes & Kim 2018, eq. 14) for the isotropic stiffness nearest to C
+//! (Fedorov 1968), and ½ e : (C − C_iso) : e for the fibre. At F = I the tangent is C.
+
+use nalgebra::{Cholesky, Matrix3, Matrix6, SMatrix, SymmetricEigen, Vector3};
+
+use crate::mechanics::kinematics::Kinematics;
+use crate::mechanics::material::{Lame, TetMaterial, Voigt};
+use crate::mechanics::polar::Polar;
+
+/// Derivatives of the nine entries of F, row by row.
+pub(crate) type Tangent = SMatrix<f64, 9, 9>;
+
+/// Sum of two principal stretches below which rotation about the third axis has no meaning: both sides of
+/// the tet have all but passed each other.
+const LEAST_STRETCH_SUM: f64 = 1e-2;
+/// Stiffness added to a tangent over its largest entry, so that its zeros, as those of turning a body at
+/// rest, do not count as negative by rounding. Newton's method converges as without.
+const DEFINITE_LIFT: f64 = 1e-10;
+/// Rows and columns of strain components in Voigt order.
+const PAIRS: [(usize, usize); 6] = [(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)];
+/// Place in Voigt order of each entry of a tensor, row by row.
+const VOIGT: [usize; 9] = [0, 5, 4, 5, 1, 3, 4, 3, 2];
+
+/// Energy density of one material.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Density {
+    neo_hookean: Option<NeoHookean>,
+    stretch: Option<Stiffness>,
+}
+
+/// Constants of the stable neo-Hookean energy
+/// ½ μ (|F|² − 3) − ½ μ ln((|F|² + 1)/4) + ½ λ (J − 1)² − ¾ μ (J − 1), MPa.
+///
+/// Equal to that of the source but for a constant: λ (J − α)²/2 with α = 1 + ¾ μ/λ.
+#[derive(Debug, Clone, Copy)]
+struct NeoHookean {
+    lambda_: f64,
+    mu: f64,
+}
+
+impl From<Lame> for NeoHookean {
+    /// μ' = 4/3 μ and λ' = λ + 5/6 μ make the linear limit that of the Lamé constants.
+    fn from(l: Lame) -> Self {
+        Self { lambda_: l.lambda_ + 5.0 / 6.0 * l.mu, mu: 4.0 / 3.0 * l.mu }
+    }
+}
+
+/// C for the stretch energy, without a detour through a box: it is read at every point.
+#[derive(Debug, Clone, Copy)]
+#[allow(clippy::large_enum_variant)]
+enum Stiffness {
+    Isotropic(Lame),
+    General(Voigt),
+}
+
+/// What a volumetric measure gives at a point: θ and ∂θ/∂F.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Volumetric {
+    /// tr U − 3 (corotational) or J − 1 (hyperelastic).
+    pub value: f64,
+    /// R or the cofactor of F.
+    pub slope: Matrix3<f64>,
+}
+
+/// Energy density and stress at a point.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct PointResponse {
+    /// N mm/mm³.
+    pub energy: f64,
+    /// First Piola–Kirchhoff stress ∂W/∂F, MPa.
+    pub stress: Matrix3<f64>,
+}
+
+impl Density {
+    /// The energy of `material` under `kinematics`, which is not linear.
+    pub fn new(material: &TetMaterial<'_>, kinematics: Kinematics) -> Self {
+        let stiffness = match material {
+            TetMaterial::Isotropic(lame) => Stiffness::Isotropic(*lame),
+            other => Stiffness::General(other.voigt()),
+        };
+        if kinematics != Kinematics::Hyperelastic {
+            return Self { neo_hookean: None, stretch: Some(stiffness) };
+        }
+        match stiffness {
+            Stiffness::Isotropic(lame) => Self { neo_hookean: Some(lame.into()), stretch: None },
+            Stiffness::General(c) => {
+                let lame = nearest_isotropic(&c);
+                let mut rest = c;
+                for (i, row) in rest.iter_mut().enumerate() {
+                    row[i] -= if i < 3 { 2.0 * lame.mu } else { lame.mu };
+                    for value in row.iter_mut().take(if i < 3 { 3 } else { 0 }) {
+                        *value -= lame.lambda_;
+                    }
+                }
+                Self { neo_hookean: Some(lame.into()), stretch: Some(Stiffness::General(rest)) }
+            }
+        }
+    }
+
+    /// Energy and stress at `f`, with `pressure` on the volumetric measure of `kinematics` added to the stress.
+    pub fn response(
+        &self,
+        f: &Matrix3<f64>,
+        kinematics: Kinematics,
+        pressure: f64,
+    ) -> PointResponse {
+        let mut out = PointResponse { energy: 0.0, stress: Matrix3::zeros() };
+        if let Some(neo) = &self.neo_hookean {
+            let (size, j) = (f.norm_squared(), f.determinant());
+            out.energy += 0.5 * neo.mu * (size - 3.0) - 0.5 * neo.mu * (0.25 * (size + 1.0)).ln()
+                + (0.5 * neo.lambda_ * (j - 1.0) - 0.75 * neo.mu) * (j - 1.0);
+            out.stress += f * (neo.mu * (1.0 - 1.0 / (size + 1.0)))
+                + cofactor(f) * (neo.lambda_ * (j - 1.0) - 0.75 * neo.mu);
+        }
+        if let Some(stiffness) = &self.stretch {
+            let polar = Polar::new(f);
+            let strain = stretch_strain(&polar);
+            let t = stiffness.apply(&strain);
+            out.energy += 0.5 * t.dot(&strain);
+            out.stress += polar.q * in_frame_stress(&polar, &t) * polar.v.transpose();
+        }
+        if pressure != 0.0 {
+            out.stress += volumetric(f, kinematics).slope * pressure;
+        }
+        out
+    }
+
+    /// ∂²W/∂F² at `f`, with `pressure` times that of the volumetric measure.
+    pub fn tangent(&self, f: &Matrix3<f64>, kinematics: Kinematics, pressure: f64) -> Tangent {
+        let mut out = Tangent::zeros();
+        let mut cofactor_stress = 0.0;
+        let mut stretch_pressure = 0.0;
+        if kinematics == Kinematics::Hyperelastic {
+            cofactor_stress += pressure;
+        } else {
+            stretch_pressure += pressure;
+        }
+        if let Some(neo) = &self.neo_hookean {
+            let (size, j) = (f.norm_squared(), f.determinant());
+            let (f9, c9) = (flat(f), flat(&cofactor(f)));
+            out += Tangent::identity() * (neo.mu * (1.0 - 1.0 / (size + 1.0)));
+            out += f9 * f9.transpose() * (2.0 * neo.mu / ((size + 1.0) * (size + 1.0)));
+            out += c9 * c9.transpose() * neo.lambda_;
+            cofactor_stress += neo.lambda_ * (j - 1.0) - 0.75 * neo.mu;
+        }
+        if cofactor_stress != 0.0 {
+            add_cofactor_tangent(&mut out, f, cofactor_stress);
+        }
+        if let Some(stiffness) = &self.stretch {
+            out += stretch_tangent(stiffness, f, stretch_pressure);
+        }
+        out
+    }
+}
+
+/// θ and ∂θ/∂F of `kinematics` at `f`.
+pub(crate) fn volumetric(f: &Matrix3<f64>, kinematics: Kinematics) -> Volumetric {
+    if kinematics == Kinematics::Hyperelastic {
+        return Volumetric { value: f.determinant() - 1.0, slope: cofactor(f) };
+    }
+    let polar = Polar::new(f);
+    Volumetric { value: polar.stretch.sum() - 3.0, slope: polar.rotation() }
+}
+
+/// `tangent` without negative curvature: steps along it downhill.
+///
+/// Hyperelastic points keep its size, so that steps stay as short along it as along positive curvature (Chen et
+/// al. 2024), where without it they leap. Corotational points lose it (Teran et al. 2005): theirs is of turns
+/// that lie far from rest, and short steps would not come to their end.
+///
+/// Most points have none: a factor of it with a trifle added shows that, and that sum is then the answer.
+pub(crate) fn definite(tangent: Tangent, kinematics: Kinematics) -> Tangent {
+    // The eigenvalue iteration would not end.
+    if tangent.iter().any(|x| !x.is_finite()) {
+        return tangent;
+    }
+    let symmetric = 0.5 * (tangent + tangent.transpose());
+    let lifted = symmetric + Tangent::identity() * (DEFINITE_LIFT * symmetric.amax());
+    if Cholesky::new(lifted).is_some() {
+        return lifted;
+    }
+    let eigen = SymmetricEigen::new(symmetric);
+    let mut out = Tangent::zeros();
+    for i in 0..9 {
+        let (mode, value) = (eigen.eigenvectors.column(i), eigen.eigenvalues[i]);
+        let kept =
+            if kinematics == Kinematics::Hyperelastic { value.abs() } else { value.max(0.0) };
+        out += mode * mode.transpose() * kept;
+    }
+    out
+}
+
+/// The isotropic stiffness nearest to `c` (Fedorov 1968): 9K = C_iijj, 30 μ = 3 C_ijij − C_iijj.
+fn nearest_isotropic(c: &Voigt) -> Lame {
+    let mut volume = 0.0;
+    for row in c.iter().take(3) {
+        volume += row[0] + row[1] + row[2];
+    }
+    let trace = c[0][0] + c[1][1] + c[2][2] + 2.0 * (c[3][3] + c[4][4] + c[5][5]);
+    let mu = (3.0 * trace - volume) / 30.0;
+    Lame { lambda_: volume / 9.0 - 2.0 / 3.0 * mu, mu }
+}
+
+impl Stiffness {
+    /// C : e.
+    fn apply(&self, e: &Matrix3<f64>) -> Matrix3<f64> {
+        match self {
+            Self::Isotropic(l) => e * (2.0 * l.mu) + Matrix3::identity() * (l.lambda_ * e.trace()),
+            Self::General(c) => {
+                let strain = PAIRS.map(|(i, j)| if i == j { e[(i, i)] } else { 2.0 * e[(i, j)] });
+                let mut out = Matrix3::zeros();
+                for (row, &(i, j)) in PAIRS.iter().enumerate() {
+                    let mut stress = 0.0;
+                    for (col, s) in strain.iter().enumerate() {
+                        stress += 0.5 * (c[row][col] + c[col][row]) * s;
+                    }
+                    out[(i, j)] = stress;
+                    out[(j, i)] = stress;
+                }
+                out
+            }
+        }
+    }
+}
+
+impl Stiffness {
+    /// C in the axes that are the columns of `v`, by the stress transformation of Bond (1943).
+    fn in_frame(&self, v: &Matrix3<f64>) -> Voigt {
+        match self {
+            Self::Isotropic(l) => std::array::from_fn(|i| {
+                std::array::from_fn(|j| match (i, j) {
+                    (0..3, 0..3) if i == j => l.lambda_ + 2.0 * l.mu,
+                    (0..3, 0..3) => l.lambda_,
+                    _ if i == j => l.mu,
+                    _ => 0.0,
+                })
+            }),
+            Self::General(c) => {
+                // σ'_ij = Σ v_ki v_lj σ_kl: a shear stress of Voigt stands for two of the sum.
+                let bond = Matrix6::from_fn(|row, col| {
+                    let ((i, j), (k, l)) = (PAIRS[row], PAIRS[col]);
+                    let one = v[(k, i)] * v[(l, j)];
+                    if k == l { one } else { one + v[(l, i)] * v[(k, j)] }
+                });
+                let c = Matrix6::from_fn(|i, j| 0.5 * (c[i][j] + c[j][i]));
+                let turned = bond * c * bond.transpose();
+                std::array::from_fn(|i| std::array::from_fn(|j| turned[(i, j)]))
+            }
+        }
+    }
+}
+
+/// e = U − I in global axes.
+fn stretch_strain(polar: &Polar) -> Matrix3<f64> {
+    let e = polar.v * Matrix3::from_diagonal(&polar.stretch.add_scalar(-1.0)) * polar.v.transpose();
+    0.5 * (e + e.transpose())
+}
+
+/// Qᵀ P V of the stretch energy with T = C : e: 2 u_i T_ij / (u_i + u_j) in the principal frame at rest.
+///
+/// From δW = T : δU and δU U + U δU = δ(FᵀF); symmetric T U, as with isotropic C, gives P = R T.
+fn in_frame_stress(polar: &Polar, t: &Matrix3<f64>) -> Matrix3<f64> {
+    let t = polar.v.transpose() * t * polar.v;
+    let u = polar.stretch;
+    Matrix3::from_fn(|i, j| {
+        if i == j { t[(i, i)] } else { 2.0 * u[i] * t[(i, j)] / stretch_sum(u[i], u[j]) }
+    })
+}
+
+fn stretch_sum(a: f64, b: f64) -> f64 {
+    (a + b).max(LEAST_STRETCH_SUM)
+}
+
+/// ∂²W/∂F² of the stretch energy; `pressure` is added to T where U bends.
+///
+/// With A = Qᵀ δF V, E_ij = (u_i A_ij + u_j A_ji)/(u_i + u_j) is δU and Ω_ij = (A_ij − A_ji)/(u_i + u_j) the
+/// turn, A_ij = Ω_ij u_j + E_ij, in the principal frame at rest. Then δ²W = E : C : E + T : δ²U, and
+/// U² = FᵀF differentiated twice gives δ²U_ij = 2 Σ_k (A_ki A_kj − E_ki E_kj)/(u_i + u_j).
+fn stretch_tangent(stiffness: &Stiffness, f: &Matrix3<f64>, pressure: f64) -> Tangent {
+    let polar = Polar::new(f);
+    let (u, v) = (polar.stretch, polar.v);
+    let t = v.transpose() * stiffness.apply(&stretch_strain(&polar)) * v
+        + Matrix3::identity() * pressure;
+    let sum = Matrix3::from_fn(|i, j| stretch_sum(u[i], u[j]));
+
+    // E : C : E. Entry (r, c) of A strains one component of E alone, by `strains` in Voigt order.
+    let strains: [f64; 9] = std::array::from_fn(|rc| {
+        let (r, c) = (rc / 3, rc % 3);
+        if r == c { 1.0 } else { 2.0 * u[r] / sum[(r, c)] }
+    });
+    let c = stiffness.in_frame(&v);
+    let mut in_frame = Tangent::zeros();
+    for a in 0..9 {
+        for b in 0..9 {
+            in_frame[(a, b)] = strains[a] * c[VOIGT[a]][VOIGT[b]] * strains[b];
+        }
+    }
+    // T : δ²U on the diagonal: A² − E² = u_i Ω (A + E), whose factor u_i is that of T_ii / u_i.
+    for i in 0..3 {
+        for k in (0..3).filter(|&k| k != i) {
+            let (here, there) = (3 * k + i, 3 * i + k);
+            let turn = t[(i, i)] / sum[(k, i)];
+            // A_ki + E_ki over A_ki and A_ik.
+            let (own, other) = (1.0 + u[k] / sum[(k, i)], u[i] / sum[(k, i)]);
+            in_frame[(here, here)] += turn * own;
+            in_frame[(there, there)] -= turn * other;
+            in_frame[(here, there)] += 0.5 * turn * (other - own);
+            in_frame[(there, here)] += 0.5 * turn * (other - own);
+        }
+    }
+    // Off the diagonal: 2 T_ij/(u_i + u_j) on both sides of it.
+    for (i, j) in [(0, 1), (1, 2), (2, 0)] {
+        let weight = 2.0 * t[(i, j)] / sum[(i, j)];
+        if weight == 0.0 {
+            continue;
+        }
+        for k in 0..3 {
+            let (ki, kj) = (3 * k + i, 3 * k + j);
+            in_frame[(ki, kj)] += weight;
+            in_frame[(kj, ki)] += weight;
+            for (a, share_a) in strained_by(k, i, &u, &sum) {
+                for (b, share_b) in strained_by(k, j, &u, &sum) {
+                    in_frame[(a, b)] -= weight * share_a * share_b;
+                    in_frame[(b, a)] -= weight * share_a * share_b;
+                }
+            }
+        }
+    }
+    carried(&in_frame, &polar.q, &v)
+}
+
+/// The entries of A that E_ij is made of, at 3r + c, with their shares.
+fn strained_by(i: usize, j: usize, u: &Vector3<f64>, sum: &Matrix3<f64>) -> [(usize, f64); 2] {
+    if i == j {
+        return [(4 * i, 0.5), (4 * i, 0.5)];
+    }
+    [(3 * i + j, u[i] / sum[(i, j)]), (3 * j + i, u[j] / sum[(i, j)])]
+}
+
+/// Derivatives by F from those by A = Qᵀ F V, one index after another.
+fn carried(in_frame: &Tangent, q: &Matrix3<f64>, v: &Matrix3<f64>) -> Tangent {
+    // Columns (t, u) to (k, l) by Q and V, twice: the form is symmetric, so its transpose is turned alike.
+    let turned = |h: &Tangent| {
+        let mut half = Tangent::zeros();
+        for t in 0..3 {
+            for l in 0..3 {
+                let mut column = h.column(3 * t) * v[(l, 0)];
+                column += h.column(3 * t + 1) * v[(l, 1)];
+                column += h.column(3 * t + 2) * v[(l, 2)];
+                half.set_column(3 * t + l, &column);
+            }
+        }
+        let mut out = Tangent::zeros();
+        for k in 0..3 {
+            for l in 0..3 {
+                let mut column = half.column(l) * q[(k, 0)];
+                column += half.column(3 + l) * q[(k, 1)];
+                column += half.column(6 + l) * q[(k, 2)];
+                out.set_column(3 * k + l, &column);
+            }
+        }
+        out
+    };
+    turned(&turned(in_frame).transpose())
+}
+
+/// Adds `stress` ∂²J/∂F²: δ²J = F : (δF × δF), the cross product of tensors.
+fn add_cofactor_tangent(out: &mut Tangent, f: &Matrix3<f64>, stress: f64) {
+    // ∂²J/∂F_ij∂F_kl = ε_ikm ε_jln F_mn.
+    for i in 0..3 {
+        for j in 0..3 {
+            for (k, m, row_sign) in
+                [((i + 1) % 3, (i + 2) % 3, 1.0), ((i + 2) % 3, (i + 1) % 3, -1.0)]
+            {
+                for (l, n, column_sign) in
+                    [((j + 1) % 3, (j + 2) % 3, 1.0), ((j + 2) % 3, (j + 1) % 3, -1.0)]
+                {
+                    out[(3 * i + j, 3 * k + l)] += stress * row_sign * column_sign * f[(m, n)];
+                }
+            }
+        }
+    }
+}
+
+/// ∂J/∂F.
+fn cofactor(f: &Matrix3<f64>) -> Matrix3<f64> {
+    Matrix3::from_fn(|i, j| {
+        let (a, b, c, d) = ((i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3);
+        f[(a, c)] * f[(b, d)] - f[(a, d)] * f[(b, c)]
+    })
+}
+
+/// Entries row by row.
+fn flat(m: &Matrix3<f64>) -> SMatrix<f64, 9, 1> {
+    SMatrix::<f64, 9, 1>::from_fn(|i, _| m[(i / 3, i % 3)])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mechanics::material::{Elastic, FibreElastic, FibreLaw, Spencer};
+
+    /// Deformation gradients: at rest, sheared, turned by a right angle, squeezed, inverted.
+    fn gradients() -> Vec<Matrix3<f64>> {
+        let shear = Matrix3::new(1.2, 0.3, -0.1, 0.05, 0.9, 0.2, 0.1, -0.2, 1.1);
+        let turn = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
+        let squeeze = Matrix3::from_diagonal(&nalgebra::Vector3::new(1.4, 0.5, 0.8));
+        let invert = Matrix3::from_diagonal(&nalgebra::Vector3::new(1.0, 1.3, -0.3));
+        let small = Matrix3::identity() + 1e-3 * (shear - Matrix3::identity());
+        vec![Matrix3::identity(), small, shear, turn * shear, squeeze * shear, invert * shear]
+    }
+
+    fn materials() -> Vec<TetMaterial<'static>> {
+        let moduli = FibreElastic { young_along: 2.0, young_across: 0.7, poisson: 0.43 };
+        let c = Spencer::from_moduli(moduli, FibreLaw::Spencer);
+        let a = nalgebra::Vector3::new(0.6, -0.3, 0.7).normalize();
+        vec![
+            TetMaterial::Isotropic(Elastic { young: 1.3, poisson: 0.45 }.into()),
+            TetMaterial::Spencer(c, a.into()),
+        ]
+    }
+
+    #[test]
+    fn stress_and_tangent_are_the_derivatives_of_energy() {
+        // Central differences of step h: error near h² and rounding near 1e-16/h.
+        const STEP: f64 = 1e-5;
+        const TOLERANCE: f64 = 1e-8;
+        for kinematics in [Kinematics::Corotational, Kinematics::Hyperelastic] {
+            for material in materials() {
+                let density = Density::new(&material, kinematics);
+                for f in gradients() {
+                    for pressure in [0.0, 0.7] {
+                        let total = |f: &Matrix3<f64>| {
+                            density.response(f, kinematics, 0.0).energy
+                                + pressure * volumetric(f, kinematics).value
+                        };
+                        let stress = density.response(&f, kinematics, pressure).stress;
+                        let tangent = density.tangent(&f, kinematics, pressure);
+                        for entry in 0..9 {
+                            let mut step = Matrix3::zeros();
+                            step[(entry / 3, entry % 3)] = STEP;
+                            let slope = (total(&(f + step)) - total(&(f - step))) / (2.0 * STEP);
+                            let off = slope - stress[(entry / 3, entry % 3)];
+                            assert!(off.abs() < TOLERANCE, "{kinematics:?} {f} stress {off}");
+                            let ahead = density.response(&(f + step), kinematics, pressure).stress;
+                            let behind = density.response(&(f - step), kinematics, pressure).stress;
+                            let column = flat(&((ahead - behind) / (2.0 * STEP)));
+                            let off = (column - tangent.column(entry)).amax();
+                            assert!(off < TOLERANCE, "{kinematics:?} {f} tangent {off}");
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_tangent_at_rest_is_the_stiffness() {
+        for kinematics in [Kinematics::Corotational, Kinematics::Hyperelastic] {
+            for material in materials() {
+                let density = Density::new(&material, kinematics);
+                let rest = density.response(&Matrix3::identity(), kinematics, 0.0);
+                assert!(rest.energy.abs() < 1e-15 && rest.stress.amax() < 1e-15);
+                let tangent = density.tangent(&Matrix3::identity(), kinematics, 0.0);
+                let c = material.voigt();
+                for (row, (i, j)) in PAIRS.into_iter().enumerate() {
+                    for (col, (k, l)) in PAIRS.into_iter().enumerate() {
+                        let off = tangent[(3 * i + j, 3 * k + l)] - c[row][col];
+                        assert!(off.abs() < 1e-14, "{kinematics:?} {row} {col}: {off}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn energy_does_not_change_and_stress_turns_with_a_rotation() {
+        let turn = *nalgebra::Rotation3::from_euler_angles(1.1, -2.0, 0.4).matrix();
+        for kinematics in [Kinematics::Corotational, Kinematics::Hyperelastic] {
+            for material in materials() {
+                let density = Density::new(&material, kinematics);
+                for f in gradients() {
+                    let here = density.response(&f, kinematics, 0.3);
+                    let there = density.response(&(turn * f), kinematics, 0.3);
+                    assert!((here.energy - there.energy).abs() < 1e-13 * here.energy.max(1.0));
+                    assert!((turn * here.stress - there.stress).amax() < 1e-13);
+                    // Moments balance: P Fᵀ is symmetric.
+                    let moment = here.stress * f.transpose();
+                    assert!((moment - moment.transpose()).amax() < 1e-13);
+                }
+            }
+        }
+    }
+}

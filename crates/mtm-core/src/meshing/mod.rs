@@ -1,0 +1,5 @@
+//! Tetrahedral meshes from label images, and the cuts through them.
+
+pub mod crack;
+pub mod signed_distance;
+pub mod stuffing;

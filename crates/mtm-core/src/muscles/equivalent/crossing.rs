@@ -1,0 +1,182 @@
+//! Which tets the surface of a muscle crosses, and which lie wholly inside.
+
+use crate::geometry::triangle::Vec3;
+use crate::mesh::TetMesh;
+use crate::muscles::equivalent::aligned_box::AlignedBox;
+use crate::muscles::equivalent::shape::{InsideTest, MuscleShape, Side};
+use crate::muscles::equivalent::tet_tree::{Branch, TetTree};
+
+/// Triangles and tets of a branch, multiplied, above which its halves go to different threads.
+const PARALLEL_PAIRS: usize = 1 << 16;
+
+/// A tet that a muscle has a part in.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Touch {
+    pub tet: u32,
+    /// Where the triangles that may cross the tet start in [`Touches::triangles`].
+    first: u32,
+    /// How many there are.
+    count: u32,
+    /// Whether the tet lies wholly inside.
+    is_whole: bool,
+}
+
+/// The tets that a muscle has a part in.
+#[derive(Debug, Default)]
+pub(super) struct Touches {
+    pub tets: Vec<Touch>,
+    triangles: Vec<u32>,
+    /// Points whose side was asked for.
+    pub evaluations: usize,
+    /// Tets that were looked at one by one.
+    pub looked_at: usize,
+}
+
+impl Touch {
+    /// Whether the tet lies wholly inside the muscle.
+    pub fn is_whole(&self) -> bool {
+        self.is_whole
+    }
+
+    fn whole(tet: u32) -> Self {
+        Self { tet, first: 0, count: 0, is_whole: true }
+    }
+}
+
+impl Touches {
+    /// Triangles that may cross the tet.
+    pub fn triangles(&self, touch: &Touch) -> &[u32] {
+        &self.triangles[touch.first as usize..(touch.first + touch.count) as usize]
+    }
+
+    fn joined(mut self, other: Self) -> Self {
+        let shift = self.triangles.len() as u32;
+        self.tets.extend(other.tets.iter().map(|t| Touch { first: t.first + shift, ..*t }));
+        self.triangles.extend_from_slice(&other.triangles);
+        self.evaluations += other.evaluations;
+        self.looked_at += other.looked_at;
+        self
+    }
+}
+
+/// The tets and their boxes, and the muscle that goes through them.
+pub(super) struct Passage<'a> {
+    pub mesh: &'a TetMesh,
+    pub boxes: &'a [AlignedBox],
+    pub tree: &'a TetTree,
+    pub muscle: &'a MuscleShape<'a>,
+    pub stop: &'a (dyn Fn() -> bool + Sync),
+}
+
+impl Passage<'_> {
+    /// The tets that the muscle has a part in, or some of them after `stop` has said so.
+    ///
+    /// A branch of tets whose box no triangle meets is settled by one evaluation where the winding number
+    /// can; below it no tet is looked at.
+    pub fn touches(&self) -> Touches {
+        let all: Vec<u32> = (0..self.muscle.n_triangles() as u32).collect();
+        self.visit(0, &all)
+    }
+
+    fn visit(&self, at: usize, triangles: &[u32]) -> Touches {
+        let mut found = Touches::default();
+        let Some(branch) = self.tree.branch(at) else { return found };
+        if !branch.bounds.meets(self.muscle.bounds()) {
+            return found;
+        }
+        let near: Vec<u32> = self.near(triangles, &branch.bounds);
+        if near.is_empty() && self.muscle.test == InsideTest::Winding {
+            found.evaluations += 1;
+            let (centre, radius) = (branch.bounds.centre(), branch.bounds.radius());
+            match self.muscle.side_of(&centre, radius) {
+                Side::Inside => {
+                    found.tets.extend(self.tree.tets(branch).iter().map(|&t| Touch::whole(t)));
+                    return found;
+                }
+                Side::Outside => return found,
+                Side::Mixed => {}
+            }
+        }
+        match branch.halves(at) {
+            None => self.look_at(branch, &near, &mut found),
+            Some([first, second]) => {
+                let (left, right) = (|| self.visit(first, &near), || self.visit(second, &near));
+                let pairs = (near.len() + 1) * self.tree.tets(branch).len();
+                let (left, right) = if pairs > PARALLEL_PAIRS {
+                    if (self.stop)() {
+                        return found;
+                    }
+                    rayon::join(left, right)
+                } else {
+                    (left(), right())
+                };
+                found = found.joined(left).joined(right);
+            }
+        }
+        found
+    }
+
+    fn near(&self, triangles: &[u32], bounds: &AlignedBox) -> Vec<u32> {
+        let meets = |&&t: &&u32| self.muscle.triangle_box(t).meets(bounds);
+        triangles.iter().filter(meets).copied().collect()
+    }
+
+    /// Settles the tets of a leaf one by one.
+    fn look_at(&self, leaf: &Branch, triangles: &[u32], found: &mut Touches) {
+        for &tet in self.tree.tets(leaf) {
+            let bounds = &self.boxes[tet as usize];
+            if !bounds.meets(self.muscle.bounds()) {
+                continue;
+            }
+            found.looked_at += 1;
+            let corners =
+                self.mesh.tets()[tet as usize].map(|v| Vec3::from(self.mesh.nodes()[v as usize]));
+            let faces = Faces::new(&corners);
+            let first = found.triangles.len();
+            for &t in triangles {
+                if self.muscle.triangle_box(t).meets(bounds)
+                    && may_cross(&corners, &faces, self.muscle.corners(t))
+                {
+                    found.triangles.push(t);
+                }
+            }
+            let count = (found.triangles.len() - first) as u32;
+            if count == 0 {
+                found.evaluations += 1;
+                let centroid = corners.iter().sum::<Vec3>() / 4.0;
+                let radius = corners.iter().map(|c| (c - centroid).norm()).fold(0.0, f64::max);
+                match self.muscle.side_of(&centroid, radius) {
+                    Side::Inside => found.tets.push(Touch::whole(tet)),
+                    Side::Outside => {}
+                    Side::Mixed => found.tets.push(Touch { tet, first: 0, count, is_whole: false }),
+                }
+            } else {
+                found.tets.push(Touch { tet, first: first as u32, count, is_whole: false });
+            }
+        }
+    }
+}
+
+/// Outward normals of a tet's faces, and their offsets.
+struct Faces([(Vec3, f64); 4]);
+
+impl Faces {
+    fn new([a, b, c, d]: &[Vec3; 4]) -> Self {
+        let face = |p: &Vec3, q: &Vec3, r: &Vec3| {
+            let normal = (q - p).cross(&(r - p));
+            (normal, normal.dot(p))
+        };
+        Self([face(b, c, d), face(a, d, c), face(a, b, d), face(a, c, b)])
+    }
+}
+
+/// False only if a face of the tet, or the triangle's own plane, parts the two.
+fn may_cross(tet: &[Vec3; 4], Faces(faces): &Faces, triangle: &[Vec3; 3]) -> bool {
+    if faces.iter().any(|(n, offset)| triangle.iter().all(|p| n.dot(p) > *offset)) {
+        return false;
+    }
+    let [a, b, c] = triangle;
+    let normal = (b - a).cross(&(c - a));
+    let sides = tet.map(|p| normal.dot(&(p - a)));
+    !(sides.iter().all(|&s| s > 0.0) || sides.iter().all(|&s| s < 0.0))
+}

@@ -1,0 +1,116 @@
+//! The mean direction of fibres, whose signs mean nothing.
+
+use nalgebra::{Matrix3, SymmetricEigen};
+
+use crate::geometry::triangle::Vec3;
+
+/// Difference of eigenvalues over their sum below which they tie.
+const TIE: f64 = 1e-9;
+
+/// Weighted sum of a ⊗ a over fibre directions a.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct DirectionSum {
+    tensor: Matrix3<f64>,
+    /// The first direction that came, which decides where eigenvalues tie.
+    first: Option<Vec3>,
+}
+
+/// Mean direction of fibres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MeanDirection {
+    /// Unit vector; its component of largest size is positive. Zero where there is no fibre.
+    pub direction: [f64; 3],
+    /// (λ₁ − λ₂)/(λ₁ + λ₂ + λ₃) of Σ w a ⊗ a: 1 where all fibres are parallel, 0 where no direction leads.
+    pub coherence: f64,
+}
+
+impl DirectionSum {
+    /// Adds a unit direction.
+    pub fn add(&mut self, direction: [f64; 3], weight: f64) {
+        let a = Vec3::from(direction);
+        self.tensor += a * a.transpose() * weight;
+        self.first.get_or_insert(a);
+    }
+
+    /// Multiplies all weights.
+    pub fn scale(&mut self, factor: f64) {
+        self.tensor *= factor;
+    }
+
+    /// Adds all of another sum, whose directions come after those of this one.
+    pub fn append(&mut self, other: &Self) {
+        self.tensor += other.tensor;
+        self.first = self.first.or(other.first);
+    }
+
+    /// Principal eigenvector of the sum.
+    ///
+    /// Where the largest eigenvalue is double or triple, it is the direction of that eigenspace nearest to
+    /// the first direction that was added.
+    pub fn mean(&self) -> MeanDirection {
+        let Some(first) = self.first else {
+            return MeanDirection { direction: [0.0; 3], coherence: 0.0 };
+        };
+        let SymmetricEigen { eigenvalues, eigenvectors } = SymmetricEigen::new(self.tensor);
+        let mut rank = [0, 1, 2];
+        rank.sort_by(|&i, &j| eigenvalues[j].total_cmp(&eigenvalues[i]));
+        let sum = eigenvalues.sum();
+        let [leading, second, _] = rank.map(|i| eigenvalues[i]);
+        let lead = eigenvectors.column(rank[0]).into_owned();
+        let tied = rank.into_iter().filter(|&i| leading - eigenvalues[i] <= TIE * sum);
+        let nearest: Vec3 = tied
+            .map(|i| {
+                let e = eigenvectors.column(i).into_owned();
+                e * e.dot(&first)
+            })
+            .sum();
+        // `first` is part of the sum, so its eigenspace is seldom at right angles to it.
+        let axis = nearest.try_normalize(TIE).unwrap_or(lead);
+        let coherence = ((leading - second) / sum).clamp(0.0, 1.0);
+        MeanDirection { direction: signed(axis).into(), coherence }
+    }
+}
+
+/// The one of ±`a` whose component of largest size is positive.
+fn signed(a: Vec3) -> Vec3 {
+    if a[a.iamax()] < 0.0 { -a } else { a }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn mean(directions: &[([f64; 3], f64)]) -> MeanDirection {
+        let mut sum = DirectionSum::default();
+        directions.iter().for_each(|&(a, w)| sum.add(a, w));
+        sum.mean()
+    }
+
+    #[test]
+    fn signs_do_not_cancel() {
+        let half = 0.5_f64.sqrt();
+        let found = mean(&[([-half, half, 0.0], 1.0), ([half, -half, 0.0], 1.0)]);
+        assert!(
+            (Vec3::from(found.direction) - Vec3::new(half, -half, 0.0)).norm() < 1e-12
+                || (Vec3::from(found.direction) - Vec3::new(-half, half, 0.0)).norm() < 1e-12
+        );
+        assert!(found.direction.iter().any(|&v| v > 0.7));
+        assert!((found.coherence - 1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_heavier_of_two_crossing_directions_leads() {
+        let found = mean(&[([1.0, 0.0, 0.0], 1.0), ([0.0, 0.0, -1.0], 3.0)]);
+        assert!((found.direction[2] - 1.0).abs() < 1e-12);
+        assert!((found.coherence - 0.5).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_tie_goes_to_the_first_direction() {
+        for axes in [[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]] {
+            let found = mean(&[(axes[0], 1.0), (axes[1], 1.0)]);
+            assert!((Vec3::from(found.direction) - Vec3::from(axes[0])).norm() < 1e-9);
+            assert!(found.coherence < 1e-12);
+        }
+    }
+}

@@ -1,0 +1,392 @@
+//! Fibre directions of a muscle, from oriented boxes of its surface (Kim et al. 2010, section 2.2)
+//! or from known fibre lines.
+//!
+//! A box lies along the principal axes of a part of the surface. One box alone is the paper's; parts
+//! in series follow a bend, lanes side by side converge where the muscle tapers, sectors go round
+//! an opening. Between boxes the direction turns smoothly: it is the principal axis of the mean of
+//! a aᵀ over the boxes' directions a, in which signs cannot cancel.
+
+mod centre_line;
+mod course;
+mod parts;
+mod region;
+
+use nalgebra::Matrix3;
+use rayon::prelude::*;
+
+use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
+use crate::geometry::surface::Surface;
+use crate::geometry::triangle::Vec3;
+use course::{Courses, Segments};
+use parts::Part;
+use region::Region;
+
+/// Second extent over the first above which a muscle's longest axis does not tell where its fibres
+/// run.
+pub const SHEET_RATIO: f64 = 0.7;
+
+/// Deviation of box axes from orthonormal that is allowed.
+pub const AXES_TOLERANCE: f64 = 1e-6;
+
+/// Smallest half extent of a box that counts in the distance to it, relative to its largest: a flat
+/// box would have no neighbourhood.
+const LEAST_EXTENT: f64 = 0.05;
+
+/// Decay of a box's weight, exp(−q/2) with q = Σ (offset/half extent)²: between the middles of two
+/// equal boxes the share of one then falls almost linearly.
+const DECAY: f64 = 0.5;
+
+/// Difference in q above which the weight of a box is lost in rounding.
+const NEGLIGIBLE: f64 = 75.0;
+
+/// Fewest boxes that go round an opening.
+const LEAST_ROUND: usize = 3;
+
+/// Most boxes that may be asked for of one muscle.
+///
+/// Boxes of a real muscle would be less than 1 mm long beyond it; cutting a surface into 100 000 of them
+/// takes minutes and gigabytes.
+pub const MOST_BOXES: usize = 64;
+
+/// Points a thread takes at once.
+const POINTS_PER_TASK: usize = 256;
+
+/// How the fibres of a muscle run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MuscleKind {
+    /// Along it.
+    Strap,
+    /// From a wide origin to a narrow insertion.
+    Fan,
+    /// Round an opening.
+    Ring,
+    /// In a layer; the direction is no better than its outline tells.
+    Sheet,
+}
+
+impl MuscleKind {
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Strap => "strap",
+            Self::Fan => "fan",
+            Self::Ring => "ring",
+            Self::Sheet => "sheet",
+        }
+    }
+
+    /// The kind of a name.
+    ///
+    /// # Errors
+    /// [`MtmError::UnknownName`].
+    pub fn parse(name: &str) -> Result<Self> {
+        let kinds = [Self::Strap, Self::Fan, Self::Ring, Self::Sheet];
+        kinds.into_iter().find(|kind| kind.name() == name).ok_or_else(|| MtmError::UnknownName {
+            what: "kind of muscle",
+            found: name.to_owned(),
+            known: "strap, fan, ring, sheet",
+            kind: ErrorKind::Mesh,
+        })
+    }
+}
+
+/// A box along the axes of a part of a muscle's surface.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct OrientedBox {
+    /// Its centre, mm.
+    pub centre: [f64; 3],
+    /// Unit axes, right-handed; the fibres run along the first.
+    pub axes: [[f64; 3]; 3],
+    /// Half of its extent along each axis, mm.
+    pub half_extents: [f64; 3],
+}
+
+/// Where the fibres of a muscle run.
+#[derive(Debug, Clone)]
+pub struct MuscleFibres {
+    boxes: Vec<OrientedBox>,
+    reaches: Vec<Reach>,
+    courses: Option<Courses>,
+    kind: Option<MuscleKind>,
+    extents: Option<[f64; 3]>,
+}
+
+/// The parts of fibre lines that decide the directions in a ball; a buffer that is filled anew for each.
+#[derive(Debug, Clone, Default)]
+pub struct NearFibres(Segments);
+
+/// A box as its weights need it.
+#[derive(Debug, Clone, Copy)]
+struct Reach {
+    centre: Vec3,
+    /// Axes over half extents, 1/mm, as rows.
+    scaled: Matrix3<f64>,
+    direction: Vec3,
+}
+
+impl MuscleFibres {
+    /// The fibres of a muscle from oriented boxes of its surface.
+    ///
+    /// `surface`: areas alone count, it may have holes and flipped triangles; pieces that do not
+    /// belong to the muscle must be taken away first. `boxes`: how many, in series (strap, sheet),
+    /// side by side (fan) or round the opening (ring, at least 3), [`MOST_BOXES`] at most; none: as the
+    /// shape needs.
+    ///
+    /// # Errors
+    /// [`MtmError::OutOfRange`] for the number of boxes.
+    pub fn from_surface(surface: &Surface, kind: MuscleKind, boxes: Option<usize>) -> Result<Self> {
+        let least = if kind == MuscleKind::Ring { LEAST_ROUND } else { 1 };
+        if let Some(count) = boxes.filter(|count| !(least..=MOST_BOXES).contains(count)) {
+            return Err(MtmError::OutOfRange {
+                what: "number of fibre boxes".to_owned(),
+                index: 0,
+                value: count as f64,
+                allowed: "1 to 64, round an opening 3 to 64",
+                kind: ErrorKind::Mesh,
+            });
+        }
+        let region = Region::new(surface);
+        let moments = region
+            .moments()
+            .ok_or(MtmError::Empty { what: "area of the muscle", kind: ErrorKind::Mesh })?;
+        let axes = moments.axes();
+        let found = match kind {
+            MuscleKind::Strap | MuscleKind::Sheet => parts::in_series(&region, boxes),
+            MuscleKind::Fan => {
+                parts::in_lanes(&region, parts::taper_direction(&region, &moments), boxes)
+            }
+            MuscleKind::Ring => parts::in_ring(&region, boxes),
+        };
+        let extents = axes.map(|axis| {
+            let [low, high] = region.range(&axis);
+            high - low
+        });
+        let boxes: Vec<OrientedBox> = found.iter().map(oriented_box).collect();
+        Ok(Self { kind: Some(kind), extents: Some(extents), ..Self::of_boxes(boxes) })
+    }
+
+    /// Fibres along the first axes of `boxes`.
+    ///
+    /// # Errors
+    /// [`MtmError::Empty`] without a box; [`MtmError::NotFinite`] for a centre, axis or extent that is
+    /// NaN or infinite; [`MtmError::OutOfRange`] for axes that are not orthonormal within
+    /// [`AXES_TOLERANCE`], and for half extents of which one is negative or all are 0.
+    pub fn from_boxes(boxes: Vec<OrientedBox>) -> Result<Self> {
+        let kind = ErrorKind::Mesh;
+        if boxes.is_empty() {
+            return Err(MtmError::Empty { what: "fibre boxes", kind });
+        }
+        let rows = |row: fn(&OrientedBox) -> [f64; 3]| boxes.iter().map(row).collect::<Vec<_>>();
+        check_finite_rows("centre of fibre boxes", &rows(|b| b.centre), kind)?;
+        check_finite_rows("half extents of fibre boxes", &rows(|b| b.half_extents), kind)?;
+        for (index, b) in boxes.iter().enumerate() {
+            check_finite_rows(&format!("axes of fibre box {index}"), &b.axes, kind)?;
+            let axes = b.axes.map(Vec3::from);
+            let frame = Matrix3::from_columns(&axes);
+            let off = (frame.transpose() * frame - Matrix3::identity()).amax();
+            let refuse = |what: &str, value, allowed| {
+                Err(MtmError::OutOfRange { what: what.to_owned(), index, value, allowed, kind })
+            };
+            if off > AXES_TOLERANCE {
+                let what = "deviation of the axes of fibre boxes from orthonormal";
+                return refuse(what, off, "at most 1e-6");
+            }
+            let least = b.half_extents.iter().copied().fold(f64::INFINITY, f64::min);
+            if least < 0.0 {
+                return refuse("half extents of fibre boxes", least, "0 mm or more");
+            }
+            if b.half_extents.iter().all(|&h| h == 0.0) {
+                return refuse("half extents of fibre boxes", 0.0, "above 0 mm along one axis");
+            }
+        }
+        Ok(Self::of_boxes(boxes))
+    }
+
+    /// Fibres along known lines alone; see [`MuscleFibres::with_courses`].
+    ///
+    /// # Errors
+    /// Those of [`MuscleFibres::with_courses`].
+    pub fn from_courses(lines: &[Vec<[f64; 3]>]) -> Result<Self> {
+        Self::of_boxes(Vec::new()).with_courses(lines)
+    }
+
+    /// The same muscle with known fibre lines, which are followed instead of the boxes.
+    ///
+    /// Between lines the tangents where they are nearest are weighted by the inverse fourth power of
+    /// the distance. `lines`: points from origin to insertion, mm; a line that ends where it starts
+    /// is closed.
+    ///
+    /// # Errors
+    /// [`MtmError::Empty`] without a line; [`MtmError::NotFinite`]; [`MtmError::Length`] for a line
+    /// of fewer than two different points.
+    pub fn with_courses(self, lines: &[Vec<[f64; 3]>]) -> Result<Self> {
+        let kind = ErrorKind::Mesh;
+        if lines.is_empty() {
+            return Err(MtmError::Empty { what: "fibre lines", kind });
+        }
+        let mut distinct = Vec::with_capacity(lines.len());
+        for (index, line) in lines.iter().enumerate() {
+            check_finite_rows(&format!("fibre line {index}"), line, kind)?;
+            let mut points: Vec<Vec3> = line.iter().map(|&p| Vec3::from(p)).collect();
+            points.dedup();
+            if points.len() < 2 {
+                return Err(MtmError::Length {
+                    what: format!("fibre line {index}"),
+                    found: points.len(),
+                    expected: 2,
+                    why: "a direction needs two different points",
+                    kind,
+                });
+            }
+            distinct.push(points);
+        }
+        Ok(Self { courses: Some(Courses::new(&distinct)), ..self })
+    }
+
+    fn of_boxes(boxes: Vec<OrientedBox>) -> Self {
+        let reaches = boxes.iter().map(Reach::new).collect();
+        Self { boxes, reaches, courses: None, kind: None, extents: None }
+    }
+
+    /// The boxes of the surface; none where the fibres were made from lines alone.
+    pub fn boxes(&self) -> &[OrientedBox] {
+        &self.boxes
+    }
+
+    /// What the muscle was taken for; none where no surface was given.
+    pub fn kind(&self) -> Option<MuscleKind> {
+        self.kind
+    }
+
+    /// Extents of the whole muscle along its principal axes, mm; none where no surface was given.
+    pub fn extents(&self) -> Option<[f64; 3]> {
+        self.extents
+    }
+
+    /// Second extent of the whole muscle over the first, 0 to 1 for most shapes; none where no
+    /// surface was given.
+    pub fn sheet_ratio(&self) -> Option<f64> {
+        self.extents.map(|[first, second, _]| second / first)
+    }
+
+    /// Whether the outline hardly tells the direction: a sheet without known lines, or a strap
+    /// without them whose two longest extents are nearly equal (above [`SHEET_RATIO`]).
+    pub fn is_sheet(&self) -> bool {
+        if self.courses.is_some() {
+            return false;
+        }
+        match self.kind {
+            Some(MuscleKind::Sheet) => true,
+            Some(MuscleKind::Strap) => self.sheet_ratio().is_some_and(|ratio| ratio > SHEET_RATIO),
+            _ => false,
+        }
+    }
+
+    /// Unit direction of the fibres at `point` (mm, finite); its sign means nothing.
+    pub fn direction(&self, point: [f64; 3]) -> [f64; 3] {
+        let x = Vec3::from(point);
+        match &self.courses {
+            Some(courses) => blended(courses.tangents(courses.segments(), &x)).into(),
+            None => self.direction_of_boxes(&x).into(),
+        }
+    }
+
+    /// Writes into `near` what the directions in a ball (mm) depend on.
+    pub fn near(&self, centre: [f64; 3], radius: f64, near: &mut NearFibres) {
+        if let Some(courses) = &self.courses {
+            courses.segments_near(&Vec3::from(centre), radius, &mut near.0);
+        }
+    }
+
+    /// Unit direction of the fibres at `point` of the ball that `near` was made for: that of
+    /// [`MuscleFibres::direction`], for less.
+    pub fn direction_near(&self, near: &NearFibres, point: [f64; 3]) -> [f64; 3] {
+        let x = Vec3::from(point);
+        match &self.courses {
+            Some(courses) => blended(courses.tangents(&near.0, &x)).into(),
+            None => self.direction_of_boxes(&x).into(),
+        }
+    }
+
+    fn direction_of_boxes(&self, x: &Vec3) -> Vec3 {
+        let distance = |reach: &Reach| (reach.scaled * (x - reach.centre)).norm_squared();
+        let least = self.reaches.iter().map(distance).fold(f64::INFINITY, f64::min);
+        let near = self.reaches.iter().filter_map(|reach| {
+            let beyond = distance(reach) - least;
+            (beyond < NEGLIGIBLE).then(|| (reach.direction, (-DECAY * beyond).exp()))
+        });
+        blended(near)
+    }
+
+    /// Unit directions at `points` (mm, finite), in their order.
+    ///
+    /// Parallel; the result does not depend on the number of threads.
+    pub fn directions(&self, points: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        points
+            .par_iter()
+            .with_min_len(POINTS_PER_TASK)
+            .map(|&point| self.direction(point))
+            .collect()
+    }
+}
+
+impl Reach {
+    fn new(b: &OrientedBox) -> Self {
+        let axes = b.axes.map(Vec3::from);
+        let largest = b.half_extents.iter().copied().fold(0.0, f64::max);
+        let rows = [0, 1, 2]
+            .map(|k| (axes[k] / b.half_extents[k].max(LEAST_EXTENT * largest)).transpose());
+        Self { centre: Vec3::from(b.centre), scaled: Matrix3::from_rows(&rows), direction: axes[0] }
+    }
+}
+
+/// The box of a part: along its direction, then along the principal axes across it.
+fn oriented_box(part: &Part) -> OrientedBox {
+    let axes = part.moments.axes_about(part.direction);
+    let ranges = axes.map(|axis| part.region.range(&axis));
+    let centre =
+        (0..3).fold(Vec3::zeros(), |sum, k| sum + axes[k] * ranges[k][0].midpoint(ranges[k][1]));
+    OrientedBox {
+        centre: centre.into(),
+        axes: axes.map(Into::into),
+        half_extents: ranges.map(|[low, high]| 0.5 * (high - low)),
+    }
+}
+
+/// The principal axis of Σ w a aᵀ over directions a with weights w; the direction of largest weight
+/// where it has none.
+fn blended(directions: impl Iterator<Item = (Vec3, f64)>) -> Vec3 {
+    let (mut sum, mut heaviest, mut most) = (Matrix3::zeros(), Vec3::x(), 0.0);
+    for (direction, weight) in directions {
+        sum += direction * direction.transpose() * weight;
+        if weight > most {
+            (heaviest, most) = (direction, weight);
+        }
+    }
+    // One direction has all the weight but rounding.
+    let rest = sum.trace() - most;
+    if rest <= f64::EPSILON * most { heaviest } else { principal_direction(&sum, heaviest) }
+}
+
+/// Unit eigenvector of the largest eigenvalue of a symmetric matrix; `otherwise` where that is
+/// double.
+///
+/// The eigenvalue in closed form (Smith 1961), the vector as the largest cross product of two rows
+/// of A − λI.
+fn principal_direction(a: &Matrix3<f64>, otherwise: Vec3) -> Vec3 {
+    let mean = a.trace() / 3.0;
+    let deviator = a - Matrix3::identity() * mean;
+    let size = (deviator.norm_squared() / 6.0).sqrt();
+    if size <= f64::EPSILON * mean.abs() {
+        return otherwise;
+    }
+    // A rounding of the angle near 0 is lost in its cosine.
+    let half_determinant = (0.5 * deviator.determinant() / size.powi(3)).clamp(-1.0, 1.0);
+    let largest = 2.0 * size * (half_determinant.acos() / 3.0).cos();
+    let m = deviator - Matrix3::identity() * largest;
+    let [x, y, z] = [0, 1, 2].map(|k| m.column(k).into_owned());
+    let candidates = [x.cross(&y), y.cross(&z), z.cross(&x)];
+    let longest =
+        candidates.into_iter().max_by(|p, q| p.norm_squared().total_cmp(&q.norm_squared()));
+    longest.and_then(|v| v.try_normalize(f64::EPSILON * size * size)).unwrap_or(otherwise)
+}

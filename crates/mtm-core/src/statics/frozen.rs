@@ -1,0 +1,107 @@
+//! Contact conditions that stay the same for several right-hand sides, as the columns of a plan operator have
+//! them: answered by factors, once the flexibility of the sliding nodes is at hand.
+//!
+//! Forces λ along the rows N and loads z along the axes A of springs of stiffness −k, which carry nodes on, follow
+//! from Nᵀ F N λ + Nᵀ F A z = g − Nᵀ u and Aᵀ F N λ + (Aᵀ F A − k⁻¹) z = goal − Aᵀ u, F the flexibility and u the
+//! displacements without them: λ is eliminated, and what is left for z is positive definite where the body holds
+//! the springs.
+
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+use rayon::prelude::*;
+
+use crate::algebra::cholesky::{DenseSymmetric, NormalFactor, TailFlexibility};
+use crate::contact::{Constraints, ContactRow, Spring};
+use crate::error::Result;
+use crate::mesh::{add, dot, scaled};
+use crate::statics::reaction::{Rows, singular, unheld};
+
+/// What answers for conditions that stay the same.
+pub(crate) struct FrozenContact {
+    rows: Rows,
+    normal: NormalFactor,
+    unstable: Vec<Spring>,
+    /// Nᵀ F A, a column for each unstable spring.
+    coupling: Vec<Vec<f64>>,
+    /// k⁻¹ − Aᵀ F A + Aᵀ F N (Nᵀ F N)⁻¹ Nᵀ F A.
+    held: Option<Cholesky<f64, Dyn>>,
+}
+
+impl FrozenContact {
+    /// The factors for `rows` and `springs`.
+    ///
+    /// # Errors
+    /// `NotPositiveDefinite` where the rows are degenerate, or where springs carry nodes on by more than the
+    /// body holds.
+    pub fn new(tail: &TailFlexibility, rows: &[ContactRow], springs: &[Spring]) -> Result<Self> {
+        let offsets = vec![0.0; rows.len()];
+        let rows = Rows::new(&Constraints {
+            rows,
+            offsets: &offsets,
+            springs,
+            about: &[],
+            share: 0.0,
+            reach: f64::INFINITY,
+        });
+        let unstable: Vec<Spring> = springs.iter().filter(|s| s.stiffness < 0.0).copied().collect();
+        let n = rows.rows.len();
+        let axes = unstable.iter().map(|s| (s.node, s.axis));
+        let all = rows.rows.iter().map(|r| (r.node, r.normal)).chain(axes);
+        let (nodes, directions): (Vec<usize>, Vec<[f64; 3]>) = all.unzip();
+        let mut softness = rows.softness.clone();
+        softness.resize(nodes.len(), 0.0);
+        let whole = tail.normal_flexibility(&nodes, &directions, &softness);
+        let part = DenseSymmetric::from_columns(n, |c, column| {
+            column.copy_from_slice(&whole.column(c)[..n - c]);
+        });
+        let normal = NormalFactor::new(part, rows.keys.clone())
+            .map_err(|at| singular(tail.row(rows.rows[at].node) as u32))?;
+        let coupling: Vec<Vec<f64>> = (0..unstable.len())
+            .map(|m| (0..n).map(|c| whole.column(c)[n + m - c]).collect())
+            .collect();
+        let answered: Vec<Vec<f64>> =
+            coupling.par_iter().map(|column| normal.solve(column.clone())).collect();
+        let held = DMatrix::from_fn(unstable.len(), unstable.len(), |a, b| {
+            let (low, high) = (a.min(b), a.max(b));
+            let by_rows: f64 = coupling[high].iter().zip(&answered[low]).map(|(g, x)| g * x).sum();
+            let own = if a == b { -1.0 / unstable[a].stiffness } else { 0.0 };
+            own - whole.column(n + low)[high - low] + by_rows
+        });
+        let held = match unstable.is_empty() {
+            true => None,
+            false => Some(Cholesky::new(held).ok_or_else(unheld)?),
+        };
+        Ok(Self { rows, normal, unstable, coupling, held })
+    }
+
+    /// Force on each sliding node, N: `free` are their displacements without contact, `offsets` and `goals` what
+    /// the conditions ask of rows and springs, mm.
+    pub fn forces(&self, free: &[[f64; 3]], c: &Constraints<'_>) -> Vec<[f64; 3]> {
+        let goals = Rows::new(c).missing(free);
+        let mut along = self.normal.solve(goals);
+        let mut out = vec![[0.0; 3]; free.len()];
+        if let Some(held) = &self.held {
+            let asked = c.springs.iter().filter(|s| s.stiffness < 0.0);
+            let open = asked.zip(&self.coupling).map(|(s, column)| {
+                let by_rows: f64 = column.iter().zip(&along).map(|(g, f)| g * f).sum();
+                dot(s.axis, free[s.node]) - s.goal + by_rows
+            });
+            let loads = held.solve(&DVector::from_iterator(self.unstable.len(), open));
+            let mut pull = vec![0.0; along.len()];
+            for (column, z) in self.coupling.iter().zip(loads.iter()) {
+                for (p, g) in pull.iter_mut().zip(column) {
+                    *p += g * z;
+                }
+            }
+            for (f, p) in along.iter_mut().zip(self.normal.solve(pull)) {
+                *f -= p;
+            }
+            for (s, z) in self.unstable.iter().zip(loads.iter()) {
+                out[s.node] = add(out[s.node], scaled(s.axis, *z));
+            }
+        }
+        for (row, f) in self.rows.rows.iter().zip(&along) {
+            out[row.node] = add(out[row.node], scaled(row.normal, *f));
+        }
+        out
+    }
+}

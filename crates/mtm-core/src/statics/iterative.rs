@@ -1,0 +1,600 @@
+//! The system solved by iteration: conjugate gradients with multigrid, or the sweeps of the literature.
+//!
+//! What an iteration knows of its own error is an estimate. Where stiff and soft tissue are mixed, or the
+//! spectrum is wide, a slow motion may hide from it: there a trial solves for a known field first, and its
+//! true errors say what the estimates are worth (`benches/error_estimate.rs` measures how often they fail).
+
+use std::sync::OnceLock;
+
+use crate::algebra::blocks::BlockMatrix;
+use crate::algebra::constraints::{Constraint, projected};
+use crate::algebra::krylov::{
+    Operator, PcgOptions, Preconditioner, Reached, Spectrum, Trial, pcg_near, trial,
+};
+use crate::algebra::multigrid::{Multigrid, MultigridOptions};
+use crate::algebra::relaxation::{RelaxationOptions, relax};
+use crate::contact::{Sliding, Spring};
+use crate::error::{MtmError, Result, Shortfall};
+use crate::mesh::{add, dot, norm, scaled, sub};
+use crate::statics::options::{Interrupt, Method, StaticOptions};
+use crate::statics::projected_product::ProjectedProduct;
+
+/// Over-relaxation of the node-wise iteration.
+const RELAXATION_FACTOR: f64 = 1.6;
+/// Sweeps after which the node-wise iteration gives up.
+const MAX_SWEEPS: usize = 200_000;
+/// Share of the tolerance to which the error left by the sweeps is measured.
+const MEASURED_SHARE: f64 = 0.1;
+/// λ/μ from which a stronger smoother pays: at ν = 0.499 it takes 113 iterations instead of 186. ν = 0.48.
+const NEARLY_INCOMPRESSIBLE: f64 = 24.0;
+
+/// Ratio of the stiffest tissue to the softest above which estimates are not believed without a trial. The
+/// tissue of a face stays below 300.
+const DOUBTFUL_CONTRAST: f64 = 1e3;
+/// Share of the tolerance to which a trial is solved.
+const TRIAL_SHARE: f64 = 0.1;
+/// Multiple of the error of a trial that stands for that of any solution, as for a factor.
+const TRIAL_SAFETY: f64 = 10.0;
+
+/// Multiple of the estimate by which an iteration stops that is reported: in `benches/error_estimate.rs` one in
+/// some thousand was up to 2.2 times too small.
+const REPORT_SAFETY: f64 = 4.0;
+
+/// Share of what the body holds along a direction that springs may take off: of those that take more, some are
+/// left out of a step.
+const LEFT_SHARE: f64 = 0.5;
+
+/// Whether estimates for tissue of such `contrast` need a trial.
+pub(crate) fn is_doubtful(contrast: f64) -> bool {
+    contrast.is_nan() || contrast > DOUBTFUL_CONTRAST
+}
+
+/// Conjugate gradients with an estimate that a trial has confirmed where that is in doubt.
+pub(crate) struct Confirmed<'a> {
+    pub a: &'a dyn Operator,
+    pub preconditioner: &'a dyn Preconditioner,
+    /// Where the trial is kept.
+    pub trial: &'a OnceLock<Trial>,
+    /// Whether there is to be one whatever the spectrum shows.
+    pub doubtful: bool,
+    /// Tolerance over the length of the motion.
+    pub relative: f64,
+}
+
+impl Confirmed<'_> {
+    /// The trial, made if need be.
+    fn trial(&self, options: &PcgOptions, interrupted: Interrupt<'_>) -> Result<&Trial> {
+        if let Some(made) = self.trial.get() {
+            return Ok(made);
+        }
+        let goal = TRIAL_SHARE * self.relative;
+        let most = options.max_iterations;
+        let made = trial(self.a, self.preconditioner, goal, most, interrupted)?;
+        Ok(self.trial.get_or_init(|| made))
+    }
+
+    /// The solution of A x = `b`, or with `share` a step towards it (see [`pcg_near`]).
+    ///
+    /// # Errors
+    /// Those of [`pcg_near`]; `NotConverged` where a known solution came back with too large an error.
+    pub fn solve(
+        &self,
+        b: &[[f64; 3]],
+        start: &[[f64; 3]],
+        options: &PcgOptions,
+        share: Option<f64>,
+        seen: &mut Spectrum,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Reached> {
+        let near = |start: &[[f64; 3]], seen: &mut Spectrum| {
+            pcg_near(self.a, b, start, self.preconditioner, options, share, seen, interrupted)
+        };
+        let known = |seen: &mut Spectrum| -> Result<f64> {
+            let trial = self.trial(options, interrupted)?;
+            if trial.error * TRIAL_SAFETY > options.slack * self.relative {
+                return Err(not_confirmed(trial, options, self.relative));
+            }
+            seen.learn(&trial.seen);
+            Ok(trial.error)
+        };
+        let mut error = None;
+        if self.doubtful {
+            error = Some(known(seen)?);
+        }
+        let mut reached = near(start, seen)?;
+        if share.is_some() && seen.is_wide() {
+            // What is only a step needs no trial, but does not pass for a solution.
+            return Ok(match reached {
+                Reached::Solution(found) => Reached::Step(found),
+                other => other,
+            });
+        }
+        if let (true, None, Reached::Solution(found)) = (seen.is_wide(), error, &reached) {
+            let start = found.solution.clone();
+            error = Some(known(seen)?);
+            reached = near(&start, seen)?;
+        }
+        let (Reached::Solution(found) | Reached::Step(found)) = &mut reached else {
+            return Ok(reached);
+        };
+        found.error_estimate_mm *= REPORT_SAFETY;
+        if let Some(error) = error {
+            let size = found.solution.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
+            found.error_estimate_mm = found.error_estimate_mm.max(TRIAL_SAFETY * error * size);
+        }
+        Ok(reached)
+    }
+}
+
+/// That a known solution came back with an error beyond the tolerance.
+fn not_confirmed(trial: &Trial, options: &PcgOptions, relative: f64) -> MtmError {
+    MtmError::NotConverged {
+        method: "pcg",
+        iterations: trial.iterations,
+        shortfall: Shortfall {
+            quantity: "the error with which a known solution came back",
+            value: trial.error,
+            limit: options.slack / TRIAL_SAFETY * relative,
+            unit: " of the displacements",
+        },
+        advice: "stiff and soft tissue, or slender parts, are beyond conjugate gradients: use \
+                 method=\"cholesky\", or allow a larger tolerance",
+    }
+}
+
+/// Counters of the iterative solves of one plan.
+#[derive(Default)]
+pub(crate) struct Effort {
+    /// Estimated error of the last solve, mm.
+    pub error_estimate: f64,
+    /// Iterations of all solves.
+    pub iterations: usize,
+    /// Residual measure of each.
+    pub history: Vec<f64>,
+}
+
+/// What the solves of one plan leave to the next, whose constraints differ a little.
+#[derive(Default)]
+pub(crate) struct Trail {
+    /// Displacements of the rows; none before the first solve, unless some are known to be near.
+    pub rows: Vec<[f64; 3]>,
+    /// What the solves showed of the spectrum.
+    seen: Spectrum,
+    /// The trial under the first constraints, once there is one.
+    trial: OnceLock<Trial>,
+    /// Length that the tolerance refers to, mm; none before the first solve.
+    reach: Option<f64>,
+}
+
+impl Trail {
+    /// A trail that begins at displacements of the rows, or at none.
+    pub fn starting(rows: Vec<[f64; 3]>) -> Self {
+        Self { rows, ..Self::default() }
+    }
+}
+
+/// What rows do under contact conditions.
+pub(crate) struct Advance {
+    /// Displacements, mm.
+    pub rows: Vec<[f64; 3]>,
+    /// Whether they are within the tolerance.
+    pub solved: bool,
+    /// Whether springs would have carried nodes on for ever.
+    pub is_carried: bool,
+}
+
+/// A system without a factor: the matrix and a multigrid hierarchy for it.
+pub(crate) struct Iterative {
+    matrix: BlockMatrix,
+    multigrid: Box<Multigrid>,
+    /// Whether sweeps solve, and the hierarchy only measures the error they leave.
+    sweeps: bool,
+    /// Estimated error over the length of the motion.
+    tolerance: f64,
+    max_iterations: Option<usize>,
+    /// Whether estimates need a trial whatever the spectrum shows.
+    doubtful: bool,
+    /// The trial of the system without constraints, once there is one.
+    trial: OnceLock<Trial>,
+}
+
+impl Iterative {
+    /// The system of `matrix`, to be solved by `method`; sliding rows are held along their normals at rest.
+    ///
+    /// `positions`: coordinates of the rows; `tissue`: how extreme the tissue is.
+    pub fn new(
+        matrix: BlockMatrix,
+        positions: &[[f64; 3]],
+        sliding: Option<&Sliding>,
+        tissue: Extremes,
+        method: Method,
+        options: &StaticOptions,
+    ) -> Result<Self> {
+        let normals: Vec<(usize, [f64; 3])> = sliding
+            .iter()
+            .flat_map(|s| s.nodes().iter().zip(s.rest_normals()))
+            .map(|(node, &n)| (node.row as usize, n))
+            .collect();
+        let constraints: Vec<Constraint> =
+            normals.iter().map(|&(row, normal)| Constraint { row, normal, offset: 0.0 }).collect();
+        let held_matrix = (!constraints.is_empty()).then(|| projected(&matrix, &constraints));
+        let multigrid = Box::new(Multigrid::new(
+            held_matrix.as_ref().unwrap_or(&matrix),
+            positions,
+            &normals,
+            &multigrid_options(tissue.lame_ratio),
+        )?);
+        Ok(Self {
+            matrix,
+            multigrid,
+            sweeps: method == Method::Relaxation,
+            tolerance: options.tolerance,
+            max_iterations: options.max_iterations,
+            doubtful: is_doubtful(tissue.contrast),
+            trial: OnceLock::new(),
+        })
+    }
+
+    /// Conjugate gradients with `a`, whose trial is kept in `trial`.
+    fn confirmed<'a>(&'a self, a: &'a dyn Operator, trial: &'a OnceLock<Trial>) -> Confirmed<'a> {
+        Confirmed {
+            a,
+            preconditioner: self.multigrid.as_ref(),
+            trial,
+            doubtful: self.doubtful,
+            relative: self.tolerance,
+        }
+    }
+
+    /// The matrix without constraints.
+    pub fn matrix(&self) -> &BlockMatrix {
+        &self.matrix
+    }
+
+    /// Bytes of the hierarchy.
+    pub fn bytes(&self) -> usize {
+        self.multigrid.memory_bytes()
+    }
+
+    /// A⁻¹ b; `scale` is the length of the prescribed field, mm.
+    pub fn solve(
+        &self,
+        b: &[[f64; 3]],
+        scale: f64,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        if is_zero(b) {
+            return Ok(vec![[0.0; 3]; b.len()]);
+        }
+        let tolerance = self.tolerance * self.reach(b, scale);
+        if self.sweeps {
+            return self.relax_to_bound(&self.matrix, b, tolerance, effort, interrupted);
+        }
+        let start = vec![[0.0; 3]; b.len()];
+        let options = self.options(tolerance);
+        let found = self
+            .confirmed(&self.matrix, &self.trial)
+            .solve(b, &start, &options, None, &mut Spectrum::default(), interrupted)?
+            .into_outcome()?;
+        effort.error_estimate = found.error_estimate_mm;
+        effort.iterations += found.iterations;
+        effort.history.extend(found.residual_history);
+        Ok(found.solution)
+    }
+
+    /// Components across the normals of w in P A P w = `b`, with springs.
+    ///
+    /// `b`: see [`projected_rhs`](crate::algebra::constraints::projected_rhs), with the pull of the springs.
+    /// `reach`: see [`Constraints`](crate::contact::Constraints). `share`: of the error at the start, which
+    /// suffices as long as it is more than the tolerance; see [`pcg_near`].
+    ///
+    /// Where springs carry nodes on by more than the body holds, those at fault are left out, and the
+    /// solution goes on to their reach along the direction that is not held, downhill.
+    pub fn solve_projected(
+        &self,
+        mut b: Vec<[f64; 3]>,
+        constraints: &[Constraint],
+        mut springs: Vec<(usize, Spring)>,
+        reach: f64,
+        scale: f64,
+        share: Option<f64>,
+        trail: &mut Trail,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Advance> {
+        if is_zero(&b) {
+            let rows = vec![[0.0; 3]; b.len()];
+            return Ok(Advance { rows, solved: true, is_carried: false });
+        }
+        let length = *trail.reach.get_or_insert_with(|| self.reach(&b, scale));
+        let length = constraints.iter().fold(length, |m, c| m.max(c.offset.abs()));
+        let tolerance = self.tolerance * length;
+        if self.sweeps {
+            let mut system = projected(&self.matrix, constraints);
+            for (row, spring) in &springs {
+                system.add_to_diagonal(*row, spring.axis, spring.stiffness);
+            }
+            let rows = self.relax_to_bound(&system, &b, tolerance, effort, interrupted)?;
+            return Ok(Advance { rows, solved: true, is_carried: false });
+        }
+        let mut start = trail.rows.clone();
+        start.resize(b.len(), [0.0; 3]);
+        for k in constraints {
+            start[k.row] = sub(start[k.row], scaled(k.normal, dot(k.normal, start[k.row])));
+        }
+        let options = self.options(tolerance);
+        let mut unheld = Vec::new();
+        let mut left_out = Vec::new();
+        let (found, solved) = loop {
+            let product = ProjectedProduct::new(&self.matrix, constraints, &springs);
+            let confirmed = self.confirmed(&product, &trail.trial);
+            let seen = &mut trail.seen;
+            match confirmed.solve(&b, &start, &options, share, seen, interrupted)? {
+                Reached::Solution(found) => break (found, true),
+                Reached::Step(found) => break (found, false),
+                Reached::Indefinite(met) => {
+                    let out = at_fault(&self.matrix, &mut springs, &met.direction);
+                    if out.is_empty() || reach.is_infinite() {
+                        return Err(met.error);
+                    }
+                    for (row, s) in &out {
+                        b[*row] = sub(b[*row], scaled(s.axis, s.stiffness * s.goal));
+                    }
+                    left_out.extend(out);
+                    effort.iterations += met.iterations;
+                    effort.history.extend(met.residual_history);
+                    start = met.solution;
+                    unheld.push(met.direction);
+                }
+            }
+        };
+        effort.error_estimate = found.error_estimate_mm;
+        effort.iterations += found.iterations;
+        effort.history.extend(found.residual_history);
+        let mut rows = found.solution;
+        let mut is_carried = false;
+        if !unheld.is_empty() {
+            for (row, s) in &left_out {
+                b[*row] = add(b[*row], scaled(s.axis, s.stiffness * s.goal));
+            }
+            springs.extend(left_out);
+            let product = ProjectedProduct::new(&self.matrix, constraints, &springs);
+            is_carried = carry_on(&product, &b, &unheld, reach, &mut rows);
+        }
+        Ok(Advance { rows, solved, is_carried })
+    }
+
+    /// Length that the tolerance refers to, mm. Loads move the body where bone does not: one cycle tells
+    /// how far, to the order of magnitude.
+    fn reach(&self, b: &[[f64; 3]], scale: f64) -> f64 {
+        let mut first = vec![[0.0; 3]; b.len()];
+        self.multigrid.apply(b, &mut first);
+        first.iter().fold(scale, |m, v| m.max(norm(*v)))
+    }
+
+    fn options(&self, tolerance: f64) -> PcgOptions {
+        let defaults = PcgOptions::default();
+        let max_iterations = self.max_iterations.unwrap_or(defaults.max_iterations);
+        PcgOptions { tolerance, max_iterations, ..defaults }
+    }
+
+    /// Sweeps until the error itself is within `tolerance`, mm.
+    ///
+    /// The steps of the sweeps do not tell: where a stiff body hangs on soft tissue they become tiny long
+    /// before it has moved. The error that is left, A⁻¹ (b − A x), is therefore solved for by conjugate
+    /// gradients each time the steps say that the sweeps are done, and measured, not used.
+    fn relax_to_bound(
+        &self,
+        matrix: &BlockMatrix,
+        b: &[[f64; 3]],
+        tolerance: f64,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        let most = self.max_iterations.unwrap_or(MAX_SWEEPS);
+        let (mut x, mut goal, mut sweeps) = (vec![[0.0; 3]; b.len()], tolerance, 0);
+        loop {
+            let options = RelaxationOptions {
+                tolerance: goal,
+                factor: RELAXATION_FACTOR,
+                max_sweeps: most - sweeps,
+            };
+            let found =
+                relax(matrix, b, &x, &options, interrupted).map_err(|e| gave_up(e, most))?;
+            (x, sweeps) = (found.solution, sweeps + found.sweeps);
+            effort.iterations += found.sweeps;
+            effort.history.extend(found.steps);
+            let rest: Vec<[f64; 3]> =
+                b.iter().zip(matrix.multiply(&x)).map(|(&b, f)| sub(b, f)).collect();
+            let options = PcgOptions {
+                tolerance: MEASURED_SHARE * tolerance,
+                energy_tolerance: MEASURED_SHARE,
+                ..PcgOptions::default()
+            };
+            let start = vec![[0.0; 3]; b.len()];
+            let trial = OnceLock::new();
+            let left = Confirmed { relative: MEASURED_SHARE, ..self.confirmed(matrix, &trial) }
+                .solve(&rest, &start, &options, None, &mut Spectrum::default(), interrupted)
+                .and_then(Reached::into_outcome)
+                .map_err(|e| gave_up(e, sweeps))?;
+            let largest = left.solution.iter().fold(0.0_f64, |m, e| m.max(norm(*e)));
+            let error = largest + left.error_estimate_mm;
+            if error <= tolerance {
+                effort.error_estimate = error;
+                return Ok(x);
+            }
+            if sweeps >= most {
+                return Err(no_rest(most, error, tolerance));
+            }
+            goal *= (0.5 * tolerance / error).min(0.5);
+        }
+    }
+}
+
+/// How extreme a tissue is.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Extremes {
+    /// Largest λ/μ.
+    pub lame_ratio: f64,
+    /// Stiffest over softest.
+    pub contrast: f64,
+}
+
+/// Options of the cycle for tissue with the given largest λ/μ.
+fn multigrid_options(lame_ratio: f64) -> MultigridOptions {
+    let defaults = MultigridOptions::default();
+    if lame_ratio < NEARLY_INCOMPRESSIBLE {
+        return defaults;
+    }
+    MultigridOptions { smoother_degree: 2 * defaults.smoother_degree, ..defaults }
+}
+
+/// What to do where sweeps do not end.
+const NO_SWEEPS: &str =
+    "use method=\"cholesky\" or \"pcg\"; node-wise relaxation is kept for comparison";
+
+/// That the sweeps ended before the error was within the tolerance.
+fn no_rest(sweeps: usize, error: f64, tolerance: f64) -> MtmError {
+    MtmError::NotConverged {
+        method: "relaxation",
+        iterations: sweeps,
+        shortfall: Shortfall {
+            quantity: "the measured error of a node",
+            value: error,
+            limit: tolerance,
+            unit: " mm",
+        },
+        advice: NO_SWEEPS,
+    }
+}
+
+/// An error of a step of the relaxation, in the terms that the caller asked in.
+fn gave_up(error: MtmError, sweeps: usize) -> MtmError {
+    match error {
+        MtmError::NotConverged { shortfall, .. } => MtmError::NotConverged {
+            method: "relaxation",
+            iterations: sweeps,
+            shortfall,
+            advice: NO_SWEEPS,
+        },
+        other => other,
+    }
+}
+
+/// Takes out of `springs` those that let the body give way along `direction`: the strongest, until what is left
+/// takes no more than half of what the body holds.
+fn at_fault(
+    matrix: &BlockMatrix,
+    springs: &mut Vec<(usize, Spring)>,
+    direction: &[[f64; 3]],
+) -> Vec<(usize, Spring)> {
+    let work = |(row, s): &(usize, Spring)| s.stiffness * dot(s.axis, direction[*row]).powi(2);
+    let mut product = vec![[0.0; 3]; direction.len()];
+    matrix.multiply_into(direction, &mut product);
+    let mut held: f64 = direction.iter().zip(&product).map(|(d, p)| dot(*d, *p)).sum();
+    held += springs.iter().map(|s| work(s).max(0.0)).sum::<f64>();
+    let mut order: Vec<usize> =
+        (0..springs.len()).filter(|&k| springs[k].1.stiffness < 0.0).collect();
+    order.sort_by(|&a, &b| work(&springs[a]).total_cmp(&work(&springs[b])));
+    let mut carried: f64 = -order.iter().map(|&k| work(&springs[k])).sum::<f64>();
+    let mut out = vec![false; springs.len()];
+    for k in order {
+        if carried <= LEFT_SHARE * held && out.contains(&true) {
+            break;
+        }
+        carried += work(&springs[k]);
+        out[k] = true;
+    }
+    let mut kept = out.iter().map(|out| !out);
+    let taken = springs.iter().zip(&out).filter(|(_, out)| **out).map(|(s, _)| *s).collect();
+    springs.retain(|_| kept.next().unwrap_or(true));
+    taken
+}
+
+/// Adds to x as much of each of `directions` as brings ½ xᵀ A x − bᵀ x down, `reach` at most; whether it has no
+/// minimum along one of them.
+fn carry_on(
+    a: &dyn Operator,
+    b: &[[f64; 3]],
+    directions: &[Vec<[f64; 3]>],
+    reach: f64,
+    x: &mut [[f64; 3]],
+) -> bool {
+    let work =
+        |u: &[[f64; 3]], f: &[[f64; 3]]| -> f64 { u.iter().zip(f).map(|(u, f)| dot(*u, *f)).sum() };
+    let mut product = vec![[0.0; 3]; b.len()];
+    let mut is_carried = false;
+    for direction in directions {
+        a.multiply_into(x, &mut product);
+        let slope = work(direction, &product) - work(direction, b);
+        a.multiply_into(direction, &mut product);
+        let curvature = work(direction, &product);
+        let largest = direction.iter().fold(0.0_f64, |m, d| m.max(norm(*d)));
+        let way = way_along(slope, curvature, reach / largest);
+        is_carried |= curvature <= 0.0;
+        for (x, d) in x.iter_mut().zip(direction) {
+            *x = add(*x, scaled(*d, way));
+        }
+    }
+    is_carried
+}
+
+/// How far to go along a direction of an energy with `slope` and `curvature` at its start: to the minimum, or
+/// by `most` downhill where there is none.
+fn way_along(slope: f64, curvature: f64, most: f64) -> f64 {
+    if curvature > 0.0 {
+        return (-slope / curvature).clamp(-most, most);
+    }
+    if slope > 0.0 { -most } else { most }
+}
+
+/// Whether nothing pulls: any iteration would only divide by it.
+fn is_zero(b: &[[f64; 3]]) -> bool {
+    b.iter().flatten().all(|&v| v == 0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn spring(row: usize, stiffness: f64) -> (usize, Spring) {
+        (row, Spring { node: row, axis: [1.0, 0.0, 0.0], stiffness, goal: 0.0 })
+    }
+
+    /// Three rows that hold themselves by 1 N/mm each.
+    fn unit() -> BlockMatrix {
+        let mut matrix = BlockMatrix::from_pattern(vec![0, 1, 2, 3], vec![0, 1, 2]);
+        for block in &mut matrix.blocks {
+            *block = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
+        }
+        matrix
+    }
+
+    #[test]
+    fn the_strongest_springs_are_left_out_of_a_direction_that_gives_way() {
+        let mut springs = vec![spring(0, -0.3), spring(1, -2.5), spring(2, 0.5), spring(2, -0.1)];
+        let out = at_fault(&unit(), &mut springs, &[[1.0, 0.0, 0.0]; 3]);
+        assert_eq!(out.iter().map(|(row, _)| *row).collect::<Vec<_>>(), [1]);
+        assert_eq!(springs.len(), 3);
+    }
+
+    #[test]
+    fn a_body_is_carried_on_to_its_minimum_or_as_far_as_springs_reach() {
+        let (matrix, along_x) = (unit(), vec![[1.0, 0.0, 0.0], [0.0; 3], [0.0; 3]]);
+        let b = vec![[0.3, 0.0, 0.0], [0.0; 3], [0.0; 3]];
+        let mut x = vec![[0.0; 3]; 3];
+        let held = [spring(0, -0.4)];
+        let product = ProjectedProduct::new(&matrix, &[], &held);
+        assert!(!carry_on(&product, &b, std::slice::from_ref(&along_x), 2.0, &mut x));
+        assert!((x[0][0] - 0.5).abs() < 1e-14, "{x:?}");
+        // From beyond the top of a hill the way down is ahead, from before it back.
+        let unheld = [spring(0, -1.4)];
+        let product = ProjectedProduct::new(&matrix, &[], &unheld);
+        for (start, end) in [(-0.7, 1.3), (-0.8, -2.8)] {
+            x[0][0] = start;
+            assert!(carry_on(&product, &b, std::slice::from_ref(&along_x), 2.0, &mut x));
+            assert!((x[0][0] - end).abs() < 1e-14, "{x:?}");
+        }
+    }
+}

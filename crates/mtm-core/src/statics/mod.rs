@@ -1,0 +1,14 @@
+//! Equilibrium of a body under a plan: options, linear solves, Newton's method, plan operators.
+
+pub(crate) mod frozen;
+pub(crate) mod iterative;
+pub(crate) mod newton;
+pub mod options;
+pub(crate) mod projected_product;
+pub(crate) mod reaction;
+pub(crate) mod reduction;
+pub mod replan;
+pub mod restraint;
+pub mod solution;
+pub mod solver;
+pub(crate) mod system;

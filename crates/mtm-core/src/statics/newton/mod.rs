@@ -1,0 +1,623 @@
+//! Equilibrium of a body that rotates and stretches: Newton's method on its energy, with line search.
+//!
+//! Each step solves with the exact tangent, or, where that is not positive definite, with the tangent
+//! whose points have lost their negative curvature; so every step goes downhill. Sliding constraints n·u = g
+//! are kept by projection, as in the linear system.
+
+mod sliding;
+
+use std::sync::{Arc, OnceLock};
+
+use crate::algebra::blocks::BlockMatrix;
+use crate::algebra::cholesky::Symbolic;
+use crate::algebra::constraints::{Constraint, add_offsets, projected, projected_rhs};
+use crate::algebra::krylov::{PcgOptions, Preconditioner, Spectrum};
+use crate::algebra::multigrid::{Multigrid, MultigridOptions};
+use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
+use crate::error::{ErrorKind, MtmError, Result, Shortfall};
+use crate::mechanics::strain_energy::StrainEnergy;
+use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
+use crate::mechanics::tensors::MassTensors;
+use crate::mesh::{add, between, dot, norm, scaled, sub};
+use crate::statics::iterative::{Confirmed, Effort, Extremes, is_doubtful};
+use crate::statics::options::{Interrupt, Method, StaticOptions};
+use crate::statics::reduction::Reduction;
+use crate::statics::solution::Clock;
+
+pub(crate) use sliding::Slide;
+
+/// Newton steps after which a share of the plan counts as too large.
+const MAX_STEPS: usize = 40;
+/// Smallest share of the plan that is tried.
+const LEAST_SHARE: f64 = 1.0 / 64.0;
+/// Share of the slope that a step must bring the energy down by (Armijo 1966).
+const DESCENT: f64 = 1e-4;
+/// Shortest step of the line search over the full one.
+const SHORTEST: f64 = 1.0 / 1024.0;
+/// Rounding of the energy over its parts, which a descent below it does not show through.
+const ENERGY_ROUNDING: f64 = 1e-12;
+/// Error that conjugate gradients may leave in a step, over the tolerance of the solution.
+const STEP_TOLERANCE: f64 = 0.1;
+/// The same over the length of the step before, which its own error outweighs until the last steps
+/// (Dembo, Eisenstat & Steihaug 1982).
+const STEP_SHARE: f64 = 1e-3;
+
+/// Longest step of the search over the full one.
+const LONGEST: f64 = 16.0;
+/// Length of a step, over that at which the exact tangent was not positive definite, from which it is tried
+/// again.
+const RETRY_EXACT: f64 = 0.5;
+/// Length of a step over all displacements, from which conjugate gradients take the exact tangent: at rest
+/// it is positive definite, and on the way they would notice only by chance where it is not.
+const NEAR_REST: f64 = 0.1;
+
+/// How tangent systems are solved.
+enum TangentSolver {
+    Cholesky(Box<Symbolic>),
+    Pcg,
+}
+
+/// A body with its unknowns, ready for any state of its boundary.
+pub(crate) struct Equilibrium {
+    energy: StrainEnergy,
+    tensors: Arc<MassTensors>,
+    solver: TangentSolver,
+    options: StaticOptions,
+    tissue: Extremes,
+}
+
+/// A body of large deformation that follows contact conditions, each to its equilibrium.
+struct Followed<'a> {
+    equilibrium: &'a Equilibrium,
+    reduction: &'a Reduction,
+    target: Target<'a>,
+    sliding: &'a Sliding,
+    u: Vec<[f64; 3]>,
+    /// Displacements before the last step.
+    before: Vec<[f64; 3]>,
+    effort: &'a mut Effort,
+    interrupted: Interrupt<'a>,
+}
+
+impl Body for Followed<'_> {
+    fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
+        (self.target.constraints, self.target.springs) = on_rows(self.sliding, c);
+        let u = self.equilibrium.follow(
+            self.reduction,
+            self.u.clone(),
+            &self.target,
+            self.effort,
+            self.interrupted,
+        )?;
+        let forces = self.equilibrium.forces(&u)?;
+        let loads = self.target.loads;
+        let reaction = |j: u32| {
+            let f = forces[j as usize];
+            loads.map_or(f, |l| sub(f, l[j as usize]))
+        };
+        let nodes = self.sliding.nodes();
+        let displacements = nodes.iter().map(|n| u[n.node as usize]).collect();
+        let reactions = nodes.iter().map(|n| reaction(n.node)).collect();
+        self.before = std::mem::replace(&mut self.u, u);
+        Ok(Response { displacements, reactions, slopes: None, solved: true, is_carried: false })
+    }
+
+    fn shorten(&mut self, share: f64) {
+        self.u = between(&self.before, &self.u, share);
+    }
+
+    fn restart(&mut self) {}
+}
+
+/// What the boundary asks for.
+struct Target<'a> {
+    /// Displacement of every node; those of unknowns are not read.
+    prescribed: &'a [[f64; 3]],
+    /// Forces on every node, N.
+    loads: Option<&'a [[f64; 3]]>,
+    /// Orthonormal on each row.
+    constraints: Vec<Constraint>,
+    springs: Vec<RowSpring>,
+    /// Length that the tolerance refers to, mm.
+    scale: f64,
+}
+
+/// A spring on one row of the system.
+struct RowSpring {
+    row: usize,
+    axis: [f64; 3],
+    stiffness: f64,
+    goal: f64,
+}
+
+/// A state with what the next step starts from.
+struct Pose {
+    u: Vec<[f64; 3]>,
+    /// Energy less the work of loads, with springs, N mm.
+    merit: f64,
+    /// Sum of the sizes of its parts.
+    size: f64,
+    /// Its slope by each row.
+    slope: Vec<[f64; 3]>,
+}
+
+/// A step of Newton's method.
+struct Step {
+    rows: Vec<[f64; 3]>,
+    /// Slope of the merit along it.
+    slope: f64,
+    /// What the merit may rise by all the same, N mm.
+    slack: f64,
+}
+
+impl Step {
+    /// Largest displacement, mm.
+    fn length(&self) -> f64 {
+        self.rows.iter().fold(0.0, |m, v| m.max(norm(*v)))
+    }
+}
+
+impl Equilibrium {
+    /// The body of `tensors` with the unknowns of `reduction`, and the method used.
+    ///
+    /// `matrix`: the reduced stiffness at rest. Errors name rows.
+    pub fn new(
+        tensors: Arc<MassTensors>,
+        matrix: &BlockMatrix,
+        options: &StaticOptions,
+        clock: &mut Clock,
+    ) -> Result<(Self, Method)> {
+        let method = match options.method {
+            Method::Relaxation => {
+                return Err(MtmError::UnknownName {
+                    what: "method with large rotations",
+                    found: options.method.name().into(),
+                    known: "auto, cholesky, pcg (relaxation is of linear kinematics)",
+                    kind: ErrorKind::Solver,
+                });
+            }
+            method => method.for_unknowns(3 * matrix.n_rows()),
+        };
+        let solver = if method == Method::Cholesky {
+            let symbolic = Symbolic::new(matrix, &[])?;
+            if let Some(limit) = options.memory_limit
+                && symbolic.factor_bytes() > limit
+            {
+                return Err(MtmError::OutOfMemory {
+                    what: "the Cholesky factor",
+                    needed_mb: symbolic.factor_bytes() >> 20,
+                    limit_mb: Some(limit >> 20),
+                    advice: "use method=\"pcg\"",
+                });
+            }
+            TangentSolver::Cholesky(Box::new(symbolic))
+        } else {
+            TangentSolver::Pcg
+        };
+        clock.lap("ordering", method == Method::Cholesky);
+        let energy = StrainEnergy::new(tensors.clone(), options.kinematics);
+        let tissue = Extremes {
+            lame_ratio: tensors.tissue().largest_lame_ratio(),
+            contrast: tensors.tissue().contrast(),
+        };
+        Ok((Self { energy, tensors, solver, options: *options, tissue }, method))
+    }
+
+    /// Bytes of a factor; 0 for conjugate gradients, which keep nothing from one tangent to the next.
+    pub fn bytes(&self) -> usize {
+        match &self.solver {
+            TangentSolver::Cholesky(symbolic) => symbolic.factor_bytes(),
+            TangentSolver::Pcg => 0,
+        }
+    }
+
+    /// Internal forces under displacements of all nodes, N.
+    pub fn forces(&self, u: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
+        Ok(self.energy.state(u)?.forces)
+    }
+
+    /// Displacements of the unknown rows with contact settled, the contact, and the seconds that it took.
+    pub fn solve(
+        &self,
+        reduction: &Reduction,
+        prescribed: &[[f64; 3]],
+        loads: Option<&[[f64; 3]]>,
+        slide: Option<&Slide<'_>>,
+        scale: f64,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<(Vec<[f64; 3]>, Option<ContactState>, f64)> {
+        let clock = Clock::new();
+        let target =
+            |constraints, springs| Target { prescribed, loads, constraints, springs, scale };
+        let mut u = vec![[0.0; 3]; prescribed.len()];
+        let Some(slide) = slide else {
+            u = self.follow(reduction, u, &target(vec![], vec![]), effort, interrupted)?;
+            return Ok((reduction.rows(&u), None, 0.0));
+        };
+        match self.slide(reduction, &target(vec![], vec![]), slide, effort, interrupted) {
+            Ok((u, state)) => return Ok((reduction.rows(&u), Some(state), clock.total())),
+            // Too far for one go: shares of the way for every set of normals.
+            Err(
+                MtmError::NotConverged { .. }
+                | MtmError::NotPositiveDefinite { .. }
+                | MtmError::ContactNotConverged { .. },
+            ) => {}
+            Err(error) => return Err(error),
+        }
+        let Slide { sliding, motions, .. } = slide;
+        let mut body = Followed {
+            equilibrium: self,
+            reduction,
+            target: target(vec![], vec![]),
+            sliding,
+            before: u.clone(),
+            u,
+            effort,
+            interrupted,
+        };
+        let state = sliding.solve(motions, None, &self.options.contact, interrupted, &mut body)?;
+        Ok((reduction.rows(&body.u), Some(state), clock.total()))
+    }
+
+    /// The state that `target` asks for, from the state `u`: at once, or by shares of the way where Newton's
+    /// method loses it.
+    fn follow(
+        &self,
+        reduction: &Reduction,
+        u: Vec<[f64; 3]>,
+        target: &Target<'_>,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        let (mut here, mut done, mut share) = (u, 0.0, 1.0_f64);
+        while done < 1.0 {
+            // Of the way that is left.
+            let part = (share / (1.0 - done)).min(1.0);
+            match self.advance(reduction, &here, target, part, effort, interrupted) {
+                Ok(next) => {
+                    here = next;
+                    done = if part == 1.0 { 1.0 } else { done + share };
+                }
+                Err(MtmError::NotConverged { .. } | MtmError::NotPositiveDefinite { .. })
+                    if share > LEAST_SHARE =>
+                {
+                    share *= 0.5;
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(here)
+    }
+
+    /// Equilibrium at `part` of the way from the boundary of `u` to that of `target`.
+    fn advance(
+        &self,
+        reduction: &Reduction,
+        u: &[[f64; 3]],
+        target: &Target<'_>,
+        part: f64,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        // The boundary moves; the unknowns follow as the tangent says.
+        let mut moved = target.prescribed.to_vec();
+        for &j in &reduction.unknowns {
+            moved[j as usize] = u[j as usize];
+        }
+        let change: Vec<[f64; 3]> =
+            moved.iter().zip(u).map(|(a, b)| scaled(sub(*a, *b), part)).collect();
+        let start = self.pose(reduction, u.to_vec(), target)?;
+        let along = |c: &Constraint| dot(c.normal, u[reduction.unknowns[c.row] as usize]);
+        let constraints: Vec<Constraint> = target
+            .constraints
+            .iter()
+            .map(|c| Constraint { offset: part * (c.offset - along(c)), ..*c })
+            .collect();
+        let allowed = self.allowed(&start, target, f64::INFINITY);
+        let (rows, _) = by_tangent(Exact, |kind| {
+            let change = Some(&change[..]);
+            self.step(reduction, &start, target, &constraints, change, (kind, allowed), interrupted)
+        })?;
+        let mut ahead = start.u;
+        for (value, d) in ahead.iter_mut().zip(&change) {
+            *value = add(*value, *d);
+        }
+        let pose = self.pose(reduction, moved_by(reduction, &ahead, &rows, 1.0), target)?;
+        effort.iterations += 1;
+
+        let still: Vec<Constraint> =
+            constraints.iter().map(|c| Constraint { offset: 0.0, ..*c }).collect();
+        let step = |pose: &Pose, how: (TangentKind, f64)| {
+            let rows = self.step(reduction, pose, target, &still, None, how, interrupted)?;
+            Ok(Step { slope: along_slope(&rows, pose), slack: 0.0, rows })
+        };
+        self.descend(reduction, pose, target, (f64::INFINITY, &[]), step, effort, interrupted)
+    }
+
+    /// The end of Newton's steps from `pose`, each of which `solve` makes from a pose, the tangent, and the
+    /// error that it may have, mm.
+    ///
+    /// `last`: the error that the last step may have, mm, and the rows that no step carries further than it
+    /// says.
+    fn descend(
+        &self,
+        reduction: &Reduction,
+        mut pose: Pose,
+        target: &Target<'_>,
+        (finest, on_walls): (f64, &[u32]),
+        mut solve: impl FnMut(&Pose, (TangentKind, f64)) -> Result<Step>,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        let by_factor = matches!(self.solver, TangentSolver::Cholesky(_));
+        // Length from which the exact tangent is worth trying.
+        let mut near = if by_factor { f64::INFINITY } else { NEAR_REST * reach(&pose, target) };
+        let mut length = f64::INFINITY;
+        // Error of the state once it is small enough and one step as fine as the last one may be is left.
+        let mut ending = None;
+        for _ in 0..MAX_STEPS {
+            if interrupted() {
+                return Err(MtmError::Interrupted);
+            }
+            let mut allowed = self.allowed(&pose, target, length);
+            if ending.is_some() {
+                allowed = allowed.min(finest);
+            }
+            let first = if length <= near { Exact } else { Definite };
+            let (step, kind) = by_tangent(first, |kind| solve(&pose, (kind, allowed)))?;
+            if kind != first {
+                near = RETRY_EXACT * length;
+            }
+            effort.iterations += 1;
+            let before = length;
+            length = step.length();
+            effort.history.push(length);
+            // A tangent that is not the energy's own gains as much each time as the last time.
+            let own = kind == Exact || length == 0.0;
+            let gain = if own { 1.0 } else { 1.0 - (length / before).min(1.0) };
+            let goal = self.options.tolerance * reach(&pose, target);
+            let bound = length / gain + allowed;
+            let bound = ending.filter(|_| length <= goal).unwrap_or(bound);
+            ending = (bound <= goal).then_some(bound);
+            if ending.is_some() && allowed <= finest {
+                effort.error_estimate = bound;
+                return Ok(moved_by(reduction, &pose.u, &step.rows, 1.0));
+            }
+            pose = self.search(reduction, pose, target, &step, kind, on_walls)?;
+        }
+        let limit = self.options.tolerance * reach(&pose, target);
+        Err(lost("the estimated error of a node", length, limit, " mm"))
+    }
+
+    /// The state at the end of `step`, shortened until it lies downhill but for its slack.
+    ///
+    /// Where the tangent is not the energy's own, steps are lengthened as long as that leads further down: a
+    /// curvature whose sign was turned tells how far the energy is to be trusted, not where it ends. Rows
+    /// `on_walls` stay where the step puts them.
+    fn search(
+        &self,
+        reduction: &Reduction,
+        pose: Pose,
+        target: &Target<'_>,
+        step: &Step,
+        kind: TangentKind,
+        on_walls: &[u32],
+    ) -> Result<Pose> {
+        let at = |share: f64| {
+            let mut u = moved_by(reduction, &pose.u, &step.rows, share);
+            if share > 1.0 {
+                for &row in on_walls {
+                    let j = reduction.unknowns[row as usize] as usize;
+                    u[j] = add(pose.u[j], step.rows[row as usize]);
+                }
+            }
+            self.pose(reduction, u, target)
+        };
+        let mut share = 1.0;
+        while share >= SHORTEST {
+            let mut next = at(share)?;
+            let rounding = ENERGY_ROUNDING * pose.size.max(next.size);
+            if next.merit <= pose.merit + DESCENT * share * step.slope + step.slack + rounding {
+                while kind == Definite && (1.0..LONGEST).contains(&share) {
+                    share *= 2.0;
+                    let further = at(share)?;
+                    if further.merit >= next.merit - rounding {
+                        break;
+                    }
+                    next = further;
+                }
+                return Ok(next);
+            }
+            share *= 0.5;
+        }
+        Err(lost("the share of the last step that lowers the energy", share, SHORTEST, ""))
+    }
+
+    /// Error that the next step from `pose` may have, mm, after one of `length`; 0 by a factor.
+    fn allowed(&self, pose: &Pose, target: &Target<'_>, length: f64) -> f64 {
+        if matches!(self.solver, TangentSolver::Cholesky(_)) {
+            return 0.0;
+        }
+        let reach = reach(pose, target);
+        let least = STEP_TOLERANCE * self.options.tolerance * reach;
+        (STEP_SHARE * length.min(reach)).max(least)
+    }
+
+    /// Merit and slope at displacements `u`.
+    fn pose(&self, reduction: &Reduction, u: Vec<[f64; 3]>, target: &Target<'_>) -> Result<Pose> {
+        let state = self.energy.state(&u)?;
+        let mut slope = reduction.rows(&state.forces);
+        let (mut merit, mut size) = (state.energy, state.energy.abs());
+        if let Some(loads) = target.loads {
+            for (s, &j) in slope.iter_mut().zip(&reduction.unknowns) {
+                *s = sub(*s, loads[j as usize]);
+                let work = dot(loads[j as usize], u[j as usize]);
+                merit -= work;
+                size += work.abs();
+            }
+        }
+        for spring in &target.springs {
+            let j = reduction.unknowns[spring.row] as usize;
+            let stretch = dot(spring.axis, u[j]) - spring.goal;
+            slope[spring.row] =
+                add(slope[spring.row], scaled(spring.axis, spring.stiffness * stretch));
+            merit += 0.5 * spring.stiffness * stretch * stretch;
+        }
+        if !merit.is_finite() {
+            let limit = self.options.tolerance * target.scale;
+            return Err(lost("the estimated error of a node", f64::INFINITY, limit, " mm"));
+        }
+        Ok(Pose { u, merit, size, slope })
+    }
+
+    /// Tangent system at `pose` on the rows, without constraints and springs: its matrix, and the right-hand
+    /// side where the other nodes go by `change`.
+    fn tangent(
+        &self,
+        reduction: &Reduction,
+        pose: &Pose,
+        kind: TangentKind,
+        change: Option<&[[f64; 3]]>,
+    ) -> Result<(BlockMatrix, Vec<[f64; 3]>)> {
+        let full = self.energy.stiffness(&pose.u, kind)?;
+        let mut b: Vec<[f64; 3]> = pose.slope.iter().map(|&s| scaled(s, -1.0)).collect();
+        if let Some(change) = change {
+            for (b, f) in b.iter_mut().zip(reduction.rows(&full.multiply(change))) {
+                *b = sub(*b, f);
+            }
+        }
+        Ok((reduction.matrix(&full), b))
+    }
+
+    /// Newton step from `pose` on the rows.
+    ///
+    /// `constraints` say how far each constrained row goes along its normal, `change` how far the other
+    /// nodes go. `how`: the tangent, and the error that the step may have, mm.
+    fn step(
+        &self,
+        reduction: &Reduction,
+        pose: &Pose,
+        target: &Target<'_>,
+        constraints: &[Constraint],
+        change: Option<&[[f64; 3]]>,
+        (kind, allowed): (TangentKind, f64),
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        let (mut matrix, b) = self.tangent(reduction, pose, kind, change)?;
+        for spring in &target.springs {
+            matrix.add_to_diagonal(spring.row, spring.axis, spring.stiffness);
+        }
+        let rhs = projected_rhs(&matrix, &b, constraints);
+        if !constraints.is_empty() {
+            matrix = projected(&matrix, constraints);
+        }
+        let mut x = self.solve_rows(reduction, &matrix, &rhs, constraints, allowed, interrupted)?;
+        add_offsets(&mut x, constraints);
+        Ok(x)
+    }
+
+    fn solve_rows(
+        &self,
+        reduction: &Reduction,
+        matrix: &BlockMatrix,
+        rhs: &[[f64; 3]],
+        constraints: &[Constraint],
+        allowed: f64,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        if let TangentSolver::Cholesky(symbolic) = &self.solver {
+            return Ok(symbolic.solve(&symbolic.factor(matrix)?, rhs));
+        }
+        let positions: Vec<[f64; 3]> = reduction.rows(self.tensors.element_nodes().positions());
+        let normals: Vec<(usize, [f64; 3])> =
+            constraints.iter().map(|c| (c.row, c.normal)).collect();
+        let multigrid = Multigrid::new(matrix, &positions, &normals, &MultigridOptions::default())?;
+        // Where loads alone move the body nothing tells how far: one cycle does, to the order of magnitude.
+        let mut first = vec![[0.0; 3]; rhs.len()];
+        multigrid.apply(rhs, &mut first);
+        let far = first.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
+        if far == 0.0 {
+            return Ok(first);
+        }
+        let defaults = PcgOptions::default();
+        let options = PcgOptions {
+            tolerance: allowed.max(STEP_TOLERANCE * self.options.tolerance * far),
+            max_iterations: self.options.max_iterations.unwrap_or(defaults.max_iterations),
+            ..defaults
+        };
+        let start = vec![[0.0; 3]; rhs.len()];
+        let confirmed = Confirmed {
+            a: matrix,
+            preconditioner: &multigrid,
+            trial: &OnceLock::new(),
+            doubtful: is_doubtful(self.tissue.contrast),
+            relative: options.tolerance / far,
+        };
+        let seen = &mut Spectrum::default();
+        let reached = confirmed.solve(rhs, &start, &options, None, seen, interrupted)?;
+        Ok(reached.into_outcome()?.solution)
+    }
+}
+
+/// That Newton's method did not bring `quantity` to `limit`.
+fn lost(quantity: &'static str, value: f64, limit: f64, unit: &'static str) -> MtmError {
+    MtmError::NotConverged {
+        method: "newton",
+        iterations: MAX_STEPS,
+        shortfall: Shortfall { quantity, value, limit, unit },
+        advice: "divide the plan into smaller moves, fix flat tets, or use kinematics=\"linear\"",
+    }
+}
+
+/// Contact constraints and springs on the rows of the system.
+fn on_rows(sliding: &Sliding, c: &Constraints<'_>) -> (Vec<Constraint>, Vec<RowSpring>) {
+    let row = |node: usize| sliding.nodes()[node].row as usize;
+    let asked = c
+        .rows
+        .iter()
+        .zip(c.offsets)
+        .map(|(r, &offset)| Constraint { row: row(r.node), normal: r.normal, offset })
+        .collect();
+    let springs = c
+        .springs
+        .iter()
+        .map(|s| RowSpring { row: row(s.node), axis: s.axis, stiffness: s.stiffness, goal: s.goal })
+        .collect();
+    (asked, springs)
+}
+
+/// What `solve` gives under the tangent `first`, or under the definite one where the exact one is not positive
+/// definite; and which it was.
+fn by_tangent<T>(
+    first: TangentKind,
+    mut solve: impl FnMut(TangentKind) -> Result<T>,
+) -> Result<(T, TangentKind)> {
+    match solve(first) {
+        Err(MtmError::NotPositiveDefinite { .. } | MtmError::NotConverged { .. })
+            if first == Exact =>
+        {
+            Ok((solve(Definite)?, Definite))
+        }
+        other => Ok((other?, first)),
+    }
+}
+
+/// Slope of the merit along `rows`.
+fn along_slope(rows: &[[f64; 3]], pose: &Pose) -> f64 {
+    rows.iter().zip(&pose.slope).map(|(&d, &s)| dot(d, s)).sum()
+}
+
+/// Length that the tolerance refers to, mm.
+fn reach(pose: &Pose, target: &Target<'_>) -> f64 {
+    pose.u.iter().fold(target.scale, |m, v| m.max(norm(*v)))
+}
+
+/// `u` with the unknowns moved by `share` of `step`.
+fn moved_by(reduction: &Reduction, u: &[[f64; 3]], step: &[[f64; 3]], share: f64) -> Vec<[f64; 3]> {
+    let mut out = u.to_vec();
+    for (&j, d) in reduction.unknowns.iter().zip(step) {
+        out[j as usize] = add(out[j as usize], scaled(*d, share));
+    }
+    out
+}

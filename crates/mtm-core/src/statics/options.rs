@@ -1,0 +1,172 @@
+//! Options of a solver: which method, how exact, how contact behaves, how much memory.
+
+use crate::contact::ContactOptions;
+use crate::error::{ErrorKind, MtmError, Result};
+use crate::mechanics::kinematics::Kinematics;
+
+/// Asked now and then whether to stop.
+pub type Interrupt<'a> = &'a (dyn Fn() -> bool + Sync);
+
+/// How the linear system is solved.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Method {
+    /// Cholesky up to 100 000 unknowns (some 180 000 tets) if its factor fits into memory, else conjugate
+    /// gradients.
+    Auto,
+    /// Sparse Cholesky factor, kept for new plans.
+    Cholesky,
+    /// Conjugate gradients with multigrid, stopped by an estimate of the error.
+    Pcg,
+    /// The node-wise iteration of the literature.
+    Relaxation,
+}
+
+/// Unknowns up to which [`Method::Auto`] takes the factor.
+///
+/// A factor grows like n^1.3 and conjugate gradients like n: for one plan they cost the same near 50 000
+/// unknowns, and at 160 000 the factor costs twice as much, in memory too. It answers the next plan sooner
+/// at any size; up to here that weighs more.
+const AUTO_DIRECT_UNKNOWNS: usize = 100_000;
+
+/// Names of the methods.
+pub const METHODS: &str = "auto, cholesky, pcg, relaxation";
+
+/// Options of a solver.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StaticOptions {
+    /// How the linear system is solved.
+    pub method: Method,
+    /// Estimated error of the iterative methods over the largest prescribed displacement.
+    pub tolerance: f64,
+    /// Most iterations of the iterative methods; their own default if `None`.
+    pub max_iterations: Option<usize>,
+    /// The contact loop.
+    pub contact: ContactOptions,
+    /// Memory that a factor may take, bytes; without limit if `None`.
+    pub memory_limit: Option<usize>,
+    /// How strain follows from displacement.
+    pub kinematics: Kinematics,
+}
+
+impl Default for StaticOptions {
+    fn default() -> Self {
+        Self {
+            method: Method::Auto,
+            tolerance: 1e-8,
+            max_iterations: None,
+            contact: ContactOptions::default(),
+            memory_limit: None,
+            kinematics: Kinematics::Linear,
+        }
+    }
+}
+
+/// Largest tolerance of contact, mm.
+const MOST_CONTACT_TOLERANCE: f64 = 1.0;
+
+impl Method {
+    /// The method called `name`.
+    pub fn from_name(name: &str) -> Result<Self> {
+        match name {
+            "auto" => Ok(Self::Auto),
+            "cholesky" => Ok(Self::Cholesky),
+            "pcg" => Ok(Self::Pcg),
+            "relaxation" => Ok(Self::Relaxation),
+            _ => Err(MtmError::UnknownName {
+                what: "method",
+                found: name.to_owned(),
+                known: METHODS,
+                kind: ErrorKind::Solver,
+            }),
+        }
+    }
+
+    /// The method for a system of so many unknowns: itself, or what [`Method::Auto`] stands for.
+    pub fn for_unknowns(self, unknowns: usize) -> Self {
+        match self {
+            Self::Auto if unknowns > AUTO_DIRECT_UNKNOWNS => Self::Pcg,
+            Self::Auto => Self::Cholesky,
+            named => named,
+        }
+    }
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Auto => "auto",
+            Self::Cholesky => "cholesky",
+            Self::Pcg => "pcg",
+            Self::Relaxation => "relaxation",
+        }
+    }
+}
+
+impl StaticOptions {
+    pub(crate) fn check(&self) -> Result<()> {
+        let positive = |what: &str, value: f64| {
+            if value.is_finite() && value > 0.0 && value < 1.0 {
+                return Ok(());
+            }
+            Err(MtmError::OutOfRange {
+                what: what.into(),
+                index: 0,
+                value,
+                allowed: "above 0 and below 1 (relative)",
+                kind: ErrorKind::Solver,
+            })
+        };
+        positive("tolerance", self.tolerance)?;
+        let within = self.contact.tolerance;
+        if !(within > 0.0 && within <= MOST_CONTACT_TOLERANCE) {
+            return Err(MtmError::OutOfRange {
+                what: "contact_tolerance".into(),
+                index: 0,
+                value: within,
+                allowed: "above 0, at most 1 mm",
+                kind: ErrorKind::Solver,
+            });
+        }
+        let reach = self.contact.border_reach;
+        if reach.is_nan() || reach < 0.0 {
+            return Err(MtmError::OutOfRange {
+                what: "border_reach".into(),
+                index: 0,
+                value: reach,
+                allowed: "0 or more (mean edges of the contact surface)",
+                kind: ErrorKind::Solver,
+            });
+        }
+        let counts = [
+            ("max_iterations", self.max_iterations),
+            ("contact_iterations", Some(self.contact.max_iterations)),
+        ];
+        for (what, value) in counts {
+            if value == Some(0) {
+                return Err(MtmError::OutOfRange {
+                    what: what.into(),
+                    index: 0,
+                    value: 0.0,
+                    allowed: "1 or more",
+                    kind: ErrorKind::Solver,
+                });
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn auto_goes_by_size_and_named_methods_do_not() {
+        assert_eq!(Method::Auto.for_unknowns(AUTO_DIRECT_UNKNOWNS), Method::Cholesky);
+        assert_eq!(Method::Auto.for_unknowns(AUTO_DIRECT_UNKNOWNS + 3), Method::Pcg);
+        for named in [Method::Cholesky, Method::Pcg, Method::Relaxation] {
+            assert_eq!(named.for_unknowns(0), named);
+            assert_eq!(named.for_unknowns(usize::MAX), named);
+        }
+    }
+}

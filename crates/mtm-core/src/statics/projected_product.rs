@@ -1,0 +1,110 @@
+//! The system under contact constraints as a product: what conjugate gradients need of P A P, without a
+//! copy of A.
+
+use crate::algebra::blocks::BlockMatrix;
+use crate::algebra::constraints::Constraint;
+use crate::algebra::krylov::Operator;
+use crate::contact::Spring;
+use crate::mesh::{add, dot, norm, scaled, sub};
+
+/// Length, relative to what it was, below which nothing but rounding is left of a projected vector.
+const PROJECTION_ROUNDING: f64 = 16.0 * f64::EPSILON;
+
+/// Share of what the body holds along a direction that springs have to leave.
+const LEAST_HOLD: f64 = 0.05;
+
+/// P (A + Σ k a⊗a) P on the vectors without a component along the normals of held rows.
+///
+/// The springs k, a lie across the normals of their rows.
+pub(crate) struct ProjectedProduct<'a> {
+    matrix: &'a BlockMatrix,
+    /// Orthonormal on each row.
+    constraints: &'a [Constraint],
+    /// Row and spring.
+    springs: &'a [(usize, Spring)],
+}
+
+impl<'a> ProjectedProduct<'a> {
+    /// The product of `matrix` with `springs` under `constraints`, orthonormal on each row.
+    pub fn new(
+        matrix: &'a BlockMatrix,
+        constraints: &'a [Constraint],
+        springs: &'a [(usize, Spring)],
+    ) -> Self {
+        Self { matrix, constraints, springs }
+    }
+}
+
+impl Operator for ProjectedProduct<'_> {
+    fn n_rows(&self) -> usize {
+        self.matrix.n_rows()
+    }
+
+    fn multiply_into(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
+        self.matrix.multiply_into(x, y);
+        for (row, spring) in self.springs {
+            let pull = spring.stiffness * dot(spring.axis, x[*row]);
+            y[*row] = add(y[*row], scaled(spring.axis, pull));
+        }
+        self.project(y);
+    }
+
+    /// Springs may take off most of what the body holds, not all.
+    fn least_curvature(&self, p: &[[f64; 3]]) -> f64 {
+        let taken = |(row, s): &(usize, Spring)| -s.stiffness * dot(s.axis, p[*row]).powi(2);
+        let unstable = self.springs.iter().filter(|(_, s)| s.stiffness < 0.0);
+        LEAST_HOLD / (1.0 - LEAST_HOLD) * unstable.map(taken).sum::<f64>()
+    }
+
+    fn project(&self, x: &mut [[f64; 3]]) {
+        for held in self.constraints.chunk_by(|a, b| a.row == b.row) {
+            let row = held[0].row;
+            let least = PROJECTION_ROUNDING * norm(x[row]);
+            for &Constraint { normal, .. } in held {
+                x[row] = sub(x[row], scaled(normal, dot(normal, x[row])));
+            }
+            // What rounding leaves points anywhere, and may be all that a held node has.
+            if norm(x[row]) <= least {
+                x[row] = [0.0; 3];
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::algebra::constraints::projected;
+
+    #[test]
+    fn product_is_that_of_the_projected_matrix() {
+        let row_start = vec![0, 2, 5, 7];
+        let mut matrix = BlockMatrix::from_pattern(row_start, vec![0, 1, 0, 1, 2, 1, 2]);
+        for (i, value) in matrix.blocks.iter_mut().flatten().enumerate() {
+            *value = (1.7 * i as f64).sin();
+        }
+        let at = |row, normal| Constraint { row, normal, offset: 0.3 };
+        let constraints = [at(0, [0.6, 0.8, 0.0]), at(2, [0.0, 0.0, 1.0]), at(2, [0.0, 1.0, 0.0])];
+        let axis = [0.8, -0.6, 0.0];
+        let springs = [(0, Spring { node: 0, axis, stiffness: 2.5, goal: 0.1 })];
+        let mut whole = projected(&matrix, &constraints);
+        whole.add_to_diagonal(0, axis, 2.5);
+        let product = ProjectedProduct::new(&matrix, &constraints, &springs);
+
+        let mut x = vec![[0.3, -1.1, 0.7], [0.2, 0.9, -0.4], [1.3, 0.8, -0.6]];
+        product.project(&mut x);
+        assert!(dot(x[0], [0.6, 0.8, 0.0]).abs() < 1e-15);
+        assert!(x[2][1].abs() + x[2][2].abs() < 1e-15);
+        let corner = [at(1, [0.6, 0.8, 0.0]), at(1, [-0.8, 0.6, 0.0]), at(1, [0.0, 0.0, 1.0])];
+        let mut held = x.clone();
+        ProjectedProduct::new(&matrix, &corner, &[]).project(&mut held);
+        assert_eq!(held[1], [0.0; 3]);
+        let mut y = vec![[0.0; 3]; 3];
+        product.multiply_into(&x, &mut y);
+        for (y, expected) in y.iter().zip(whole.multiply(&x)) {
+            for i in 0..3 {
+                assert!((y[i] - expected[i]).abs() < 1e-14, "{y:?} {expected:?}");
+            }
+        }
+    }
+}

@@ -1,0 +1,747 @@
+//! How sliding nodes answer to constraints where the factor of the body without them is kept.
+//!
+//! Contact forces λ along the normals N follow from (Nᵀ A⁻¹ N) λ = g − Nᵀ u_free, by conjugate gradients that
+//! the matrix at rest preconditions. Until closest points settle they stop early, and begin where the last
+//! displacements put them: two or three products for each set of normals, rough ones but for two in a plan.
+//!
+//! Few sliding nodes have their whole flexibility A⁻¹ at hand for the products, and the matrix of other
+//! normals is written down and factored where too many are needed. Where nodes are many, products come from
+//! sweeps through the part of the factor that they reach: less to make and to keep, but springs and second
+//! walls, which the matrix at rest knows nothing of, can take a hundred of them.
+
+use nalgebra::{DMatrix, DVector, SymmetricEigen};
+
+use crate::algebra::cholesky::{
+    Begun, DenseSymmetric, Factor, Moved, NormalFactor, NormalForces, Precision, Preconditioner,
+    Progress, ROUGH, Reach, RowKey, Symbolic, TailFlexibility, Wanted, conjugate_gradients,
+    hopeless,
+};
+use crate::contact::{Constraints, ContactRow, Sliding, Spring};
+use crate::error::{MtmError, Result, Shortfall};
+use crate::mesh::{add, dot, norm, scaled, sub};
+
+/// Steps of sweeps after which contact gives up: ten on smooth bone, a hundred on teeth.
+const MOST_SWEEPS: usize = 1000;
+/// Share of what is left to change that rough products may have left open before one that is exact.
+const DOUBT_SHARE: f64 = 0.1;
+/// Share of the loads of unstable springs to which they are solved at the least.
+const LOAD_SHARE: f64 = 1e-5;
+/// Steps of conjugate gradients after which the loads stay as they are.
+const MOST_LOAD_STEPS: usize = 60;
+/// Softness of unstable springs above which they are as good as none.
+const MOST_SOFTNESS: f64 = 1e6;
+/// Halvings in the search for it.
+const SOFTENINGS: usize = 30;
+/// Share of what a direction moves that may be wrong in a step.
+const PROBE_ERROR: f64 = 1e-3;
+/// Loads by which directions are tried, over the contact forces: what they move is far above rounding.
+const PROBE_SHARE: f64 = 1e-2;
+/// Relative error of contact forces, in the energy norm, at which only rounding is left.
+const ROUNDING: f64 = 1e-14;
+/// Share of the contact tolerance that the forces of settled contact may be off, relative to all of them.
+const EXACT_SHARE: f64 = 1e-2;
+
+/// What is kept for sliding nodes: their flexibility, and the inverse of its part along the normals at
+/// rest.
+pub(crate) struct ContactFactor {
+    flexibility: Flexibility,
+    rest: NormalFactor,
+}
+
+/// Displacements of sliding nodes under forces on them.
+enum Flexibility {
+    /// Written down.
+    Dense(TailFlexibility),
+    /// By sweeps.
+    Sweeps {
+        reach: Reach,
+        /// Row of the system of each sliding node.
+        rows: Vec<u32>,
+        /// Flexibility of each by itself along its normal at rest, mm/N.
+        own: Vec<f64>,
+    },
+}
+
+impl ContactFactor {
+    /// The whole flexibility of the sliding nodes, which the structure keeps last.
+    pub fn dense(symbolic: &Symbolic, factor: &Factor, sliding: &Sliding) -> Result<Self> {
+        let tail = symbolic.tail_flexibility(factor);
+        let row = |(node, &normal)| ContactRow { node, normal, point: [0.0; 3] };
+        let rows: Vec<ContactRow> = sliding.rest_normals().iter().enumerate().map(row).collect();
+        let offsets = vec![0.0; rows.len()];
+        let rows = Rows::new(&Constraints {
+            rows: &rows,
+            offsets: &offsets,
+            springs: &[],
+            about: &[],
+            share: 0.0,
+            reach: f64::INFINITY,
+        });
+        let rest = rows.factor(&tail)?.inverse();
+        Ok(Self { flexibility: Flexibility::Dense(tail), rest })
+    }
+
+    /// The flexibility along the normals at rest, and what sweeps need for the rest of it.
+    pub fn by_sweeps(symbolic: &Symbolic, factor: &Factor, sliding: &Sliding) -> Result<Self> {
+        let rows: Vec<u32> = sliding.nodes().iter().map(|n| n.row).collect();
+        let reach = symbolic.reach(&rows);
+        let (normal, order) = symbolic.reach_flexibility(factor, &reach, sliding.rest_normals());
+        let mut own = vec![0.0; rows.len()];
+        for (c, &i) in order.iter().enumerate() {
+            own[i] = normal.column(c)[0];
+        }
+        let keys = order.iter().map(|&i| (i, 0)).collect();
+        let rest = NormalFactor::new(normal, keys).map_err(|at| singular(rows[order[at]]))?;
+        let rest = rest.inverse();
+        Ok(Self { flexibility: Flexibility::Sweeps { reach, rows, own }, rest })
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        let flexibility = match &self.flexibility {
+            Flexibility::Dense(tail) => tail.bytes(),
+            Flexibility::Sweeps { reach, rows, .. } => reach.bytes() + 12 * rows.len(),
+        };
+        flexibility + self.rest.bytes()
+    }
+
+    /// Answers to one plan's constraints, whose forces are `b`.
+    pub fn answers<'a>(
+        &'a self,
+        symbolic: &'a Symbolic,
+        factor: &'a Factor,
+        b: &[[f64; 3]],
+    ) -> Answers<'a> {
+        let (free, swept) = match &self.flexibility {
+            Flexibility::Dense(tail) => {
+                let (forces, swept) = symbolic.on_tail(factor, b);
+                (tail.respond(&forces), swept)
+            }
+            Flexibility::Sweeps { reach, .. } => {
+                let mut swept = symbolic.permuted(b);
+                symbolic.forward(factor, &mut swept);
+                (symbolic.reach_displacements(factor, reach, &mut swept.clone()), swept)
+            }
+        };
+        let work = match &self.flexibility {
+            Flexibility::Dense(_) => Vec::new(),
+            Flexibility::Sweeps { .. } => vec![0.0; swept.len()],
+        };
+        let (moved, pushed) = (vec![[0.0; 3]; free.len()], vec![[0.0; 3]; free.len()]);
+        Answers {
+            contact: self,
+            symbolic,
+            factor,
+            swept,
+            free,
+            pushed,
+            moved,
+            precision: Precision::Exact,
+            doubt: 0.0,
+            enough: 0.0,
+            work,
+            made: None,
+            last: Vec::new(),
+            carried: None,
+        }
+    }
+
+    /// The whole flexibility of the sliding nodes, where it is written down.
+    pub fn tail(&self) -> Option<&TailFlexibility> {
+        match &self.flexibility {
+            Flexibility::Dense(tail) => Some(tail),
+            Flexibility::Sweeps { .. } => None,
+        }
+    }
+}
+
+/// Answers of the sliding nodes to one plan's constraints, each begun from the one before.
+pub(crate) struct Answers<'a> {
+    contact: &'a ContactFactor,
+    symbolic: &'a Symbolic,
+    factor: &'a Factor,
+    /// The forces after the sweep to the sliding nodes, in elimination order.
+    swept: Vec<f64>,
+    /// Displacements of the sliding nodes without contact forces, mm.
+    free: Vec<[f64; 3]>,
+    /// Forces of the last answer on each.
+    pushed: Vec<[f64; 3]>,
+    /// What they added to the displacements, mm, and how exactly.
+    moved: Vec<[f64; 3]>,
+    precision: Precision,
+    /// What rough products may have left open, in the measure of the preconditioner.
+    doubt: f64,
+    /// Measure that the last answer had to come within.
+    enough: f64,
+    /// Zeros for the sweeps.
+    work: Vec<f64>,
+    /// The factor made last in this plan, once the one at rest did not serve.
+    made: Option<NormalFactor>,
+    /// Rows of the last answer, ascending, with their forces.
+    last: Vec<(RowKey, f64)>,
+    /// Loads that unstable springs bring.
+    carried: Option<Carried>,
+}
+
+/// Loads on the sliding nodes.
+struct Carried {
+    /// N.
+    loads: Vec<[f64; 3]>,
+    /// What they add to the displacements, mm.
+    moved: Vec<[f64; 3]>,
+}
+
+/// What sliding nodes do under contact conditions.
+pub(crate) struct Answer {
+    /// Displacement of each, mm.
+    pub displacements: Vec<[f64; 3]>,
+    /// Force on each, N.
+    pub forces: Vec<[f64; 3]>,
+    /// Whether they are within the tolerance.
+    pub solved: bool,
+    /// Whether unstable springs would have carried nodes past their reach.
+    pub is_carried: bool,
+}
+
+impl<'a> Answers<'a> {
+    /// The sliding nodes under conditions `c`, to the share of what these change that they ask for; `tolerance`:
+    /// of contact, over the size of the scene.
+    ///
+    /// Springs that hold a node back stand among the rows. Those that carry it on, of stiffness −k along the axes
+    /// A, are loads z = k (Aᵀ u − goal): (1/k − Aᵀ F A) z = Aᵀ u₀ − goal with F the flexibility of the body
+    /// under the rows, solved by [`Krylov`], which softens springs that the body does not hold.
+    ///
+    /// # Errors
+    /// `NotPositiveDefinite` where the body does not hold the loads and their reach has no end.
+    pub fn respond(&mut self, c: &Constraints<'_>, tolerance: f64) -> Result<Answer> {
+        let unstable: Vec<Spring> =
+            c.springs.iter().filter(|s| s.stiffness < 0.0).copied().collect();
+        let rows = Rows::new(c);
+        let exact = ROUNDING.max(EXACT_SHARE * tolerance);
+        self.carried = None;
+        let mut found = self.forces(&rows, Aim::Share(c.share), exact)?;
+        let mut is_carried = false;
+        if !unstable.is_empty() {
+            let enough = Aim::Measure(self.enough);
+            let loads;
+            (loads, is_carried) = self.loads(&unstable, c, &rows, exact)?;
+            self.carry(&unstable, &loads, Precision::Exact);
+            found = self.forces(&rows, enough, exact)?;
+        }
+        let mut forces = self.pushed.clone();
+        if let Some(Carried { loads, .. }) = &self.carried {
+            for (f, load) in forces.iter_mut().zip(loads) {
+                *f = add(*f, *load);
+            }
+        }
+        Ok(Answer { displacements: self.displacements(), forces, solved: found.solved, is_carried })
+    }
+
+    /// Loads along `unstable` springs, N, and whether these had to be softened.
+    fn loads(
+        &mut self,
+        unstable: &[Spring],
+        c: &Constraints<'_>,
+        rows: &Rows,
+        exact: f64,
+    ) -> Result<(Vec<f64>, bool)> {
+        // For a step, the next one corrects what is left; an operator has no next one.
+        let is_step = c.reach.is_finite();
+        let share = if is_step { c.share.max(PROBE_ERROR) } else { LOAD_SHARE };
+        let (aim, precision) = if is_step {
+            (Aim::Share(share), Precision::Rough)
+        } else {
+            (Aim::Share(0.0), Precision::Exact)
+        };
+        let root: Vec<f64> = unstable.iter().map(|s| (-s.stiffness).sqrt()).collect();
+        let here = self.displacements();
+        let stretch = unstable.iter().map(|s| dot(s.axis, here[s.node]) - s.goal);
+        let open: Vec<f64> = stretch.zip(&root).map(|(v, r)| v * r).collect();
+        let size = length(&open);
+        let most = self.pushed.iter().map(|f| dot(*f, *f)).sum::<f64>().sqrt();
+        let (base, mut answered) = (self.pose(), Vec::new());
+        let mut krylov = Krylov::new(size);
+        let mut next: Vec<f64> = open.iter().map(|v| v / size).collect();
+        while size > 0.0 && krylov.basis.len() < MOST_LOAD_STEPS.min(unstable.len()) {
+            let q: Vec<f64> = next.iter().zip(&root).map(|(v, r)| v * r).collect();
+            // As large as what is known of the answers to it.
+            let up = PROBE_SHARE * most / length(&q);
+            let loads: Vec<f64> = q.iter().map(|q| q * up).collect();
+            self.take(base.clone());
+            self.carry(unstable, &loads, precision);
+            self.forces(rows, aim, exact)?;
+            answered.push((up, self.pose()));
+            let there = self.displacements();
+            let moved: Vec<[f64; 3]> =
+                there.iter().zip(&here).map(|(a, b)| scaled(sub(*a, *b), 1.0 / up)).collect();
+            let answer = unstable.iter().zip(&root).map(|(s, r)| r * dot(s.axis, moved[s.node]));
+            let answer = answer.collect();
+            next = krylov.push(next, answer, moved);
+            krylov.soften(c.reach);
+            if krylov.left <= share * size {
+                break;
+            }
+        }
+        if c.reach.is_infinite() && (krylov.softness > 0.0 || krylov.left > share * size) {
+            return Err(unheld());
+        }
+        // Answers add up: from there the last one is near.
+        let mut sum = base.clone();
+        for (y, (up, pose)) in krylov.solution.iter().zip(&answered) {
+            sum.add(y / up, pose, &base);
+        }
+        self.take(sum);
+        self.doubt = f64::INFINITY;
+        let mut loads = vec![0.0; unstable.len()];
+        for (y, q) in krylov.solution.iter().zip(&krylov.basis) {
+            for ((z, q), root) in loads.iter_mut().zip(q).zip(&root) {
+                *z += y * q * root;
+            }
+        }
+        Ok((loads, krylov.softness > 0.0))
+    }
+
+    /// Puts loads z along unstable springs on the body.
+    fn carry(&mut self, unstable: &[Spring], z: &[f64], precision: Precision) {
+        let mut loads = vec![[0.0; 3]; self.free.len()];
+        for (s, z) in unstable.iter().zip(z) {
+            loads[s.node] = add(loads[s.node], scaled(s.axis, *z));
+        }
+        let moved = match (&self.contact.flexibility, precision) {
+            (Flexibility::Dense(tail), Precision::Rough) => tail.respond_roughly(&loads),
+            (Flexibility::Dense(tail), Precision::Exact) => tail.respond(&loads),
+            (Flexibility::Sweeps { reach, .. }, _) => {
+                self.symbolic.respond(self.factor, reach, &loads, &mut self.work)
+            }
+        };
+        self.carried = Some(Carried { loads, moved });
+    }
+
+    /// Displacements of the sliding nodes without contact, mm.
+    pub fn free(&self) -> &[[f64; 3]] {
+        &self.free
+    }
+
+    /// Displacements without the forces of the rows, mm.
+    fn unpushed(&self) -> Vec<[f64; 3]> {
+        match &self.carried {
+            Some(Carried { moved, .. }) => {
+                self.free.iter().zip(moved).map(|(f, a)| add(*f, *a)).collect()
+            }
+            None => self.free.clone(),
+        }
+    }
+
+    /// Displacements after the last answer, mm.
+    fn displacements(&self) -> Vec<[f64; 3]> {
+        self.unpushed().iter().zip(&self.moved).map(|(f, m)| add(*f, *m)).collect()
+    }
+
+    /// Contact forces and what they do, to begin from.
+    fn pose(&self) -> Pose {
+        Pose { last: self.last.clone(), pushed: self.pushed.clone(), moved: self.moved.clone() }
+    }
+
+    fn take(&mut self, pose: Pose) {
+        (self.last, self.pushed, self.moved) = (pose.last, pose.pushed, pose.moved);
+    }
+
+    /// Contact forces along `rows`, and what they add to the displacements: as near as `aim` says, or to `exact`
+    /// of all.
+    fn forces(&mut self, rows: &Rows, aim: Aim, exact: f64) -> Result<NormalForces> {
+        let kept = self.made.as_ref().unwrap_or(&self.contact.rest);
+        let preconditioner = Preconditioner::new(self.diagonal(rows), &rows.keys, kept);
+        let before = |key: &RowKey| {
+            self.last.binary_search_by(|(k, _)| k.cmp(key)).map_or(0.0, |at| self.last[at].1)
+        };
+        let mut start: Vec<f64> = rows.keys.iter().map(before).collect();
+        // What the last displacements leave open, were its forces not to turn with the normals.
+        let goals = rows.missing(&self.unpushed());
+        let there = rows.along(&self.moved, &start);
+        let open: Vec<f64> = goals.iter().zip(there).map(|(g, v)| g - v).collect();
+        let (change, measure) = preconditioner.measure(&open);
+        for (x, v) in start.iter_mut().zip(change) {
+            *x += v;
+        }
+        let (n, work) = (self.free.len(), &mut self.work);
+        let mut respond = |pushes: &[[f64; 3]], precision| match &self.contact.flexibility {
+            Flexibility::Dense(tail) if precision == Precision::Rough => {
+                (tail.respond_roughly(pushes), precision)
+            }
+            Flexibility::Dense(tail) => (tail.respond(pushes), precision),
+            Flexibility::Sweeps { reach, .. } => {
+                (self.symbolic.respond(self.factor, reach, pushes, work), Precision::Exact)
+            }
+        };
+        // What is rough of a change is little of the whole, until that little is what is left to change.
+        let now = pushes(n, &rows.rows, &start);
+        let (nodes, precision) = if self.doubt > DOUBT_SHARE * measure {
+            self.doubt = 0.0;
+            respond(&now, Precision::Exact)
+        } else {
+            let change: Vec<_> = now.iter().zip(&self.pushed).map(|(a, b)| sub(*a, *b)).collect();
+            let (change, precision) = respond(&change, Precision::Rough);
+            let nodes = self.moved.iter().zip(change).map(|(a, b)| add(*a, b)).collect();
+            (nodes, precision.min(self.precision))
+        };
+        let begun = Begun {
+            moved: Moved { along: rows.along(&nodes, &start), nodes, precision },
+            forces: start,
+        };
+        let product = |x: &[f64], precision| {
+            let (nodes, precision) = respond(&pushes(n, &rows.rows, x), precision);
+            Moved { along: rows.along(&nodes, x), nodes, precision }
+        };
+        let enough = match aim {
+            Aim::Share(share) => share * measure,
+            Aim::Measure(enough) => enough,
+        };
+        self.enough = enough;
+        let wanted = Wanted { exact, enough };
+        let found = match &self.contact.flexibility {
+            Flexibility::Dense(tail) => {
+                let near =
+                    conjugate_gradients(product, &preconditioner, &goals, begun, wanted, hopeless);
+                match near {
+                    Ok(found) => found,
+                    Err(_) => {
+                        let made = rows.factor(tail)?;
+                        let forces = made.solve(goals);
+                        let nodes = tail.respond(&pushes(n, &rows.rows, &forces));
+                        self.made = Some(made);
+                        let precision = Precision::Exact;
+                        NormalForces { forces, nodes, precision, solved: true }
+                    }
+                }
+            }
+            Flexibility::Sweeps { .. } => {
+                let give_up = |progress: &Progress| progress.step >= MOST_SWEEPS;
+                conjugate_gradients(product, &preconditioner, &goals, begun, wanted, give_up)
+                    .map_err(|error| MtmError::NotConverged {
+                        method: "contact by sweeps",
+                        iterations: MOST_SWEEPS,
+                        shortfall: Shortfall {
+                            quantity: "the error of the contact nodes",
+                            value: error,
+                            limit: exact,
+                            unit: " mm",
+                        },
+                        advice: "use method=\"pcg\"; contact normals or walls may be degenerate",
+                    })?
+            }
+        };
+        self.moved.clone_from(&found.nodes);
+        self.precision = found.precision;
+        self.doubt = match found.precision {
+            Precision::Rough => self.doubt + ROUGH * measure,
+            Precision::Exact => 0.0,
+        };
+        self.pushed = pushes(n, &rows.rows, &found.forces);
+        self.last = rows.keys.iter().copied().zip(found.forces.iter().copied()).collect();
+        self.last.sort_unstable_by_key(|(key, _)| *key);
+        Ok(found)
+    }
+
+    /// Flexibility of each row by itself, mm/N.
+    fn diagonal(&self, rows: &Rows) -> Vec<f64> {
+        let own = |r: &ContactRow| match &self.contact.flexibility {
+            Flexibility::Dense(tail) => tail.own(r.node, r.normal),
+            Flexibility::Sweeps { own, .. } => own[r.node],
+        };
+        rows.rows.iter().zip(&rows.softness).map(|(r, s)| own(r) + s).collect()
+    }
+
+    /// Displacements of all rows of the system with `forces` on the sliding nodes.
+    pub fn of_all(self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let Self { symbolic, factor, mut swept, mut work, .. } = self;
+        match &self.contact.flexibility {
+            Flexibility::Dense(tail) => {
+                let moved = tail.respond(forces);
+                let there: Vec<_> =
+                    moved.iter().zip(&self.free).map(|(r, f)| add(*r, *f)).collect();
+                symbolic.above_tail(factor, swept, &there)
+            }
+            Flexibility::Sweeps { reach, .. } => {
+                symbolic.add_reach_forces(factor, reach, forces, &mut work, &mut swept);
+                symbolic.backward(factor, &mut swept);
+                symbolic.unpermuted(&swept)
+            }
+        }
+    }
+}
+
+/// How near forces have to come.
+#[derive(Clone, Copy)]
+enum Aim {
+    /// To a share of what the rows change.
+    Share(f64),
+    /// Within so much, in the measure of the preconditioner.
+    Measure(f64),
+}
+
+/// Contact forces of some answer, and what they do.
+#[derive(Clone)]
+struct Pose {
+    last: Vec<(RowKey, f64)>,
+    pushed: Vec<[f64; 3]>,
+    moved: Vec<[f64; 3]>,
+}
+
+impl Pose {
+    /// Adds `share` of what `to` has more than `from`, for the same rows.
+    fn add(&mut self, share: f64, to: &Self, from: &Self) {
+        for (own, (to, from)) in self.last.iter_mut().zip(to.last.iter().zip(&from.last)) {
+            own.1 += share * (to.1 - from.1);
+        }
+        let more = |own: &mut Vec<[f64; 3]>, to: &[[f64; 3]], from: &[[f64; 3]]| {
+            for (own, (to, from)) in own.iter_mut().zip(to.iter().zip(from)) {
+                *own = add(*own, scaled(sub(*to, *from), share));
+            }
+        };
+        more(&mut self.pushed, &to.pushed, &from.pushed);
+        more(&mut self.moved, &to.moved, &from.moved);
+    }
+}
+
+/// Constraint rows, and after them one for each spring: a spring of stiffness k adds a column along its
+/// axis, with 1/k on the diagonal.
+pub(crate) struct Rows {
+    pub rows: Vec<ContactRow>,
+    /// Displacement that each row asks for, mm.
+    goals: Vec<f64>,
+    /// What is added to the diagonal, mm/N.
+    pub softness: Vec<f64>,
+    pub keys: Vec<RowKey>,
+}
+
+impl Rows {
+    pub fn new(c: &Constraints<'_>) -> Self {
+        let (mut rows, mut goals) = (c.rows.to_vec(), c.offsets.to_vec());
+        let mut softness = vec![0.0; rows.len()];
+        for spring in c.springs.iter().filter(|s| s.stiffness > 0.0) {
+            rows.push(ContactRow { node: spring.node, normal: spring.axis, point: [0.0; 3] });
+            goals.push(spring.goal);
+            softness.push(1.0 / spring.stiffness);
+        }
+        let most = rows.iter().map(|r| r.node + 1).max().unwrap_or(0);
+        let mut count = vec![0; most];
+        let key = |r: &ContactRow| {
+            count[r.node] += 1;
+            (r.node, count[r.node] - 1)
+        };
+        let keys = rows.iter().map(key).collect();
+        Self { rows, goals, softness, keys }
+    }
+
+    /// What contact forces have to add to displacements `free`, mm.
+    pub fn missing(&self, free: &[[f64; 3]]) -> Vec<f64> {
+        self.rows.iter().zip(&self.goals).map(|(r, g)| g - dot(r.normal, free[r.node])).collect()
+    }
+
+    /// Displacement along each row where nodes move by `nodes` and the forces along the rows are `forces`.
+    fn along(&self, nodes: &[[f64; 3]], forces: &[f64]) -> Vec<f64> {
+        let along = |((r, s), f): ((&ContactRow, &f64), &f64)| dot(r.normal, nodes[r.node]) + s * f;
+        self.rows.iter().zip(&self.softness).zip(forces).map(along).collect()
+    }
+
+    /// Nᵀ S⁻¹ N with the softness.
+    fn flexibility(&self, tail: &TailFlexibility) -> DenseSymmetric {
+        let nodes: Vec<usize> = self.rows.iter().map(|r| r.node).collect();
+        let normals: Vec<[f64; 3]> = self.rows.iter().map(|r| r.normal).collect();
+        tail.normal_flexibility(&nodes, &normals, &self.softness)
+    }
+
+    /// The factor of the flexibility.
+    fn factor(&self, tail: &TailFlexibility) -> Result<NormalFactor> {
+        NormalFactor::new(self.flexibility(tail), self.keys.clone())
+            .map_err(|at| self.singular(tail, at))
+    }
+
+    fn singular(&self, tail: &TailFlexibility, at: usize) -> MtmError {
+        singular(tail.row(self.rows[at].node) as u32)
+    }
+}
+
+/// Loads y of unstable springs in the space that their products span: ((1 + μ) I − G) y = b, G the flexibility
+/// between the springs, each by the root of its stiffness; μ softens all springs alike, so that the body holds
+/// them and no node goes farther than they reach (a trust region; Gould, Lucidi, Roma & Toint 1999).
+struct Krylov {
+    /// Length of b.
+    size: f64,
+    /// Orthonormal directions, the first along b.
+    basis: Vec<Vec<f64>>,
+    /// What loads along them add to the displacements of the sliding nodes, mm.
+    moved: Vec<Vec<[f64; 3]>>,
+    /// G between them.
+    flexibility: DMatrix<f64>,
+    /// Part of the last product that lies outside them.
+    rest: f64,
+    /// y along each.
+    solution: DVector<f64>,
+    /// μ.
+    softness: f64,
+    /// Length of b − ((1 + μ) I − G) y.
+    left: f64,
+}
+
+impl Krylov {
+    fn new(size: f64) -> Self {
+        Self {
+            size,
+            basis: Vec::new(),
+            moved: Vec::new(),
+            flexibility: DMatrix::zeros(0, 0),
+            rest: 0.0,
+            solution: DVector::zeros(0),
+            softness: 0.0,
+            left: size,
+        }
+    }
+
+    /// Adds a direction with its product and what it moves; the next one.
+    fn push(&mut self, direction: Vec<f64>, answer: Vec<f64>, moved: Vec<[f64; 3]>) -> Vec<f64> {
+        let m = self.basis.len();
+        self.basis.push(direction);
+        self.moved.push(moved);
+        let mut flexibility = std::mem::take(&mut self.flexibility).resize(m + 1, m + 1, 0.0);
+        let mut next = answer;
+        // Twice is enough against rounding (Parlett 1980).
+        for _ in 0..2 {
+            for (k, q) in self.basis.iter().enumerate() {
+                let along: f64 = q.iter().zip(&next).map(|(a, b)| a * b).sum();
+                flexibility[(k, m)] += along;
+                for (n, q) in next.iter_mut().zip(q) {
+                    *n -= along * q;
+                }
+            }
+        }
+        for k in 0..m {
+            flexibility[(m, k)] = flexibility[(k, m)];
+        }
+        self.flexibility = flexibility;
+        self.rest = length(&next);
+        next.iter().map(|v| v / self.rest.max(f64::MIN_POSITIVE)).collect()
+    }
+
+    /// The solution with the least softness with which no node goes farther than `reach`, mm.
+    fn soften(&mut self, reach: f64) {
+        let m = self.basis.len();
+        let eigen = SymmetricEigen::new(self.flexibility.clone());
+        let start = eigen.eigenvectors.row(0).transpose() * self.size;
+        let solution = |softness: f64| -> DVector<f64> {
+            let held = eigen.eigenvalues.map(|g| 1.0 + softness - g);
+            &eigen.eigenvectors * start.component_div(&held)
+        };
+        let farthest = |y: &DVector<f64>| {
+            let moved = (0..self.moved[0].len()).map(|i| {
+                let sum = (0..m).fold([0.0; 3], |sum, k| add(sum, scaled(self.moved[k][i], y[k])));
+                norm(sum)
+            });
+            moved.fold(0.0, f64::max)
+        };
+        let most = eigen.eigenvalues.max();
+        self.softness = 0.0;
+        self.solution = solution(0.0);
+        if most >= 1.0 || farthest(&self.solution) > reach {
+            // From just held on, the way falls as the softness grows.
+            let least = (most - 1.0).max(0.0);
+            let (mut low, mut high) = (least, least + 1.0);
+            while farthest(&solution(high)) > reach && high < MOST_SOFTNESS {
+                high = least + 4.0 * (high - least);
+            }
+            for _ in 0..SOFTENINGS {
+                let middle = 0.5 * (low + high);
+                if farthest(&solution(middle)) > reach {
+                    low = middle;
+                } else {
+                    high = middle;
+                }
+            }
+            self.softness = high;
+            self.solution = solution(high);
+        }
+        self.left = self.rest * self.solution[m - 1].abs();
+    }
+}
+
+fn length(v: &[f64]) -> f64 {
+    v.iter().map(|v| v * v).sum::<f64>().sqrt()
+}
+
+/// That contact forces carry nodes on by more than the body holds.
+pub(crate) fn unheld() -> MtmError {
+    MtmError::NotPositiveDefinite {
+        node: 0,
+        detail: "contact forces carry sliding nodes on by more than the tissue holds".into(),
+    }
+}
+
+/// That the flexibility has no positive pivot at a row of the system.
+pub(crate) fn singular(row: u32) -> MtmError {
+    MtmError::NotPositiveDefinite {
+        node: row as usize,
+        detail: "the flexibility of the sliding nodes is singular".into(),
+    }
+}
+
+/// Force vector of each of `n` sliding nodes from the forces along the rows.
+fn pushes(n: usize, rows: &[ContactRow], forces: &[f64]) -> Vec<[f64; 3]> {
+    let mut out = vec![[0.0; 3]; n];
+    for (r, &force) in rows.iter().zip(forces) {
+        out[r.node] = add(out[r.node], scaled(r.normal, force));
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Loads of springs on three nodes that move along x, y and z alone: G is diagonal in the basis.
+    fn solved(flexibility: [f64; 3], b: [f64; 3], reach: f64) -> (Krylov, [f64; 3]) {
+        let size = length(&b);
+        let mut krylov = Krylov::new(size);
+        let mut next: Vec<f64> = b.iter().map(|v| v / size).collect();
+        for _ in 0..3 {
+            let answer: Vec<f64> = next.iter().zip(flexibility).map(|(v, g)| v * g).collect();
+            let moved = (0..3).map(|i| [0, 1, 2].map(|j| if i == j { answer[i] } else { 0.0 }));
+            next = krylov.push(next.clone(), answer.clone(), moved.collect());
+            krylov.soften(reach);
+        }
+        let mut y = [0.0; 3];
+        for (share, q) in krylov.solution.iter().zip(&krylov.basis) {
+            for (y, q) in y.iter_mut().zip(q) {
+                *y += share * q;
+            }
+        }
+        (krylov, y)
+    }
+
+    #[test]
+    fn springs_that_the_body_holds_are_not_softened() {
+        let (flexibility, b) = ([0.2, 0.5, 0.9], [1.0, -2.0, 0.5]);
+        let (krylov, y) = solved(flexibility, b, f64::INFINITY);
+        assert_eq!(krylov.softness, 0.0);
+        assert!(krylov.left < 1e-13, "{}", krylov.left);
+        for i in 0..3 {
+            assert!((y[i] * (1.0 - flexibility[i]) - b[i]).abs() < 1e-13, "{y:?}");
+        }
+    }
+
+    #[test]
+    fn springs_that_the_body_does_not_hold_carry_nodes_as_far_as_they_reach() {
+        // The last one takes more than the body holds, or nearly as much.
+        for last in [1.3, 0.999] {
+            let (flexibility, b) = ([0.2, 0.5, last], [1.0, -2.0, 0.5]);
+            let (krylov, y) = solved(flexibility, b, 3.0);
+            assert!(krylov.softness > last - 1.0 && krylov.softness > 0.0);
+            let mu = krylov.softness;
+            let mut farthest = 0.0_f64;
+            for i in 0..3 {
+                assert!((y[i] * (1.0 + mu - flexibility[i]) - b[i]).abs() < 1e-12, "{y:?}");
+                farthest = farthest.max((y[i] * flexibility[i]).abs());
+            }
+            assert!((farthest - 3.0).abs() < 1e-6, "{farthest}");
+        }
+    }
+}

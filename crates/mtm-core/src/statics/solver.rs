@@ -1,0 +1,543 @@
+//! `StaticSolver`: eliminates prescribed nodes, keeps all that a new plan does not change, and composes
+//! the solution of each plan.
+
+use std::sync::Arc;
+
+use crate::algebra::blocks::{Block, BlockMatrix};
+use crate::boundary::{Boundary, Motion, NodeKind, Plan};
+use crate::contact::{ContactState, Sliding};
+use crate::error::{ErrorKind, MtmError, Result, check_forces};
+use crate::mechanics::kinematics::Kinematics;
+use crate::mechanics::tensors::MassTensors;
+use crate::mesh::{add, dot, norm, scaled, sub};
+use crate::statics::iterative::{Effort, Extremes, is_doubtful};
+use crate::statics::newton::{Equilibrium, Slide};
+use crate::statics::options::{Interrupt, Method, StaticOptions};
+use crate::statics::reduction::{NO_ROW, Reduction};
+use crate::statics::restraint::{self, Held};
+use crate::statics::solution::{Clock, ContactResult, Solution, Timings};
+use crate::statics::system::{Begin, Frozen, System};
+
+/// Multiple of the correction of a solution by factor that stands for the error of the corrected one.
+const CORRECTION_SAFETY: f64 = 2.0;
+
+/// A patient's tensors and node kinds, ready for any plan.
+pub struct StaticSolver {
+    pub(crate) tensors: Arc<MassTensors>,
+    boundary: Arc<Boundary>,
+    /// The boundary with the nodes in the middle of edges, where the element has them.
+    pub(crate) node_kinds: Arc<Boundary>,
+    options: StaticOptions,
+    method: Method,
+    /// Whether solutions by factor are corrected once.
+    refines: bool,
+    pub(crate) reduction: Reduction,
+    pub(crate) sliding: Option<Sliding>,
+    mechanics: Mechanics,
+    held: Held,
+    /// Coupling of unknown rows with joined nodes: (row, node, tensor).
+    couplings: Vec<(u32, u32, Block)>,
+    timings: Timings,
+}
+
+/// How the unknown rows follow from a plan.
+enum Mechanics {
+    /// One linear system for every plan.
+    Linear(Box<System>),
+    /// Newton's method.
+    LargeRotation(Box<Equilibrium>),
+}
+
+impl StaticSolver {
+    /// The solver of `tensors` under `boundary`.
+    ///
+    /// # Errors
+    /// Options out of range, node indices out of range, a body that is not held (with its free rigid
+    /// modes), an inverted contact surface, a factor that fails or does not fit in memory.
+    pub fn new(
+        tensors: Arc<MassTensors>,
+        boundary: Arc<Boundary>,
+        options: StaticOptions,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Self> {
+        options.check()?;
+        let mut clock = Clock::new();
+        let mesh = tensors.mesh().clone();
+        let places = tensors.element_nodes().positions();
+        let node_kinds = with_mid_edges(&tensors, &boundary)?;
+        let kinds = node_kinds.kinds(places.len())?;
+        let reduction = Reduction::new(&kinds);
+        let is_unknown = |j: usize| reduction.row_of[j] != NO_ROW;
+        let stiffness = |j: usize| own_stiffness(tensors.matrix(), j);
+        let sliding = Sliding::new(
+            &node_kinds,
+            &mesh,
+            places,
+            &reduction.row_of,
+            stiffness,
+            options.contact.mode,
+        )?;
+        clock.lap("contact_setup", sliding.is_some());
+        let normals: Vec<(u32, [f64; 3])> = sliding
+            .iter()
+            .flat_map(|s| s.nodes().iter().zip(s.rest_normals()))
+            .map(|(s, &n)| (s.node, n))
+            // Whole faces join the tets of a part, so its corners say how it is held.
+            .filter(|(node, _)| (*node as usize) < mesh.n_nodes())
+            .collect();
+        let held = restraint::check(&mesh, |j| !is_unknown(j), &normals)?;
+        clock.lap("restraint", true);
+
+        let couplings = couplings(tensors.matrix(), &reduction.unknowns, &kinds);
+        let matrix = reduction.matrix(tensors.matrix());
+        clock.lap("reduce", true);
+        if interrupted() {
+            return Err(MtmError::Interrupted);
+        }
+        let made = if options.kinematics == Kinematics::Linear {
+            System::new(
+                matrix,
+                &reduction.rows(places),
+                sliding.as_ref(),
+                held,
+                Extremes {
+                    lame_ratio: tensors.tissue().largest_lame_ratio(),
+                    contrast: tensors.tissue().contrast(),
+                },
+                &options,
+                &mut clock,
+                interrupted,
+            )
+            .map(|(system, method)| (Mechanics::Linear(Box::new(system)), method))
+        } else {
+            Equilibrium::new(tensors.clone(), &matrix, &options, &mut clock)
+                .map(|(body, method)| (Mechanics::LargeRotation(Box::new(body)), method))
+        };
+        let (mechanics, method) = made.map_err(|e| by_node(e, &reduction.unknowns))?;
+        let refines = method == Method::Cholesky
+            && options.kinematics == Kinematics::Linear
+            && is_doubtful(tensors.tissue().contrast());
+        Ok(Self {
+            tensors,
+            boundary,
+            node_kinds,
+            options,
+            method,
+            refines,
+            reduction,
+            sliding,
+            mechanics,
+            held,
+            couplings,
+            timings: clock.laps,
+        })
+    }
+
+    /// How strain follows from displacement.
+    pub fn kinematics(&self) -> Kinematics {
+        self.options.kinematics
+    }
+
+    /// The method used: never `Auto`.
+    pub fn method(&self) -> Method {
+        self.method
+    }
+
+    /// The tensors.
+    pub fn tensors(&self) -> &Arc<MassTensors> {
+        &self.tensors
+    }
+
+    /// The boundary.
+    pub fn boundary(&self) -> &Arc<Boundary> {
+        &self.boundary
+    }
+
+    /// Number of unknowns, three per free or sliding node.
+    pub fn n_unknowns(&self) -> usize {
+        3 * self.reduction.unknowns.len()
+    }
+
+    /// Bytes of the factor or preconditioner that is kept.
+    pub fn factor_bytes(&self) -> usize {
+        match &self.mechanics {
+            Mechanics::Linear(system) => system.bytes(),
+            Mechanics::LargeRotation(body) => body.bytes(),
+        }
+    }
+
+    /// Seconds by stage of the set-up.
+    pub fn timings(&self) -> &Timings {
+        &self.timings
+    }
+
+    /// Displacements under `plan` and nodal `loads` (N, one row per corner, or per node with those in the
+    /// middle of edges).
+    ///
+    /// Depends on its arguments alone: nothing is left over from earlier plans.
+    ///
+    /// # Errors
+    /// A plan or loads that do not fit, contact that does not converge, an iteration that does not
+    /// converge, interruption.
+    pub fn solve(
+        &self,
+        plan: &Plan,
+        loads: Option<&[[f64; 3]]>,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Solution> {
+        self.solve_from(None, plan, loads, interrupted)
+    }
+
+    /// As [`solve`](Self::solve), with contact begun where `start`, a solution of this solver for another plan, has
+    /// the nodes on their segments: fewer steps for a plan that differs little. The end is the same within the
+    /// tolerances wherever there is one equilibrium. Large deformation begins at rest whatever the start.
+    ///
+    /// # Errors
+    /// As [`solve`](Self::solve); a start with other nodes.
+    pub fn solve_from(
+        &self,
+        start: Option<&Solution>,
+        plan: &Plan,
+        loads: Option<&[[f64; 3]]>,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Solution> {
+        if let Some(start) = start {
+            self.check_start(start)?;
+        }
+        let mut clock = Clock::new();
+        let loads = loads.map(|rows| self.checked_loads(rows)).transpose()?;
+        let loads = loads.as_deref();
+        let motions = self.node_kinds.motions(plan)?;
+        let mut u = self.prescribed(&motions)?;
+        let scale = u.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
+        let mut b = self.coupled(&u);
+        if let Some(rows) = loads {
+            for (b, &j) in b.iter_mut().zip(&self.reduction.unknowns) {
+                *b = [0, 1, 2].map(|i| b[i] + rows[j as usize][i]);
+            }
+        }
+        clock.lap("plan", true);
+
+        let mut effort = Effort::default();
+        let (rows, contact, contact_seconds) =
+            self.solve_rows(&b, &u, loads, &motions, start, scale, &mut effort, interrupted)?;
+        clock.lap("solve", true);
+        for (&j, v) in self.reduction.unknowns.iter().zip(&rows) {
+            u[j as usize] = *v;
+        }
+        let mut forces = self.forces(&u)?;
+        if self.refines && contact.is_none() {
+            self.refine(&mut u, &forces, loads, &mut effort, interrupted)?;
+            forces = self.forces(&u)?;
+        }
+        let residual = self.residual(&forces, loads, contact.as_ref(), &b);
+        if !(residual.is_finite() && effort.error_estimate.is_finite()) {
+            return Err(MtmError::NotPositiveDefinite {
+                node: 0,
+                detail: "the solution is not finite; the plan or the moduli overflow f64".into(),
+            });
+        }
+        clock.lap("forces", true);
+
+        let mut timings: Timings = self.timings.clone();
+        timings.extend(clock.laps.iter().map(|&(stage, seconds)| {
+            (stage, if stage == "solve" { seconds - contact_seconds } else { seconds })
+        }));
+        timings.push(("contact", contact_seconds));
+        timings.push(("total", clock.total()));
+        let contact_iterations = contact.as_ref().map_or(0, |c| c.iterations);
+        Ok(Solution {
+            displacements: u,
+            forces,
+            residual,
+            error_estimate: effort.error_estimate,
+            iterations: effort.iterations,
+            residual_history: effort.history,
+            contact: self.contact_result(contact, &motions),
+            contact_iterations,
+            timings,
+        })
+    }
+
+    /// Internal forces under displacements of all nodes, N.
+    fn forces(&self, u: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
+        match &self.mechanics {
+            Mechanics::Linear(_) => Ok(self.tensors.matrix().multiply(u)),
+            Mechanics::LargeRotation(body) => body.forces(u),
+        }
+    }
+
+    /// Adds to `u` what its own forces out of balance still bring, and counts it as error: where stiff and
+    /// soft tissue are mixed, a solution may lose digits that the known one of the factor kept.
+    fn refine(
+        &self,
+        u: &mut [[f64; 3]],
+        forces: &[[f64; 3]],
+        loads: Option<&[[f64; 3]]>,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<()> {
+        let Mechanics::Linear(system) = &self.mechanics else { return Ok(()) };
+        let out_of_balance = |&j: &u32| {
+            let f = scaled(forces[j as usize], -1.0);
+            loads.map_or(f, |rows| add(rows[j as usize], f))
+        };
+        let b: Vec<[f64; 3]> = self.reduction.unknowns.iter().map(out_of_balance).collect();
+        let correction = system.solve(&b, 0.0, &mut Effort::default(), interrupted)?;
+        let mut largest = 0.0_f64;
+        for (&j, d) in self.reduction.unknowns.iter().zip(&correction) {
+            u[j as usize] = add(u[j as usize], *d);
+            largest = largest.max(norm(*d));
+        }
+        effort.error_estimate = effort.error_estimate.max(CORRECTION_SAFETY * largest);
+        Ok(())
+    }
+
+    /// Displacements of all nodes with the prescribed ones filled in, mm.
+    fn prescribed(&self, motions: &[&Motion]) -> Result<Vec<[f64; 3]>> {
+        let nodes = self.tensors.element_nodes().positions();
+        let mut u = vec![[0.0; 3]; nodes.len()];
+        for (s, motion) in motions.iter().enumerate() {
+            for (j, v) in self.node_kinds.joined_displacements(s, motion, nodes)? {
+                u[j as usize] = v;
+            }
+        }
+        Ok(u)
+    }
+
+    /// Forces −K_UB u_B that prescribed nodes bring to the unknown rows, N.
+    pub(crate) fn coupled(&self, u: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let mut b = vec![[0.0; 3]; self.reduction.unknowns.len()];
+        for (row, node, k) in &self.couplings {
+            let v = u[*node as usize];
+            let out = &mut b[*row as usize];
+            for i in 0..3 {
+                out[i] -= k[3 * i] * v[0] + k[3 * i + 1] * v[1] + k[3 * i + 2] * v[2];
+            }
+        }
+        b
+    }
+
+    /// `loads` for every node, those in the middle of edges included.
+    fn checked_loads(&self, loads: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
+        let n = self.tensors.element_nodes().n_nodes();
+        let corners = self.tensors.mesh().n_nodes();
+        if loads.len() != n && loads.len() != corners {
+            return Err(MtmError::Length {
+                what: "loads".into(),
+                found: loads.len(),
+                expected: corners,
+                why: "one row per node",
+                kind: ErrorKind::Boundary,
+            });
+        }
+        check_forces("loads", loads, ErrorKind::Boundary)?;
+        let mut out = loads.to_vec();
+        out.resize(n, [0.0; 3]);
+        Ok(out)
+    }
+
+    /// Displacements of the unknown rows, contact, and the seconds it took.
+    ///
+    /// `b`: forces that joined nodes and loads bring to the rows of the linear system. `u`: displacements
+    /// of all nodes, those of joined ones filled in.
+    fn solve_rows(
+        &self,
+        b: &[[f64; 3]],
+        u: &[[f64; 3]],
+        loads: Option<&[[f64; 3]]>,
+        motions: &[&Motion],
+        start: Option<&Solution>,
+        scale: f64,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<(Vec<[f64; 3]>, Option<ContactState>, f64)> {
+        let found = match (&self.mechanics, &self.sliding) {
+            (Mechanics::LargeRotation(body), sliding) => {
+                let slide =
+                    sliding.as_ref().map(|sliding| Slide { sliding, motions, held: self.held });
+                body.solve(&self.reduction, u, loads, slide.as_ref(), scale, effort, interrupted)
+            }
+            (Mechanics::Linear(system), None) => {
+                system.solve(b, scale, effort, interrupted).map(|u| (u, None, 0.0))
+            }
+            (Mechanics::Linear(system), Some(sliding)) => {
+                let rows =
+                    start.map_or_else(Vec::new, |start| self.reduction.rows(&start.displacements));
+                let rest = start.and_then(|start| start.contact.at_rest.as_ref());
+                let contact = rest.and_then(|rest| sliding.carried(motions, rest));
+                let found = system.solve_with_contact(
+                    b,
+                    sliding,
+                    motions,
+                    contact.map(|contact| Begin { rows: &rows, contact }),
+                    &self.options,
+                    scale,
+                    effort,
+                    interrupted,
+                );
+                found.map(|(u, state, seconds)| (u, Some(state), seconds))
+            }
+        };
+        found.map_err(|e| by_node(e, &self.reduction.unknowns))
+    }
+
+    /// Force out of balance at the unknown nodes over the forces that the plan brings in: those of joined
+    /// nodes and loads on the unknown rows, contact forces, and what each held node alone would take to go
+    /// where its walls ask. Without the last, walls that carry a body about unstrained bring in nothing.
+    fn residual(
+        &self,
+        forces: &[[f64; 3]],
+        loads: Option<&[[f64; 3]]>,
+        contact: Option<&ContactState>,
+        b: &[[f64; 3]],
+    ) -> f64 {
+        let mut rest: Vec<[f64; 3]> = self
+            .reduction
+            .unknowns
+            .iter()
+            .map(|&j| {
+                let f = forces[j as usize];
+                loads.map_or(f, |rows| sub(f, rows[j as usize]))
+            })
+            .collect();
+        let mut scale: f64 = b.iter().map(|v| dot(*v, *v)).sum();
+        if let (Some(sliding), Some(state)) = (&self.sliding, contact) {
+            for (i, node) in sliding.nodes().iter().enumerate() {
+                let push = scaled(state.normals[i], state.forces[i]);
+                rest[node.row as usize] = sub(rest[node.row as usize], push);
+                scale += dot(push, push);
+            }
+            for row in &state.rows {
+                let j = sliding.nodes()[row.node].node as usize;
+                let k = self.tensors.matrix().diagonal_block(j);
+                let way = scaled(row.normal, dot(row.normal, state.displacements[row.node]));
+                let alone = [0, 1, 2].map(|i| dot([k[3 * i], k[3 * i + 1], k[3 * i + 2]], way));
+                scale += dot(alone, alone);
+            }
+        }
+        let sum: f64 = rest.iter().map(|v| dot(*v, *v)).sum();
+        if sum == 0.0 { 0.0 } else { (sum / scale.max(f64::MIN_POSITIVE)).sqrt() }
+    }
+
+    /// Refuses a solution of another mesh or boundary to start from.
+    fn check_start(&self, start: &Solution) -> Result<()> {
+        let n = self.tensors.element_nodes().n_nodes();
+        let nodes = self.sliding.as_ref().map_or(0, |s| s.nodes().len());
+        let counts = [
+            ("displacements of the start", start.displacements.len(), n),
+            ("sliding nodes of the start", start.contact.nodes.len(), nodes),
+        ];
+        for (what, found, expected) in counts {
+            if found != expected {
+                return Err(MtmError::Length {
+                    what: what.into(),
+                    found,
+                    expected,
+                    why: "the start is a solution of the same solver",
+                    kind: ErrorKind::Boundary,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    fn contact_result(&self, state: Option<ContactState>, motions: &[&Motion]) -> ContactResult {
+        let (Some(sliding), Some(state)) = (&self.sliding, state) else {
+            return ContactResult::default();
+        };
+        let at_rest = sliding.carried_back(motions, &state);
+        ContactResult {
+            nodes: sliding.nodes().iter().map(|n| n.node).collect(),
+            points: state.points,
+            normals: state.normals,
+            forces: state.forces,
+            gaps: state.gaps,
+            unbalanced: state.unbalanced,
+            at_rest,
+            converged: state.converged,
+            active: state.active,
+        }
+    }
+
+    /// Contact settled for `plan`: where the linear operator of re-planning is frozen.
+    pub(crate) fn settled(
+        &self,
+        plan: &Plan,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Option<ContactState>> {
+        if self.sliding.is_none() {
+            return Ok(None);
+        }
+        let motions = self.node_kinds.motions(plan)?;
+        let u = self.prescribed(&motions)?;
+        let scale = u.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
+        let b = self.coupled(&u);
+        let mut effort = Effort::default();
+        Ok(self.solve_rows(&b, &u, None, &motions, None, scale, &mut effort, interrupted)?.1)
+    }
+
+    /// Unknown rows for several right-hand sides, with contact frozen where there is any.
+    pub(crate) fn solve_columns(
+        &self,
+        columns: Vec<Vec<[f64; 3]>>,
+        scales: &[f64],
+        frozen: Option<Frozen<'_>>,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<Vec<[f64; 3]>>> {
+        let Mechanics::Linear(system) = &self.mechanics else {
+            unreachable!("plan operators of other kinematics are refused before they get here")
+        };
+        system
+            .solve_columns(columns, scales, self.sliding.as_ref().zip(frozen), interrupted)
+            .map_err(|e| by_node(e, &self.reduction.unknowns))
+    }
+}
+
+/// `boundary` with the mid-edge nodes of `tensors`; itself where there are none.
+fn with_mid_edges(tensors: &MassTensors, boundary: &Arc<Boundary>) -> Result<Arc<Boundary>> {
+    let edges = tensors.element_nodes().mid_edges();
+    if edges.is_empty() {
+        return Ok(boundary.clone());
+    }
+    let mesh = tensors.mesh();
+    let mut surface: Vec<[u32; 2]> = mesh
+        .boundary_triangles()
+        .iter()
+        .flat_map(|&[a, b, c]| [[a, b], [b, c], [c, a]])
+        .map(|[a, b]| if a < b { [a, b] } else { [b, a] })
+        .collect();
+    surface.sort_unstable();
+    let on_surface = |edge: [u32; 2]| surface.binary_search(&edge).is_ok();
+    Ok(Arc::new(boundary.with_mid_edges(mesh.n_nodes(), edges, on_surface)?))
+}
+
+/// Mean stiffness of node `j` by itself, a third of the trace of K_jj, N/mm.
+fn own_stiffness(matrix: &BlockMatrix, j: usize) -> f64 {
+    let own = matrix.diagonal_block(j);
+    (own[0] + own[4] + own[8]) / 3.0
+}
+
+/// Names the node instead of the row of the reduced system.
+fn by_node(error: MtmError, unknowns: &[u32]) -> MtmError {
+    match error {
+        MtmError::NotPositiveDefinite { node, detail } => MtmError::NotPositiveDefinite {
+            node: unknowns.get(node).map_or(node, |&j| j as usize),
+            detail,
+        },
+        other => other,
+    }
+}
+
+fn couplings(matrix: &BlockMatrix, unknowns: &[u32], kinds: &[NodeKind]) -> Vec<(u32, u32, Block)> {
+    let mut out = Vec::new();
+    for (row, &j) in unknowns.iter().enumerate() {
+        let (columns, blocks) = matrix.row(j as usize);
+        for (&k, block) in columns.iter().zip(blocks) {
+            if matches!(kinds[k as usize], NodeKind::Joined(_)) {
+                out.push((row as u32, k, *block));
+            }
+        }
+    }
+    out
+}

@@ -1,0 +1,503 @@
+//! The reduced linear system: what a method keeps from one plan to the next, and how it solves with
+//! and without contact.
+
+use crate::algebra::blocks::BlockMatrix;
+use crate::algebra::cholesky::{Factor, Symbolic};
+use crate::algebra::constraints::{Constraint, add_offsets, projected, projected_rhs};
+use crate::algebra::row_sums::in_pool;
+use crate::boundary::Motion;
+use crate::contact::{
+    Body, Constraints, ContactRow, ContactStart, ContactState, Response, Sliding, Spring,
+};
+use crate::error::{MtmError, Result};
+use crate::mesh::{add, between, dot, norm, scaled, sub};
+use crate::statics::frozen::FrozenContact;
+use crate::statics::iterative::{Advance, Effort, Extremes, Iterative, Trail};
+use crate::statics::options::{Interrupt, Method, StaticOptions};
+use crate::statics::reaction::{Answer, Answers, ContactFactor};
+use crate::statics::restraint::Held;
+use crate::statics::solution::Clock;
+
+/// Most sliding nodes whose whole flexibility is kept (three unknowns each, 12 bytes a pair: doubles and
+/// floats): with it a set of normals costs a few dense products, by sweeps a few passes over the factor.
+const MAX_DENSE_SLIDING: usize = 2500;
+/// Most sliding nodes of which the flexibility along the normals at rest is kept: 8 bytes a pair.
+const MAX_KEPT_SLIDING: usize = 6000;
+
+/// Share of the error allowed to an iterative solve that contact may have as well: it cannot settle nearer
+/// than the solves repeat.
+const CONTACT_SHARE: f64 = 0.1;
+/// Multiple of a factor's trial error that stands for the error of any solution by it. Ten of them were too
+/// few for one solution in 300 of `benches/error_estimate.rs`, most of them with contact.
+const TRIAL_SAFETY: f64 = 100.0;
+
+/// Multiple of the largest gap that contact leaves which stands for the error of a solution with it.
+const GAP_SAFETY: f64 = 10.0;
+
+/// One row of three for each unknown node.
+type Rows = Vec<[f64; 3]>;
+
+/// What is kept from one plan to the next.
+enum Kept {
+    /// The factor, and with sliding nodes what answers for them.
+    Direct { symbolic: Symbolic, factor: Factor, contact: Option<ContactFactor> },
+    /// The structure of the factor: the values change with the contact normals.
+    Refactored { symbolic: Symbolic, matrix: BlockMatrix },
+    /// The preconditioner.
+    Iterative(Iterative),
+}
+
+/// The system of the unknown nodes, ready for any right-hand side.
+pub(crate) struct System {
+    kept: Kept,
+}
+
+/// Where a solve with contact starts: the end of one for a plan or a body a little different.
+pub(crate) struct Begin<'a> {
+    /// Displacements of the rows.
+    pub rows: &'a [[f64; 3]],
+    pub contact: ContactStart,
+}
+
+/// Contact constraints that do not change, for several right-hand sides.
+pub(crate) struct Frozen<'a> {
+    /// Sliding node and normal of each constraint.
+    pub rows: &'a [ContactRow],
+    /// Offset of every row, for each right-hand side.
+    pub offsets: &'a [Vec<f64>],
+    /// How the contact forces turn as nodes slide.
+    pub springs: &'a [Spring],
+    /// Goal of every spring, for each right-hand side.
+    pub goals: &'a [Vec<f64>],
+}
+
+impl Frozen<'_> {
+    /// The springs with their goals for right-hand side `k`.
+    fn springs(&self, k: usize) -> Vec<Spring> {
+        let goals = self.springs.iter().zip(&self.goals[k]);
+        goals.map(|(spring, &goal)| Spring { goal, ..*spring }).collect()
+    }
+}
+
+impl System {
+    /// The system of `matrix`, with what the method of `options` keeps, and the method used.
+    ///
+    /// `positions`: coordinates of the rows; `tissue`: how extreme the tissue is. Errors name rows.
+    pub fn new(
+        matrix: BlockMatrix,
+        positions: &[[f64; 3]],
+        sliding: Option<&Sliding>,
+        held: Held,
+        tissue: Extremes,
+        options: &StaticOptions,
+        clock: &mut Clock,
+        interrupted: Interrupt<'_>,
+    ) -> Result<(Self, Method)> {
+        let mut method = options.method.for_unknowns(3 * matrix.n_rows());
+        let with = |kept: Kept| Self { kept };
+        if method == Method::Cholesky {
+            let slide_rows: Vec<u32> =
+                sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
+            // Where sliding nodes alone hold a part, there is no flexibility without them.
+            let kept = !slide_rows.is_empty()
+                && held == Held::ByPrescribed
+                && slide_rows.len() <= MAX_KEPT_SLIDING;
+            let dense = kept && slide_rows.len() <= MAX_DENSE_SLIDING;
+            let symbolic = Symbolic::new(&matrix, if dense { &slide_rows } else { &[] })?;
+            clock.lap("ordering", true);
+            if interrupted() {
+                return Err(MtmError::Interrupted);
+            }
+            let fits = options.memory_limit.is_none_or(|limit| symbolic.factor_bytes() <= limit);
+            if fits && sliding.is_some() && !kept {
+                return Ok((with(Kept::Refactored { symbolic, matrix }), method));
+            }
+            if fits {
+                let factor = symbolic.factor(&matrix)?;
+                clock.lap("factor", true);
+                let contact = sliding.map(|sliding| {
+                    if dense {
+                        ContactFactor::dense(&symbolic, &factor, sliding)
+                    } else {
+                        ContactFactor::by_sweeps(&symbolic, &factor, sliding)
+                    }
+                });
+                let contact = contact.transpose()?;
+                clock.lap("contact_factor", contact.is_some());
+                return Ok((with(Kept::Direct { symbolic, factor, contact }), method));
+            }
+            if options.method == Method::Cholesky {
+                return Err(MtmError::OutOfMemory {
+                    what: "the Cholesky factor",
+                    needed_mb: symbolic.factor_bytes() >> 20,
+                    limit_mb: options.memory_limit.map(|bytes| bytes >> 20),
+                    advice: "use method=\"pcg\" or \"auto\"",
+                });
+            }
+            method = Method::Pcg;
+        }
+        let iterative = Iterative::new(matrix, positions, sliding, tissue, method, options)?;
+        clock.lap("preconditioner", true);
+        Ok((with(Kept::Iterative(iterative)), method))
+    }
+
+    /// Bytes of the factor or preconditioner.
+    pub fn bytes(&self) -> usize {
+        match &self.kept {
+            Kept::Direct { symbolic, contact, .. } => {
+                symbolic.factor_bytes() + contact.as_ref().map_or(0, ContactFactor::bytes)
+            }
+            Kept::Refactored { symbolic, .. } => symbolic.factor_bytes(),
+            Kept::Iterative(iterative) => iterative.bytes(),
+        }
+    }
+
+    /// A⁻¹ b without sliding nodes; `scale` is the length that the tolerance refers to, mm.
+    pub fn solve(
+        &self,
+        b: &[[f64; 3]],
+        scale: f64,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        match &self.kept {
+            Kept::Direct { symbolic, factor, .. } => {
+                let x = in_pool(|| symbolic.solve(factor, b));
+                effort.error_estimate = direct_error(factor, &x);
+                Ok(x)
+            }
+            Kept::Refactored { symbolic, matrix } => {
+                Ok(symbolic.solve(&symbolic.factor(matrix)?, b))
+            }
+            Kept::Iterative(iterative) => iterative.solve(b, scale, effort, interrupted),
+        }
+    }
+
+    /// Displacements of the rows with contact settled, the contact, and the seconds that contact took.
+    pub fn solve_with_contact(
+        &self,
+        b: &[[f64; 3]],
+        sliding: &Sliding,
+        motions: &[&Motion],
+        begin: Option<Begin<'_>>,
+        options: &StaticOptions,
+        scale: f64,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<(Vec<[f64; 3]>, ContactState, f64)> {
+        let clock = Clock::new();
+        let rows = begin.as_ref().map_or(&[][..], |b| b.rows);
+        let first = begin.as_ref().map(|b| &b.contact);
+        if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
+            // Each on a thread of the pool, so that loops inside begin without a hand-over; not all at once:
+            // interrupts are of the calling thread.
+            let answers = in_pool(|| contact.answers(symbolic, factor, b));
+            let tolerance = sliding.gap_limit(&options.contact) / sliding.diagonal;
+            let mut body = Flexible { answers, tolerance, last: None, is_known: false };
+            let state = sliding.solve(motions, first, &options.contact, interrupted, &mut body)?;
+            let seconds = clock.total();
+            let x = in_pool(|| body.answers.of_all(&state.reactions));
+            effort.error_estimate = direct_error(factor, &x).max(left_by(&state));
+            return Ok((x, state, seconds));
+        }
+        let mut contact = options.contact;
+        if let Kept::Iterative(_) = self.kept {
+            let far = scale.max(sliding.farthest(motions));
+            contact.allowed = contact.allowed.max(CONTACT_SHARE * options.tolerance * far);
+        }
+        let trail = Trail::starting(rows.to_vec());
+        let mut body =
+            Projected { system: self, b, sliding, scale, trail, effort, interrupted, last: None };
+        let state = sliding.solve(motions, first, &contact, interrupted, &mut body)?;
+        // No state without a step.
+        let rows = body.last.map_or_else(Vec::new, |last| last.to);
+        effort.error_estimate = effort.error_estimate.max(left_by(&state));
+        Ok((rows, state, clock.total()))
+    }
+
+    /// Rows for several right-hand sides; `scales` is the length of each one's prescribed field, mm.
+    pub fn solve_columns(
+        &self,
+        mut columns: Vec<Vec<[f64; 3]>>,
+        scales: &[f64],
+        sliding: Option<(&Sliding, Frozen<'_>)>,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<Vec<[f64; 3]>>> {
+        let mut effort = Effort::default();
+        let Some((sliding, frozen)) = sliding else {
+            if let Kept::Direct { symbolic, factor, .. } = &self.kept {
+                symbolic.solve_many(factor, &mut columns);
+                return Ok(columns);
+            }
+            let each = columns.iter().zip(scales);
+            return each.map(|(b, &s)| self.solve(b, s, &mut effort, interrupted)).collect();
+        };
+        let still = vec![[0.0; 3]; sliding.nodes().len()];
+        let conditions = |k: usize, solve: &mut dyn FnMut(&Constraints<'_>) -> Result<Rows>| {
+            if interrupted() {
+                return Err(MtmError::Interrupted);
+            }
+            let (rows, offsets) = (frozen.rows, &frozen.offsets[k][..]);
+            let springs = frozen.springs(k);
+            let reach = f64::INFINITY;
+            solve(&Constraints {
+                rows,
+                offsets,
+                springs: &springs,
+                about: &still,
+                share: 0.0,
+                reach,
+            })
+        };
+        if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
+            let kept = contact.tail().map(|t| FrozenContact::new(t, frozen.rows, frozen.springs));
+            let kept = kept.transpose()?;
+            let solve = |(k, b): (usize, &Rows)| {
+                conditions(k, &mut |c| {
+                    let mut answers = contact.answers(symbolic, factor, b);
+                    let forces = match &kept {
+                        Some(kept) => kept.forces(answers.free(), c),
+                        None => answers.respond(c, 0.0)?.forces,
+                    };
+                    Ok(answers.of_all(&forces))
+                })
+            };
+            return columns.iter().enumerate().map(solve).collect();
+        }
+        let mut solve = |((k, b), &scale): ((usize, &Rows), &f64)| {
+            conditions(k, &mut |c| {
+                let mut trail = Trail::default();
+                let found = self.solve_projected(
+                    b,
+                    sliding,
+                    c,
+                    scale,
+                    None,
+                    &mut trail,
+                    &mut effort,
+                    interrupted,
+                );
+                found.map(|found| found.rows)
+            })
+        };
+        columns.iter().enumerate().zip(scales).map(&mut solve).collect()
+    }
+
+    /// Rows of the projected system, P A P + k (I − P), P = I − n⊗n on held nodes.
+    ///
+    /// `share`: see [`Iterative::solve_projected`].
+    fn solve_projected(
+        &self,
+        b: &[[f64; 3]],
+        sliding: &Sliding,
+        c: &Constraints<'_>,
+        scale: f64,
+        share: Option<f64>,
+        trail: &mut Trail,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Advance> {
+        let row = |node: usize| sliding.nodes()[node].row as usize;
+        let constraints: Vec<Constraint> = c
+            .rows
+            .iter()
+            .zip(c.offsets)
+            .map(|(r, &offset)| Constraint { row: row(r.node), normal: r.normal, offset })
+            .collect();
+        let springs: Vec<(usize, Spring)> = c.springs.iter().map(|&s| (row(s.node), s)).collect();
+        let mut rhs = projected_rhs(self.matrix(), b, &constraints);
+        for (row, s) in &springs {
+            rhs[*row] = add(rhs[*row], scaled(s.axis, s.stiffness * s.goal));
+        }
+        let mut found = match &self.kept {
+            Kept::Iterative(iterative) => iterative.solve_projected(
+                rhs,
+                &constraints,
+                springs,
+                c.reach,
+                scale,
+                share,
+                trail,
+                effort,
+                interrupted,
+            )?,
+            Kept::Refactored { symbolic, matrix } => {
+                let mut system = projected(matrix, &constraints);
+                for (row, s) in &springs {
+                    system.add_to_diagonal(*row, s.axis, s.stiffness);
+                }
+                let factor = symbolic.factor(&system)?;
+                let rows = symbolic.solve(&factor, &rhs);
+                effort.error_estimate = direct_error(&factor, &rows);
+                Advance { rows, solved: true, is_carried: false }
+            }
+            Kept::Direct { .. } => unreachable!("the factor without contact serves there"),
+        };
+        add_offsets(&mut found.rows, &constraints);
+        Ok(found)
+    }
+
+    /// The matrix without constraints, where it is kept.
+    fn matrix(&self) -> &BlockMatrix {
+        match &self.kept {
+            Kept::Iterative(iterative) => iterative.matrix(),
+            Kept::Refactored { matrix, .. } => matrix,
+            Kept::Direct { .. } => unreachable!("the factor without contact serves there"),
+        }
+    }
+}
+
+/// The body by what its sliding nodes do to one another: every other node follows them exactly.
+struct Flexible<'a> {
+    answers: Answers<'a>,
+    tolerance: f64,
+    last: Option<Step>,
+    /// Whether the forces at the start of the last step are known.
+    is_known: bool,
+}
+
+/// A step of some rows with the forces out of balance at its ends, N.
+struct Step {
+    from: Vec<[f64; 3]>,
+    to: Vec<[f64; 3]>,
+    forces_from: Vec<[f64; 3]>,
+    forces_to: Vec<[f64; 3]>,
+}
+
+impl Step {
+    /// Slopes of the energy along the step, at its start and at its end.
+    fn slopes(&self) -> (f64, f64) {
+        let (mut first, mut last) = (0.0, 0.0);
+        let forces = self.forces_from.iter().zip(&self.forces_to);
+        for ((a, b), (f, g)) in self.from.iter().zip(&self.to).zip(forces) {
+            let way = sub(*b, *a);
+            first += dot(*f, way);
+            last += dot(*g, way);
+        }
+        (first, last)
+    }
+
+    /// The step to `share` of the way; energy is quadratic, forces are linear.
+    fn shorten(&mut self, share: f64) {
+        self.to = between(&self.from, &self.to, share);
+        self.forces_to = between(&self.forces_from, &self.forces_to, share);
+    }
+}
+
+impl Body for Flexible<'_> {
+    fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
+        let Self { answers, tolerance, .. } = self;
+        let Answer { displacements, forces, solved, is_carried } =
+            in_pool(|| answers.respond(c, *tolerance))?;
+        let before = self.last.take().map(|last| (last.to, last.forces_to));
+        self.is_known = before.is_some();
+        let (from, forces_from) = before.unwrap_or_else(|| (displacements.clone(), forces.clone()));
+        let step = Step { from, to: displacements.clone(), forces_from, forces_to: forces.clone() };
+        let slopes = self.is_known.then(|| step.slopes());
+        self.last = Some(step);
+        Ok(Response { displacements, reactions: forces, slopes, solved, is_carried })
+    }
+
+    fn shorten(&mut self, share: f64) {
+        if !self.is_known {
+            // What a share of the way takes depends on the forces at its start.
+            self.last = None;
+        } else if let Some(step) = &mut self.last {
+            step.shorten(share);
+        }
+    }
+
+    fn restart(&mut self) {
+        self.last = None;
+    }
+}
+
+/// The body by all its rows, those of held nodes projected.
+struct Projected<'a> {
+    system: &'a System,
+    b: &'a [[f64; 3]],
+    sliding: &'a Sliding,
+    scale: f64,
+    trail: Trail,
+    effort: &'a mut Effort,
+    interrupted: Interrupt<'a>,
+    last: Option<Step>,
+}
+
+impl Projected<'_> {
+    /// Forces out of balance of all rows, A x − b.
+    fn forces(&self, x: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let mut out = self.system.matrix().multiply(x);
+        for (f, b) in out.iter_mut().zip(self.b) {
+            *f = sub(*f, *b);
+        }
+        out
+    }
+}
+
+impl Body for Projected<'_> {
+    fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
+        let (from, forces_from) = match self.last.take() {
+            Some(last) => (last.to, last.forces_to),
+            None => {
+                let mut rows = std::mem::take(&mut self.trail.rows);
+                rows.resize(self.b.len(), [0.0; 3]);
+                for (node, &u) in self.sliding.nodes().iter().zip(c.about) {
+                    rows[node.row as usize] = u;
+                }
+                let forces = self.forces(&rows);
+                (rows, forces)
+            }
+        };
+        self.trail.rows.clone_from(&from);
+        let found = self.system.solve_projected(
+            self.b,
+            self.sliding,
+            c,
+            self.scale,
+            (c.share > 0.0).then_some(c.share),
+            &mut self.trail,
+            self.effort,
+            self.interrupted,
+        );
+        let Advance { rows: x, solved, is_carried } = match found {
+            Ok(found) => found,
+            Err(error) => {
+                let (to, forces_to) = (from.clone(), forces_from.clone());
+                self.last = Some(Step { from, to, forces_from, forces_to });
+                return Err(error);
+            }
+        };
+        let forces = self.forces(&x);
+        let of = |rows: &[[f64; 3]]| {
+            self.sliding.nodes().iter().map(|n| rows[n.row as usize]).collect::<Vec<_>>()
+        };
+        let (displacements, reactions) = (of(&x), of(&forces));
+        let step = Step { from, to: x, forces_from, forces_to: forces };
+        let slopes = Some(step.slopes());
+        self.last = Some(step);
+        Ok(Response { displacements, reactions, slopes, solved, is_carried })
+    }
+
+    fn shorten(&mut self, share: f64) {
+        if let Some(step) = &mut self.last {
+            step.shorten(share);
+        }
+    }
+
+    fn restart(&mut self) {
+        if let Some(last) = self.last.take() {
+            self.trail.rows = last.to;
+        }
+    }
+}
+
+/// What contact leaves of error, mm.
+fn left_by(state: &ContactState) -> f64 {
+    GAP_SAFETY * state.largest_gap().max(state.unbalanced)
+}
+
+/// Estimate of the largest nodal error of a solution by factor, mm.
+fn direct_error(factor: &Factor, x: &[[f64; 3]]) -> f64 {
+    TRIAL_SAFETY * factor.trial_error() * x.iter().fold(0.0_f64, |m, v| m.max(norm(*v)))
+}
