@@ -6,7 +6,7 @@ use std::sync::Arc;
 use crate::error::{ErrorKind, LARGEST_COORDINATE, MtmError, Result, check_coordinates};
 use crate::geometry::motion::{RigidMotion, SurfaceMotion};
 use crate::geometry::surface::Surface;
-use crate::mesh::{add, scaled};
+use crate::vector::{add, scaled};
 
 /// Prescribed distance of sliding nodes from their contact surface, negative behind it, mm.
 #[derive(Debug, Clone, PartialEq)]

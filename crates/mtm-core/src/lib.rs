@@ -61,6 +61,7 @@ pub mod meshing;
 pub mod muscles;
 pub mod registration;
 pub mod statics;
+mod vector;
 
 pub use boundary::{Boundary, Conflicts, Gap, Motion, NodeKind, Plan, Segment};
 pub use contact::{ContactMode, ContactOptions};

@@ -2,7 +2,7 @@
 //! hold to rounding.
 
 use crate::algebra::blocks::BlockMatrix;
-use crate::mesh::{dot, scaled, sub};
+use crate::vector::{dot, scaled, sub};
 
 /// n·u = offset on one row.
 #[derive(Debug, Clone, Copy, PartialEq)]

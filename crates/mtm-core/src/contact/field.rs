@@ -17,7 +17,7 @@ use rayon::prelude::*;
 
 use crate::geometry::lattice_hash::KeyHasher;
 use crate::geometry::surface::Surface;
-use crate::mesh::{add, dot, scaled, sub};
+use crate::vector::{add, dot, scaled, sub};
 
 /// Distance relative to the lattice spacing below which the way to the surface has no direction.
 const ON_SURFACE: f64 = 1e-9;

@@ -12,7 +12,8 @@ use crate::boundary::{Boundary, Gap, Motion};
 use crate::error::{MtmError, Result};
 use crate::geometry::motion::RigidMotion;
 use crate::geometry::surface::{Closest, Surface};
-use crate::mesh::{TetMesh, add, dot, norm, scaled, sub};
+use crate::mesh::TetMesh;
+use crate::vector::{add, dot, norm, scaled, sub};
 use field::Field;
 
 /// Share of sliding nodes that may face away from the contact surface before it counts as inverted.

@@ -20,8 +20,7 @@ use crate::contact::{
     Response, Sliding, Spring,
 };
 use crate::error::{ErrorKind, MtmError, Result};
-use crate::geometry::triangle::Vec3;
-use crate::mesh::{add, between, dot, norm, scaled, sub};
+use crate::vector::{Vec3, add, between, dot, norm, scaled, sub};
 
 /// Most nodes an error names.
 const NAMED_NODES: usize = 10;

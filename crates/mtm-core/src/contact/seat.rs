@@ -8,7 +8,7 @@ use crate::boundary::Motion;
 use crate::error::Result;
 use crate::geometry::motion::RigidMotion;
 use crate::geometry::surface::Closest;
-use crate::mesh::{add, dot, norm, scaled, sub};
+use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Gradient of the distance below which it counts as lost: nodes there lie in the middle of a sheet that is
 /// far thinner than the tissue's mesh resolves.

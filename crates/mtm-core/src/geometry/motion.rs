@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::surface::{Closest, Surface};
-use crate::geometry::triangle::Vec3;
+use crate::vector::Vec3;
 
 /// Largest entry by which RᵀR of a matrix that is read as a rigid motion may differ from I.
 ///

@@ -15,8 +15,9 @@ use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result, check_coordinates};
 use crate::geometry::topology::{NO_TRIANGLE, Topology};
-use crate::geometry::triangle::{self, Facet, TrianglePoint, Vec3};
+use crate::geometry::triangle::{self, Facet, TrianglePoint};
 pub use crate::geometry::triangle::{DEGENERATE_AREA, Feature};
+use crate::vector::Vec3;
 
 /// Angle between facet normals above which an edge is a crease, rad (60°): box and tooth edges stay
 /// sharp, coarse round shapes stay smooth.

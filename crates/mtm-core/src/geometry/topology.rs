@@ -1,6 +1,6 @@
 //! How the triangles of a surface hang together: edges, neighbours, border, smoothing groups.
 
-use crate::geometry::triangle::Vec3;
+use crate::vector::Vec3;
 use rayon::prelude::*;
 
 /// Stands for "no neighbour": a border, non-manifold or flipped edge.

@@ -1,9 +1,6 @@
 //! Geometry of one triangle: closest point, corner angles, flat normal, degeneracy.
 
-use nalgebra::Vector3;
-
-/// A point or direction, mm or unitless.
-pub(crate) type Vec3 = Vector3<f64>;
+use crate::vector::Vec3;
 
 /// Area of a triangle over its longest edge squared below which it has no usable normal.
 ///

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::surface::Surface;
-use crate::geometry::triangle::Vec3;
+use crate::vector::Vec3;
 
 /// Triangles below which a cluster is not split: one pass over them costs about as much as two far
 /// fields.

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result};
-use crate::mesh::{Incidence, TetGeometry, TetMesh, add, scaled};
+use crate::mesh::{Incidence, TetGeometry, TetMesh};
+use crate::vector::{add, scaled};
 
 /// How displacement and pressure vary in a tet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -5,7 +5,7 @@ use nalgebra::{Matrix6, SymmetricEigen};
 use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result};
-use crate::mesh::{dot, norm};
+use crate::vector::{dot, norm};
 
 /// Smallest admissible eigenvalue of a stiffness over its largest. Rounding in the constants is near
 /// 1e-16; ν = 0.4999 with E_l/E_t = 1e3 is still at 1e-7.

@@ -16,7 +16,8 @@ use crate::algebra::blocks::{Block, BlockMatrix};
 use crate::mechanics::material::{
     Lame, Spencer, TetMaterial, Tissue, Voigt, voigt_eigenvalues, voigt_matrix,
 };
-use crate::mesh::{TetMesh, add};
+use crate::mesh::TetMesh;
+use crate::vector::add;
 
 /// κ of a material, MPa, and what is left of it.
 #[derive(Debug, Clone, Copy)]

@@ -11,7 +11,8 @@ use crate::mechanics::element::{Element, ElementNodes};
 use crate::mechanics::material::{Lame, Spencer, TetMaterial, Tissue, Voigt};
 use crate::mechanics::nodal_pressure::{Patches, split};
 use crate::mechanics::quadratic::quadratic_tensor;
-use crate::mesh::{TetGeometry, TetMesh, dot};
+use crate::mesh::{TetGeometry, TetMesh};
+use crate::vector::dot;
 
 /// Nodes a thread assembles at once.
 const NODES_PER_TASK: usize = 256;

@@ -8,8 +8,9 @@ use std::collections::HashMap;
 
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::surface::Surface;
-use crate::mesh::{TetMesh, add, dot, norm, scaled, sub};
+use crate::mesh::TetMesh;
 use crate::meshing::stuffing::cut::shape;
+use crate::vector::{add, dot, norm, scaled, sub};
 
 /// A node moves onto the surface from up to this share of its shortest edge.
 const REACH: f64 = 0.4;

@@ -5,8 +5,8 @@ use rayon::prelude::*;
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::surface::Surface;
 use crate::geometry::winding::WindingTree;
-use crate::mesh::{norm, sub};
 use crate::meshing::stuffing::level::{Grid, LevelImage};
+use crate::vector::{norm, sub};
 
 /// Winding number that parts inside from outside.
 const INSIDE: f64 = 0.5;

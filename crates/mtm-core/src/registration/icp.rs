@@ -11,10 +11,10 @@ use rayon::prelude::*;
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
 use crate::geometry::motion::{RigidMotion, rigid_matrix};
 use crate::geometry::surface::Surface;
-use crate::geometry::triangle::Vec3;
 use crate::registration::nearest::PointTree;
 use crate::registration::rigid::{LEAST_PAIRS, Pose, fit_pairs};
 use crate::registration::spread::{check_coordinates, check_not_in_line};
+use crate::vector::Vec3;
 
 /// Pairs that fix a motion by their tangent planes.
 const LEAST_PLANE_PAIRS: usize = 6;

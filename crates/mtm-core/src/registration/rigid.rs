@@ -3,8 +3,8 @@
 use nalgebra::{Matrix3, Matrix4, Quaternion, UnitQuaternion};
 
 use crate::error::{ErrorKind, MtmError, Result};
-use crate::geometry::triangle::Vec3;
 use crate::registration::spread::{check_coordinates, check_not_in_line};
+use crate::vector::Vec3;
 
 /// Pairs that fix a rigid motion, if they are not in one line.
 pub const LEAST_PAIRS: usize = 3;

@@ -3,7 +3,7 @@
 use nalgebra::Matrix3;
 
 use crate::error::{self, ErrorKind, MtmError, Result};
-use crate::geometry::triangle::Vec3;
+use crate::vector::Vec3;
 
 /// Thickness of points over their longest extent below which they count as lying in a plane or line.
 ///

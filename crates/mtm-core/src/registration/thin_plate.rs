@@ -15,8 +15,8 @@ use nalgebra::{Cholesky, DMatrix, Dyn, Matrix3};
 use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result};
-use crate::geometry::triangle::Vec3;
 use crate::registration::spread::{check_coordinates, check_not_in_plane, extents};
+use crate::vector::Vec3;
 
 /// Landmarks that a spline needs: four that are not in one plane fix its affine part.
 pub const LEAST_LANDMARKS: usize = 4;

@@ -12,8 +12,8 @@ use rayon::prelude::*;
 use crate::algebra::cholesky::{DenseSymmetric, NormalFactor, TailFlexibility};
 use crate::contact::{Constraints, ContactRow, Spring};
 use crate::error::Result;
-use crate::mesh::{add, dot, scaled};
 use crate::statics::reaction::{Rows, singular, unheld};
+use crate::vector::{add, dot, scaled};
 
 /// What answers for conditions that stay the same.
 pub(crate) struct FrozenContact {

@@ -15,9 +15,9 @@ use crate::algebra::multigrid::{Multigrid, MultigridOptions};
 use crate::algebra::relaxation::{RelaxationOptions, relax};
 use crate::contact::{Sliding, Spring};
 use crate::error::{MtmError, Result, Shortfall};
-use crate::mesh::{add, dot, norm, scaled, sub};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::projected_product::ProjectedProduct;
+use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Over-relaxation of the node-wise iteration.
 const RELAXATION_FACTOR: f64 = 1.6;

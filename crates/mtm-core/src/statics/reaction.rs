@@ -18,7 +18,7 @@ use crate::algebra::cholesky::{
 };
 use crate::contact::{Constraints, ContactRow, Sliding, Spring};
 use crate::error::{MtmError, Result, Shortfall};
-use crate::mesh::{add, dot, norm, scaled, sub};
+use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Steps of sweeps after which contact gives up: ten on smooth bone, a hundred on teeth.
 const MOST_SWEEPS: usize = 1000;

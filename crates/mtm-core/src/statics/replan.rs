@@ -11,11 +11,11 @@ use crate::contact::{ContactState, SlidingNode, Spring};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::motion::RigidMotion;
 use crate::mechanics::kinematics::Kinematics;
-use crate::mesh::{add, dot, scaled, sub};
 use crate::statics::options::Interrupt;
 use crate::statics::reduction::NO_ROW;
 use crate::statics::solver::StaticSolver;
 use crate::statics::system::Frozen;
+use crate::vector::{add, dot, scaled, sub};
 
 /// Unit fields per segment.
 pub const COLUMNS: usize = 12;

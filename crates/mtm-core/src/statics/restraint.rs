@@ -6,7 +6,8 @@
 use nalgebra::{DMatrix, Matrix6, SMatrix, SymmetricEigen, Vector3, Vector6};
 
 use crate::error::{MtmError, Result};
-use crate::mesh::{TetMesh, cross, dot, norm, scaled, sub};
+use crate::mesh::TetMesh;
+use crate::vector::{cross, dot, norm, scaled, sub};
 
 /// Share of the largest eigenvalue of a part's restraint below which a rigid mode counts as free.
 const FREE_MODE: f64 = 1e-10;

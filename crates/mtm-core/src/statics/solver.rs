@@ -9,7 +9,6 @@ use crate::contact::{ContactState, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, check_forces};
 use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::tensors::MassTensors;
-use crate::mesh::{add, dot, norm, scaled, sub};
 use crate::statics::iterative::{Effort, Extremes, is_doubtful};
 use crate::statics::newton::{Equilibrium, Slide};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
@@ -17,6 +16,7 @@ use crate::statics::reduction::{NO_ROW, Reduction};
 use crate::statics::restraint::{self, Held};
 use crate::statics::solution::{Clock, ContactResult, Solution, Timings};
 use crate::statics::system::{Begin, Frozen, System};
+use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Multiple of the correction of a solution by factor that stands for the error of the corrected one.
 const CORRECTION_SAFETY: f64 = 2.0;

@@ -10,13 +10,13 @@ use crate::contact::{
     Body, Constraints, ContactRow, ContactStart, ContactState, Response, Sliding, Spring,
 };
 use crate::error::{MtmError, Result};
-use crate::mesh::{add, between, dot, norm, scaled, sub};
 use crate::statics::frozen::FrozenContact;
 use crate::statics::iterative::{Advance, Effort, Extremes, Iterative, Trail};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::reaction::{Answer, Answers, ContactFactor};
 use crate::statics::restraint::Held;
 use crate::statics::solution::Clock;
+use crate::vector::{add, between, dot, norm, scaled, sub};
 
 /// Most sliding nodes whose whole flexibility is kept (three unknowns each, 12 bytes a pair: doubles and
 /// floats): with it a set of normals costs a few dense products, by sweeps a few passes over the factor.

@@ -234,7 +234,7 @@ mod tests {
             b[rows[j] as usize] = normals[j];
             let u = symbolic.solve(&factor, &b);
             for (&i, v) in order[c..].iter().zip(found.column(c)) {
-                let exact = crate::mesh::dot(normals[i], u[rows[i] as usize]);
+                let exact = crate::vector::dot(normals[i], u[rows[i] as usize]);
                 assert!((exact - v).abs() <= 1e-13, "{i} {j}: {exact:e} {v:e}");
             }
         }

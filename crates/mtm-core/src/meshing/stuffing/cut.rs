@@ -5,7 +5,7 @@
 
 use rayon::prelude::*;
 
-use crate::mesh::{add, cross, dot, norm, scaled, sub};
+use crate::vector::{add, cross, dot, norm, scaled, sub};
 
 use super::lattice::{Lattice, Place};
 use super::level::LevelImage;

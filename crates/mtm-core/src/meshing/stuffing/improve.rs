@@ -4,7 +4,8 @@
 //! it. What is still poor lies at the surface, where a tet can be dropped: the mesh stays conforming and the
 //! surface moves by less than the height of that tet.
 
-use crate::mesh::{Incidence, add, dot, norm, scaled, sub};
+use crate::mesh::Incidence;
+use crate::vector::{add, dot, norm, scaled, sub};
 
 use super::cut::{Cut, shape};
 use super::level::LevelImage;

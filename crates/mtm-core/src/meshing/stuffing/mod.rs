@@ -14,7 +14,8 @@ pub mod parts;
 use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result};
-use crate::mesh::{TetMesh, add, cross, norm, scaled, sub};
+use crate::mesh::TetMesh;
+use crate::vector::{add, cross, norm, scaled, sub};
 
 use cut::cut;
 use distance::{core_squared, squared_distance, thin_parts};

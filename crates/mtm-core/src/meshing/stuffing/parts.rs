@@ -1,6 +1,6 @@
 //! The bodies of a cut lattice: specks go, and bodies that only touch are parted.
 
-use crate::mesh::{cross, dot, sub};
+use crate::vector::{cross, dot, sub};
 
 use super::cut::Cut;
 

@@ -1,6 +1,6 @@
 //! Boxes along the coordinate axes.
 
-use crate::geometry::triangle::Vec3;
+use crate::vector::Vec3;
 
 /// A box along the coordinate axes, mm; empty where `low` exceeds `high`.
 #[derive(Debug, Clone, Copy, PartialEq)]

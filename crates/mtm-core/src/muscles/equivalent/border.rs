@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::f64::consts::PI;
 
 use crate::geometry::surface::Surface;
-use crate::geometry::triangle::Vec3;
+use crate::vector::Vec3;
 
 /// Edges at which the triangles of a surface do not cancel.
 ///

@@ -1,10 +1,10 @@
 //! Which tets the surface of a muscle crosses, and which lie wholly inside.
 
-use crate::geometry::triangle::Vec3;
 use crate::mesh::TetMesh;
 use crate::muscles::equivalent::aligned_box::AlignedBox;
 use crate::muscles::equivalent::shape::{InsideTest, MuscleShape, Side};
 use crate::muscles::equivalent::tet_tree::{Branch, TetTree};
+use crate::vector::Vec3;
 
 /// Triangles and tets of a branch, multiplied, above which its halves go to different threads.
 const PARALLEL_PAIRS: usize = 1 << 16;

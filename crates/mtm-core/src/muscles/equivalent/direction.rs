@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, SymmetricEigen};
 
-use crate::geometry::triangle::Vec3;
+use crate::vector::Vec3;
 
 /// Difference of eigenvalues over their sum below which they tie.
 const TIE: f64 = 1e-9;

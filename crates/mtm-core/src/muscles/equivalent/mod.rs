@@ -20,9 +20,9 @@ use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::surface::Surface;
-use crate::geometry::triangle::Vec3;
 use crate::mesh::TetMesh;
 use crate::muscles::fibre::MuscleFibres;
+use crate::vector::Vec3;
 use aligned_box::AlignedBox;
 use crossing::{Passage, Touches};
 pub use direction::MeanDirection;

@@ -1,8 +1,9 @@
 //! The sides of all samples of one tet at once: one winding number, carried on by crossings.
 
-use crate::geometry::triangle::{self, Vec3};
+use crate::geometry::triangle;
 use crate::muscles::equivalent::sequence::{Sequence, place};
 use crate::muscles::equivalent::shape::{InsideTest, MuscleShape, is_inside};
+use crate::vector::Vec3;
 
 /// Distance of an anchor to the surface over the longest edge of the tet below which another is taken: its
 /// side must be beyond the rounding of coordinates.

@@ -1,6 +1,6 @@
 //! Points spread evenly in a tet: a Sobol sequence, shifted anew for each tet.
 
-use crate::geometry::triangle::Vec3;
+use crate::vector::Vec3;
 
 /// Bits of a coordinate: those of a number in 0 to 1.
 const BITS: u32 = 52;

@@ -1,10 +1,10 @@
 //! A muscle's surface made ready for many questions: triangles with their boxes, border, winding tree.
 
 use crate::geometry::surface::Surface;
-use crate::geometry::triangle::Vec3;
 use crate::geometry::winding::{WindingOptions, WindingTree};
 use crate::muscles::equivalent::aligned_box::AlignedBox;
 use crate::muscles::equivalent::border::Border;
+use crate::vector::Vec3;
 
 /// Winding number that parts inside from outside.
 const INSIDE: f64 = 0.5;

@@ -2,7 +2,6 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::triangle::Vec3;
 use crate::mesh::TetMesh;
 use crate::muscles::equivalent::crossing::{Touch, Touches};
 use crate::muscles::equivalent::direction::{DirectionSum, MeanDirection};
@@ -11,6 +10,7 @@ use crate::muscles::equivalent::sequence::Sequence;
 use crate::muscles::equivalent::shape::MuscleShape;
 use crate::muscles::equivalent::{Muscle, SamplingCounts, SamplingTimings};
 use crate::muscles::fibre::NearFibres;
+use crate::vector::Vec3;
 
 /// Tets that a thread takes at once.
 const TETS_PER_TASK: usize = 64;

@@ -1,7 +1,7 @@
 //! A tree of boxes over tets, so that what lies far from a muscle is settled many tets at a time.
 
-use crate::geometry::triangle::Vec3;
 use crate::muscles::equivalent::aligned_box::AlignedBox;
+use crate::vector::Vec3;
 
 /// Tets below which a branch is not split: their boxes are looked at one by one.
 const LEAF_TETS: usize = 4;

@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::region::{Moments, Region};
-use crate::geometry::triangle::Vec3;
+use crate::vector::Vec3;
 
 /// Slices of equal area whose centroids the line is fitted to.
 const SLICES: usize = 16;

@@ -1,6 +1,6 @@
 //! Directions from known fibre lines.
 
-use crate::geometry::triangle::Vec3;
+use crate::vector::Vec3;
 
 /// Distance within which a line counts as met, relative to the mean length of the lines: 0.4 mm on
 /// a muscle of 40 mm.

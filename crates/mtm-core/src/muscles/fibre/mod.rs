@@ -16,7 +16,7 @@ use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
 use crate::geometry::surface::Surface;
-use crate::geometry::triangle::Vec3;
+use crate::vector::Vec3;
 use course::{Courses, Segments};
 use parts::Part;
 use region::Region;

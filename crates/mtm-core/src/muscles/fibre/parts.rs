@@ -4,7 +4,7 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 use super::centre_line::{CentreLine, EXTENT_PER_DEVIATION};
 use super::region::{Moments, Region};
-use crate::geometry::triangle::Vec3;
+use crate::vector::Vec3;
 
 /// Turn of the centre line that one box stands for, rad (8°): at its ends it is off by half of that.
 const TURN_PER_BOX: f64 = 0.14;

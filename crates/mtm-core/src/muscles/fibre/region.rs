@@ -5,7 +5,7 @@
 use nalgebra::{Matrix3, SymmetricEigen};
 
 use crate::geometry::surface::Surface;
-use crate::geometry::triangle::Vec3;
+use crate::vector::Vec3;
 
 /// Halvings of the interval in which a plane of a given share of area is sought: the offset is then
 /// exact to a millionth of the extent, far below the size of a box.

@@ -18,11 +18,11 @@ use crate::error::{ErrorKind, MtmError, Result, Shortfall};
 use crate::mechanics::strain_energy::StrainEnergy;
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::mechanics::tensors::MassTensors;
-use crate::mesh::{add, between, dot, norm, scaled, sub};
 use crate::statics::iterative::{Confirmed, Effort, Extremes, is_doubtful};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::reduction::Reduction;
 use crate::statics::solution::Clock;
+use crate::vector::{add, between, dot, norm, scaled, sub};
 
 pub(crate) use sliding::Slide;
 

@@ -6,7 +6,6 @@ use crate::boundary::Motion;
 use crate::contact::{ContactState, Sliding};
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Exact};
-use crate::mesh::{add, sub};
 use crate::statics::iterative::Effort;
 use crate::statics::newton::{
     Equilibrium, Pose, STEP_SHARE, STEP_TOLERANCE, Step, TangentSolver, Target, along_slope,
@@ -17,6 +16,7 @@ use crate::statics::reduction::Reduction;
 use crate::statics::restraint::Held;
 use crate::statics::solution::Clock;
 use crate::statics::system::{Begin, System};
+use crate::vector::{add, sub};
 
 /// Sliding nodes of a body with what their solver asks.
 pub(crate) struct Slide<'a> {

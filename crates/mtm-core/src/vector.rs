@@ -1,0 +1,38 @@
+//! Arithmetic of vectors in space: of `[f64; 3]`, and nalgebra's where a formula reads better with it.
+
+use nalgebra::Vector3;
+
+/// A point or direction, mm or unitless.
+pub(crate) type Vec3 = Vector3<f64>;
+
+pub(crate) fn sub(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+
+pub(crate) fn add(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+}
+
+pub(crate) fn scaled(a: [f64; 3], s: f64) -> [f64; 3] {
+    [a[0] * s, a[1] * s, a[2] * s]
+}
+
+/// a + share (b − a) row by row, and `b` itself for the whole way.
+pub(crate) fn between(a: &[[f64; 3]], b: &[[f64; 3]], share: f64) -> Vec<[f64; 3]> {
+    if share == 1.0 {
+        return b.to_vec();
+    }
+    a.iter().zip(b).map(|(a, b)| add(*a, scaled(sub(*b, *a), share))).collect()
+}
+
+pub(crate) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+pub(crate) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+pub(crate) fn norm(a: [f64; 3]) -> f64 {
+    dot(a, a).sqrt()
+}
