@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import cmfsim
-from cmfsim.study.prediction import build_patient
+from cmfsim.pipeline.predicting import build_patient
 from marked import publish
 
 HEAD = (

@@ -47,9 +47,9 @@ FIGURES = {
 
 INTRODUCTION = f"""# Numerical stability: the stiff and extreme suite
 
-Made by `python benches/stability.py --markdown docs/stability.md`; `tests/python/test_extreme.py`
-runs the linear cases and the quicker ones of the others. Numbers near 1e-15 differ from machine to
-machine.
+Made by `python benches/stability.py --markdown docs/stability.md`;
+`tests/python/core/test_extreme.py` runs the linear cases and the quicker ones of the others.
+Numbers near 1e-15 differ from machine to machine.
 
 ## How to read the tables
 

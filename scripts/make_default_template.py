@@ -7,7 +7,7 @@ a minute and needs the extra `imaging`.
 import sys
 from pathlib import Path
 
-from cmfsim.template import phantom_template, template_path
+from cmfsim.muscles.template import phantom_template, template_path
 
 
 def main(path: Path) -> int:

@@ -20,11 +20,11 @@ import numpy as np
 import pyvista
 
 from cmfsim import Case, SurfaceData, __version__, make_head, write_landmarks
-from cmfsim.insilico.patient_folder import case_text
-from cmfsim.insilico.people import PATIENTS
-from cmfsim.insilico.truth import PostoperativeTruth, postoperative_truth
 from cmfsim.io.files import replacing
 from cmfsim.phantom import PhantomHead
+from cmfsim.virtual.patient_folder import case_text
+from cmfsim.virtual.people import PATIENTS
+from cmfsim.virtual.truth import PostoperativeTruth, postoperative_truth
 
 PATIENT = PATIENTS[1]
 EDGE_LENGTH = 6.0
@@ -32,7 +32,7 @@ EDGE_LENGTH = 6.0
 # ends, mm.
 TRIANGLES = 14_000
 BEHIND, ABOVE = 5.0, 60.0
-FILE = Path(__file__).parents[1] / "python" / "cmfsim" / "demo" / "truth.npz"
+FILE = Path(__file__).parents[1] / "python" / "cmfsim" / "phantom" / "demo" / "truth.npz"
 
 
 def main(path: Path) -> int:

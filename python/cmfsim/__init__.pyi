@@ -22,13 +22,6 @@ from cmfsim._core import (
     __version__,
     rigid_fit,
 )
-from cmfsim.achieved import (
-    AchievedMotion,
-    AchievedPlan,
-    MatchOptions,
-    achieved_plan,
-    measure_motion,
-)
 from cmfsim.bench import (
     Choice,
     Frontier,
@@ -37,11 +30,27 @@ from cmfsim.bench import (
     frontier,
     sweep_choices,
 )
-from cmfsim.build import build_case, build_model, with_muscles, write_phantom_case
-from cmfsim.case import Anatomy, BoneSegment, DentalArch, Finding, ImageData, NodeKinds
-from cmfsim.clinical_plan import ClinicalMotion, clinical_motion, planned_motion
+from cmfsim.bones import (
+    ContactSheet,
+    CutBones,
+    CuttingPlane,
+    Procedure,
+    SheetOptions,
+    contact_sheet,
+    cut_bones,
+    free_cut,
+    place_procedure,
+    procedure_options,
+    segments_from_surfaces,
+)
+from cmfsim.bones.achieved import (
+    AchievedMotion,
+    AchievedPlan,
+    MatchOptions,
+    achieved_plan,
+    measure_motion,
+)
 from cmfsim.doctor import Examination, diagnose, examine
-from cmfsim.equivalent import Mixture, MuscleVolume, equivalent_material
 from cmfsim.errors import (
     BoundaryError,
     CaseError,
@@ -68,23 +77,6 @@ from cmfsim.evaluation import (
     skin_regions,
     wilcoxon_test,
 )
-from cmfsim.face_measures import (
-    MEASURES,
-    BoneSite,
-    FaceSites,
-    Measure,
-    face_sites,
-    measure_face,
-    measure_sites,
-)
-from cmfsim.face_planning import (
-    FacePlan,
-    FaceSearch,
-    MeasureTarget,
-    PointTarget,
-    SurfaceTarget,
-    plan_for_face,
-)
 from cmfsim.imaging import (
     AlignmentOptions,
     SegmentOptions,
@@ -93,7 +85,6 @@ from cmfsim.imaging import (
     segment_head,
     undeformed_mask,
 )
-from cmfsim.insilico import virtual_patients, write_virtual_patient
 from cmfsim.io import (
     Case,
     Cohort,
@@ -117,7 +108,6 @@ from cmfsim.io import (
     write_surface,
     write_transform,
 )
-from cmfsim.landmark_sites import SKULL_LANDMARKS
 from cmfsim.meshing import (
     MeshOptions,
     MeshReport,
@@ -132,8 +122,14 @@ from cmfsim.meshing import (
     signed_level,
     tissue_level,
 )
-from cmfsim.model import PatientModel
-from cmfsim.musculature import MuscleSurface, Musculature
+from cmfsim.muscles.equivalent import Mixture, MuscleVolume, equivalent_material
+from cmfsim.muscles.template import (
+    MorphedMusculature,
+    MuscleTemplate,
+    check_template,
+    import_bodyparts3d,
+    template_names,
+)
 from cmfsim.node_kinds import (
     ClassifiedNodes,
     DentalArches,
@@ -145,27 +141,37 @@ from cmfsim.node_kinds import (
     kind_options,
     segment_data,
 )
-from cmfsim.osteotomy import (
-    ContactSheet,
-    CutBones,
-    CuttingPlane,
-    Procedure,
-    SheetOptions,
-    contact_sheet,
-    contact_surface,
-    cut_bones,
-    free_cut,
-    place_procedure,
-    procedure_options,
-    segments_from_surfaces,
-)
-from cmfsim.patient import CaseMuscles
-from cmfsim.patient_prediction import model_scene, predict_patient
 from cmfsim.phantom import HeadParameters, Muscle, PhantomHead, make_head
-from cmfsim.planning import RigidMotion, decompose_motion, rigid_matrix, rigid_motion
-from cmfsim.planning_page import PageContent, page_content, page_text, write_planning_page
-from cmfsim.planning_server import serve_planning
-from cmfsim.prediction import MODELS, Prediction
+from cmfsim.phantom.case_files import write_phantom_case
+from cmfsim.pipeline.building import build_case, build_model, with_muscles
+from cmfsim.pipeline.evaluating import CaseEvaluation, evaluate
+from cmfsim.pipeline.predicting import predict, predict_models
+from cmfsim.planning.face_measures import (
+    MEASURES,
+    BoneSite,
+    FaceSites,
+    Measure,
+    face_sites,
+    measure_face,
+    measure_sites,
+)
+from cmfsim.planning.face_planning import (
+    FacePlan,
+    FaceSearch,
+    MeasureTarget,
+    PointTarget,
+    SurfaceTarget,
+    plan_for_face,
+)
+from cmfsim.planning.page import PageContent, page_content, page_text, write_planning_page
+from cmfsim.planning.replanning import (
+    ExpectedError,
+    PlanningModel,
+    PlanTrial,
+    expected_error,
+    planning_model,
+)
+from cmfsim.planning.server import serve_planning
 from cmfsim.registration import (
     FoldReport,
     LandmarkAgreement,
@@ -175,14 +181,21 @@ from cmfsim.registration import (
     leave_one_out,
     match_landmarks,
 )
-from cmfsim.replanning import (
-    ExpectedError,
-    PlanningModel,
-    PlanTrial,
-    expected_error,
-    planning_model,
-)
-from cmfsim.scene import (
+from cmfsim.solving.models import model_scene, predict_patient
+from cmfsim.solving.simulation import scene_plan, scene_solver, solve_scene
+from cmfsim.study import SensitivityReport, StudyReport, landmark_trials, run_study, sensitivity
+from cmfsim.surfaces.checks import SurfaceReport, check_surface
+from cmfsim.surfaces.levels import contact_surface
+from cmfsim.surfaces.repair import RepairOptions, repair_surface
+from cmfsim.values.anatomy import Anatomy, BoneSegment, DentalArch, Finding, ImageData, NodeKinds
+from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion, planned_motion
+from cmfsim.values.landmark_sites import SKULL_LANDMARKS
+from cmfsim.values.motion import RigidMotion, decompose_motion, rigid_matrix, rigid_motion
+from cmfsim.values.musculature import MuscleSurface, Musculature
+from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.prediction import MODELS, Prediction
+from cmfsim.values.scene import (
     MovedSurface,
     Scene,
     SceneResult,
@@ -191,27 +204,7 @@ from cmfsim.scene import (
     SurfaceData,
     TissueData,
 )
-from cmfsim.simulation import scene_plan, scene_solver, solve_scene
-from cmfsim.study import (
-    CaseEvaluation,
-    SensitivityReport,
-    StudyReport,
-    evaluate,
-    landmark_trials,
-    predict,
-    predict_models,
-    run_study,
-    sensitivity,
-)
-from cmfsim.surface_checks import SurfaceReport, check_surface
-from cmfsim.surface_repair import RepairOptions, repair_surface
-from cmfsim.template import (
-    MorphedMusculature,
-    MuscleTemplate,
-    check_template,
-    import_bodyparts3d,
-    template_names,
-)
+from cmfsim.virtual import virtual_patients, write_virtual_patient
 
 __all__ = [
     "ELEMENTS",

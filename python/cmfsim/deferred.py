@@ -17,16 +17,18 @@ def deferred(
     package : str
         Its `__name__`.
     homes : mapping of str to tuple of str
-        The public names by the module of the package that defines them. The modules too are
-        attributes. `__init__.pyi` has the same list for type checkers.
+        The public names by the module of the package that defines them, `folder.module` where
+        it lies in a folder. Modules and folders too are attributes. `__init__.pyi` has the same
+        list for type checkers.
     """
     home_of = {name: home for home, names in homes.items() for name in names}
     names = sorted(home_of)
+    beside = {home.split(".")[0] for home in homes}
 
     def get(name: str) -> Any:
         if name in home_of:
             value = getattr(import_module(f"{package}.{home_of[name]}"), name)
-        elif name in homes:
+        elif name in beside:
             value = import_module(f"{package}.{name}")
         else:
             raise AttributeError(f"module {package!r} has no attribute {name!r}", name=name)

@@ -5,6 +5,7 @@ import functools
 import numpy as np
 
 import cmfsim
+from cmfsim.surfaces.levels import surface_of_level
 
 # The middle of the row of teeth: half an ellipse, open to the back, with straight ends; mm.
 WIDTH, LENGTH, STRAIGHT = 24.0, 32.0, 14.0
@@ -57,7 +58,7 @@ def jaw():
     anatomy = cmfsim.Anatomy(
         image.with_values(skin.astype(np.float32)), {"maxilla": image}, teeth=dense
     )
-    segment = cmfsim.BoneSegment("maxilla", image, cmfsim.osteotomy.surface_of_level("m", image))
+    segment = cmfsim.BoneSegment("maxilla", image, surface_of_level("m", image))
     return anatomy, segment
 
 

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import cmfsim
-from cmfsim.demo import write_demo_case
-from cmfsim.study.prediction import build_patient
+from cmfsim.phantom.demo import write_demo_case
+from cmfsim.pipeline.predicting import build_patient
 
 EDGE = 14.0
 

@@ -9,9 +9,9 @@ from typing import Any
 from cmfsim.checks import as_positive, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
-from cmfsim.patient import CaseMuscles
-from cmfsim.prediction import MODELS
-from cmfsim.scene import MIXINGS, SolverOptions
+from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.prediction import MODELS
+from cmfsim.values.scene import MIXINGS, SolverOptions
 
 __all__ = ["Choice", "case_choice"]
 

@@ -19,11 +19,11 @@ from cmfsim.bench.rows import Frontier, FrontierRow, Spread, with_front
 from cmfsim.bench.skin_points import WHOLE, read_points, skin_errors
 from cmfsim.bench.sweep import reference_choice, sweep_choices
 from cmfsim.bench.worker import MOVED_FORMAT
-from cmfsim.build import input_hashes
 from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.io import Case
 from cmfsim.io.archives import member_of, read_archive
+from cmfsim.pipeline.building import input_hashes
 
 __all__ = ["content_key", "frontier"]
 

@@ -16,7 +16,7 @@ from cmfsim.evaluation import (
     skin_regions,
 )
 from cmfsim.io.archives import member_of, read_archive, write_archive
-from cmfsim.model import PatientModel
+from cmfsim.values.patient_model import PatientModel
 
 __all__ = ["SKIN", "WHOLE", "read_points", "skin_errors", "skin_points", "write_points"]
 

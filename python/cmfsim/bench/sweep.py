@@ -7,8 +7,8 @@ from typing import Any
 
 from cmfsim.bench.choice import Choice
 from cmfsim.errors import CaseInputError
-from cmfsim.prediction import MODELS
-from cmfsim.scene import CONTACTS, ELEMENTS, KINEMATICS, METHODS, MIXINGS
+from cmfsim.values.prediction import MODELS
+from cmfsim.values.scene import CONTACTS, ELEMENTS, KINEMATICS, METHODS, MIXINGS
 
 __all__ = ["EDGES", "FACTORS", "reference_choice", "sweep_choices"]
 

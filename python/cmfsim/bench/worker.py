@@ -17,14 +17,14 @@ import numpy as np
 from cmfsim.bench.choice import Choice
 from cmfsim.bench.memory import peak_memory
 from cmfsim.bench.skin_points import read_points, skin_points, write_points
-from cmfsim.build import build_model
 from cmfsim.errors import CmfsimError
 from cmfsim.io import Case, read_scene, replacing, write_scene
 from cmfsim.io.archives import member_of, read_archive, write_archive
-from cmfsim.patient_prediction import model_scene
-from cmfsim.prediction import carried_points
-from cmfsim.scene import SurfaceData
-from cmfsim.simulation import solve_scene
+from cmfsim.pipeline.building import build_model
+from cmfsim.solving.models import model_scene
+from cmfsim.solving.simulation import solve_scene
+from cmfsim.values.prediction import carried_points
+from cmfsim.values.scene import SurfaceData
 
 __all__ = ["MOVED_FORMAT", "main"]
 

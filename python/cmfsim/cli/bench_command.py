@@ -19,12 +19,12 @@ from cmfsim.bench import (
 from cmfsim.bench import frontier as run_frontier
 from cmfsim.bench.files import write_frontier
 from cmfsim.bench.table import GRID, base_verdict
-from cmfsim.build import write_phantom_case
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.phantom import make_head
+from cmfsim.phantom.case_files import write_phantom_case
 
 __all__ = ["FRONTIER_FOLDER", "SCRIPTS", "frontier", "script"]
 

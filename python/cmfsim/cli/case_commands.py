@@ -12,19 +12,19 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
-from cmfsim.build import plan_key
-from cmfsim.case import SEVERITIES, Finding
 from cmfsim.checks import as_positive
 from cmfsim.cli.build_report import WIDTH, build_text
 from cmfsim.cli.exit_codes import BAD_INPUT, DONE
 from cmfsim.cli.notices import FindingsError, Notices
 from cmfsim.cli.preparation import prepare
 from cmfsim.cli.terminal import StageProgress, columns, escaped, in_colour
-from cmfsim.clinical_plan import plan_lines
 from cmfsim.doctor import Examination, examine, findings_text
 from cmfsim.io import Case
 from cmfsim.io.models import is_model_file
-from cmfsim.study.prediction import case_for_models
+from cmfsim.pipeline.building import plan_key
+from cmfsim.pipeline.predicting import case_for_models
+from cmfsim.values.anatomy import SEVERITIES, Finding
+from cmfsim.values.clinical_motion import plan_lines
 
 _log = logging.getLogger(__name__)
 # What the planning page states of the case that a plan was made for.
@@ -67,7 +67,7 @@ def build(options: argparse.Namespace) -> int:
     findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
     seconds = time.perf_counter() - begun
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
-        build_case = import_module("cmfsim.build").build_case
+        build_case = import_module("cmfsim.pipeline.building").build_case
         built = build_case(
             case, progress=progress.stage, check=False, findings=findings, on_findings=notices.add
         )

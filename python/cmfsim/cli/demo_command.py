@@ -12,12 +12,13 @@ from pathlib import Path
 from cmfsim.cli.exit_codes import DONE, FAILED
 from cmfsim.cli.notices import Notices
 from cmfsim.cli.preparation import prepare
-from cmfsim.cli.results import WrittenResults, write_results
 from cmfsim.cli.terminal import StageProgress, escaped
-from cmfsim.demo import DemoCase, write_demo_case
+from cmfsim.phantom.demo import DemoCase, write_demo_case
 from cmfsim.pictures import has_screen
-from cmfsim.prediction import Prediction
-from cmfsim.study import evaluate, predict_models
+from cmfsim.pipeline.evaluating import evaluate
+from cmfsim.pipeline.outputs import WrittenResults, write_results
+from cmfsim.pipeline.predicting import predict_models
+from cmfsim.values.prediction import Prediction
 
 __all__ = ["DEMO_FOLDER", "DEMO_MODELS", "demo"]
 

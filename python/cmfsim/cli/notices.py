@@ -5,9 +5,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from cmfsim.case import Finding
 from cmfsim.cli.terminal import CLEAR_LINE, escaped, in_colour
-from cmfsim.finding_groups import FindingGroup, counted, grouped
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding_groups import FindingGroup, counted, grouped
 
 __all__ = ["FindingsError", "Notices"]
 

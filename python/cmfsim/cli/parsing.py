@@ -18,11 +18,11 @@ from cmfsim.cli import (
     view_command,
     virtual_patients_command,
 )
-from cmfsim.insilico import PATIENTS
 from cmfsim.io import result_suffixes
-from cmfsim.prediction import MODELS
-from cmfsim.scene import CONTACTS, ELEMENTS, KINEMATICS, METHODS
-from cmfsim.template import WHERE
+from cmfsim.muscles.template import WHERE
+from cmfsim.values.prediction import MODELS
+from cmfsim.values.scene import CONTACTS, ELEMENTS, KINEMATICS, METHODS
+from cmfsim.virtual import PATIENTS
 
 __all__ = ["make_parser"]
 

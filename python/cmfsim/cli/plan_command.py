@@ -19,13 +19,13 @@ from cmfsim.cli.preparation import prepare
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.cli.wished_faces import TARGET_STD, read_targets
 from cmfsim.errors import CaseInputError
-from cmfsim.face_planning import FacePlan, FaceSearch, plan_for_face
 from cmfsim.io import Case, write_plan
 from cmfsim.pictures import has_screen
-from cmfsim.planning_page import PAGE_FILE, PageContent, page_content, write_planning_page
-from cmfsim.planning_server import check_serving, serve_planning
-from cmfsim.replanning import ExpectedError, PlanningModel, expected_error, planning_model
-from cmfsim.study.prediction import build_patient
+from cmfsim.pipeline.predicting import build_patient
+from cmfsim.planning.face_planning import FacePlan, FaceSearch, plan_for_face
+from cmfsim.planning.page import PAGE_FILE, PageContent, page_content, write_planning_page
+from cmfsim.planning.replanning import ExpectedError, PlanningModel, expected_error, planning_model
+from cmfsim.planning.server import check_serving, serve_planning
 
 __all__ = ["TRIALS", "plan"]
 

@@ -5,10 +5,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 
-from cmfsim.build import check_output
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.io.predictions import is_prediction_file
+from cmfsim.pipeline.building import check_output
 
 __all__ = ["check_extras", "prepare"]
 

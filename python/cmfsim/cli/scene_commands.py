@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.case import Finding
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.notices import Notices
 from cmfsim.cli.terminal import escaped
 from cmfsim.errors import CaseInputError
 from cmfsim.io import read_plan, read_scene, result_suffixes, write_result
-from cmfsim.scene import Scene
-from cmfsim.simulation import solve_scene
+from cmfsim.solving.simulation import solve_scene
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.scene import Scene
 
 __all__ = ["info", "solve"]
 

@@ -11,21 +11,22 @@ from cmfsim.cli.case_commands import case_of, checked
 from cmfsim.cli.exit_codes import DONE, FAILED
 from cmfsim.cli.notices import Notices
 from cmfsim.cli.preparation import prepare
-from cmfsim.cli.results import (
+from cmfsim.cli.terminal import StageProgress, end_with_input, escaped
+from cmfsim.errors import CmfsimError
+from cmfsim.io import Cohort, read_landmark_file, replacing
+from cmfsim.pipeline.evaluating import evaluate as evaluate_case
+from cmfsim.pipeline.outputs import (
     WrittenPrediction,
     WrittenResults,
     write_case_report,
     write_results,
     write_study_report,
 )
-from cmfsim.cli.terminal import StageProgress, end_with_input, escaped
-from cmfsim.clinical_plan import plan_lines
-from cmfsim.errors import CmfsimError
-from cmfsim.io import Cohort, read_landmark_file, replacing
-from cmfsim.prediction import MODELS, Prediction
-from cmfsim.study import CaseOutcome, StudyReport, predict_models, run_study
-from cmfsim.study import evaluate as evaluate_case
+from cmfsim.pipeline.predicting import predict_models
+from cmfsim.study import CaseOutcome, StudyReport, run_study
 from cmfsim.study import sensitivity as landmark_sensitivity
+from cmfsim.values.clinical_motion import plan_lines
+from cmfsim.values.prediction import MODELS, Prediction
 
 __all__ = ["achieved_text", "evaluate", "models_of", "predict", "report", "sensitivity", "study"]
 

@@ -10,20 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.case import SEVERITIES, Finding
 from cmfsim.cli.exit_codes import BAD_INPUT, DONE
 from cmfsim.cli.terminal import StageProgress, columns, escaped, in_colour
 from cmfsim.doctor import findings_text
 from cmfsim.errors import CaseInputError
-from cmfsim.musculature import Musculature
-from cmfsim.pictures import picture_muscles
-from cmfsim.template import (
+from cmfsim.muscles.template import (
     MorphedMusculature,
     MuscleTemplate,
     check_template,
     import_bodyparts3d,
     template_names,
 )
+from cmfsim.pictures import picture_muscles
+from cmfsim.values.anatomy import SEVERITIES, Finding
+from cmfsim.values.musculature import Musculature
 
 __all__ = ["check", "import_atlas", "list_templates", "morph", "show"]
 

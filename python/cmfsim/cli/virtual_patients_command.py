@@ -6,7 +6,7 @@ import sys
 
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.terminal import StageProgress
-from cmfsim.insilico import virtual_patients as write_patients
+from cmfsim.virtual import virtual_patients as write_patients
 
 __all__ = ["virtual_patients"]
 

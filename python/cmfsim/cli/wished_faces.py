@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim.errors import CaseInputError, LandmarkInputError
-from cmfsim.face_planning import PointTarget, SurfaceTarget, Target
 from cmfsim.io import read_landmarks, read_surface
-from cmfsim.landmark_sites import label_key
-from cmfsim.replanning import PlanningModel
+from cmfsim.planning.face_planning import PointTarget, SurfaceTarget, Target
+from cmfsim.planning.replanning import PlanningModel
+from cmfsim.values.landmark_sites import label_key
 
 __all__ = ["TARGET_STD", "read_targets"]
 

@@ -12,8 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from cmfsim.case import SEVERITIES, Finding
-from cmfsim.clinical_plan import ClinicalMotion
 from cmfsim.doctor.after import check_after
 from cmfsim.doctor.ends import check_ends
 from cmfsim.doctor.evidence import gather
@@ -25,6 +23,8 @@ from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
 from cmfsim.doctor.report import findings_text
 from cmfsim.doctor.surfaces import check_image, check_mesh_size, check_surfaces
 from cmfsim.io import CaseOrPath, as_case
+from cmfsim.values.anatomy import SEVERITIES, Finding
+from cmfsim.values.clinical_motion import ClinicalMotion
 
 __all__ = [
     "Examination",

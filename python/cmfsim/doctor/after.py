@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from cmfsim._core import Surface
-from cmfsim.case import Finding
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.doctor.placement import LANDMARK_WARNING
 from cmfsim.errors import CmfsimError
 from cmfsim.io import read_landmark_file, read_surface
+from cmfsim.values.anatomy import Finding
 
 __all__ = ["check_after"]
 

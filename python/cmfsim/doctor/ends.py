@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from cmfsim.case import Finding
 from cmfsim.doctor.evidence import Evidence
+from cmfsim.values.anatomy import Finding
 
 __all__ = ["check_ends"]
 

@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import PRESETS, Surface
-from cmfsim.case import Finding, ImageData
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseError, CmfsimError
 from cmfsim.io import Case, read_landmark_file, read_moved_surface, read_surface
 from cmfsim.io.images import read_image_file
 from cmfsim.io.transforms import TransformFile, read_transform_file
-from cmfsim.patient import CaseMotion, CaseSurfaces
-from cmfsim.scene import MovedSurface, SurfaceData
-from cmfsim.surface_checks import SurfaceReport, check_surface
-from cmfsim.surface_repair import RepairOptions, repair_surface
+from cmfsim.surfaces.checks import SurfaceReport, check_surface
+from cmfsim.surfaces.repair import RepairOptions, repair_surface
+from cmfsim.values.anatomy import Finding, ImageData
+from cmfsim.values.case_parts import CaseMotion, CaseSurfaces
+from cmfsim.values.scene import MovedSurface, SurfaceData
 
 __all__ = ["Body", "Evidence", "gather"]
 

@@ -10,7 +10,6 @@ from importlib import import_module
 import numpy as np
 
 from cmfsim._core import Surface
-from cmfsim.case import Finding, ImageData
 from cmfsim.checks import Floats
 from cmfsim.doctor.places import direction_text, place_text, shift_text
 from cmfsim.errors import LandmarkError, RegistrationError
@@ -21,6 +20,7 @@ from cmfsim.registration import (
     mirror_agreement,
     swapped_names,
 )
+from cmfsim.values.anatomy import Finding, ImageData
 
 __all__ = [
     "LANDMARK_CODES",

@@ -5,16 +5,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from cmfsim._core import rigid_fit
-from cmfsim.case import Finding
 from cmfsim.checks import Floats
-from cmfsim.clinical_plan import clinical_motion
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.doctor.operation import check_against_skin
 from cmfsim.doctor.places import place_text
 from cmfsim.doctor.plan_size import FAR, TOO_FAR, check_tiny, check_turn
 from cmfsim.errors import CmfsimError, RegistrationError
-from cmfsim.scene import MovedSurface
-from cmfsim.topology import edges_of
+from cmfsim.surfaces.topology import edges_of
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.clinical_motion import clinical_motion
+from cmfsim.values.scene import MovedSurface
 
 __all__ = ["check_moved"]
 

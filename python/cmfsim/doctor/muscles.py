@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator
 
-from cmfsim.case import Finding
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.errors import CmfsimError
+from cmfsim.muscles.template import MuscleTemplate
+from cmfsim.muscles.template.morphing import missing_landmarks
 from cmfsim.registration import match_landmarks
-from cmfsim.template import MuscleTemplate
-from cmfsim.template.morphing import missing_landmarks
+from cmfsim.values.anatomy import Finding
 
 __all__ = ["check_muscles"]
 

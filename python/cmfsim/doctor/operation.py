@@ -4,16 +4,16 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from cmfsim.case import Finding
+from cmfsim.bones import Procedure, place_procedure
 from cmfsim.checks import Floats
-from cmfsim.clinical_plan import ClinicalMotion
 from cmfsim.doctor.evidence import Body, Evidence
 from cmfsim.doctor.places import place_text
 from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
 from cmfsim.errors import CaseError, LandmarkError
 from cmfsim.io.transforms import motion_in_lps
-from cmfsim.osteotomy import Procedure, place_procedure
-from cmfsim.patient import CaseOsteotomy
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.case_parts import CaseOsteotomy
+from cmfsim.values.clinical_motion import ClinicalMotion
 
 __all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of"]
 

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import Finding
 from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Body, Evidence
 from cmfsim.doctor.landmarks import (
@@ -16,8 +15,9 @@ from cmfsim.doctor.landmarks import (
 )
 from cmfsim.doctor.places import place_text
 from cmfsim.errors import ImageError
-from cmfsim.patient import UNITS
 from cmfsim.registration import side_vectors, wrong_sides
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.case_parts import UNITS
 
 __all__ = ["check_placement"]
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 
-from cmfsim.bone_motion import sound_motion, torn_pieces
+from cmfsim.bones.motion import sound_motion, torn_pieces
 from cmfsim.checks import Floats
-from cmfsim.clinical_plan import ClinicalMotion, clinical_motion
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.errors import CmfsimError
-from cmfsim.scene import MovedSurface
+from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion
+from cmfsim.values.scene import MovedSurface
 
 __all__ = ["state_plan"]
 

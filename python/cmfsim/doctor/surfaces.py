@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from cmfsim.case import Finding
 from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Body, Evidence
 from cmfsim.doctor.places import place_text
+from cmfsim.values.anatomy import Finding
 
 __all__ = ["check_image", "check_mesh_size", "check_surfaces"]
 

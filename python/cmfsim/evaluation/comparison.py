@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, ThinPlateSpline
-from cmfsim.case import Finding
 from cmfsim.checks import (
     Floats,
     as_indices,
@@ -28,7 +27,8 @@ from cmfsim.evaluation.correspondence import Matches, Skin, match_skins
 from cmfsim.evaluation.regions import SKIN_LANDMARKS, skin_regions
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.registration import match_landmarks
-from cmfsim.scene import SurfaceData
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.scene import SurfaceData
 
 __all__ = ["MATCHINGS", "SkinComparison", "compare_skins"]
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import Floats, as_floats, as_rows
 from cmfsim.errors import LandmarkInputError
-from cmfsim.landmark_sites import SKIN_LANDMARKS
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 
 __all__ = ["REGIONS", "SKIN_LANDMARKS", "skin_regions"]
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import Finding
 from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.morphology import Mask, Volume, box_of, depth, label, opened, reached, simplex
 from cmfsim.imaging.skin import Skin
 from cmfsim.imaging.working import Working, coarse_of
+from cmfsim.values.anatomy import Finding
 
 __all__ = ["attached_findings"]
 

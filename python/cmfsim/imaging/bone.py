@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim.case import Finding
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.levels import level_of
 from cmfsim.imaging.metal import Metal, without_streaks
@@ -21,6 +20,7 @@ from cmfsim.imaging.morphology import (
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import Skin
 from cmfsim.imaging.working import Working, coarse_of
+from cmfsim.values.anatomy import Finding
 
 __all__ = ["Bone", "find_bone"]
 

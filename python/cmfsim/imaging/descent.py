@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.case import ImageData
 from cmfsim.checks import Floats
 from cmfsim.errors import RegistrationError, RegistrationInputError
 from cmfsim.imaging.alignment_options import AlignmentOptions
 from cmfsim.imaging.morphology import Mask, as_itk, box_of, resampled_to, simpleitk, smoothed
+from cmfsim.values.anatomy import ImageData
 
 __all__ = ["Clipped", "Places", "align", "inverse", "matrix_of"]
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.case import Anatomy, Finding, ImageData
 from cmfsim.checks import Floats, as_rows
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.air import air_level
@@ -21,6 +20,7 @@ from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import find_skin
 from cmfsim.imaging.view import view_findings
 from cmfsim.imaging.working import Working, without_noise, working_grid
+from cmfsim.values.anatomy import Anatomy, Finding, ImageData
 
 __all__ = ["segment_head"]
 

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import Finding
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.morphology import Volume
+from cmfsim.values.anatomy import Finding
 
 __all__ = ["Calibration", "calibration", "noise_of", "saturation_of", "weak_bone"]
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import Finding
 from cmfsim.checks import Floats
 from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.guess import guessed_landmarks
@@ -25,6 +24,7 @@ from cmfsim.imaging.morphology import (
     watershed,
 )
 from cmfsim.imaging.working import Working
+from cmfsim.values.anatomy import Finding
 
 __all__ = ["Jaws", "part_jaws"]
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import Finding
 from cmfsim.imaging.morphology import (
     Block,
     Mask,
@@ -21,6 +20,7 @@ from cmfsim.imaging.morphology import (
 )
 from cmfsim.imaging.options import METAL, SegmentOptions
 from cmfsim.imaging.working import Working
+from cmfsim.values.anatomy import Finding
 
 __all__ = ["Metal", "find_metal", "metal_within", "without_streaks"]
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import Finding
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.levels import level_of
 from cmfsim.imaging.metal import Metal, metal_within, without_streaks
@@ -27,6 +26,7 @@ from cmfsim.imaging.morphology import (
 )
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.working import Working, coarse_of
+from cmfsim.values.anatomy import Finding
 
 __all__ = ["Skin", "find_skin"]
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from cmfsim.case import Finding
 from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.morphology import depth
 from cmfsim.imaging.skin import Skin
 from cmfsim.imaging.working import COARSE, Working
+from cmfsim.values.anatomy import Finding
 
 __all__ = ["view_findings"]
 

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import Finding, ImageData
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.intensity import Calibration, calibration, noise_of, saturation_of
 from cmfsim.imaging.morphology import (
@@ -21,6 +20,7 @@ from cmfsim.imaging.morphology import (
     smoothed,
 )
 from cmfsim.imaging.options import SegmentOptions
+from cmfsim.values.anatomy import Finding, ImageData
 
 __all__ = ["COARSE", "Working", "coarse_of", "without_noise", "working_grid"]
 

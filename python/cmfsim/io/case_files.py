@@ -15,7 +15,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.files import FORMAT_VERSION, is_there
 from cmfsim.io.tables import Table, read_tables
 from cmfsim.io.transforms import DIRECTION_CHOICE, is_itk_file, motion_in_lps
-from cmfsim.patient import (
+from cmfsim.values.case_parts import (
     DIRECTIONS,
     FRAMES,
     PROCEDURES,
@@ -31,8 +31,8 @@ from cmfsim.patient import (
     Plane,
     Region,
 )
-from cmfsim.planning import rigid_matrix, rigid_motion
-from cmfsim.scene import (
+from cmfsim.values.motion import rigid_matrix, rigid_motion
+from cmfsim.values.scene import (
     CONTACTS,
     ELEMENTS,
     KINEMATICS,

@@ -8,7 +8,7 @@ from cmfsim.checks import as_text, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import FORMAT_VERSION, is_there
 from cmfsim.io.tables import read_tables
-from cmfsim.prediction import MODELS
+from cmfsim.values.prediction import MODELS
 
 __all__ = ["COHORT_FORMAT", "Cohort"]
 

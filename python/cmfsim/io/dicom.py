@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import Finding, ImageData
 from cmfsim.errors import ImageInputError
 from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
 from cmfsim.io.dicom_headers import DicomHeader, dicom_header, numbers_of
 from cmfsim.io.image_grids import aligned, of_slices, turn_of, upright
 from cmfsim.io.image_headers import check_shape
+from cmfsim.values.anatomy import Finding, ImageData
 
 __all__ = ["read_dicom_file", "read_dicom_folder"]
 

@@ -8,9 +8,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import ImageData
 from cmfsim.errors import ImageInputError
 from cmfsim.io.image_headers import MOST_VOXELS
+from cmfsim.values.anatomy import ImageData
 
 Floats: TypeAlias = NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import Finding
 from cmfsim.errors import ImageInputError
 from cmfsim.io.files import check_readable, is_below
+from cmfsim.values.anatomy import Finding
 
 __all__ = [
     "KNOWN",

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import Finding, ImageData
 from cmfsim.errors import ImageError, ImageInputError
 from cmfsim.extras import third_party
 from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
@@ -22,6 +21,7 @@ from cmfsim.io.leftovers import abandoned, temporary_folder
 from cmfsim.io.metaimage import is_meta, meta_header
 from cmfsim.io.nifti import GZIP, is_nifti, read_nifti
 from cmfsim.io.nrrd import nrrd_header
+from cmfsim.values.anatomy import Finding, ImageData
 
 __all__ = ["ImageFile", "read_image", "read_image_file", "write_image"]
 

@@ -16,7 +16,6 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.case import Finding
 from cmfsim.checks import Floats, check_one_of
 from cmfsim.errors import LandmarkInputError
 from cmfsim.io.markups import (
@@ -28,7 +27,8 @@ from cmfsim.io.markups import (
     markups_of,
     write_markups,
 )
-from cmfsim.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, label_key
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, label_key
 
 __all__ = ["LandmarkFile", "read_landmark_file", "read_landmarks", "write_landmarks"]
 

@@ -23,7 +23,7 @@ from cmfsim.io.summaries import (
     text,
     whole,
 )
-from cmfsim.prediction import MODELS
+from cmfsim.values.prediction import MODELS
 
 __all__ = [
     "EVALUATION_FILE",

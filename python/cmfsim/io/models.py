@@ -10,13 +10,13 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import NodeKinds
 from cmfsim.io.files import replacing
 from cmfsim.io.folders import replacing_files
 from cmfsim.io.scenes import write_scene
 from cmfsim.io.surfaces import write_surface
 from cmfsim.io.vtk import write_tets
-from cmfsim.model import PatientModel
+from cmfsim.values.anatomy import NodeKinds
+from cmfsim.values.patient_model import PatientModel
 
 __all__ = ["is_model_file", "write_model"]
 

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import Finding
 from cmfsim.errors import ImageInputError
 from cmfsim.io.image_headers import (
     KNOWN,
@@ -26,6 +25,7 @@ from cmfsim.io.image_headers import (
     check_shape,
     unstated,
 )
+from cmfsim.values.anatomy import Finding
 
 __all__ = ["is_nifti", "read_nifti"]
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import Finding
 from cmfsim.errors import ImageInputError
 from cmfsim.io.image_headers import (
     LENGTHS,
@@ -23,6 +22,7 @@ from cmfsim.io.image_headers import (
     unstated,
     whole,
 )
+from cmfsim.values.anatomy import Finding
 
 __all__ = ["nrrd_header"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.io.files import replacing
-from cmfsim.planning import rigid_matrix
+from cmfsim.values.motion import rigid_matrix
 
 __all__ = ["write_plan"]
 

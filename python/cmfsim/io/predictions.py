@@ -40,8 +40,8 @@ from cmfsim.io.summaries import (
 )
 from cmfsim.io.surfaces import write_surface
 from cmfsim.io.vtk import write_tets, write_triangles
-from cmfsim.prediction import MODELS, Prediction
-from cmfsim.scene import SurfaceData
+from cmfsim.values.prediction import MODELS, Prediction
+from cmfsim.values.scene import SurfaceData
 
 __all__ = [
     "fill_prediction",

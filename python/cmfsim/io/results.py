@@ -12,7 +12,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.archives import member_of, read_archive, write_archive
 from cmfsim.io.files import named, replacing
 from cmfsim.io.vtk import write_tets, write_triangles
-from cmfsim.scene import SceneResult
+from cmfsim.values.scene import SceneResult
 
 __all__ = ["read_result", "result_suffixes", "write_result"]
 

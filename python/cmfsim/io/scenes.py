@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.case import NODE_KINDS
 from cmfsim.checks import as_floats
 from cmfsim.errors import CaseInputError
 from cmfsim.io.archives import member_of, read_archive, write_archive
@@ -23,8 +22,9 @@ from cmfsim.io.files import (
 )
 from cmfsim.io.meshes import read_mesh, read_tets
 from cmfsim.io.surfaces import read_moved_surface, read_surface
-from cmfsim.planning import rigid_motion
-from cmfsim.scene import (
+from cmfsim.values.anatomy import NODE_KINDS
+from cmfsim.values.motion import rigid_motion
+from cmfsim.values.scene import (
     TISSUE_ARRAYS,
     MovedSurface,
     Scene,

@@ -14,9 +14,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from cmfsim.case import SEVERITIES
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import refuse_constant
+from cmfsim.values.anatomy import SEVERITIES
 
 __all__ = [
     "Check",

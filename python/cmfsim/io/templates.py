@@ -15,7 +15,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from cmfsim.case import Finding
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.curves import read_curves, write_curves
 from cmfsim.io.files import FORMAT_VERSION, beside, is_there, named
@@ -28,10 +27,11 @@ from cmfsim.io.template_archives import (
     read_template_archive,
     write_template_archive,
 )
-from cmfsim.musculature import MOST_BOXES, MUSCLE_KINDS, MUSCLE_SIDES, MuscleSurface
-from cmfsim.patient import FRAMES, UNITS
-from cmfsim.scene import SurfaceData
-from cmfsim.template_data import TemplateData
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.case_parts import FRAMES, UNITS
+from cmfsim.values.musculature import MOST_BOXES, MUSCLE_KINDS, MUSCLE_SIDES, MuscleSurface
+from cmfsim.values.scene import SurfaceData
+from cmfsim.values.template import TemplateData
 
 __all__ = ["TEMPLATE_FILE", "TemplateSurvey", "read_template", "survey_template", "write_template"]
 

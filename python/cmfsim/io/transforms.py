@@ -18,8 +18,8 @@ from cmfsim.checks import Floats, as_floats, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import MAX_TEXT, check_readable, named, replacing
 from cmfsim.io.itk_hdf5 import read_itk_hdf5
-from cmfsim.patient import DIRECTIONS, FRAMES
-from cmfsim.planning import rigid_matrix
+from cmfsim.values.case_parts import DIRECTIONS, FRAMES
+from cmfsim.values.motion import rigid_matrix
 
 __all__ = [
     "DIRECTION_CHOICE",

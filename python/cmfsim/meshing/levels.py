@@ -6,10 +6,10 @@ import numpy as np
 
 from cmfsim import _core
 from cmfsim._core import Surface
-from cmfsim.case import Anatomy, Finding, ImageData
 from cmfsim.checks import as_positive
 from cmfsim.errors import MeshInputError
-from cmfsim.scene import SurfaceData
+from cmfsim.values.anatomy import Anatomy, Finding, ImageData
+from cmfsim.values.scene import SurfaceData
 
 __all__ = ["anatomy_from_surfaces", "signed_level"]
 

@@ -7,11 +7,11 @@ from numpy.typing import ArrayLike
 
 from cmfsim import _core
 from cmfsim._core import Surface, TetMesh
-from cmfsim.case import Finding, ImageData
 from cmfsim.checks import as_number, as_positive, as_rows
 from cmfsim.errors import MeshInputError
 from cmfsim.meshing.quality import MeshReport, mesh_findings, mesh_report
-from cmfsim.scene import SurfaceData
+from cmfsim.values.anatomy import Finding, ImageData
+from cmfsim.values.scene import SurfaceData
 
 __all__ = ["MeshOptions", "TissueMesh", "mesh_from_labels", "mesh_from_level", "part_mesh"]
 

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim import _core
-from cmfsim.case import Anatomy, Finding, ImageData
 from cmfsim.checks import as_number, as_positive, as_rows
 from cmfsim.errors import MeshInputError
 from cmfsim.extras import third_party
+from cmfsim.values.anatomy import Anatomy, Finding, ImageData
 
 __all__ = ["TissueRegion", "near_skin", "tissue_level"]
 

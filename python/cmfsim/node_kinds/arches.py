@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
-from cmfsim.case import Anatomy, BoneSegment, DentalArch, Finding
 from cmfsim.checks import Floats, as_rows
 from cmfsim.errors import CaseInputError
+from cmfsim.values.anatomy import Anatomy, BoneSegment, DentalArch, Finding
 
 __all__ = ["LOWER_ARCH", "UPPER_ARCH", "DentalArches", "dental_arches"]
 

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
-from cmfsim.case import NODE_KINDS, Anatomy, BoneSegment, Finding, NodeKinds
 from cmfsim.checks import Floats, Indices, as_index_rows, as_rows, check_instance
 from cmfsim.errors import CaseInputError
 from cmfsim.node_kinds.arches import DentalArches, dental_arches
 from cmfsim.node_kinds.options import BORDERS, KindOptions
 from cmfsim.node_kinds.sliding import sliding_nodes
-from cmfsim.scene import SegmentData, SurfaceData
+from cmfsim.values.anatomy import NODE_KINDS, Anatomy, BoneSegment, Finding, NodeKinds
+from cmfsim.values.scene import SegmentData, SurfaceData
 
 __all__ = ["ClassifiedNodes", "classify_nodes", "segment_data"]
 

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface
-from cmfsim.case import SHEET_DEPTH, Anatomy, BoneSegment, DentalArch, Finding
 from cmfsim.checks import Floats
 from cmfsim.extras import third_party
 from cmfsim.node_kinds.arches import DentalArches
 from cmfsim.node_kinds.options import KindOptions
-from cmfsim.scene import SurfaceData
+from cmfsim.values.anatomy import SHEET_DEPTH, Anatomy, BoneSegment, DentalArch, Finding
+from cmfsim.values.scene import SurfaceData
 
 __all__ = ["sliding_nodes"]
 

@@ -8,7 +8,6 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.case import Anatomy, ImageData
 from cmfsim.checks import Floats, as_number, as_positive, as_rows, check_instance, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import scan
@@ -28,7 +27,8 @@ from cmfsim.phantom.skull import (
     teeth_shape,
 )
 from cmfsim.phantom.warp import FaceWarp, JawWarp, JawWarped
-from cmfsim.scene import SurfaceData
+from cmfsim.values.anatomy import Anatomy, ImageData
+from cmfsim.values.scene import SurfaceData
 
 __all__ = ["BONES", "LABELS", "PARTS", "PhantomHead", "make_head"]
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.case import NODE_KINDS, BoneSegment, NodeKinds
 from cmfsim.checks import Floats, as_index_rows, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
-from cmfsim.scene import SurfaceData
+from cmfsim.values.anatomy import NODE_KINDS, BoneSegment, NodeKinds
+from cmfsim.values.scene import SurfaceData
 
 __all__ = [
     "add_bone",

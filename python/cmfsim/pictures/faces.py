@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.clinical_plan import plan_lines
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
 from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.skin_ends import skin_ends, trimmed
-from cmfsim.prediction import Prediction
-from cmfsim.scene import SurfaceData
+from cmfsim.values.clinical_motion import plan_lines
+from cmfsim.values.prediction import Prediction
+from cmfsim.values.scene import SurfaceData
 
 __all__ = ["picture_plan", "picture_prediction"]
 

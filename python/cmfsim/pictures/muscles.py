@@ -12,10 +12,10 @@ from cmfsim._core import MuscleFibres, Surface
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import LEGEND_ROW, SIZE, View, bounds, draw, polydata
-from cmfsim.scene import SurfaceData
+from cmfsim.values.scene import SurfaceData
 
 if TYPE_CHECKING:
-    from cmfsim.musculature import MuscleSurface, Musculature
+    from cmfsim.values.musculature import MuscleSurface, Musculature
 
 __all__ = ["add_muscle", "picture_muscles"]
 

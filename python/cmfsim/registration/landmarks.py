@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import ThinPlateSpline, rigid_fit
-from cmfsim.case import Finding
 from cmfsim.checks import Floats, frozen
 from cmfsim.errors import LandmarkInputError, RegistrationError
-from cmfsim.landmark_sites import label_key
 from cmfsim.registration.sides import swapped_pairs, wrong_sides
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.landmark_sites import label_key
 
 __all__ = ["LandmarkMatch", "match_landmarks"]
 

@@ -1,4 +1,4 @@
-"""Cases through every stage: prediction, evaluation, sensitivity, and cohorts of many cases."""
+"""Many cases, and many trials of one: cohorts by several models, and moved landmarks."""
 
 from cmfsim.deferred import deferred
 
@@ -9,15 +9,6 @@ __getattr__, __dir__, __all__ = deferred(
             "CaseOutcome",
             "StudyReport",
             "run_study",
-        ),
-        "evaluation": (
-            "EVALUATION_FILE",
-            "CaseEvaluation",
-            "evaluate",
-        ),
-        "prediction": (
-            "predict",
-            "predict_models",
         ),
         "trials": (
             "LandmarkTrial",

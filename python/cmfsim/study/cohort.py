@@ -19,7 +19,7 @@ from cmfsim.extras import third_party
 from cmfsim.io import Case, Cohort, finish_writing
 from cmfsim.io.folders import check_below, check_writable
 from cmfsim.io.metrics import EVALUATION_FILE, read_evaluation
-from cmfsim.study.evaluation import evaluation_key
+from cmfsim.pipeline.evaluating import evaluation_key
 
 __all__ = ["CaseJob", "CaseOutcome", "StudyReport", "run_study"]
 

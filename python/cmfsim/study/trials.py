@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.build import with_muscles
-from cmfsim.case import Finding
 from cmfsim.checks import Floats, as_positive, as_rows
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io import CaseOrPath, as_case
-from cmfsim.model import PatientModel
-from cmfsim.musculature import Musculature
-from cmfsim.patient import CaseMuscles
-from cmfsim.patient_prediction import predict_patient
-from cmfsim.prediction import Prediction
-from cmfsim.study.prediction import build_patient
+from cmfsim.pipeline.building import with_muscles
+from cmfsim.pipeline.predicting import build_patient
+from cmfsim.solving.models import predict_patient
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.musculature import Musculature
+from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.prediction import Prediction
 
 __all__ = ["LandmarkTrial", "SensitivityReport", "landmark_trials", "sensitivity"]
 

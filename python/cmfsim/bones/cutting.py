@@ -1,0 +1,355 @@
+"""Bones cut into segments: the levels of the pieces, and what became of crumbs."""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim.bones.planes import Cut, Procedure
+from cmfsim.bones.procedures import PROCEDURES, place_procedure
+from cmfsim.bones.segment_checks import check_segments
+from cmfsim.checks import as_number, check_instance
+from cmfsim.errors import CaseInputError
+from cmfsim.extras import third_party
+from cmfsim.surfaces.levels import SurfaceOptions, block_of, surface_of_level
+from cmfsim.values.anatomy import BoneSegment, Finding, ImageData
+from cmfsim.values.scene import SurfaceData
+
+__all__ = ["CutBones", "CutOptions", "cut_bones", "segments_from_surfaces"]
+
+Levels = NDArray[np.float32]
+# The upper jaw's cuts come before the lower's, the larger piece before the one inside it.
+ORDER = {"le_fort_3": 0, "le_fort_1": 1, "bsso": 2, "genioplasty": 3}
+# Half-width of the block of voxels that goes over with a crumb.
+CRUMB_RIM = 2
+# Surfaces that are made at the same time.
+SURFACES_AT_ONCE = 2
+
+
+@dataclass(frozen=True)
+class CutOptions:
+    """How bones are cut.
+
+    Attributes
+    ----------
+    crumb_volume : float, mm³
+        A piece that a cut leaves apart from its segment and that is smaller than this joins the
+        segment on the other side of the cut, which it still hangs on.
+    surface : SurfaceOptions
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A negative volume.
+    """
+
+    crumb_volume: float = 500.0
+    surface: SurfaceOptions = field(default_factory=SurfaceOptions)
+
+    def __post_init__(self) -> None:
+        if as_number("crumb_volume", self.crumb_volume) < 0.0:
+            raise CaseInputError(f"crumb_volume is {self.crumb_volume:g} mm³: 0 or more is needed")
+        check_instance("surface", self.surface, SurfaceOptions)
+
+
+@dataclass(frozen=True, eq=False)
+class CutBones:
+    """The segments of all bones, with what was noticed while cutting.
+
+    Attributes
+    ----------
+    segments : tuple of BoneSegment
+        Uncut bones first, each under its own name.
+    procedures : tuple of Procedure
+        As placed, with every plane and option.
+    findings : tuple of Finding
+    """
+
+    segments: tuple[BoneSegment, ...]
+    procedures: tuple[Procedure, ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+    def __getitem__(self, name: str) -> BoneSegment:
+        for segment in self.segments:
+            if segment.name == name:
+                return segment
+        known = ", ".join(repr(s.name) for s in self.segments)
+        raise CaseInputError(f"there is no segment {name!r}; segments are: {known}")
+
+
+def cut_bones(
+    bones: Mapping[str, ImageData],
+    procedures: Sequence[Procedure] | Mapping[str, Mapping[str, float]] = (),
+    *,
+    landmarks: Mapping[str, ArrayLike] | None = None,
+    options: CutOptions | None = None,
+) -> CutBones:
+    """The bone segments that osteotomies make of bones.
+
+    Parameters
+    ----------
+    bones : mapping of str to ImageData
+        Levels (positive inside) on one grid: "cranium" and "mandible" for the standard procedures.
+    procedures : sequence of Procedure, or mapping of procedure name to options
+        Standard ones are made from above to below, then the others as they stand.
+    landmarks : mapping of str to (3,) float64, mm, optional
+        Skull landmarks, LPS; needed where procedures are given by name.
+    options : CutOptions, optional
+
+    Returns
+    -------
+    CutBones
+
+    Raises
+    ------
+    CaseError
+        Two segments with the same surface, or one whose surface is not that of its level; also
+        `ValueError`: no bone to cut, a cut that misses its bone or leaves nothing of it, two pieces
+        of one name.
+    LandmarkError
+        (also `ValueError`) A landmark missing; names it and the procedure.
+
+    Notes
+    -----
+    A piece is the minimum of the bone's level and the planes' signed distances, the rest that of
+    the level and their negative: no voxel is lost or counted twice, and the cut lies on the plane
+    to a fraction of a voxel.
+
+    Examples
+    --------
+    >>> import cmfsim, numpy as np
+    >>> ball = cmfsim.ImageData(np.zeros((20, 20, 20)), spacing=(1, 1, 1))
+    >>> x, y, z = ball.axes()
+    >>> ball = ball.with_values(7 - np.sqrt((x - 10) ** 2 + (y - 10) ** 2 + (z - 10) ** 2))
+    >>> plane = cmfsim.CuttingPlane((0, 0, 8), (0, 0, -1))
+    >>> cut = cmfsim.free_cut("mandible", "chin", (plane,), rest="mandible_body")
+    >>> [s.name for s in cmfsim.cut_bones({"mandible": ball}, [cut]).segments]
+    ['mandible_body', 'chin']
+    """
+    options = options or CutOptions()
+    if not bones:
+        raise CaseInputError("there is no bone to cut")
+    for name, level in bones.items():
+        check_instance(f"bone {name!r}", level, ImageData)
+        first = next(iter(bones.values()))
+        same = level.values.shape == first.values.shape and all(
+            np.array_equal(np.asarray(getattr(level, n)), np.asarray(getattr(first, n)))
+            for n in ("spacing", "origin")
+        )
+        if not same:
+            raise CaseInputError(f"bone {name!r} lies on another grid than {next(iter(bones))!r}")
+    placed = _placed(procedures, landmarks or {})
+    findings = [f for p in placed for f in p.findings]
+    pieces: dict[str, Levels] = {
+        name: np.asarray(level.values, dtype=np.float32) for name, level in bones.items()
+    }
+    grid = next(iter(bones.values()))
+    for procedure in placed:
+        for cut in procedure.cuts:
+            _make_cut(procedure, cut, grid, pieces, findings, options)
+    levels = {name: grid.with_values(values) for name, values in pieces.items()}
+    # Marching cubes and smoothing of one piece go on while another is decimated; decimation itself
+    # takes one piece at a time.
+    with ThreadPoolExecutor(SURFACES_AT_ONCE) as pool:
+        surfaces = pool.map(
+            lambda name: surface_of_level(name, levels[name], options.surface), levels
+        )
+        segments = tuple(
+            BoneSegment(name, levels[name], surface)
+            for name, surface in zip(levels, surfaces, strict=True)
+        )
+    check_segments(segments)
+    return CutBones(segments, placed, tuple(findings))
+
+
+def segments_from_surfaces(
+    levels: Mapping[str, ImageData], surfaces: Mapping[str, SurfaceData]
+) -> tuple[BoneSegment, ...]:
+    """The segments whose surfaces are ready: nothing is cut.
+
+    Parameters
+    ----------
+    levels : mapping of str to ImageData
+        As in `Anatomy.bones`.
+    surfaces : mapping of str to SurfaceData
+        As in `Anatomy.surfaces`; a level without one gets the surface of its zero set, and "skin"
+        is left out.
+
+    Returns
+    -------
+    tuple of BoneSegment
+
+    Raises
+    ------
+    CaseError
+        Two segments with the same surface, or one whose surface is not that of its level; also
+        `ValueError`: a surface without a level.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.segments_from_surfaces(anatomy.bones, anatomy.surfaces)  # doctest: +SKIP
+    """
+    for name in surfaces:
+        if name != "skin" and name not in levels:
+            known = ", ".join(repr(n) for n in levels) or "none"
+            raise CaseInputError(f"surface {name!r} has no level; levels are: {known}")
+    segments = tuple(
+        BoneSegment(
+            name, level, surfaces[name] if name in surfaces else surface_of_level(name, level)
+        )
+        for name, level in levels.items()
+    )
+    check_segments(segments, given=surfaces)
+    return segments
+
+
+def _placed(
+    procedures: Sequence[Procedure] | Mapping[str, Mapping[str, float]],
+    landmarks: Mapping[str, ArrayLike],
+) -> tuple[Procedure, ...]:
+    if isinstance(procedures, Mapping):
+        placed = [place_procedure(kind, landmarks, table) for kind, table in procedures.items()]
+    else:
+        placed = list(procedures)
+        for procedure in placed:
+            check_instance("procedure", procedure, Procedure)
+    # Sorting is stable: free cuts keep their order, after the standard ones.
+    return tuple(sorted(placed, key=lambda p: ORDER.get(p.kind, len(ORDER))))
+
+
+def _make_cut(
+    procedure: Procedure,
+    cut: Cut,
+    grid: ImageData,
+    pieces: dict[str, Levels],
+    findings: list[Finding],
+    options: CutOptions,
+) -> None:
+    source = next((name for name in cut.sources if name in pieces), None)
+    if source is None or (source == "skull" and procedure.kind in PROCEDURES):
+        have = ", ".join(repr(n) for n in pieces)
+        raise CaseInputError(
+            f"{procedure.kind} cuts {' or '.join(repr(s) for s in cut.sources if s != 'skull')}, "
+            f"but the bones are {have}: part the jaws (give landmarks to the segmentation), or "
+            "give the surfaces of the segments"
+        )
+    rest_name = cut.rest or source
+    if cut.segment in pieces or (rest_name != source and rest_name in pieces):
+        raise CaseInputError(f"{procedure.kind} makes {cut.segment!r}, which there is already")
+    bone = pieces[source]
+    limit = max(float(bone.max()), -float(bone.min()))
+    # Where the bone's level is at its limit, so are those of both pieces.
+    low, high = block_of(bone > -limit)
+    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    whole, bone = bone, bone[box]
+    part_grid = ImageData(bone, grid.spacing, grid.lowest + low * np.asarray(grid.spacing))
+    region = _scaled(cut, part_grid, limit)
+    piece, rest = np.minimum(bone, region), np.minimum(bone, -region)
+    voxel = float(np.prod(np.asarray(grid.spacing)))
+    names = (cut.segment, rest_name)
+    planes = ", ".join(sorted({p.name for group in cut.groups for p in group}))
+    for name, part in ((cut.segment, piece), (rest_name, rest)):
+        if not (part > 0.0).any():
+            what = "misses the bone" if name == cut.segment else "takes the whole bone"
+            raise CaseInputError(
+                f"{procedure.kind}: the cut of {cut.segment!r} from {source!r} {what} "
+                f"(planes: {planes}): check the landmarks, or move the planes"
+            )
+    for one, other, both in ((piece, rest, names), (rest, piece, names[::-1])):
+        moved, kept = _join_crumbs(one, other, bone, limit, int(options.crumb_volume / voxel))
+        if moved:
+            findings.append(
+                Finding(
+                    "note",
+                    "osteotomy-crumbs",
+                    f"{len(moved)} pieces of {both[0]!r} that the cut parted from it, "
+                    f"{sum(moved) * voxel:.0f} mm³ in all, stay with {both[1]!r}",
+                    procedure.kind,
+                    "they would move with a bone that they do not hang on",
+                    "move the planes, or lower crumb_volume",
+                )
+            )
+        if kept:
+            findings.append(
+                Finding(
+                    "warning",
+                    "osteotomy-parts",
+                    f"{both[0]!r} has {len(kept) + 1} separate parts; the smaller have "
+                    f"{', '.join(f'{n * voxel:.0f}' for n in kept)} mm³",
+                    procedure.kind,
+                    "parts that are not joined move together all the same",
+                    "look at the picture of the segments; move the planes",
+                )
+            )
+    names_now = list(pieces.items())
+    pieces.clear()
+    for name, values in names_now:
+        pieces[rest_name if name == source else name] = (
+            _within(whole, box, rest, limit) if name == source else values
+        )
+    pieces[cut.segment] = _within(whole, box, piece, limit)
+
+
+def _within(whole: Levels, box: tuple[slice, ...], part: Levels, limit: float) -> Levels:
+    """A part on the whole grid, at its limit elsewhere."""
+    values = np.full(whole.shape, np.float32(-limit))
+    values[box] = part
+    return values
+
+
+def _scaled(cut: Cut, grid: ImageData, limit: float) -> Levels:
+    """The depth in the region, of the size of a level, and straight across any cell it passes."""
+    # Levels are clipped at `limit`. A plane clipped at less than a cell's diagonal would be bent
+    # inside the cells that it cuts, and its zero would shift: so the diagonal becomes the limit.
+    diagonal = float(np.linalg.norm(np.asarray(grid.spacing)))
+    depth = cut.region_on(grid) * (limit / diagonal)
+    return np.clip(depth, -limit, limit).astype(np.float32)
+
+
+def _join_crumbs(
+    piece: Levels, rest: Levels, bone: Levels, bound: float, most: int
+) -> tuple[list[int], list[int]]:
+    """Gives small parts of a piece to the rest, in place; voxels of those given and of those left.
+
+    `bound` is the greatest size of a level, `most` the voxels of a small part.
+    Only parts that hang on the rest are given: what lay apart in the bone already stays.
+    """
+    ndimage = third_party("scipy.ndimage", "bones are cut", "imaging")
+    block = np.ones((3, 3, 3), dtype=np.int8)
+    labels, count = ndimage.label(piece > 0.0, block)
+    if count < 2:
+        return [], []
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    largest = int(np.argmax(sizes))
+    moved, kept = [], []
+    boxes = ndimage.find_objects(labels)
+    for label in range(1, count + 1):
+        if label == largest:
+            continue
+        around = tuple(
+            slice(max(s.start - CRUMB_RIM - 1, 0), s.stop + CRUMB_RIM + 1)
+            for s in cast("tuple[slice, slice, slice]", boxes[label - 1])
+        )
+        crumb = labels[around] == label
+        others = (labels[around] > 0) & ~crumb
+        rim = ndimage.binary_dilation(crumb, block, CRUMB_RIM) & ~ndimage.binary_dilation(
+            others, block
+        )
+        rim |= crumb
+        # Two steps: a plane through voxel centres leaves a layer on neither side.
+        touching = ndimage.binary_dilation(crumb, block, CRUMB_RIM) & (rest[around] > 0.0)
+        if not touching.any():
+            continue
+        if sizes[label] > most:
+            kept.append(int(sizes[label]))
+            continue
+        moved.append(int(sizes[label]))
+        rest[around] = np.where(rim, bone[around], rest[around])
+        outside = -np.abs(bone[around]).clip(min=np.float32(bound * 1e-3))
+        piece[around] = np.where(rim, np.minimum(piece[around], outside), piece[around])
+    return moved, kept

@@ -1,0 +1,378 @@
+"""Bone motions that are given vertex by vertex: what they say about cuts, and how noisy they are.
+
+A skull whose jaw was cut off and moved may come as one surface, before and after. Across the cut
+neighbouring vertices move apart, and the triangles between them are torn: what they cover is no
+bone. `torn_pieces` takes them out and gives the pieces that moved each as one.
+
+Where bone was ground away, the vertices after lie inside the bone before: they went nowhere, their
+bone is gone. `without_removed` lets them follow the rest of the piece.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import Surface, SurfaceMotion, rigid_fit
+from cmfsim.checks import Floats
+from cmfsim.errors import BoundaryInputError, RegistrationError
+from cmfsim.extras import third_party
+from cmfsim.surfaces.checks import duplicate_triangles, has_three_corners, thin_triangles
+from cmfsim.surfaces.topology import connected_labels, edges_of
+from cmfsim.values.scene import MovedSurface, SurfaceData
+
+__all__ = [
+    "RemovedBone",
+    "missing_patches",
+    "moves_as_one",
+    "smooth_motion",
+    "sound_motion",
+    "torn_pieces",
+    "without_removed",
+]
+
+# An edge is torn if its ends move apart by more than this, mm, and by more than this share of its
+# length: noise of 0.3 mm per vertex does the first to one edge in 10 000, and a turn of 15° the
+# second to none.
+TEAR = 2.0
+TEAR_SHARE = 0.3
+# A piece with less of the area than this, mm², is a crumb of a tear, not a segment of bone.
+LEAST_AREA = 150.0
+# Two pieces moved as one if the motion of either takes the other's vertices this near, rms mm.
+ALIKE = 1.0
+# Vertices of a piece that are asked how another would move them.
+SAMPLES = 2000
+# Neighbourhood over which a noisy motion is averaged: the standard deviation of its weights, mm.
+# Some thirty vertices of a skull at 1.5 mm lie in it, and bone does not bend within it.
+AVERAGED = 3.0
+# Weights end here, in standard deviations.
+REACH = 2.0
+# Noise that is let be, mm rms: a tenth of what a segmented bone is known to.
+QUIET = 0.03
+
+# A patch of bone was removed if a vertex of it went further than the first from where the rest of
+# the piece would take it, mm, and lies deeper than the second inside the bone before; the patch
+# reaches as far as its vertices are off by the third: three times the noise of a segmented bone.
+REMOVED, REMOVED_DEPTH, REMOVED_RIM = 1.5, 0.75, 0.75
+# Such a patch ends abruptly: around it, this far, vertices are off by this share of its worst at
+# most (median). A bone that bends is off all around.
+RING, RING_SHARE = 6.0, 0.35
+# A larger share of a piece is not what is ground away, but how it moved.
+MOST_REMOVED = 0.2
+# Vertices that a motion is fitted to; rounds of fitting, each to the share of vertices nearest.
+LEAST_FITTED, FIT_ROUNDS, FIT_SHARE = 50, 20, 0.75
+# What lies further from the bone after than this, mm, is not shown by its scan; patches smaller
+# than this, mm², are corners of a cut.
+SHOWN, LEAST_PATCH = 10.0, 10.0
+# Volume that a map must keep for its inverse to mean something.
+LEAST_DETERMINANT = 0.1
+
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class RemovedBone:
+    """A patch of bone that is not there after the operation.
+
+    Attributes
+    ----------
+    area : float, mm²
+        Of the surface before.
+    depth : float, mm
+        The greatest distance of a vertex from where the rest of the piece would have taken it.
+    place : (3,) float64, mm
+        Where that is, before.
+    """
+
+    area: float
+    depth: float
+    place: Floats
+
+
+def sound_motion(motion: MovedSurface) -> MovedSurface:
+    """The motion without triangles that have no area before or after, or repeat others.
+
+    A surface file has some; the motion of points near them is that of the triangles round them.
+
+    Raises
+    ------
+    BoundaryError
+        (also `ValueError`) No triangle is left.
+    """
+    here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
+    triangles = np.asarray(motion.surface.triangles).astype(np.int64)
+    triangles = triangles[has_three_corners(triangles)]
+    keep = np.ones(len(triangles), dtype=bool)
+    keep[duplicate_triangles(triangles)] = False
+    for vertices in (here, there):
+        keep[thin_triangles(vertices, triangles)[0]] = False
+    if not keep.any():
+        raise BoundaryInputError(
+            "no triangle of the moved surface has an area both before and after: give the bone "
+            "before, and the same bone after, in the same unit"
+        )
+    return _part(motion, triangles[keep])
+
+
+def torn_pieces(motion: MovedSurface) -> tuple[MovedSurface, ...]:
+    """The pieces of bone that moved each as one, the largest first; triangles of a tear in none.
+
+    Pieces hang together by edges that are not torn. Those that moved alike are one piece, whether
+    they hang together or not: islands of a skull stay with it.
+
+    Parameters
+    ----------
+    motion : MovedSurface
+        Without triangles that have no area (`sound_motion`).
+
+    Returns
+    -------
+    tuple of MovedSurface
+    """
+    here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
+    triangles = np.asarray(motion.surface.triangles).astype(np.int64)
+    ends = edges_of(triangles).ends
+    before, after = here[ends[:, 1]] - here[ends[:, 0]], there[ends[:, 1]] - there[ends[:, 0]]
+    apart = np.linalg.norm(after - before, axis=1)
+    torn = (apart > TEAR) & (apart > TEAR_SHARE * np.linalg.norm(before, axis=1))
+    label = connected_labels(ends[~torn], len(here))
+    whole = (label[triangles] == label[triangles[:, :1]]).all(axis=1)
+    sound = triangles[whole]
+    if not len(sound):
+        return (motion,)
+    piece = label[sound[:, 0]]
+    areas = np.bincount(piece, weights=_areas(here, sound), minlength=label.max() + 1)
+    order = np.argsort(-areas, kind="stable")
+    large = [int(n) for n in order if areas[n] >= LEAST_AREA] or [int(order[0])]
+    parts = [_part(motion, sound[piece == number]) for number in large]
+    groups: list[list[int]] = []
+    for number, part in enumerate(parts):
+        alike = next((group for group in groups if moves_as_one(parts[group[0]], part)), None)
+        if alike is None:
+            groups.append([number])
+        else:
+            alike.append(number)
+    if len(groups) == 1:
+        # Crumbs and torn triangles of a bone that moved as one are not what it was cut into.
+        return (motion,)
+    return tuple(
+        _part(motion, sound[np.isin(piece, [large[n] for n in group])]) for group in groups
+    )
+
+
+def moves_as_one(one: MovedSurface, other: MovedSurface) -> bool:
+    """Whether the motion of either piece is the other's as well: as a rigid one, or bent."""
+    return any(_misses(a, b) <= ALIKE for a, b in ((one, other), (other, one)))
+
+
+def smooth_motion(motion: MovedSurface) -> tuple[MovedSurface, float]:
+    """The motion without the noise of its vertices, and the size of that noise, mm rms.
+
+    The best rigid motion is kept as it is; what vertices deviate from it is averaged over their
+    neighbours within some millimetres (Gaussian weights by area). A motion with less noise than a
+    segmented bone is known to is given back as it is.
+    """
+    here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
+    rigid = _rigid(here, there)
+    if rigid is None:
+        return motion, 0.0
+    rest = there - (here @ rigid[:3, :3].T + rigid[:3, 3])
+    if float(np.sqrt((rest**2).sum(axis=1).mean())) <= QUIET:
+        return motion, 0.0
+    smooth = _averaged(here, rest)
+    noise = float(np.sqrt(((rest - smooth) ** 2).sum(axis=1).mean()))
+    if noise <= QUIET:
+        return motion, noise
+    return MovedSurface(motion.surface, there - rest + smooth), noise
+
+
+def without_removed(motion: MovedSurface) -> tuple[MovedSurface, tuple[RemovedBone, ...]]:
+    """The motion with vertices over removed bone carried as the rest, and the patches they are of.
+
+    The rest is an affine map fitted to the vertices that agree best: a bone that bends a little, or
+    that is measured a few per cent too small, has lost nothing by that.
+
+    Parameters
+    ----------
+    motion : MovedSurface
+        Of one piece (`torn_pieces`).
+
+    Returns
+    -------
+    motion : MovedSurface
+        As given if no bone was removed.
+    removed : tuple of RemovedBone
+        The largest first.
+
+    Notes
+    -----
+    Mechanics: bone that is ground away does not pull the tissue over it to the new surface. Tissue
+    that was joined to it goes on as if it were joined to the segment; that it sinks into the space
+    afterwards is not computed.
+    """
+    here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
+    triangles = np.asarray(motion.surface.triangles).astype(np.int64)
+    if len(here) < LEAST_FITTED:
+        return motion, ()
+    expected = _rest_of(here, there)
+    if expected is None:
+        return motion, ()
+    went, back = expected
+    off = np.linalg.norm(there - went, axis=1)
+    if not (off > REMOVED).any():
+        return motion, ()
+    # In the frame before: where a vertex is now, as the rest of the bone sees it.
+    seen = back(there)
+    surface = Surface(motion.surface.vertices, motion.surface.triangles)
+    far = np.flatnonzero(off > REMOVED_RIM)
+    depth = np.zeros(len(here))
+    inside = surface.winding_number(seen[far]) > 0.5
+    deep = far[inside]
+    depth[deep] = np.linalg.norm(surface.closest(seen[deep])[0] - seen[deep], axis=1)
+    seed = (off > REMOVED) & (depth > REMOVED_DEPTH)
+    if not seed.any():
+        return motion, ()
+    ends = edges_of(triangles).ends
+    loose = off > REMOVED_RIM
+    label = connected_labels(ends[loose[ends].all(axis=1)], len(here))
+    areas = _areas(here, triangles)
+    total = float(areas.sum())
+    corrected, found = there.copy(), []
+    for number in np.unique(label[seed]):
+        patch = (label == number) & loose
+        area = float(areas[patch[triangles].any(axis=1)].sum())
+        box = (here >= here[patch].min(axis=0) - RING) & (here <= here[patch].max(axis=0) + RING)
+        ring = box.all(axis=1) & ~patch
+        worst = int(np.argmax(np.where(patch, off, 0.0)))
+        if area > MOST_REMOVED * total or not ring.any():
+            continue
+        if float(np.median(off[ring])) > RING_SHARE * off[worst]:
+            continue
+        corrected[patch] = went[patch]
+        found.append(RemovedBone(area, float(off[worst]), here[worst].copy()))
+    if not found:
+        return motion, ()
+    found.sort(key=lambda patch: -patch.area)
+    return MovedSurface(motion.surface, corrected), tuple(found)
+
+
+def missing_patches(segment: SurfaceData, bone: Surface, matrix: Floats) -> tuple[RemovedBone, ...]:
+    """Patches of a segment that are not there once it is laid on the bone after the operation.
+
+    Parameters
+    ----------
+    segment : SurfaceData
+        Before.
+    bone : Surface
+        After; what is not closed by it encloses nothing, and nothing is then found.
+    matrix : (4, 4) float64, mm
+        The motion of the segment.
+
+    Returns
+    -------
+    tuple of RemovedBone
+        The largest first; without what lies so far off that the scan after does not show it.
+    """
+    here = np.asarray(segment.vertices)
+    triangles = np.asarray(segment.triangles).astype(np.int64)
+    moved = here @ np.asarray(matrix)[:3, :3].T + np.asarray(matrix)[:3, 3]
+    off = np.linalg.norm(bone.closest(moved)[0] - moved, axis=1)
+    far = np.flatnonzero((off > REMOVED_RIM) & (off < SHOWN))
+    gone = np.zeros(len(here), dtype=bool)
+    if bone.is_closed:
+        gone[far[bone.winding_number(moved[far]) < 0.5]] = True
+    if not (off[gone] > REMOVED).any():
+        return ()
+    ends = edges_of(triangles).ends
+    label = connected_labels(ends[gone[ends].all(axis=1)], len(here))
+    areas = _areas(here, triangles)
+    found = []
+    for number in np.unique(label[gone & (off > REMOVED)]):
+        patch = (label == number) & gone
+        area = float(areas[patch[triangles].all(axis=1)].sum())
+        worst = int(np.argmax(np.where(patch, off, 0.0)))
+        if area >= LEAST_PATCH:
+            found.append(RemovedBone(area, float(off[worst]), here[worst].copy()))
+    return tuple(sorted(found, key=lambda patch: -patch.area))
+
+
+def _rest_of(here: Floats, there: Floats) -> tuple[Floats, Callable[[Floats], Floats]] | None:
+    """Where the affine map of most vertices takes all of them, and that map's inverse."""
+    middle = here.mean(axis=0)
+    columns = np.column_stack([here - middle, np.ones(len(here))])
+    kept = np.ones(len(here), dtype=bool)
+    for _ in range(FIT_ROUNDS):
+        # A flat piece leaves the map across it open: the smallest one is taken.
+        coefficients = np.linalg.lstsq(columns[kept], there[kept], rcond=1e-6)[0]
+        off = np.linalg.norm(columns @ coefficients - there, axis=1)
+        nearest = off <= max(float(np.quantile(off, FIT_SHARE)), REMOVED_RIM / 3.0)
+        if np.array_equal(nearest, kept):
+            break
+        kept = nearest
+    linear = coefficients[:3]
+    if abs(float(np.linalg.det(linear))) < LEAST_DETERMINANT:
+        return None
+
+    def back(points: Floats) -> Floats:
+        return np.asarray(np.linalg.solve(linear.T, (points - coefficients[3]).T).T + middle)
+
+    return np.asarray(columns @ coefficients), back
+
+
+def _averaged(points: Floats, values: Floats) -> Floats:
+    """The values averaged over neighbours in space, each point with its own among them."""
+    tree = third_party(
+        "scipy.spatial", "noise of a moved surface is averaged", "imaging", BoundaryInputError
+    ).cKDTree(points)
+    pairs = tree.query_pairs(REACH * AVERAGED, output_type="ndarray")
+    size = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    weight = np.exp(-0.5 * (size / AVERAGED) ** 2)
+    total, summed = np.ones(len(points)), values.copy()
+    for a, b in ((0, 1), (1, 0)):
+        total += np.bincount(pairs[:, a], weight, len(points))
+        for axis in range(3):
+            summed[:, axis] += np.bincount(
+                pairs[:, a], weight * values[pairs[:, b], axis], len(points)
+            )
+    averaged: Floats = summed / total[:, None]
+    return averaged
+
+
+def _misses(one: MovedSurface, other: MovedSurface) -> float:
+    """How far the motion of one piece takes the vertices of another from where they went, rms."""
+    vertices, went = np.asarray(other.surface.vertices), np.asarray(other.moved_vertices)
+    step = -(-len(vertices) // SAMPLES)
+    vertices, went = vertices[::step], went[::step]
+    surface = one.surface
+    bent = SurfaceMotion(Surface(surface.vertices, surface.triangles), one.moved_vertices)
+    missed = [vertices + bent.displacement(vertices) - went]
+    rigid = _rigid(np.asarray(surface.vertices), np.asarray(one.moved_vertices))
+    if rigid is not None:
+        missed.append(vertices @ rigid[:3, :3].T + rigid[:3, 3] - went)
+    return min(float(np.sqrt((m**2).sum(axis=1).mean())) for m in missed)
+
+
+def _rigid(here: Floats, there: Floats) -> Floats | None:
+    """The best rigid motion; none where the vertices lie on a line."""
+    try:
+        return np.asarray(rigid_fit(here, there).matrix, dtype=np.float64)
+    except RegistrationError:
+        return None
+
+
+def _areas(vertices: Floats, triangles: Integers) -> Floats:
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    areas: Floats = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return areas
+
+
+def _part(motion: MovedSurface, triangles: Integers) -> MovedSurface:
+    """The motion of some of its triangles, with their vertices alone."""
+    used, renumbered = np.unique(triangles, return_inverse=True)
+    surface = SurfaceData(
+        np.asarray(motion.surface.vertices)[used],
+        renumbered.reshape(-1, 3),
+        motion.surface.crease_angle,
+    )
+    return MovedSurface(surface, np.asarray(motion.moved_vertices)[used])

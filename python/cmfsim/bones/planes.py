@@ -1,0 +1,173 @@
+"""Cutting planes and the procedures made of them: frozen values, no bones yet."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim.checks import Floats, as_rows, as_text, check_instance
+from cmfsim.errors import CaseInputError
+from cmfsim.values.anatomy import Finding, ImageData
+
+__all__ = ["Cut", "CuttingPlane", "Procedure", "free_cut"]
+
+
+@dataclass(frozen=True, eq=False)
+class CuttingPlane:
+    """An unbounded plane that parts bone; its normal points into the piece that is cut off.
+
+    Attributes
+    ----------
+    point : (3,) float64, mm
+        LPS.
+    normal : (3,) float64
+        Any length but zero; kept as a unit vector.
+    name : str
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A zero normal, a wrong shape, NaN or infinity.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> plane = cmfsim.CuttingPlane((0, 0, 10), (0, 0, -2), "below 10 mm")
+    >>> plane.distance([[5, 5, 7]]).tolist()
+    [3.0]
+    """
+
+    point: ArrayLike
+    normal: ArrayLike
+    name: str = "plane"
+
+    def __post_init__(self) -> None:
+        as_text("plane name", self.name)
+        where = f"plane {self.name!r}"
+        point = as_rows(f"{where} point", np.reshape(self.point, (1, -1)), 3)[0]
+        normal = as_rows(f"{where} normal", np.reshape(self.normal, (1, -1)), 3)[0]
+        largest = float(np.abs(normal).max())
+        if largest == 0.0:
+            raise CaseInputError(f"{where} normal is (0, 0, 0): give a direction of any length")
+        normal = normal / largest
+        normal = normal / np.linalg.norm(normal)
+        normal.setflags(write=False)
+        object.__setattr__(self, "point", point)
+        object.__setattr__(self, "normal", normal)
+
+    def distance(self, points: ArrayLike) -> Floats:
+        """The signed distance of points (n, 3), mm: positive on the side of the normal."""
+        offset = as_rows("points", points, 3) - np.asarray(self.point)
+        return cast("Floats", offset @ np.asarray(self.normal))
+
+    def distance_on(self, image: ImageData) -> Floats:
+        """The signed distance at every voxel of an image's grid, (nx, ny, nz) mm."""
+        point, normal = np.asarray(self.point), np.asarray(self.normal)
+        x, y, z = image.axes()
+        dx, dy, dz = x - point[0], y - point[1], z - point[2]
+        return cast("Floats", normal[0] * dx + normal[1] * dy + normal[2] * dz)
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """A piece to be cut from a bone: it lies where all planes of any one group are positive.
+
+    Attributes
+    ----------
+    segment : str
+        Name of the piece.
+    groups : tuple of tuples of CuttingPlane
+        Each group is a convex region; the piece is their union.
+    sources : tuple of str
+        The piece is taken from the first of these bones or segments that there is.
+    rest : str or None
+        What the source is called afterwards; None leaves its name.
+    """
+
+    segment: str
+    groups: tuple[tuple[CuttingPlane, ...], ...]
+    sources: tuple[str, ...]
+    rest: str | None = None
+
+    def __post_init__(self) -> None:
+        as_text("segment", self.segment)
+        if not self.sources:
+            raise CaseInputError(f"cut of {self.segment!r} names no bone to cut")
+        if not self.groups or not all(self.groups):
+            raise CaseInputError(f"cut of {self.segment!r} has a group without planes")
+        for plane in (p for group in self.groups for p in group):
+            check_instance(f"plane of {self.segment!r}", plane, CuttingPlane)
+
+    def region_on(self, image: ImageData) -> Floats:
+        """How deep each voxel of a grid lies in the region: positive inside, in mm near planes."""
+        return cast(
+            "Floats",
+            np.maximum.reduce(
+                [np.minimum.reduce([p.distance_on(image) for p in g]) for g in self.groups]
+            ),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Procedure:
+    """An osteotomy: cuts made one after another.
+
+    Attributes
+    ----------
+    kind : str
+        "le_fort_1", "le_fort_3", "bsso", "genioplasty" or "free".
+    cuts : tuple of Cut
+    options : mapping of str to float
+        The distances (mm) and angles (degrees) that placed the planes, defaults included.
+    findings : tuple of Finding
+        What its placement should be looked at for.
+    """
+
+    kind: str
+    cuts: tuple[Cut, ...]
+    options: Mapping[str, float] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
+
+    def __post_init__(self) -> None:
+        as_text("procedure", self.kind)
+        for cut in self.cuts:
+            check_instance(f"cut of {self.kind!r}", cut, Cut)
+        object.__setattr__(self, "options", MappingProxyType(dict(self.options)))
+
+
+def free_cut(
+    bone: str, segment: str, planes: tuple[CuttingPlane, ...], *, rest: str | None = None
+) -> Procedure:
+    """The procedure that cuts a piece from a bone where all given planes are positive.
+
+    Parameters
+    ----------
+    bone : str
+        The bone or segment to cut.
+    segment : str
+        The name of the piece.
+    planes : tuple of CuttingPlane
+        Normals point into the piece.
+    rest : str, optional
+        What the bone is called afterwards; its own name by default.
+
+    Returns
+    -------
+    Procedure
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) No plane.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> plane = cmfsim.CuttingPlane((0, -180, 1440), (0, 0, -1), "chin")
+    >>> cmfsim.free_cut("mandible", "chin", (plane,)).cuts[0].segment
+    'chin'
+    """
+    return Procedure("free", (Cut(segment, (tuple(planes),), (bone,), rest),))

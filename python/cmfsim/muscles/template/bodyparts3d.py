@@ -1,0 +1,268 @@
+"""A muscle template from BodyParts3D, release 3.0: a real head's muscles, bones and teeth.
+
+BodyParts3D (Mitsuhashi et al. 2009) is licensed under CC BY-SA 2.1 JP. Its files are not part of
+this package; `WHERE` says where a user downloads them.
+"""
+
+import hashlib
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError, LandmarkInputError
+from cmfsim.io.landmarks import read_landmarks
+from cmfsim.io.surfaces import read_surface
+from cmfsim.muscles.template.bodyparts3d_courses import atlas_course
+from cmfsim.muscles.template.bodyparts3d_parts import (
+    BONES,
+    HASHES,
+    MIDLINE_MUSCLES,
+    PAIRED_MUSCLES,
+    TEETH,
+    MusclePair,
+)
+from cmfsim.muscles.template.muscle_template import MuscleTemplate
+from cmfsim.muscles.template.skull_reference import joined_surface
+from cmfsim.registration import side_vectors
+from cmfsim.surfaces.checks import SurfaceReport, check_surface
+from cmfsim.surfaces.repair import RepairOptions, clean_surface, repair_surface
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.landmark_sites import SKULL_LANDMARKS
+from cmfsim.values.musculature import MuscleSurface
+from cmfsim.values.scene import SurfaceData
+from cmfsim.values.template import as_landmarks
+
+__all__ = ["WHERE", "import_bodyparts3d"]
+
+WHERE = (
+    "https://github.com/LuisLuisLuisLuisLuisLuisLuisLuis/AnatomyExplorer3D at 53e1aebb, folder "
+    "src/main/resources/Project/anatomy/BodyParts3D_3.0_obj_99"
+)
+LICENCE = "CC BY-SA 2.1 JP"
+ATTRIBUTION = "BodyParts3D, © The Database Center for Life Science"
+# Left and right of one person differ by 1 % in volume in these files; where they differ by more,
+# the broken one of them has lost a part.
+MIRROR_VOLUME_SHARE = 0.05
+
+
+# Measured on these files: 49002 runs forward on its way down, behind and 2.4 mm inside 49005, as
+# the deep part does. Names follow the ids all the same, so that they can be looked up.
+_EXCHANGED_NAMES = Finding(
+    "note",
+    "bodyparts3d-names",
+    "the parts called superficial lie behind and inside those called deep: the atlas seems to have "
+    "exchanged them",
+    "masseter_superficial, masseter_deep (FMA49001 to FMA49005)",
+    "only the names are affected: each keeps its own place and direction",
+    "mind it where a name is read as anatomy",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A file as it was and as it was mended."""
+
+    concept: str
+    raw: SurfaceReport
+    surface: SurfaceData
+    volume: float
+    is_sound: bool
+    findings: tuple[Finding, ...]
+
+    @property
+    def damage(self) -> tuple[int, int, int]:
+        """What was wrong with the file: borders, forks, pieces. Less is better."""
+        return (len(self.raw.borders), len(self.raw.non_manifold), len(self.raw.components))
+
+
+def import_bodyparts3d(
+    folder: str | os.PathLike[str],
+    landmarks: Mapping[str, ArrayLike] | str | os.PathLike[str],
+    *,
+    verify: bool = True,
+    progress: Callable[[str], None] | None = None,
+) -> MuscleTemplate:
+    """The template that the OBJ files of BodyParts3D 3.0 make: 65 muscles, bones and teeth.
+
+    Vertices in the same place are made one, debris is dropped, gaps are closed, and a muscle that
+    has lost a part on one side is mirrored from the other; each is a finding. Nothing is
+    downloaded: get the files from the repository that `WHERE` in this file names.
+
+    Parameters
+    ----------
+    folder : path
+        Holds `FMA49001.obj` and the others, 99 % reduced, LPS mm. Release 4.0 has other
+        coordinates.
+    landmarks : mapping of str to (3,) float64, mm, or path
+        On these bones, by the names of `cmfsim.SKULL_LANDMARKS`; or their file.
+    verify : bool
+        Whether files must have the known SHA-256 hashes; otherwise differences are warnings.
+    progress : callable, optional
+        Is told what is read.
+
+    Returns
+    -------
+    MuscleTemplate
+
+    Raises
+    ------
+    FileNotFoundError
+        Files are missing: how many, which first, and where to get them.
+    CaseError
+        (also `ValueError`) A file is not the known one, or no surface; meshio is not installed.
+    LandmarkError
+        (also `ValueError`) The landmarks cannot be read.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> template = cmfsim.import_bodyparts3d("obj_99", "skull.mrk.json")  # doctest: +SKIP
+    >>> template.save("atlas")  # doctest: +SKIP
+    """
+    folder = Path(folder)
+    findings = _verified(folder, must_be_known=verify)
+    if isinstance(landmarks, str | os.PathLike):
+        landmarks = read_landmarks(landmarks)
+    points = as_landmarks(landmarks)
+    say = progress or (lambda _: None)
+    muscles: list[MuscleSurface] = []
+    concepts: dict[str, tuple[str, ...]] = {}
+    for pair in PAIRED_MUSCLES:
+        say(pair.name)
+        left, right = (_part(folder, concept) for concept in (pair.left, pair.right))
+        surfaces, mirrored = _both_sides(pair, left, right, points)
+        for side, part, surface in zip("LR", (left, right), surfaces, strict=True):
+            name = f"{pair.name}_{side}"
+            course = atlas_course(pair.name, side, surface)
+            muscles.append(MuscleSurface(name, side, surface, pair.kind, course=course))
+            concepts[name] = (part.concept,)
+            findings += _renamed(part.findings, name)
+        findings += mirrored
+    for name, kind, concept in MIDLINE_MUSCLES:
+        say(name)
+        part = _part(folder, concept)
+        muscles.append(MuscleSurface(name, "both", part.surface, kind))
+        concepts[name] = (concept,)
+        findings += _renamed(part.findings, name)
+    findings.append(_EXCHANGED_NAMES)
+    say("bones")
+    # Flat triangles would keep others from measuring distances to it.
+    bones = (*BONES, *TEETH)
+    skull = [clean_surface(read_surface(folder / f"{concept}.obj")) for concept in bones]
+    return MuscleTemplate(
+        name="bodyparts3d",
+        muscles=tuple(muscles),
+        skull=joined_surface(skull),
+        landmarks=points,
+        definitions={n: where for n, where in SKULL_LANDMARKS.items() if n in points},
+        licence=LICENCE,
+        attribution=ATTRIBUTION,
+        source=f"BodyParts3D release 3.0, 99 % reduced; files from {WHERE}; mended by cmfsim",
+        concepts=concepts,
+        findings=tuple(findings),
+    )
+
+
+def _verified(folder: Path, *, must_be_known: bool) -> list[Finding]:
+    """Warnings about files with other hashes than the known ones, if these are allowed."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder; get the files from {WHERE}")
+    missing = [name for name in HASHES if not (folder / f"{name}.obj").is_file()]
+    if missing:
+        raise FileNotFoundError(
+            f"{folder}: {len(missing)} of {len(HASHES)} files are missing, {missing[0]}.obj first; "
+            f"get them from {WHERE}"
+        )
+    other = [
+        name
+        for name, known in HASHES.items()
+        if hashlib.sha256((folder / f"{name}.obj").read_bytes()).hexdigest() != known
+    ]
+    if not other:
+        return []
+    named = ", ".join(f"{name}.obj" for name in other[:3]) + (", …" if len(other) > 3 else "")
+    what = f"{len(other)} of {len(HASHES)} files have other SHA-256 hashes than known: {named}"
+    mend = f"get them anew from {WHERE}"
+    if must_be_known:
+        raise CaseInputError(f"{folder.name}: {what}; {mend}, or import with verification off")
+    why = "another release has other coordinates, and files may have been damaged"
+    return [Finding("warning", "bodyparts3d-other-file", what, folder.name, why, mend)]
+
+
+def _part(folder: Path, concept: str) -> _Part:
+    """A muscle's file, mended."""
+    read = read_surface(folder / f"{concept}.obj")
+    raw = check_surface(read, crossings=False)
+    surface, findings = repair_surface(read, concept, RepairOptions())
+    mended = check_surface(surface, crossings=False)
+    is_sound = mended.is_closed and not len(mended.non_manifold) and not mended.inconsistent
+    if not is_sound:
+        findings = (
+            *findings,
+            Finding(
+                "warning",
+                "bodyparts3d-broken",
+                f"{len(mended.borders)} borders and {len(mended.non_manifold)} forked edges remain",
+                concept,
+                "generalised winding numbers bridge small gaps; the edge of the muscle is blurred",
+                "look at the muscle; mend it by hand if it matters",
+            ),
+        )
+    return _Part(concept, raw, surface, mended.volume, is_sound, findings)
+
+
+def _both_sides(
+    pair: MusclePair, left: _Part, right: _Part, landmarks: Mapping[str, Floats]
+) -> tuple[tuple[SurfaceData, SurfaceData], list[Finding]]:
+    """The surfaces of the left and the right muscle, a broken one mirrored from the other."""
+    difference = abs(left.volume - right.volume) / max(left.volume, right.volume)
+    sound = left.is_sound and right.is_sound
+    if (sound and difference <= MIRROR_VOLUME_SHARE) or left.damage == right.damage:
+        return (left.surface, right.surface), []
+    if not sound and left.is_sound == right.is_sound:
+        return (left.surface, right.surface), []
+    # Without a volume that tells, the sound one is the better; else the less damaged file.
+    left_is_better = left.is_sound if not sound else left.damage < right.damage
+    good, bad = (left, right) if left_is_better else (right, left)
+    sides = ("left", "right") if left_is_better else ("right", "left")
+    mirrored = _mirrored(good.surface, landmarks)
+    finding = Finding(
+        "note",
+        "bodyparts3d-mirrored",
+        f"the {sides[1]} one ({bad.concept}: {bad.volume:.0f} mm³, {bad.damage[2]} pieces) is "
+        f"mirrored from the {sides[0]} one ({good.concept}: {good.volume:.0f} mm³)",
+        f"{pair.name}_{'R' if left_is_better else 'L'}",
+        "its file has lost a part of it",
+        "look at the muscle; nothing to do",
+    )
+    surfaces = (good.surface, mirrored) if left_is_better else (mirrored, good.surface)
+    return surfaces, [finding]
+
+
+def _mirrored(surface: SurfaceData, landmarks: Mapping[str, Floats]) -> SurfaceData:
+    """A surface mirrored in the median plane that pairs of landmarks lie on either side of."""
+    vectors = side_vectors(landmarks)
+    if not vectors:
+        raise LandmarkInputError(
+            "a broken muscle is to be mirrored, but no landmark is given on both sides (_L and _R)"
+        )
+    across = np.mean(list(vectors.values()), axis=0)
+    normal = across / np.linalg.norm(across)
+    pairs = [0.5 * (landmarks[f"{name}_L"] + landmarks[f"{name}_R"]) for name in vectors]
+    middle = np.mean(pairs, axis=0)
+    vertices = np.asarray(surface.vertices)
+    height = (vertices - middle) @ normal
+    triangles = np.asarray(surface.triangles)[:, ::-1]
+    return SurfaceData(vertices - 2.0 * height[:, None] * normal, triangles)
+
+
+def _renamed(findings: tuple[Finding, ...], name: str) -> list[Finding]:
+    """Findings about a file as findings about a muscle."""
+    return [
+        Finding(f.severity, f.code, f.what, f"{name} ({f.where})", f.why, f.mend) for f in findings
+    ]

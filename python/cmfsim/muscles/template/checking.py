@@ -1,0 +1,347 @@
+"""What is wrong with a muscle template: files, surfaces, sides, landmarks, each with its mend."""
+
+import os
+from collections.abc import Iterator
+
+import numpy as np
+
+from cmfsim._core import Surface
+from cmfsim.checks import Floats
+from cmfsim.io.templates import survey_template
+from cmfsim.muscles.template.built_in import template_path
+from cmfsim.registration import side_vectors, wrong_sides
+from cmfsim.surfaces.checks import check_surface
+from cmfsim.surfaces.repair import clean_surface
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.landmark_sites import SKULL_LANDMARKS
+from cmfsim.values.musculature import MuscleSurface
+from cmfsim.values.template import TemplateData
+
+__all__ = ["check_contents", "check_template"]
+
+# Longest extents of a skull or its face, mm: from the facial skeleton alone to a head with neck.
+SKULL_EXTENT = (90.0, 400.0)
+# Distance of a landmark from the skull reference beyond which it lies on something else, mm: twice
+# the placing error of an operator.
+LANDMARK_DISTANCE = 5.0
+# Least distance between a muscle and the skull beyond which one of them is in another place, mm:
+# muscles round the mouth and of the neck reach within a centimetre of bone.
+MUSCLE_DISTANCE = 20.0
+# Distance of a fibre line outside its muscle beyond which it belongs to another, mm: lines start in
+# bone, where the muscle's surface is cut off.
+COURSE_DISTANCE = 8.0
+# Landmarks with less spread across their best plane than this share of their greatest lie in it.
+# A spline through them has no third direction.
+PLANE_SHARE = 1e-3
+# How many names a finding lists.
+MOST_NAMES = 6
+
+
+def check_template(template: TemplateData | str | os.PathLike[str]) -> tuple[Finding, ...]:
+    """Everything that is wrong with a template, each with its place, reason and mend.
+
+    Parameters
+    ----------
+    template : MuscleTemplate, or path or name of one on disk
+        A folder is surveyed as a whole: missing files, unknown keys, broken surfaces and landmarks
+        are all found at once.
+
+    Returns
+    -------
+    tuple of Finding
+        Errors keep it from being used; warnings make its muscles doubtful.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is no such template.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> [f.code for f in cmfsim.check_template("default") if f.severity == "error"]
+    []
+    """
+    if isinstance(template, TemplateData):
+        return check_contents(template)
+    survey = survey_template(template_path(template))
+    if survey.template is None:
+        return survey.findings
+    return check_contents(survey.template)
+
+
+def check_contents(template: TemplateData) -> tuple[Finding, ...]:
+    """What is wrong with the contents of a template, after what was noticed while it was read."""
+    skull = _searchable(template.skull)
+    return (
+        *template.findings,
+        *_check_terms(template),
+        *_check_sites(template),
+        *_check_landmark_places(template, skull),
+        *_check_skull(template),
+        *_check_partners(template),
+        *(finding for muscle in template.muscles for finding in _check_muscle(muscle, skull)),
+        *_check_sides(template),
+    )
+
+
+def _searchable(surface: object) -> Surface | None:
+    """A surface to measure distances from; None if no triangle of it has an area."""
+    cleaned = clean_surface(surface)  # type: ignore[arg-type]
+    if not len(np.asarray(cleaned.triangles)):
+        return None
+    return Surface(cleaned.vertices, cleaned.triangles)
+
+
+def _distances(surface: Surface, points: Floats) -> Floats:
+    closest = surface.closest(points)[0]
+    return np.asarray(np.linalg.norm(closest - points, axis=1))
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:MOST_NAMES]) + (", …" if len(names) > MOST_NAMES else "")
+
+
+def _check_terms(template: TemplateData) -> Iterator[Finding]:
+    for key, why in (
+        ("attribution", "most licences ask that its makers are named"),
+        ("source", "nobody can tell where it comes from"),
+    ):
+        if not getattr(template, key):
+            yield Finding(
+                "warning",
+                f"template-{key}",
+                f"{key} is not stated",
+                template.name,
+                why,
+                f'write {key} = "…" in template.toml',
+            )
+
+
+def _check_sites(template: TemplateData) -> Iterator[Finding]:
+    """Names of landmarks against the usual ones, their definitions, and whether they span space."""
+    names = list(template.landmarks)
+    missing = [name for name in SKULL_LANDMARKS if name not in template.landmarks]
+    extra = [name for name in names if name not in SKULL_LANDMARKS]
+    if missing:
+        yield Finding(
+            "warning",
+            "template-landmarks-missing",
+            f"{len(missing)} of the {len(SKULL_LANDMARKS)} usual landmarks are missing: "
+            f"{_listed(missing)}",
+            template.name,
+            "near them the muscles follow landmarks that lie further away",
+            "place them on the skull reference",
+        )
+    undefined = [name for name in extra if name not in template.definitions]
+    if extra:
+        yield Finding(
+            "warning" if undefined else "note",
+            "template-landmarks-extra",
+            f"{len(extra)} landmarks have names of this template's own: {_listed(extra)}"
+            + (f"; without a definition: {_listed(undefined)}" if undefined else ""),
+            template.name,
+            "only patients with landmarks of the same names can use them",
+            "say where they lie under [landmarks.definitions], or take the usual names",
+        )
+    points = np.array(list(template.landmarks.values()))
+    pairs = _coincident(points)
+    for one, other in pairs:
+        yield Finding(
+            "error",
+            "template-landmarks-coincide",
+            f"{names[one]} and {names[other]} lie in the same place",
+            template.name,
+            "no map takes one place to two",
+            "place one of them anew",
+        )
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if len(points) < 4 or spread[-1] <= PLANE_SHARE * spread[0]:
+        found = f"there are {len(points)}" if len(points) < 4 else "all lie in one plane"
+        yield Finding(
+            "error",
+            "template-landmarks-flat",
+            f"four landmarks that do not lie in a plane are needed: {found}",
+            template.name,
+            "the map to a patient has no third direction",
+            "place more landmarks",
+        )
+
+
+def _coincident(points: Floats) -> list[tuple[int, int]]:
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+    close = np.argwhere(np.triu(distance <= 1e-6 * max(float(distance.max()), 1e-300), k=1))
+    return [(int(one), int(other)) for one, other in close]
+
+
+def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Iterator[Finding]:
+    """Left landmarks on the left, and all of them on the skull."""
+    pairs = side_vectors(template.landmarks)
+    swapped = wrong_sides(template.landmarks)
+    if swapped:
+        everything = len(swapped) == len(pairs)
+        yield Finding(
+            "error",
+            "template-landmarks-swapped",
+            "left and right are exchanged in "
+            + ("every pair" if everything else f"{len(swapped)} pairs")
+            + f": {_listed(swapped)}",
+            template.name,
+            "muscles would be turned inside out on the way to a patient",
+            "the set is mirrored, or in another frame than LPS"
+            if everything
+            else "exchange their labels: _L is the patient's left, at greater x in LPS",
+        )
+    if skull is None:
+        return
+    points = np.array(list(template.landmarks.values()))
+    for name, distance in zip(template.landmarks, _distances(skull, points), strict=True):
+        if distance > LANDMARK_DISTANCE:
+            yield Finding(
+                "warning",
+                "template-landmark-off-skull",
+                f"{name} lies {distance:.1f} mm from the skull reference (at most "
+                f"{LANDMARK_DISTANCE:g})",
+                template.name,
+                "muscles follow it to where no bone is",
+                "place it on the bone, in the frame and units of the skull reference",
+            )
+
+
+def _check_skull(template: TemplateData) -> Iterator[Finding]:
+    vertices = np.asarray(template.skull.vertices)
+    extent = float(np.ptp(vertices, axis=0).max()) if len(vertices) else 0.0
+    low, high = SKULL_EXTENT
+    if not low <= extent <= high:
+        yield Finding(
+            "error",
+            "template-skull-size",
+            f"the skull reference is {extent:.3g} mm long (a head has {low:g} to {high:g})",
+            template.name,
+            "it is in another unit than mm, or no skull",
+            'state the unit of the files: units = "cm"',
+        )
+
+
+def _check_partners(template: TemplateData) -> Iterator[Finding]:
+    """Names that say another side than the muscle has, and muscles on one side alone."""
+    kinds = {muscle.name: muscle.kind for muscle in template.muscles}
+    for muscle in template.muscles:
+        ending = muscle.name[-2:] if muscle.name[-2:] in {"_L", "_R"} else ""
+        if ending != ("" if muscle.side == "both" else f"_{muscle.side}"):
+            yield Finding(
+                "error",
+                "template-side-name",
+                f"the side is {muscle.side!r}, the name ends in {ending or 'no side'!r}",
+                muscle.name,
+                "muscles are addressed by names that say their side",
+                "end the name in _L or _R, or in neither for side both",
+            )
+        elif ending:
+            partner = muscle.name[:-1] + ("R" if muscle.side == "L" else "L")
+            if partner not in kinds:
+                yield Finding(
+                    "warning",
+                    "template-partner-missing",
+                    f"there is no {partner}",
+                    muscle.name,
+                    "a face with a muscle on one side alone is drawn to that side",
+                    "add it, mirrored if need be",
+                )
+            elif muscle.side == "L" and kinds[partner] != muscle.kind:
+                yield Finding(
+                    "warning",
+                    "template-partner-kind",
+                    f"it is a {muscle.kind}, {partner} a {kinds[partner]}",
+                    muscle.name,
+                    "fibres would differ between the sides",
+                    "give both the same kind",
+                )
+
+
+def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Finding]:
+    report = check_surface(muscle.surface)
+    if report.volume < 0.0:
+        yield Finding(
+            "error",
+            "template-inside-out",
+            f"it encloses {report.volume:.0f} mm³: normals point inwards",
+            muscle.name,
+            "inside and outside are exchanged",
+            "turn its triangles round (cmfsim.repair_surface)",
+        )
+    if not report.is_closed:
+        length = sum(loop.length for loop in report.borders)
+        yield Finding(
+            "warning",
+            "template-open",
+            f"{len(report.borders)} borders, {length:.1f} mm long",
+            muscle.name,
+            "near a gap the winding number fades from 1 to 0 instead of falling",
+            "close it (cmfsim.repair_surface)",
+        )
+    if len(report.non_manifold) or report.inconsistent:
+        yield Finding(
+            "warning",
+            "template-not-manifold",
+            f"{len(report.non_manifold)} edges of more than two triangles, {report.inconsistent} "
+            "between triangles that face opposite ways",
+            muscle.name,
+            "which side is inside is not certain there",
+            "mend it (cmfsim.repair_surface)",
+        )
+    if report.crossings is not None and len(report.crossings):
+        yield Finding(
+            "note",
+            "template-crosses-itself",
+            f"{len(report.crossings)} pairs of triangles cut through each other",
+            muscle.name,
+            "winding numbers above ½ count as inside, so that only folds of the surface suffer",
+            "nothing, if the muscle looks right",
+        )
+    if skull is None or not len(np.asarray(muscle.surface.vertices)):
+        return
+    nearest = float(_distances(skull, np.asarray(muscle.surface.vertices)).min())
+    if nearest > MUSCLE_DISTANCE:
+        yield Finding(
+            "warning",
+            "template-far-from-skull",
+            f"it comes no nearer to the skull than {nearest:.0f} mm (at most {MUSCLE_DISTANCE:g})",
+            muscle.name,
+            "it lies in another frame or unit than the skull, or is no muscle of the face",
+            "bring both into one frame",
+        )
+    body = _searchable(muscle.surface)
+    if body is None:
+        return
+    for number, line in enumerate(muscle.course):
+        outside = body.winding_number(line) < 0.5
+        away = float(_distances(body, line)[outside].max(initial=0.0))
+        if away > COURSE_DISTANCE:
+            yield Finding(
+                "warning",
+                "template-course-outside",
+                f"fibre line {number} leaves it by {away:.1f} mm (at most {COURSE_DISTANCE:g})",
+                muscle.name,
+                "the line may belong to another muscle",
+                "correct the line",
+            )
+
+
+def _check_sides(template: TemplateData) -> Iterator[Finding]:
+    """Left muscles on the left of right ones: x grows to the patient's left."""
+    middles = {m.name: np.asarray(m.surface.vertices).mean(axis=0)[0] for m in template.muscles}
+    for muscle in template.muscles:
+        partner = f"{muscle.name[:-1]}R"
+        if muscle.side != "L" or partner not in middles:
+            continue
+        across = middles[muscle.name] - middles[partner]
+        if across < 0.0:
+            yield Finding(
+                "error",
+                "template-muscles-swapped",
+                f"it lies {-across:.0f} mm to the right of {partner}",
+                muscle.name,
+                "left and right are exchanged",
+                "exchange the names, or correct the frame: x grows to the patient's left",
+            )

@@ -1,0 +1,1 @@
+"""A case through every stage: here alone the stages are connected, and their outputs written."""

@@ -1,0 +1,126 @@
+"""The clefts between segments of bone, where there is no tissue to stretch: mouth and cut."""
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import Surface, TetMesh
+from cmfsim.checks import Floats
+from cmfsim.values.anatomy import BoneSegment, Finding, NodeKinds
+
+__all__ = ["cleft_tets", "without_clefts"]
+
+
+def without_clefts(
+    mesh: TetMesh,
+    kinds: NodeKinds,
+    segments: Sequence[BoneSegment],
+    moved: Collection[str],
+    width: float,
+) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
+    """The mesh without what lies in the clefts beside segments that move, and a finding for it.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    kinds : NodeKinds
+    segments : sequence of BoneSegment
+        Those that the kinds were found with.
+    moved : collection of str
+        Names of the segments that may move.
+    width : float, mm
+        As for `cleft_tets`.
+    """
+    nodes, tets = np.asarray(mesh.nodes), np.asarray(mesh.tets)
+    inside = cleft_tets(nodes, tets, kinds, segments, moved, width)
+    if not inside.any():
+        return mesh, kinds, ()
+    kept = tets[~inside]
+    used = np.zeros(len(nodes), dtype=bool)
+    used[kept] = True
+    number = np.cumsum(used) - 1
+    left = TetMesh(nodes[used], number[kept])
+    volume = float(np.asarray(mesh.volumes)[inside].sum())
+    finding = Finding(
+        "note",
+        "clefts-left-out",
+        f"{int(inside.sum())} tets of {volume:.0f} mm³ in all lie in the clefts between segments "
+        f"and were left out: of two segments they are less than {width:g} mm away, taken together",
+        f"segments {', '.join(sorted(moved))}",
+        "between tooth rows there is air, and at a cut tissue is lifted off the bone: stretched "
+        "across, tets would turn inside out and hold the bones back",
+        "set cleft in [mesh] to another width, or to 0 to keep all tissue",
+    )
+    return left, NodeKinds(kinds.kind[used], kinds.segment[used], kinds.segments), (finding,)
+
+
+def cleft_tets(
+    nodes: Floats,
+    tets: NDArray[np.uint32],
+    kinds: NodeKinds,
+    segments: Sequence[BoneSegment],
+    moved: Collection[str],
+    width: float,
+) -> NDArray[np.bool_]:
+    """Which tets lie between two segments of which one or both move, (m,).
+
+    Those are tets that hold nodes of both, and those whose centroid has both within `width`, taken
+    together: a cut in the bone and the slit between the tooth rows look the same.
+
+    Parameters
+    ----------
+    nodes : (n, 3) float64, mm
+    tets : (m, 4) uint32
+    kinds : NodeKinds
+    segments : sequence of BoneSegment
+    moved : collection of str
+    width : float, mm
+        0: no tet.
+    """
+    inside = np.zeros(len(tets), dtype=bool)
+    if width <= 0.0 or not moved:
+        return inside
+    moves = np.array([name in moved for name in kinds.segments])
+    owner = np.asarray(kinds.segment)[tets]
+    most = owner.max(axis=1)
+    least = np.where(owner < 0, most[:, None], owner).min(axis=1)
+    inside |= (most != least) & (moves[most] | moves[least])
+
+    corners = nodes[tets]
+    centroids = corners.mean(axis=1)
+    # A point is at most so much nearer to anything than the nearest corner of its tet.
+    radius = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
+    reach = width + float(radius.max())
+    surfaces = [Surface(s.surface.vertices, s.surface.triangles) for s in segments]
+    about = [_least_at_corners(nodes, tets, surface, reach) - radius for surface in surfaces]
+    names = [segment.name for segment in segments]
+    for one in (i for i, name in enumerate(names) if name in moved):
+        for other in range(len(surfaces)):
+            if other == one or (other < one and names[other] in moved):
+                continue
+            ids = np.flatnonzero(
+                np.maximum(about[one], 0.0) + np.maximum(about[other], 0.0) < width
+            )
+            both = [_distances(centroids[ids], surfaces[each]) for each in (one, other)]
+            inside[ids[both[0] + both[1] < width]] = True
+    return inside
+
+
+def _least_at_corners(
+    nodes: Floats, tets: NDArray[np.uint32], surface: Surface, reach: float
+) -> Floats:
+    """The distance of each tet's nearest corner from a surface; infinity beyond its box."""
+    vertices = np.asarray(surface.vertices)
+    low, high = vertices.min(axis=0) - reach, vertices.max(axis=0) + reach
+    near = np.flatnonzero(((nodes >= low) & (nodes <= high)).all(axis=1))
+    distance = np.full(len(nodes), np.inf)
+    distance[near] = _distances(nodes[near], surface)
+    return np.asarray(distance[tets].min(axis=1))
+
+
+def _distances(points: Floats, surface: Surface) -> Floats:
+    if not len(points):
+        return np.zeros(0)
+    closest, _, _ = surface.closest(points)
+    return np.asarray(np.linalg.norm(closest - points, axis=1))

@@ -1,0 +1,65 @@
+"""Which bodies of a mesh are held, and the mesh without those that are not."""
+
+import numpy as np
+
+from cmfsim._core import TetMesh
+from cmfsim.errors import MeshInputError
+from cmfsim.surfaces.topology import tet_bodies
+from cmfsim.values.anatomy import Finding, NodeKinds
+
+__all__ = ["held_part"]
+
+# Held nodes that a body needs: three hold it unless they are in line.
+LEAST_HELD = 3
+# What is left out below this volume nobody will miss, mm³.
+SPECKS = 100.0
+
+
+def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
+    """The mesh without bodies that neither bone nor plane holds, and a finding for them.
+
+    A body hangs together by the faces of its tets: what an edge or a node joins to the rest swings
+    about it.
+
+    Raises
+    ------
+    MeshError
+        (also `ValueError`) Nothing of it is held.
+    """
+    tets = np.asarray(mesh.tets)
+    body = tet_bodies(tets)
+    n_bodies = int(body.max(initial=-1)) + 1
+    holds = np.isin(kinds.kind, (1, 2))
+    corner = holds[tets]
+    # Each held node once for each body that it is in.
+    pairs = np.unique(np.stack([np.repeat(body, 4)[corner.ravel()], tets[corner]]), axis=1)
+    loose = np.bincount(pairs[0], minlength=n_bodies) < LEAST_HELD
+    if not loose.any():
+        return mesh, kinds, ()
+    if loose.all():
+        raise MeshInputError(
+            "no part of the tissue is held: no node lies on the posterior plane or on a bone; "
+            "check that bones and skin are in one frame, and the posterior plane"
+        )
+    dropped = loose[body]
+    keep_node = np.zeros(mesh.n_nodes, dtype=bool)
+    keep_node[tets[~dropped]] = True
+    number = np.cumsum(keep_node) - 1
+    kept = TetMesh(np.asarray(mesh.nodes)[keep_node], number[tets[~dropped]])
+    volume = float(np.asarray(mesh.volumes)[dropped].sum())
+    place = np.asarray(mesh.nodes)[tets[dropped]].reshape(-1, 3).mean(axis=0)
+    speck = volume < SPECKS
+    finding = Finding(
+        "note" if speck else "warning",
+        "tissue-not-held",
+        f"{int(loose.sum())} bodies of tissue of {volume:.3g} mm³ in all touch no bone and were "
+        "left out",
+        f"mesh, about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
+        "nothing says where they would go",
+        "nothing: they are specks beside the face"
+        if speck
+        else "check skin and bone near there; a larger bone threshold or closing may have parted "
+        "them",
+    )
+    left = NodeKinds(kinds.kind[keep_node], kinds.segment[keep_node], kinds.segments)
+    return kept, left, (finding,)

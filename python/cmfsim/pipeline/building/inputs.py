@@ -1,0 +1,300 @@
+"""What the files of a case hold: anatomy, landmarks, motions, and the hashes of them all."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cmfsim._core import __version__
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError
+from cmfsim.io import (
+    Case,
+    read_landmark_file,
+    read_moved_surface,
+    read_surface,
+    read_transform,
+)
+from cmfsim.io.folders import check_below, check_writable
+from cmfsim.io.images import read_image_file
+from cmfsim.io.models import is_model_file
+from cmfsim.io.transforms import read_transform_file
+from cmfsim.meshing import anatomy_from_surfaces
+from cmfsim.surfaces.repair import repair_surface
+from cmfsim.values.anatomy import Anatomy, Finding
+from cmfsim.values.case_parts import CaseMesh, CaseMotion
+from cmfsim.values.scene import MovedSurface
+
+if TYPE_CHECKING:
+    from cmfsim.imaging import SegmentOptions
+
+__all__ = [
+    "case_key",
+    "check_output",
+    "input_hashes",
+    "motion_source",
+    "plan_key",
+    "read_anatomy",
+    "read_case_landmarks",
+    "read_motion",
+    "segment_options",
+]
+
+Progress = Callable[[str], None]
+
+# Voxels of the grid that surfaces are worked on, in edges of the mesh to come, and in mm at least.
+VOXELS_PER_EDGE = 3.0
+LEAST_VOXEL = 0.5
+# Bytes that are hashed at a time.
+CHUNK = 1 << 20
+
+
+def read_case_landmarks(case: Case) -> tuple[dict[str, Mapping[str, Floats]], tuple[Finding, ...]]:
+    """The landmarks of a case, "skull" and "skin", with what was noticed on reading them."""
+    landmarks: dict[str, Mapping[str, Floats]] = {}
+    findings: list[Finding] = []
+    for name in ("skull", "skin"):
+        path = getattr(case.landmarks, name)
+        if path is not None:
+            found = read_landmark_file(path, frame=case.landmarks.frame)
+            landmarks[name] = found.points
+            findings.extend(found.findings)
+    return landmarks, tuple(findings)
+
+
+def read_anatomy(
+    case: Case, landmarks: Mapping[str, Floats], progress: Progress
+) -> tuple[Anatomy, tuple[Finding, ...]]:
+    """The head of a case, from its CT or its surfaces."""
+    if case.image is not None:
+        # A case of surfaces loads nothing of imaging.
+        from cmfsim.imaging import segment_head  # noqa: PLC0415
+
+        progress("reading the image")
+        read = read_image_file(case.image.file, series=case.image.series)
+        anatomy = segment_head(
+            read.image,
+            segment_options(case),
+            landmarks=landmarks or None,
+            progress=lambda stage: progress(f"segmenting the head: {stage}"),
+        )
+        return anatomy, (*read.findings, *anatomy.findings)
+    given_surfaces = case.surfaces
+    if given_surfaces is None:  # a Case has the one or the other
+        raise AssertionError(case.name)
+    findings: list[Finding] = []
+    surfaces = {}
+    files = {"skin": given_surfaces.skin, **given_surfaces.bones}
+    for name, path in files.items():
+        progress(f"reading surface {name}")
+        surface = read_surface(path, units=given_surfaces.units, frame=given_surfaces.frame)
+        surfaces[name], mended = repair_surface(surface, name)
+        findings.extend(mended)
+    progress("measuring distances from the surfaces")
+    spacing = max(case.mesh.edge_length / VOXELS_PER_EDGE, LEAST_VOXEL)
+    skin = surfaces.pop("skin")
+    anatomy = anatomy_from_surfaces(skin, surfaces, spacing=spacing)
+    return anatomy, (*findings, *anatomy.findings)
+
+
+def segment_options(case: Case) -> SegmentOptions:
+    """How tissue is read from a CT of the case, before the operation or after it."""
+    from cmfsim.imaging import SegmentOptions  # noqa: PLC0415
+
+    if case.image is None:
+        return SegmentOptions()
+    given = {
+        name: getattr(case.image, name)
+        for name in (
+            "skin_threshold",
+            "bone_threshold",
+            "metal_threshold",
+            "working_spacing",
+            "rescale",
+        )
+        if getattr(case.image, name) is not None
+    }
+    return SegmentOptions(**given)
+
+
+def read_motion(case: Case, motion: CaseMotion) -> Floats | MovedSurface:
+    """How a segment moves, from its table and the files that this names."""
+    if motion.matrix is not None:
+        return motion.matrix
+    if motion.transform is not None:
+        return read_transform(motion.transform, direction=motion.direction, frame=motion.frame)
+    if motion.surface is None or motion.moved_surface is None:
+        return np.eye(4)
+    units, frame = ("mm", "LPS")
+    if case.surfaces is not None:
+        units, frame = case.surfaces.units, case.surfaces.frame
+    return read_moved_surface(motion.surface, motion.moved_surface, units=units, frame=frame)
+
+
+def motion_source(motion: CaseMotion) -> str:
+    """Where a motion comes from and how its transform file was understood, in words."""
+    if motion.transform is None:
+        return motion.source()
+    read = read_transform_file(motion.transform, direction=motion.direction, frame=motion.frame)
+    return motion.source(read.text)
+
+
+def input_hashes(case: Case) -> dict[str, str]:
+    """The SHA-256 of every file that a case names, by its path from the case's folder.
+
+    A file elsewhere counts by its name, the second of one name as "name (2)". The hash of a folder
+    is of the files in it.
+    """
+    return _hashes(_files(case), case.file.parent)
+
+
+def _hashes(paths: Iterable[Path], folder: Path) -> dict[str, str]:
+    found: dict[str, str] = {}
+    # In the order of their parts in the case, so that two files of one name are not exchanged.
+    for path in dict.fromkeys(paths):
+        name = key = _path_from(path, folder)
+        number = 1
+        while key in found:
+            number += 1
+            key = f"{name} ({number})"
+        found[key] = _sha256(path)
+    return dict(sorted(found.items()))
+
+
+def case_key(case: Case, hashes: Mapping[str, str] | None = None) -> str:
+    """The SHA-256 of everything that results of a case depend on: files, plan, options, version.
+
+    Results of one key may be shown together. Folders may be moved: paths count from the case's own,
+    and where the results go does not count.
+
+    Parameters
+    ----------
+    case : Case
+        Changes that were made to it in memory count as those in its file.
+    hashes : mapping of str to str, optional
+        Its `input_hashes`, where they are known already.
+
+    Raises
+    ------
+    OSError
+        A file that the case names cannot be read.
+    """
+    folder = case.file.parent
+    content = {
+        "inputs": dict(input_hashes(case) if hashes is None else hashes),
+        "case": {
+            field.name: _plain(getattr(case, field.name), folder)
+            for field in fields(case)
+            if field.name not in {"file", "output", "lines"}
+        },
+        "version": __version__,
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def plan_key(case: Case) -> str:
+    """The SHA-256 of what the numbers of a plan are about: image or surfaces, landmarks and cuts.
+
+    A plan of one key means the same for every case of that key, whatever its mesh, tissue, muscles
+    or own plan.
+
+    Raises
+    ------
+    OSError
+        A file that the case names cannot be read.
+    """
+    about = replace(
+        case, plan={}, achieved=False, muscles=None, postoperative=None, mesh=CaseMesh()
+    )
+    folder = case.file.parent
+    parts = ("image", "surfaces", "landmarks", "osteotomies")
+    content = {name: _plain(getattr(about, name), folder) for name in parts}
+    content["inputs"] = _hashes((p for p in _files(about) if p != case.file), folder)
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _plain(value: Any, folder: Path) -> Any:
+    """A value of a case as JSON holds it, so that equal values have equal texts."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name), folder) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(name): _plain(entry, folder) for name, entry in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist(), folder)
+    if isinstance(value, list | tuple | set | frozenset):
+        return [_plain(entry, folder) for entry in value]
+    if isinstance(value, Path):
+        return _path_from(value, folder)
+    if value is None or isinstance(value, str | int | float):
+        return value
+    raise TypeError(f"{type(value).__name__} in a case")  # no repr: it may hold an address
+
+
+def _path_from(path: Path, folder: Path) -> str:
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
+
+
+def check_output(case: Case, is_written: Callable[[str], bool] = is_model_file) -> None:
+    """Finds before the work what would keep results from being written, or spoil an input.
+
+    Parameters
+    ----------
+    case : Case
+    is_written : callable
+        Whether a file of a name is written: of a model where left out.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) The output folder is a file, a link that leads out of the case's folder,
+        or holds an input of a name that is written there.
+    OSError
+        It cannot be written to.
+    """
+    folder = case.output
+    check_below(folder, case.file.parent)
+    check_writable(folder)
+    for path in _files(case):
+        written = folder / path.name
+        if not is_written(path.name) or not path.exists() or not written.exists():
+            continue
+        if path.samefile(written):
+            raise CaseInputError(
+                f"{path}: the results would replace this input; give another output folder"
+            )
+
+
+def _files(case: Case) -> Iterator[Path]:
+    yield case.file
+    if case.image is not None:
+        yield case.image.file
+    if case.surfaces is not None:
+        yield case.surfaces.skin
+        yield from case.surfaces.bones.values()
+    optional = [case.landmarks.skull, case.landmarks.skin, case.mesh.parting, case.mesh.file]
+    if case.muscles is not None and isinstance(case.muscles.template, Path):
+        optional.append(case.muscles.template)
+    after = case.postoperative
+    if after is not None:
+        optional += [after.skin, after.image, after.landmarks, *after.bones.values()]
+    for motion in case.plan.values():
+        optional += [motion.transform, motion.surface, motion.moved_surface]
+    yield from (path for path in optional if path is not None)
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        if path.is_dir():
+            digest.update(f"{file.name}\n".encode())
+        with file.open("rb") as stream:
+            while chunk := stream.read(CHUNK):
+                digest.update(chunk)
+    return digest.hexdigest()

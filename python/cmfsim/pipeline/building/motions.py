@@ -1,0 +1,277 @@
+"""How the bone segments of a case move: as its plan says, and parted where a motion is torn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cmfsim.bones import part_segment
+from cmfsim.bones.motion import (
+    RemovedBone,
+    smooth_motion,
+    sound_motion,
+    torn_pieces,
+    without_removed,
+)
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError
+from cmfsim.io import Case, read_surface
+from cmfsim.pipeline.building.inputs import motion_source, read_motion
+from cmfsim.pipeline.building.postoperative import REFERENCES, Postoperative, read_postoperative
+from cmfsim.surfaces.repair import clean_surface
+from cmfsim.values.anatomy import BoneSegment, Finding
+from cmfsim.values.scene import MovedSurface, SurfaceData
+
+if TYPE_CHECKING:
+    from cmfsim.bones.achieved import AchievedPlan
+
+__all__ = ["PlannedBones", "planned_bones"]
+
+Motions = Mapping[str, Floats | MovedSurface]
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedBones:
+    """The bone segments of a case with their motions.
+
+    Attributes
+    ----------
+    segments : tuple of BoneSegment
+    motions : mapping of str to (4, 4) float64, mm, or MovedSurface
+        Of the segments that the plan moves.
+    findings : tuple of Finding
+    achieved : AchievedPlan or None
+        How they were found, where the plan is the achieved one and was searched for.
+    sources : mapping of str to str
+        Where each motion comes from and how it was understood, in words.
+    """
+
+    segments: tuple[BoneSegment, ...]
+    motions: Motions
+    findings: tuple[Finding, ...] = ()
+    achieved: AchievedPlan | None = None
+    sources: Mapping[str, str] = field(default_factory=dict)
+
+
+def planned_bones(
+    case: Case, segments: tuple[BoneSegment, ...], after: Postoperative | None = None
+) -> PlannedBones:
+    """The segments of a case with the motions that its plan, or the operation, gives them.
+
+    Parameters
+    ----------
+    case : Case
+    segments : tuple of BoneSegment
+        Cut already.
+    after : Postoperative, optional
+        What `read_postoperative` gives, where it is known already.
+
+    Raises
+    ------
+    CaseError, BoundaryError, RegistrationError
+        (also `ValueError`) A segment that there is not; a motion that cannot be read or meant.
+    """
+    known = [segment.name for segment in segments]
+    for name in case.plan:
+        if name not in known:
+            raise CaseInputError(
+                f"{case.where(f'plan.{name}')}: there is no segment {name!r}; segments are: "
+                f"{', '.join(known)}; an osteotomy makes others"
+            )
+    if case.achieved:
+        return _achieved_bones(case, segments, after or read_postoperative(case))
+    motions = {name: read_motion(case, motion) for name, motion in case.plan.items()}
+    planned = _with_motions(case, segments, motions)
+    return replace(
+        planned, sources={name: motion_source(motion) for name, motion in case.plan.items()}
+    )
+
+
+def _with_motions(
+    case: Case,
+    segments: tuple[BoneSegment, ...],
+    motions: Motions,
+    achieved: AchievedPlan | None = None,
+) -> PlannedBones:
+    findings: list[Finding] = []
+    parted: list[BoneSegment] = []
+    planned: dict[str, Floats | MovedSurface] = {}
+    for segment in segments:
+        motion = motions.get(segment.name)
+        if not isinstance(motion, MovedSurface):
+            parted.append(segment)
+            if motion is not None:
+                planned[segment.name] = motion
+            continue
+        pieces = _parted(case, segment, motion, findings)
+        for piece, its_own in pieces:
+            parted.append(piece)
+            kept = _without_removed(case, segment.name, piece.name, its_own, findings)
+            planned[piece.name] = _quiet(case, segment.name, piece.name, kept, findings)
+    return PlannedBones(tuple(parted), planned, tuple(findings), achieved)
+
+
+def _achieved_bones(
+    case: Case, segments: tuple[BoneSegment, ...], after: Postoperative
+) -> PlannedBones:
+    """The segments with the motions that the bones after the operation tell (paper 3, Figure 5).
+
+    A bone with the same triangles after says where each vertex went; any other segment is laid on
+    the bone of its name, or on all of them.
+    """
+    names = [segment.name for segment in segments]
+    by_vertex = {
+        name: moved
+        for name in names
+        if name in after.bones and (moved := _same_bone(case, name, after.bones[name])) is not None
+    }
+    searched = [segment for segment in segments if segment.name not in by_vertex]
+    reference = next((name for name in REFERENCES if name in names), None)
+    if searched and reference is not None and reference not in by_vertex:
+        if after.bones.keys() & {reference, "bone"}:
+            still = [s for s in searched if s.name == reference]
+        else:
+            # Nothing is known of it after the operation, in which it was not touched.
+            still, reference = [], None
+            searched = [s for s in searched if s.name not in REFERENCES]
+    else:
+        still, reference = [], None
+    unknown = [n for n in after.bones if n not in names and n not in _sources(case) and n != "bone"]
+    if unknown:
+        raise CaseInputError(
+            f"{case.where(f'postoperative.bones.{unknown[0]}')}: there is no bone or segment "
+            f"{unknown[0]!r}; use one of: {', '.join(names)}"
+        )
+    achieved: AchievedPlan | None = None
+    motions: dict[str, Floats | MovedSurface] = dict(by_vertex)
+    if searched:
+        bones = {name: clean_surface(surface) for name, surface in after.bones.items()}
+        whole = _joined(list(bones.values()))
+        from cmfsim.bones.achieved import achieved_plan  # noqa: PLC0415
+
+        achieved = achieved_plan(
+            {s.name: s for s in (*still, *(s for s in searched if s not in still))},
+            {s.name: bones.get(s.name, whole) for s in searched},
+            reference=reference,
+        )
+        motions |= {name: found for name, found in achieved.plan.items() if name != reference}
+    made = _with_motions(case, segments, motions, achieved)
+    noticed = [
+        _removed_finding(case, name, name, patch, "note")
+        for name, found in ({} if achieved is None else achieved.motions).items()
+        for patch in found.removed
+    ]
+    return replace(made, findings=(*made.findings, *noticed))
+
+
+def _sources(case: Case) -> tuple[str, ...]:
+    """Bones of the case, as they are called before they are cut."""
+    return ("cranium", "mandible", "skull") if case.surfaces is None else tuple(case.surfaces.bones)
+
+
+def _same_bone(case: Case, name: str, there: SurfaceData) -> MovedSurface | None:
+    """The motion of a bone whose surface has the same triangles before and after; else none."""
+    given = case.postoperative
+    before = None if case.surfaces is None else case.surfaces.bones.get(name)
+    if before is None or given is None or case.surfaces is None:
+        return None
+    here = read_surface(before, units=case.surfaces.units, frame=case.surfaces.frame)
+    same = len(np.asarray(here.vertices)) == len(np.asarray(there.vertices)) and np.array_equal(
+        np.asarray(here.triangles), np.asarray(there.triangles)
+    )
+    return MovedSurface(here, there.vertices) if same else None
+
+
+def _joined(surfaces: list[SurfaceData]) -> SurfaceData:
+    """Several surfaces as one."""
+    starts = np.cumsum([0, *(len(np.asarray(s.vertices)) for s in surfaces)])
+    return SurfaceData(
+        np.concatenate([np.asarray(s.vertices) for s in surfaces]),
+        np.concatenate(
+            [
+                np.asarray(s.triangles).astype(np.int64) + start
+                for s, start in zip(surfaces, starts[:-1], strict=True)
+            ]
+        ),
+    )
+
+
+def _parted(
+    case: Case, segment: BoneSegment, motion: MovedSurface, findings: list[Finding]
+) -> list[tuple[BoneSegment, MovedSurface]]:
+    """The pieces of a segment that moved apart, each with its motion."""
+    motion = sound_motion(motion)
+    pieces = torn_pieces(motion)
+    if len(pieces) == 1:
+        return [(segment, pieces[0])]
+    named = {_numbered(segment.name, n): piece for n, piece in enumerate(pieces)}
+    made = part_segment(segment, {name: piece.surface for name, piece in named.items()})
+    findings.append(
+        Finding(
+            "note",
+            "motion-torn",
+            f"{segment.name} moved as {len(made)} pieces: {', '.join(p.name for p in made)}",
+            case.where(_plan_key(case, segment.name)),
+            "between them neighbouring vertices moved apart by millimetres, so that the bone was "
+            "cut there: no tissue is joined to the gap, and each piece has its contact surface",
+            "look at the picture of the plan; nothing to do",
+        )
+    )
+    return [(piece, named[piece.name]) for piece in made]
+
+
+def _plan_key(case: Case, name: str) -> str:
+    return f"postoperative.bones.{name}" if case.achieved else f"plan.{name}"
+
+
+def _numbered(name: str, number: int) -> str:
+    return name if number == 0 else f"{name}_{number + 1}"
+
+
+def _without_removed(
+    case: Case, bone: str, name: str, motion: MovedSurface, findings: list[Finding]
+) -> MovedSurface:
+    """The motion in which removed bone moves nothing, and a finding for each patch of it."""
+    sound, removed = without_removed(motion)
+    findings += [_removed_finding(case, bone, name, patch, "warning") for patch in removed]
+    return sound
+
+
+def _removed_finding(
+    case: Case, bone: str, name: str, patch: RemovedBone, severity: str
+) -> Finding:
+    at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
+    used = "its vertices are not used" if severity == "warning" else "it had no say in the motion"
+    return Finding(
+        severity,
+        "bone-removed",
+        f"{patch.area:.0f} mm² of {name} about ({at}) mm are no longer there after the operation, "
+        f"by up to {patch.depth:.1f} mm: taken as removed bone, not as motion",
+        case.where(_plan_key(case, bone)),
+        "bone that is ground away does not pull the tissue over it: that tissue follows the rest "
+        f"of the segment; {used}",
+        "look at the bone there; if it was pushed in (fracture, impaction), give that part as a "
+        "bone of its own",
+    )
+
+
+def _quiet(
+    case: Case, bone: str, name: str, motion: MovedSurface, findings: list[Finding]
+) -> MovedSurface:
+    """The motion without the noise of a measurement, which is said."""
+    smooth, noise = smooth_motion(motion)
+    if smooth is not motion:
+        findings.append(
+            Finding(
+                "note",
+                "motion-noisy",
+                f"the vertices of {name} moved with {noise:.2f} mm of noise, which is averaged out",
+                case.where(_plan_key(case, bone)),
+                "bone does not bend from one vertex to the next; tissue would be crumpled on it",
+                "nothing to do",
+            )
+        )
+    return smooth

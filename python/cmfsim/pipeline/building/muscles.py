@@ -1,0 +1,93 @@
+"""The muscles of a patient: a template carried to the skull, and its share in each tet."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+
+from cmfsim._core import TetMesh
+from cmfsim.checks import Floats
+from cmfsim.errors import LandmarkInputError
+from cmfsim.muscles.equivalent import equivalent_material
+from cmfsim.muscles.template import MuscleTemplate
+from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.patient_model import PatientModel
+
+__all__ = ["with_muscles"]
+
+
+def with_muscles(
+    patient: PatientModel,
+    given: CaseMuscles,
+    *,
+    landmarks: Mapping[str, Floats] | None = None,
+    mesh: TetMesh | None = None,
+) -> PatientModel:
+    """The patient with a template's muscles and their equivalent material (paper 2.2, 2.3).
+
+    Parameters
+    ----------
+    patient : PatientModel
+    given : CaseMuscles
+    landmarks : mapping of str to (3,) float64, mm, optional
+        Instead of the patient's own skull landmarks, as for a trial of their error.
+    mesh : TetMesh, optional
+        That of the patient's scene, where the caller has it already.
+
+    Returns
+    -------
+    PatientModel
+
+    Raises
+    ------
+    LandmarkError
+        (also `ValueError`) The patient has no skull landmarks, or they do not fit the template's.
+    CaseError
+        (also `ValueError`) There is no such template.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> patient = cmfsim.with_muscles(patient, cmfsim.CaseMuscles())  # doctest: +SKIP
+    """
+    skull = patient.landmarks.get("skull") if landmarks is None else landmarks
+    if not skull:
+        raise LandmarkInputError(
+            f"{patient.name}: muscles are placed from skull landmarks, and the case has none: add "
+            "[landmarks] skull, or take a homogeneous model"
+        )
+    begun = time.perf_counter()
+    muscles = MuscleTemplate.load(given.template).morph(skull, smoothing=given.smoothing)
+    placed = time.perf_counter()
+    scene = patient.scene
+    mixture = equivalent_material(
+        TetMesh(scene.nodes, scene.tets) if mesh is None else mesh,
+        muscles,
+        preset=given.preset,
+        mixing=given.mixing,
+        samples=given.samples,
+        seed=given.seed,
+    )
+    timings = {
+        **patient.summary.get("timings", {}),
+        "placing the muscles": placed - begun,
+        "sampling the muscles": time.perf_counter() - placed,
+    }
+    # What the doctor found already has the line of the case.
+    known = {f.code for f in patient.findings} & {"template-landmarks-missing"}
+    more = [f for f in muscles.findings if f.code not in known]
+    findings = tuple(dict.fromkeys([*patient.findings, *more, *mixture.findings]))
+    summary = {
+        **patient.summary,
+        "timings": timings,
+        "findings": [asdict(finding) for finding in findings],
+        "muscles": {**asdict(given), "template": str(given.template), **mixture.summary},
+    }
+    return replace(
+        patient,
+        scene=replace(scene, tissue=mixture.tissue_data),
+        muscles=muscles,
+        fraction=mixture.fraction,
+        fibre=mixture.fibre,
+        findings=findings,
+        summary=summary,
+    )

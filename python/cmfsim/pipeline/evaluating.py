@@ -1,0 +1,211 @@
+"""One case by several models, compared with the face after the operation."""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.evaluation import NO_CHANGE, WHOLE, ModelComparison, compare_models
+from cmfsim.io import Case, CaseOrPath, as_case
+from cmfsim.io.metrics import EVALUATION_FILE
+from cmfsim.pipeline.building import Postoperative, case_key, read_postoperative
+from cmfsim.pipeline.predicting import named_models, predict_models
+from cmfsim.values.anatomy import Anatomy, Finding
+from cmfsim.values.finding_groups import grouped
+from cmfsim.values.prediction import MODELS, Prediction
+from cmfsim.values.scene import SurfaceData
+
+__all__ = ["EVALUATION_FILE", "CaseEvaluation", "evaluate", "evaluation_key"]
+
+Progress = Callable[[str], None]
+OnFindings = Callable[[Iterable[Finding]], None]
+WILCOXON_NOTE = (
+    "Wilcoxon's signed-rank test vertex by vertex, as the paper has it: neighbouring vertices are "
+    "not independent, so that its p values are far too small; look at the size of the difference."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class CaseEvaluation:
+    """How well models predict one patient.
+
+    Attributes
+    ----------
+    predictions : tuple of Prediction
+    postoperative : Postoperative
+    comparison : ModelComparison
+    key : str
+        Of everything that the result depends on: inputs, models, version.
+    failed : mapping of str to str
+        Why a model has no prediction, by its name.
+    """
+
+    predictions: tuple[Prediction, ...]
+    postoperative: Postoperative
+    comparison: ModelComparison
+    key: str
+    failed: Mapping[str, str] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON: errors by model and region, tests, key."""
+        errors = {name: self._of(name) for name in self.comparison.errors}
+        still = errors.pop(NO_CHANGE)
+        names = list(errors)
+        tests = {
+            f"{one}, {other}": self.comparison.wilcoxon(one, other).as_dict()
+            for i, one in enumerate(names)
+            for other in names[i + 1 :]
+        }
+        first = self.predictions[0]
+        timings = {
+            name: sum(p.summary["timings"].values())
+            for name, p in zip(names, self.predictions, strict=True)
+        }
+        return {
+            "case": first.name,
+            "key": self.key,
+            # That of the predictions: what is shown together must have the same.
+            "case_key": first.summary["case_key"],
+            "models": errors,
+            "failed": dict(self.failed),
+            "no_change": still,
+            "wilcoxon": tests,
+            "notes": [WILCOXON_NOTE] if tests else [],
+            "seconds": timings,
+            "findings": [asdict(finding) for finding in self.findings],
+            "warnings": self._warnings(),
+        }
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What was noticed of the face after the operation, and of the comparison with it."""
+        compared = [f for c in self.comparison.comparisons.values() for f in c.findings]
+        return tuple(dict.fromkeys([*self.postoperative.findings, *compared]))
+
+    def _warnings(self) -> list[str]:
+        """Errors and warnings of everything that led to the figures, one line for each kind."""
+        found = [finding for prediction in self.predictions for finding in prediction.findings]
+        groups = grouped([*found, *self.findings])
+        return [f"{g.severity}: {g.line}" for g in groups if g.severity != "note"]
+
+    def _of(self, name: str) -> dict[str, Any]:
+        comparison = self.comparison
+        by_region = {region: table[name] for region, table in comparison.regions.items()}
+        regions = {WHOLE: comparison.statistics[name], **by_region}
+        return {
+            "regions": {region: values.as_dict() for region, values in regions.items()},
+            "comparison": comparison.comparisons[name].as_dict(),
+        }
+
+
+def evaluate(
+    case: CaseOrPath,
+    models: str | Sequence[str] = MODELS,
+    *,
+    progress: Progress | None = None,
+    check: bool = True,
+    findings: Iterable[Finding] = (),
+    anatomy: Anatomy | None = None,
+    on_findings: OnFindings | None = None,
+) -> CaseEvaluation:
+    """The predictions of several models for a case, compared with what came after.
+
+    Errors are taken over the face where the case has skin landmarks before and after, else over
+    all of the skin (Kim et al. 2010, section 3.2).
+
+    Parameters
+    ----------
+    case : Case, or path of its file or folder
+        With [postoperative].
+    models : str or sequence of str
+    progress : callable, optional
+    check : bool
+    findings : iterable of Finding
+    anatomy : Anatomy, optional
+    on_findings : callable, optional
+        As for `predict_models`.
+
+    Returns
+    -------
+    CaseEvaluation
+
+    Raises
+    ------
+    CmfsimError
+        (also `ValueError` where the input is at fault) What a stage cannot work with; a model that
+        does not solve, where none of the others does.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> found = cmfsim.evaluate(cmfsim.Case.load("case.toml"), ["H", "M+S"])  # doctest: +SKIP
+    >>> found.comparison.statistics["M+S"].mean  # doctest: +SKIP
+    1.21
+    """
+    case, models = as_case(case), named_models(models)
+    if progress is not None:
+        progress("reading the face after the operation")
+    key = evaluation_key(case, models)
+    # First, for it fails at once where the case has none.
+    postoperative = read_postoperative(case)
+    if postoperative.skin is None:
+        raise CaseInputError(
+            f"{case.where('postoperative')}: there is no face to compare with: add skin or image"
+        )
+    failed: dict[str, CmfsimError] = {}
+    predictions = tuple(
+        predict_models(
+            case,
+            models,
+            progress=progress,
+            check=check,
+            findings=findings,
+            after=postoperative,
+            failed=failed,
+            anatomy=anatomy,
+            on_findings=on_findings,
+        )
+    )
+    if not predictions:
+        raise next(iter(failed.values()))
+    if progress is not None:
+        progress("comparing the faces")
+    comparison = _compare(predictions, postoperative.skin, postoperative.landmarks)
+    reasons = {model: str(error) for model, error in failed.items()}
+    found = CaseEvaluation(predictions, postoperative, comparison, key, reasons)
+    if on_findings is not None and found.findings:
+        on_findings(found.findings)
+    return found
+
+
+def _compare(
+    predictions: Sequence[Prediction], skin: SurfaceData, landmarks: Mapping[str, Floats]
+) -> ModelComparison:
+    before = predictions[0].skin_before
+    ours = predictions[0].patient.landmarks.get("skin", {})
+    both = bool(ours) and bool(landmarks)
+    moved = {p.model: np.asarray(p.skin.vertices) for p in predictions}
+    return compare_models(
+        before,
+        moved,
+        skin,
+        landmarks=(ours, landmarks) if both else None,
+        mask="face" if both else None,
+    )
+
+
+def evaluation_key(case: Case, models: Sequence[str]) -> str:
+    """The SHA-256 of everything that an evaluation depends on: inputs, models and version.
+
+    Raises
+    ------
+    OSError
+        A file that the case names cannot be read.
+    """
+    content = {"case": case_key(case), "models": sorted(models)}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

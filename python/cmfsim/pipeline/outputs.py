@@ -1,0 +1,385 @@
+"""What commands on cases write: predictions with pictures, errors, and the report of both.
+
+All files of a command take their places together at its end: whoever reads the folder finds the
+results of one run. What belongs to another plan, or to other inputs or another version, goes.
+"""
+
+import contextlib
+import json
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cmfsim.errors import CmfsimError
+from cmfsim.evaluation import error_table
+from cmfsim.io import replacing_files
+from cmfsim.io.metrics import (
+    EVALUATION_FILE,
+    REPORT_FILE,
+    read_evaluation,
+    read_evaluation_picture,
+)
+from cmfsim.io.predictions import (
+    fill_prediction,
+    is_prediction_file,
+    is_result_file,
+    predictions_of,
+    read_prediction,
+    read_prediction_picture,
+    stale_results,
+)
+from cmfsim.io.summaries import write_summary
+from cmfsim.muscles.template import joined_surface
+from cmfsim.pictures import (
+    chart_errors,
+    picture_distances,
+    picture_muscles,
+    picture_plan,
+    picture_prediction,
+)
+from cmfsim.pipeline.evaluating import CaseEvaluation
+from cmfsim.planning.page import PAGE_FILE, page_state
+from cmfsim.report import Figure, case_document, study_document, write_page
+from cmfsim.study import StudyReport
+from cmfsim.values.prediction import MODELS, Prediction
+
+__all__ = [
+    "WrittenPrediction",
+    "WrittenResults",
+    "write_case_report",
+    "write_results",
+    "write_study_report",
+]
+
+_log = logging.getLogger(__name__)
+
+# Pictures of a case's report, in the folder of its prediction and in its own.
+PREDICTION_PICTURES = ("prediction", "plan", "muscles")
+BOXES_CAPTION = (
+    "Sizes of the errors by region: quartiles, median, mean (diamond), whiskers to 1.5 boxes, and "
+    "beyond them each outlier, with their number above (as the paper's Figure 9)."
+)
+
+
+@dataclass(frozen=True)
+class WrittenPrediction:
+    """The files of a prediction, from the output folder, and its summary."""
+
+    place: str
+    files: list[str]
+    summary: Mapping[str, Any]
+
+
+@dataclass
+class WrittenResults:
+    """What was written to an output folder.
+
+    Attributes
+    ----------
+    predictions : list of WrittenPrediction
+        In the order in which they were solved.
+    files : list of str
+        Of a comparison, its report included.
+    report : str or None
+        The name of the report; none where none was made.
+    left_out : list of str
+        Files that were removed, since they belonged to something else.
+    """
+
+    predictions: list[WrittenPrediction] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)
+    report: str | None = None
+    left_out: list[str] = field(default_factory=list)
+
+
+def write_results(
+    output: Path,
+    predictions: Iterable[Prediction],
+    n_models: int,
+    *,
+    stage: Callable[[str], None],
+    evaluation: Callable[[], CaseEvaluation] | None = None,
+    with_report: bool = True,
+    pictures: Callable[[str], bool] = lambda _: True,
+) -> WrittenResults:
+    """What was written of predictions, their comparison and the report of both.
+
+    Parameters
+    ----------
+    output : Path
+        The case's output folder: predictions of several models lie in a folder for each.
+    predictions : iterable of Prediction
+        Written one by one, as each is solved.
+    n_models : int
+        That were asked for.
+    stage : callable
+        Called with the name of each stage as it begins.
+    evaluation : callable, optional
+        Gives the comparison, once the predictions are there.
+    with_report : bool
+    pictures : callable
+        Whether those of a model are drawn, by its name.
+
+    Raises
+    ------
+    CmfsimError, OSError
+        What a prediction or a file ends in; the folder is then as it was.
+    """
+    written = WrittenResults()
+
+    def fill(fresh: Path) -> list[str]:
+        for prediction in predictions:
+            stage(f"writing {prediction.model}")
+            place = "" if n_models == 1 else prediction.model
+            (fresh / place).mkdir(exist_ok=True)
+            draw = partial(_draw, prediction) if pictures(prediction.model) else None
+            names = fill_prediction(fresh / place, prediction, draw)
+            written.predictions.append(WrittenPrediction(place, names, prediction.summary))
+        key = written.predictions[0].summary["case_key"]
+        compared = None
+        if evaluation is not None:
+            stage("writing the comparison")
+            compared = _fill_evaluation(fresh, evaluation())
+            written.files = [*compared["files"], EVALUATION_FILE]
+        elif (output / EVALUATION_FILE).exists() and EVALUATION_FILE not in stale_results(
+            output, key
+        ):
+            compared = read_evaluation(output)
+        if with_report:
+            stage("writing the report")
+            written.report = _report_of(fresh, output, written, compared)
+        if evaluation is not None and written.report is not None:
+            written.files.append(written.report)
+        if evaluation is not None and compared is not None:
+            values = {**compared, "files": written.files}
+            sealed = [n for n in written.files if n not in {EVALUATION_FILE, REPORT_FILE}]
+            write_summary(fresh / EVALUATION_FILE, values, sealed)
+        own = [written.report] if written.report is not None else []
+        of_models = [f"{w.place}/{n}".lstrip("/") for w in written.predictions for n in w.files]
+        return list(dict.fromkeys([*of_models, *written.files, *own]))
+
+    def stale() -> list[str]:
+        key = written.predictions[0].summary["case_key"]
+        written.left_out = stale_results(output, key)
+        # Pictures of an earlier run that this one has not drawn, and a report that it has not made.
+        older = [REPORT_FILE]
+        for place in (entry.place for entry in written.predictions):
+            folder = output / place
+            if folder.is_dir() and (folder / "prediction.json").exists():
+                names = [path.name for path in folder.iterdir() if is_prediction_file(path.name)]
+                older += [f"{place}/{name}".lstrip("/") for name in names]
+        return [*written.left_out, *older]
+
+    # A comparison lists its files; those of predictions are found by their names.
+    summary = None if evaluation is None else EVALUATION_FILE
+    names = replacing_files(output, summary, is_result_file, fill, stale)
+    written.left_out = [name for name in written.left_out if name not in names]
+    if written.left_out:
+        _log.warning(
+            "%s: removed %d files of another plan, other inputs or another version: %s",
+            output,
+            len(written.left_out),
+            ", ".join(_statements(written.left_out)),
+        )
+        if EVALUATION_FILE in written.left_out:
+            _log.warning("the comparison belonged to another plan: run cmfsim evaluate again")
+    return written
+
+
+def _statements(names: Iterable[str]) -> list[str]:
+    """The files among some that state what the others are."""
+    names = list(names)
+    return [name for name in names if name.endswith((".json", ".html"))] or names
+
+
+def _draw(prediction: Prediction, folder: Path) -> list[str]:
+    drawn: list[str] = []
+    with _pictures():
+        for name, draw in _pictures_of(prediction):
+            draw(folder / name)
+            drawn.append(name)
+    return drawn
+
+
+def _pictures_of(prediction: Prediction) -> Iterator[tuple[str, Callable[[Path], None]]]:
+    yield "prediction.png", partial(picture_prediction, prediction=prediction)
+    yield "plan.png", partial(picture_plan, prediction=prediction)
+    if prediction.muscles is not None:
+        segments = prediction.patient.segments
+        yield (
+            "muscles.png",
+            partial(
+                picture_muscles,
+                musculature=prediction.muscles,
+                skull=joined_surface([segment.surface for segment in segments]),
+            ),
+        )
+
+
+@contextlib.contextmanager
+def _pictures() -> Iterator[None]:
+    """Lets results be written without pictures where these cannot be drawn, and reports it."""
+    try:
+        yield
+    except CmfsimError as error:
+        _log.warning("no more pictures: %s", error)
+
+
+def _fill_evaluation(fresh: Path, evaluation: CaseEvaluation) -> dict[str, Any]:
+    """The values of a comparison whose figures and pictures were written into a folder."""
+    comparison = evaluation.comparison
+    names = ["metrics.csv"]
+    table = error_table({evaluation.predictions[0].name: comparison})
+    (fresh / names[0]).write_text(table.csv(), encoding="utf-8")
+    with _pictures():
+        for prediction in evaluation.predictions:
+            model = prediction.model
+            found = comparison.comparisons[model]
+            picture_distances(
+                fresh / f"error-{model}.png",
+                prediction.skin,
+                found.field(len(prediction.skin_nodes)),
+                regions={name: s.signed_mean for name, s in found.regions.items()},
+            )
+            names.append(f"error-{model}.png")
+        chart_errors(fresh / "errors.png", _by_region(evaluation))
+        names.append("errors.png")
+    return {**evaluation.as_dict(), "files": names}
+
+
+def _by_region(evaluation: CaseEvaluation) -> dict[str, dict[str, Any]]:
+    """Errors of each model in each region."""
+    comparison = evaluation.comparison
+    parts: dict[str, Any] = {"whole": slice(None)}
+    vertices = next(iter(comparison.comparisons.values())).region_vertices
+    for region in comparison.regions:
+        parts[region] = np.isin(comparison.vertices, vertices[region])
+    return {
+        region: {model: errors[part] for model, errors in comparison.errors.items()}
+        for region, part in parts.items()
+    }
+
+
+def _report_of(
+    fresh: Path, output: Path, written: WrittenResults, evaluation: Mapping[str, Any] | None
+) -> str | None:
+    """The name of the report of what was just written, with the comparison that belongs to it."""
+    order = {model: number for number, model in enumerate(MODELS)}
+    entries = sorted(written.predictions, key=lambda entry: order[entry.summary["model"]])
+    found = {fresh / entry.place: read_prediction(fresh / entry.place) for entry in entries}
+    links = _links(output, found)
+    if evaluation is None:
+        return _write_report(fresh, replace(_document(found, None, {}), links=links))
+    new = "sha256" not in evaluation
+    figures = {
+        name: (fresh / name).read_bytes()
+        if new
+        else read_evaluation_picture(output, evaluation, name)
+        for name in evaluation["files"]
+        if name.endswith(".png")
+    }
+    return _write_report(fresh, replace(_document(found, evaluation, figures), links=links))
+
+
+def _links(folder: Path, found: Mapping[Path, Mapping[str, Any]]) -> dict[str, str]:
+    """The planning page of the folder, if it was made for the head and cuts of the predictions."""
+    state = page_state(folder / PAGE_FILE)
+    # Compared one by one: a file that was changed may hold anything there.
+    fits = state is not None and all(entry.get("plan_key") == state for entry in found.values())
+    return {"Planning page": PAGE_FILE} if fits else {}
+
+
+def write_case_report(folder: Path) -> str | None:
+    """The name of the report made of the results in a folder; none without Jinja2.
+
+    Raises
+    ------
+    FileNotFoundError, CaseError
+        As `predictions_of`: there is no prediction; some belong to different plans.
+    """
+    found = predictions_of(folder)
+    key = next(iter(found.values()))["case_key"]
+    evaluation, figures, left_out = None, {}, ""
+    if (folder / EVALUATION_FILE).exists():
+        evaluation = read_evaluation(folder)
+        if evaluation["case_key"] != key:
+            evaluation = None
+            left_out = (
+                f"the comparison of {EVALUATION_FILE} belongs to another plan, other inputs or "
+                "another version: left out; run cmfsim evaluate"
+            )
+            _log.warning("%s", left_out)
+    if evaluation is not None:
+        names = [name for name in evaluation["files"] if name.endswith(".png")]
+        figures = {name: read_evaluation_picture(folder, evaluation, name) for name in names}
+    document = _document(found, evaluation, figures, left_out)
+    return _write_report(folder, replace(document, links=_links(folder, found)))
+
+
+def _document(
+    found: Mapping[Path, Mapping[str, Any]],
+    evaluation: Mapping[str, Any] | None,
+    figures: Mapping[str, bytes],
+    left_out: str = "",
+) -> Any:
+    """The report of predictions in their places, with the pictures of the last that has some."""
+    pictures: dict[str, bytes] = {}
+    shown = ""
+    for place, summary in found.items():
+        drawn = {
+            name: image
+            for name in PREDICTION_PICTURES
+            if (image := read_prediction_picture(place, summary, f"{name}.png")) is not None
+        }
+        if drawn or not pictures:
+            pictures, shown = drawn, summary["model"]
+    shown_figures = []
+    # The box plot first: it shows all models together.
+    for name in sorted(figures, key=lambda name: name != "errors.png"):
+        model = name.removeprefix("error-").removesuffix(".png")
+        caption = BOXES_CAPTION if name == "errors.png" else _error_caption(model)
+        shown_figures.append(Figure(figures[name], caption))
+    return case_document(
+        list(found.values()),
+        shown=shown,
+        evaluation=evaluation,
+        pictures=pictures,
+        figures=shown_figures,
+        left_out=left_out,
+    )
+
+
+def _error_caption(model: str) -> str:
+    return (
+        f"Model {model}: signed distance from the face after the operation, −5 to 5 mm; blue where "
+        "the prediction lies behind it, grey where nothing was evaluated (the paper's Figure 10)."
+    )
+
+
+def write_study_report(report: StudyReport) -> list[str]:
+    """The names of the files of a study: its table as JSON and its report."""
+    folder, names = report.cohort.output, ["study.json"]
+    text = json.dumps(report.as_dict(), indent=1, allow_nan=False)
+
+    def fill(fresh: Path) -> list[str]:
+        (fresh / "study.json").write_text(text + "\n", encoding="utf-8")
+        if _write_report(fresh, study_document(report.as_dict())) is not None:
+            return [*names, REPORT_FILE]
+        return names
+
+    ours = {"study.json", REPORT_FILE}
+    return replacing_files(folder, None, ours.__contains__, fill, lambda: [*ours])
+
+
+def _write_report(folder: Path, document: Any) -> str | None:
+    try:
+        write_page(folder / REPORT_FILE, document)
+    except CmfsimError as error:
+        _log.warning("no report: %s", error)
+        return None
+    return REPORT_FILE

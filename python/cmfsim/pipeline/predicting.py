@@ -1,0 +1,205 @@
+"""One case from its files to the predicted face."""
+
+import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+
+from cmfsim.checks import check_one_of
+from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
+from cmfsim.io import Case, CaseOrPath, as_case
+from cmfsim.pipeline.building import Postoperative, build_model, case_key, input_hashes, plan_key
+from cmfsim.solving.models import predict_patient
+from cmfsim.values.anatomy import Anatomy, Finding
+from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.prediction import MODELS, Prediction
+
+__all__ = ["build_patient", "case_for_models", "named_models", "predict", "predict_models"]
+
+_log = logging.getLogger(__name__)
+
+Progress = Callable[[str], None]
+OnFindings = Callable[[Iterable[Finding]], None]
+
+
+def predict(
+    case: CaseOrPath, *, model: str = "M+S", progress: Progress | None = None, check: bool = True
+) -> Prediction:
+    """The face that a model predicts for a case; nothing is written.
+
+    Models with muscles take the case's template, or the package's own where the case names none.
+
+    Parameters
+    ----------
+    case : Case, or path of its file or folder
+    model : str
+        "H", "M", "H+S" or "M+S" (Kim et al. 2010, section 3.2): homogeneous or with muscles,
+        without or with sliding at teeth and mucosa.
+    progress : callable, optional
+        Called with the name of each stage as it begins.
+    check : bool
+        Whether the doctor looks at the case first; an error that it finds ends the work.
+
+    Returns
+    -------
+    Prediction
+
+    Raises
+    ------
+    CmfsimError
+        (also `ValueError` where the input is at fault) What a stage cannot work with.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> prediction = cmfsim.predict(cmfsim.Case.load("case.toml"), model="M+S")  # doctest: +SKIP
+    >>> prediction.skin.vertices.shape  # doctest: +SKIP
+    (19840, 3)
+    """
+    return next(predict_models(case, model, progress=progress, check=check))
+
+
+def predict_models(
+    case: CaseOrPath,
+    models: str | Sequence[str] = MODELS,
+    *,
+    progress: Progress | None = None,
+    check: bool = True,
+    findings: Iterable[Finding] = (),
+    anatomy: Anatomy | None = None,
+    after: Postoperative | None = None,
+    failed: dict[str, CmfsimError] | None = None,
+    on_findings: OnFindings | None = None,
+) -> Iterator[Prediction]:
+    """The predictions of several models for one case, which is built once.
+
+    Parameters
+    ----------
+    case : Case, or path of its file or folder
+    models : str or sequence of str
+    progress : callable, optional
+    check : bool
+        As for `predict`.
+    findings : iterable of Finding
+        What is known of the case already.
+    anatomy : Anatomy, optional
+        The head, where it is known; the image or surfaces of the case are then not read.
+    after : Postoperative, optional
+        What is known after the operation, where that was read already.
+    failed : dict, optional
+        Where given, a model whose solution does not come about (contact that does not settle, say)
+        is put there with its error, and the others go on.
+    on_findings : callable, optional
+        Called with new findings as the stages of building and each solution notice them.
+
+    Yields
+    ------
+    Prediction
+        One by one, as each is solved.
+
+    Raises
+    ------
+    CmfsimError
+        As `predict`.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> for prediction in cmfsim.predict_models(case, ["H", "M+S"]):  # doctest: +SKIP
+    ...     print(prediction.model, prediction.result.summary["residual"])
+    """
+    models = named_models(models)
+    patient = build_patient(
+        case,
+        models,
+        progress=progress,
+        check=check,
+        findings=findings,
+        anatomy=anatomy,
+        after=after,
+        on_findings=on_findings,
+    )
+    known = set(patient.findings)
+    for model in models:
+        if progress is not None:
+            progress(f"solving {model}")
+        try:
+            prediction = predict_patient(patient, model)
+        except (ContactError, SolverError) as error:
+            if failed is None:
+                raise
+            _log.warning("model %s: %s", model, error)
+            failed[model] = error
+        else:
+            new = [finding for finding in prediction.findings if finding not in known]
+            if new and on_findings is not None:
+                on_findings(new)
+            known.update(new)
+            yield prediction
+
+
+def named_models(models: str | Sequence[str]) -> tuple[str, ...]:
+    """Models by name, each once, in the order given.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) None, or another name: with the one that was meant, it seems.
+    """
+    named = (models,) if isinstance(models, str) else tuple(dict.fromkeys(models))
+    if not named:
+        raise CaseInputError(f"no model is named: give one or more of {', '.join(MODELS)}")
+    for model in named:
+        meant = model.strip().upper() if isinstance(model, str) else None
+        if model not in MODELS and meant in MODELS:
+            raise CaseInputError(f"model is {model!r}: did you mean {meant!r}?")
+        check_one_of("model", model, MODELS)
+    return named
+
+
+def case_for_models(case: Case, models: Sequence[str]) -> Case:
+    """The case as models need it: with muscles, if one of them has muscles, and only then."""
+    if not any(model.startswith("M") for model in models):
+        return replace(case, muscles=None)
+    return case if case.muscles is not None else replace(case, muscles=CaseMuscles())
+
+
+def build_patient(
+    case: CaseOrPath,
+    models: Sequence[str],
+    *,
+    progress: Progress | None = None,
+    check: bool = True,
+    findings: Iterable[Finding] = (),
+    anatomy: Anatomy | None = None,
+    after: Postoperative | None = None,
+    on_findings: OnFindings | None = None,
+) -> PatientModel:
+    """The patient as models need it: muscles are placed if one of them has muscles.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A file of the case changed while the work went on.
+    """
+    case = as_case(case)
+    # Before the files are read: the key must be that of what is built.
+    hashes = input_hashes(case)
+    key, about = case_key(case, hashes), plan_key(case)
+    patient = build_model(
+        case_for_models(case, models),
+        progress=progress,
+        check=check,
+        findings=findings,
+        anatomy=anatomy,
+        after=after,
+        on_findings=on_findings,
+    )
+    if on_findings is not None:
+        on_findings(patient.findings)
+    for name, found in patient.summary["inputs"].items():
+        if hashes.get(name, found) != found:
+            raise CaseInputError(
+                f"{name}: changed while the case was worked on; run it again once nothing writes it"
+            )
+    return replace(patient, summary={**patient.summary, "inputs_key": key, "plan_key": about})

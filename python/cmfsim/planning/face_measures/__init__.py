@@ -1,0 +1,18 @@
+"""Measures that surgeons take of a face: angles and distances between named sites."""
+
+from cmfsim.planning.face_measures.definitions import FORMULAS, MEASURES, Measure, measure_sites
+from cmfsim.planning.face_measures.profile import MidlineProfile, midline_profile
+from cmfsim.planning.face_measures.sites import BoneSite, FaceSites, face_sites, measure_face
+
+__all__ = [
+    "FORMULAS",
+    "MEASURES",
+    "BoneSite",
+    "FaceSites",
+    "Measure",
+    "MidlineProfile",
+    "face_sites",
+    "measure_face",
+    "measure_sites",
+    "midline_profile",
+]

@@ -1,0 +1,329 @@
+"""The sites that a face is measured at: landmarks as given, and others found on its profile.
+
+What a case gives is taken. Sites that it does not give are found once, on the profile before the
+operation, by their definitions (Farkas 1994; Legan and Burstone 1980), and then move with the skin:
+they are points of the tissue, not found again on the moved face.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cmfsim.checks import Floats
+from cmfsim.errors import LandmarkInputError
+from cmfsim.planning.face_measures.definitions import MEASURES, measure_sites
+from cmfsim.planning.face_measures.profile import midline_profile
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.landmark_sites import label_key
+from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.prediction import Prediction
+
+__all__ = ["BoneSite", "FaceSites", "face_sites", "measure_face"]
+
+UPPER_INCISOR = "upper_incisor"
+# Segments that may bear the upper teeth, the smallest first.
+UPPER_BEARERS = ("maxilla", "midface", "cranium", "skull")
+# Glabella lies this far above nasion, mm.
+GLABELLA = (8.0, 35.0)
+# Menton lies at most this far behind pogonion, mm; the throat is looked for this far below it.
+MENTON_BEHIND = 25.0
+THROAT_BELOW = 45.0
+# The throat must be followed at least so far below menton to have an angle, mm.
+LEAST_THROAT = 20.0
+# How far from supradentale the edge of an incisor lies, mm: to the side, in depth, and below.
+INCISOR_SIDE, INCISOR_DEPTH, INCISOR_BELOW = 5.0, 9.0, 14.0
+# The edge of a lip is its furthest point towards the other lip; what lies deeper counts for less by
+# this share of its depth, so that it is not sought inside the mouth.
+LIP_DEPTH = 0.5
+# Lips whose edges are nearer than this, mm, are closed: the skin is one there, and cannot open.
+LEAST_GAP = 0.3
+# An incisor whose edge is not this far below the bone's edge is none, mm.
+LEAST_CROWN = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class BoneSite:
+    """A site on bone or teeth.
+
+    Attributes
+    ----------
+    place : (3,) float64, mm
+        Before the operation.
+    segment : str
+        The segment that it moves with.
+    """
+
+    place: Floats
+    segment: str
+
+
+@dataclass(frozen=True, eq=False)
+class FaceSites:
+    """The sites of one face, before the operation.
+
+    Attributes
+    ----------
+    skin : mapping of str to (3,) float64, mm
+    bone : mapping of str to BoneSite
+    absent : mapping of str to str
+        Sites that measures need and that are not known, with the reason.
+    found : tuple of str
+        Those that were found on the profile or the bone, not given by the case.
+    """
+
+    skin: Mapping[str, Floats]
+    bone: Mapping[str, BoneSite]
+    absent: Mapping[str, str]
+    found: tuple[str, ...]
+
+    def why_absent(self, sites: tuple[str, ...]) -> str:
+        """Why a measure of these sites cannot be taken; empty where it can."""
+        reasons: dict[str, list[str]] = {}
+        for name in sites:
+            if name in self.absent:
+                reasons.setdefault(self.absent[name], []).append(name.replace("_", " "))
+        return "; ".join(
+            f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} absent: {why}"
+            for why, names in reasons.items()
+        )
+
+
+def face_sites(patient: PatientModel) -> FaceSites:
+    """The sites of a patient's face before the operation.
+
+    Parameters
+    ----------
+    patient : PatientModel
+        Its skin landmarks are taken by name; those of `MEASURES` that they lack are found on the
+        midline profile where that is possible.
+
+    Returns
+    -------
+    FaceSites
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> sites = cmfsim.face_sites(patient)  # doctest: +SKIP
+    >>> sites.skin["columella"]  # doctest: +SKIP
+    """
+    needed = dict.fromkeys(name for measure in MEASURES for name in measure.sites)
+    keys = {label_key(name): name for name in needed}
+    given = {
+        keys.get(label_key(name), name): np.asarray(place, dtype=np.float64)
+        for name, place in patient.landmarks.get("skin", {}).items()
+    }
+    skin = {name: given[name] for name in needed if name in given}
+    absent: dict[str, str] = {}
+    bone: dict[str, BoneSite] = {}
+    on_profile = [name for name in needed if name not in skin and name in _FINDERS]
+    try:
+        profile = midline_profile(patient.face or patient.skin, given).points
+    except LandmarkInputError as error:
+        absent.update(dict.fromkeys(on_profile, str(error)))
+    else:
+        for name in on_profile:
+            try:
+                skin[name] = _FINDERS[name](profile, {**given, **skin})
+            except LandmarkInputError as error:
+                absent[name] = str(error)
+    found = [name for name in on_profile if name in skin]
+    try:
+        bone[UPPER_INCISOR] = _upper_incisor(patient)
+        found.append(UPPER_INCISOR)
+    except LandmarkInputError as error:
+        absent[UPPER_INCISOR] = str(error)
+    for name in needed:
+        if name not in skin and name not in bone:
+            absent.setdefault(name, "the case gives no such skin landmark")
+    return FaceSites(skin, bone, absent, tuple(found))
+
+
+def measure_face(prediction: Prediction, sites: FaceSites | None = None) -> dict[str, float | None]:
+    """The measures of a predicted face; None where a site is absent.
+
+    Parameters
+    ----------
+    prediction : Prediction
+    sites : FaceSites, optional
+        Those of its patient, where they are known already.
+
+    Returns
+    -------
+    dict of str to float or None
+        By `Measure.key`, mm or degrees.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.measure_face(prediction)["nasolabial_angle"]  # doctest: +SKIP
+    104.2
+    """
+    sites = sites or face_sites(prediction.patient)
+    names = list(sites.skin)
+    places: dict[str, Floats] = {}
+    if names:
+        before = np.array([sites.skin[name] for name in names])
+        places.update(zip(names, before + prediction.carried(before), strict=True))
+    for name, site in sites.bone.items():
+        motion = np.asarray(prediction.scene.plan.get(site.segment, np.eye(4)), dtype=np.float64)
+        if motion.shape == (4, 4):
+            places[name] = motion[:3, :3] @ site.place + motion[:3, 3]
+    return measure_sites(places)
+
+
+def _at(profile: Floats, known: Mapping[str, Floats], name: str) -> int:
+    """The point of the profile nearest to a landmark."""
+    if name not in known:
+        raise LandmarkInputError(f"it is found from {name}, which the case does not give")
+    return int(np.argmin(np.linalg.norm(profile - known[name], axis=1)))
+
+
+def _between(profile: Floats, known: Mapping[str, Floats], upper: str, lower: str) -> Floats:
+    """The stretch of the profile from one landmark down to another."""
+    first, last = _at(profile, known, upper), _at(profile, known, lower)
+    if last - first < 2:
+        raise LandmarkInputError(f"{upper} does not lie above {lower} on the profile")
+    return profile[first : last + 1]
+
+
+def _glabella(profile: Floats, known: Mapping[str, Floats]) -> Floats:
+    above = profile[:, 2] - profile[_at(profile, known, "nasion"), 2]
+    part = profile[(above >= GLABELLA[0]) & (above <= GLABELLA[1])]
+    if not len(part):
+        raise LandmarkInputError("the skin ends too near above nasion")
+    return np.asarray(part[np.argmin(part[:, 1])])
+
+
+def _columella(profile: Floats, known: Mapping[str, Floats]) -> Floats:
+    """Half-way along the profile from pronasale to subnasale."""
+    part = _between(profile, known, "pronasale", "subnasale")
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(part, axis=0), axis=1))])
+    return np.array([np.interp(0.5 * way[-1], way, part[:, axis]) for axis in range(3)])
+
+
+def _lips(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+    """The profile of the upper and of the lower lip, divided where it lies deepest between them."""
+    part = _between(profile, known, "labiale_superius", "labiale_inferius")
+    deepest = _deepest(part)
+    if not 0 < deepest < len(part) - 1:
+        raise LandmarkInputError("the profile shows no cleft between the lips")
+    return part[: deepest + 1], part[deepest:]
+
+
+def _deepest(part: Floats) -> int:
+    """The point of a stretch that lies furthest behind, or above, the line between its ends."""
+    (dy, dz) = (part[-1] - part[0])[1:]
+    away = part - part[0]
+    return int(np.argmax(away[:, 2] * dy - away[:, 1] * dz))
+
+
+def _stomion_superius(profile: Floats, known: Mapping[str, Floats]) -> Floats:
+    upper, _ = _lips(profile, known)
+    return np.asarray(upper[np.argmin(upper[:, 2] + LIP_DEPTH * upper[:, 1])])
+
+
+def _stomion_inferius(profile: Floats, known: Mapping[str, Floats]) -> Floats:
+    _, lower = _lips(profile, known)
+    return np.asarray(lower[np.argmax(lower[:, 2] - LIP_DEPTH * lower[:, 1])])
+
+
+def _open(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+    """The edges of lips that are apart."""
+    upper, lower = _stomion_superius(profile, known), _stomion_inferius(profile, known)
+    if np.linalg.norm(upper - lower) < LEAST_GAP:
+        raise LandmarkInputError("the lips are closed, and their tissue is one in this model")
+    return upper, lower
+
+
+def _upper_lip_edge(profile: Floats, known: Mapping[str, Floats]) -> Floats:
+    return _open(profile, known)[0]
+
+
+def _lower_lip_edge(profile: Floats, known: Mapping[str, Floats]) -> Floats:
+    return _open(profile, known)[1]
+
+
+def _sublabiale(profile: Floats, known: Mapping[str, Floats]) -> Floats:
+    """The point between lower lip and chin that lies furthest behind the line between them."""
+    part = _between(profile, known, "labiale_inferius", "pogonion")
+    deepest = _deepest(part)
+    if not 0 < deepest < len(part) - 1:
+        raise LandmarkInputError("the profile has no fold between lower lip and chin")
+    return np.asarray(part[deepest])
+
+
+def _below_pogonion(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, int]:
+    """The profile from pogonion on, and where on it menton is: its lowest point under the chin."""
+    part = profile[_at(profile, known, "pogonion") :]
+    under = np.flatnonzero(part[:, 1] <= part[0, 1] + MENTON_BEHIND)
+    # Up to where the profile first leaves the chin.
+    under = under[: int(np.argmax(np.diff(under, append=len(part) + 1) > 1)) + 1]
+    lowest = int(under[np.argmin(part[under, 2])])
+    if lowest in (0, len(part) - 1):
+        raise LandmarkInputError("the skin ends at the chin")
+    return part, lowest
+
+
+def _menton(profile: Floats, known: Mapping[str, Floats]) -> Floats:
+    part, lowest = _below_pogonion(profile, known)
+    return np.asarray(part[lowest])
+
+
+def _cervical_point(profile: Floats, known: Mapping[str, Floats]) -> Floats:
+    """Between chin and neck, the point furthest above the line from one to the other."""
+    part, lowest = _below_pogonion(profile, known)
+    throat = part[lowest:]
+    throat = throat[throat[:, 2] >= throat[0, 2] - THROAT_BELOW]
+    if throat[0, 2] - throat[:, 2].min() < LEAST_THROAT:
+        raise LandmarkInputError(
+            f"the skin is not shown {LEAST_THROAT:g} mm below menton, down the neck"
+        )
+    corner = _deepest(throat)
+    if not 0 < corner < len(throat) - 1:
+        raise LandmarkInputError("chin and neck have no angle between them")
+    return np.asarray(throat[corner])
+
+
+_FINDERS: Mapping[str, Callable[[Floats, Mapping[str, Floats]], Floats]] = {
+    "glabella": _glabella,
+    "columella": _columella,
+    "stomion_superius": _stomion_superius,
+    "stomion_inferius": _stomion_inferius,
+    "upper_lip_edge": _upper_lip_edge,
+    "lower_lip_edge": _lower_lip_edge,
+    "sublabiale": _sublabiale,
+    "menton": _menton,
+    "cervical_point": _cervical_point,
+}
+
+
+def _upper_incisor(patient: PatientModel) -> BoneSite:
+    """The edge of the upper central incisors: the lowest point of the bone below supradentale."""
+    skull = patient.landmarks.get("skull", {})
+    if "supradentale" not in skull:
+        raise LandmarkInputError("the case gives no skull landmark supradentale")
+    root = np.asarray(skull["supradentale"], dtype=np.float64)
+    bearer = _upper_bearer(patient.segments)
+    vertices = np.asarray(bearer.surface.vertices)
+    away = vertices - root
+    near = vertices[
+        (np.abs(away[:, 0]) <= INCISOR_SIDE)
+        & (np.abs(away[:, 1]) <= INCISOR_DEPTH)
+        & (away[:, 2] <= 0.0)
+        & (away[:, 2] >= -INCISOR_BELOW)
+    ]
+    if not len(near) or root[2] - near[:, 2].min() < LEAST_CROWN:
+        raise LandmarkInputError(
+            f"the surface of {bearer.name} shows no incisor below supradentale"
+        )
+    return BoneSite(np.asarray(near[np.argmin(near[:, 2])]), bearer.name)
+
+
+def _upper_bearer(segments: tuple[BoneSegment, ...]) -> BoneSegment:
+    by_name = {segment.name: segment for segment in segments}
+    for name in UPPER_BEARERS:
+        if name in by_name:
+            return by_name[name]
+    raise LandmarkInputError("no segment is known to bear the upper teeth")

@@ -1,0 +1,14 @@
+"""Planning from the face: the bone moves that come nearest to a face that is wished for."""
+
+from cmfsim.planning.face_planning.planning import FacePlan, FaceSearch, plan_for_face
+from cmfsim.planning.face_planning.targets import MeasureTarget, PointTarget, SurfaceTarget, Target
+
+__all__ = [
+    "FacePlan",
+    "FaceSearch",
+    "MeasureTarget",
+    "PointTarget",
+    "SurfaceTarget",
+    "Target",
+    "plan_for_face",
+]

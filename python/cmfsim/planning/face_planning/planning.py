@@ -1,0 +1,290 @@
+"""The plan whose face comes nearest to a target: Gauss-Newton over the plan operator.
+
+The unknowns are surgeons' numbers of each segment: forwards, up and left at its point, pitch, yaw
+and roll. Targets, and a prior that prefers small moves, give residuals in standard deviations; the
+inverse of their normal matrix is the covariance of the numbers. The result is solved exactly once.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.checks import Floats, as_positive
+from cmfsim.errors import CaseInputError
+from cmfsim.planning.face_planning.search import bounded_least_squares
+from cmfsim.planning.face_planning.targets import CarriedPoints, Target, Wish, wish_of
+from cmfsim.planning.replanning import PlanningModel
+from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion, planned_motion
+from cmfsim.values.prediction import Prediction
+
+__all__ = ["NUMBERS", "FacePlan", "FaceSearch", "plan_for_face"]
+
+# The numbers of a segment, in their order: mm and degrees.
+NUMBERS = ("forwards", "up", "left", "pitch", "yaw", "roll")
+# A number within this of a bound is held by it, mm or degrees.
+AT_BOUND = 1e-6
+# Standard deviation of what nothing determines, mm or degrees; and the share of what the prior
+# alone allows, from which on a number counts as open.
+OPEN, OPEN_SHARE = 1e3, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class FaceSearch:
+    """How a plan is searched for.
+
+    Attributes
+    ----------
+    segments : sequence of str or None
+        Those that may move; those that the reference moves if left out.
+    follows : mapping of str to str
+        Segments that keep their place to another one: {"mandible_body": "maxilla"} keeps the final
+        bite of the reference plan.
+    shift, turn : float, mm and degrees
+        Bounds of every number, to either side of no movement.
+    prior_shift, prior_turn : float or None, mm and degrees
+        Standard deviations of a prior about no movement; None for no prior.
+    steps : int
+        At most so many steps.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A bound, deviation or count that is not above 0.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> search = cmfsim.FaceSearch(follows={"mandible_body": "maxilla"}, shift=10.0)
+    >>> search.prior_turn
+    20.0
+    """
+
+    segments: Sequence[str] | None = None
+    follows: Mapping[str, str] = field(default_factory=dict)
+    shift: float = 15.0
+    turn: float = 15.0
+    prior_shift: float | None = 20.0
+    prior_turn: float | None = 20.0
+    steps: int = 50
+
+    def __post_init__(self) -> None:
+        for name in ("shift", "turn", "steps"):
+            as_positive(name, getattr(self, name))
+        for name in ("prior_shift", "prior_turn"):
+            if getattr(self, name) is not None:
+                as_positive(name, getattr(self, name))
+
+
+@dataclass(frozen=True, eq=False)
+class FacePlan:
+    """A plan that was found for a face.
+
+    Attributes
+    ----------
+    plan : mapping of str to (4, 4) float64, mm
+        Of every segment.
+    motions : mapping of str to ClinicalMotion
+        Of those that were free, in words and numbers.
+    std : mapping of str to (6,) float64
+        What targets and prior leave open of each number of `NUMBERS`, as standard deviations, mm
+        and degrees; 0 where a bound holds it.
+    covariance : (6 s, 6 s) float64
+        Of the numbers of the free segments, one after the other; 0 where a bound holds one.
+    undetermined : tuple of str
+        Numbers that the targets leave open: with them the standard deviation is more than half of
+        what the prior alone allows, or there is no prior and nothing else fixes the number.
+    at_bounds : tuple of str
+        Numbers that a bound holds.
+    residuals : tuple of (m,) float64
+        Of each target, in its standard deviations, by the plan operator.
+    exact : Prediction or None
+        The exact solution of the plan.
+    exact_residuals : tuple of (m,) float64
+        As `residuals`, of the exact solution; empty where it was not asked for.
+    steps : int
+    converged : bool
+    """
+
+    plan: Mapping[str, Floats]
+    motions: Mapping[str, ClinicalMotion]
+    std: Mapping[str, Floats]
+    covariance: Floats
+    undetermined: tuple[str, ...]
+    at_bounds: tuple[str, ...]
+    residuals: tuple[Floats, ...]
+    exact: Prediction | None
+    exact_residuals: tuple[Floats, ...]
+    steps: int
+    converged: bool
+
+
+def plan_for_face(
+    planning: PlanningModel,
+    targets: Sequence[Target],
+    search: FaceSearch | None = None,
+    *,
+    exact: bool = True,
+) -> FacePlan:
+    """The plan whose face comes nearest to targets.
+
+    Parameters
+    ----------
+    planning : PlanningModel
+    targets : sequence of PointTarget, MeasureTarget and SurfaceTarget
+    search : FaceSearch, optional
+    exact : bool
+        Whether the plan is solved exactly in the end, contact included.
+
+    Returns
+    -------
+    FacePlan
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) No target; a segment that the patient does not have, or that follows one
+        which itself follows; a target that no plan moves.
+    ContactError, SolverError
+        The plan that was found cannot be solved.
+
+    Notes
+    -----
+    The search uses the plan operator: where tissue slides, its error away from the reference
+    (`expected_error`) is an error of the plan as well; `exact_residuals` shows it.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> wish = [cmfsim.MeasureTarget("nasolabial_angle", 105.0)]
+    >>> found = cmfsim.plan_for_face(planning, wish)  # doctest: +SKIP
+    >>> found.motions["maxilla"].text  # doctest: +SKIP
+    '3.1 mm forwards, 0.4 mm down at the upper incisors (supradentale)'
+    """
+    search = search or FaceSearch()
+    if not targets:
+        raise CaseInputError("there is no target: give points, measures or a surface")
+    space = _Space(planning, search)
+    wishes = [wish_of(planning, target) for target in targets]
+    points = np.concatenate([wish.points for wish in wishes])
+    carried = CarriedPoints(planning, points) if len(points) else None
+    prior = _prior(search, len(space.free))
+
+    def residuals(numbers: Floats) -> Floats:
+        plan = space.plan(numbers)
+        places = points + carried.displacements(plan) if carried else points
+        return np.concatenate([*_rows(wishes, places, plan), numbers * prior])
+
+    bound = np.tile([search.shift] * 3 + [search.turn] * 3, len(space.free)).astype(np.float64)
+    found = bounded_least_squares(
+        residuals, space.numbers_of_reference(), -bound, bound, steps=search.steps
+    )
+    plan = space.plan(found.x)
+    solved, exact_rows = None, tuple[Floats, ...]()
+    if exact:
+        solved = planning.solve(plan)
+        places = points + solved.carried(points) if len(points) else points
+        exact_rows = _rows(wishes, places, plan)
+    held = np.abs(found.x) >= bound - AT_BOUND
+    covariance, undetermined = _covariance(found.jacobian, prior, held)
+    stds = np.sqrt(np.diagonal(covariance))
+    sizes = np.cumsum([len(row) for row in _rows(wishes, points, plan)])
+    return FacePlan(
+        plan=plan,
+        motions={name: space.stated(name, plan[name]) for name in space.free},
+        std={name: stds[6 * i : 6 * i + 6] for i, name in enumerate(space.free)},
+        covariance=covariance,
+        undetermined=tuple(space.labels[i] for i in np.flatnonzero(undetermined)),
+        at_bounds=tuple(space.labels[i] for i in np.flatnonzero(held)),
+        residuals=tuple(np.split(found.residuals, sizes)[:-1]),
+        exact=solved,
+        exact_residuals=exact_rows,
+        steps=found.steps,
+        converged=found.converged,
+    )
+
+
+def _rows(wishes: Sequence[Wish], places: Floats, plan: Mapping[str, Floats]) -> tuple[Floats, ...]:
+    """The residuals of each wish, with the places of all their points in a row."""
+    ends = np.cumsum([len(wish.points) for wish in wishes])
+    parts = np.split(places, ends[:-1])
+    return tuple(wish.rows(part, plan) for wish, part in zip(wishes, parts, strict=True))
+
+
+def _covariance(
+    jacobian: Floats, prior: Floats, held: NDArray[np.bool_]
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """The covariance of the numbers that no bound holds, and which of them targets leave open.
+
+    (JᵀJ)⁻¹ with the rows of the prior in J. Directions of which neither targets nor prior say
+    anything get the variance OPEN².
+    """
+    free = ~held
+    normal = (jacobian.T @ jacobian)[np.ix_(free, free)]
+    values, vectors = np.linalg.eigh(normal)
+    variance = 1.0 / np.maximum(values, OPEN**-2)
+    covariance = np.zeros((len(prior), len(prior)))
+    covariance[np.ix_(free, free)] = (vectors * variance) @ vectors.T
+    alone = np.where(prior > 0.0, 1.0 / np.where(prior > 0.0, prior, 1.0), OPEN)
+    return covariance, free & (np.sqrt(np.diagonal(covariance)) > OPEN_SHARE * alone)
+
+
+class _Space:
+    """The numbers of the segments that are free, and the plans that they stand for."""
+
+    def __init__(self, planning: PlanningModel, search: FaceSearch) -> None:
+        reference = planning.reference
+        moving = [n for n, m in reference.items() if not np.array_equal(m, np.eye(4))]
+        named = list(search.segments or moving or planning.segments)
+        for name in (*named, *search.follows, *search.follows.values()):
+            if name not in planning.segments:
+                known = ", ".join(planning.segments)
+                raise CaseInputError(f"there is no segment {name!r}; segments are: {known}")
+        for follower, leader in search.follows.items():
+            if leader in search.follows or leader == follower:
+                raise CaseInputError(
+                    f"{follower!r} follows {leader!r}, which does not move by itself"
+                )
+        self.reference = reference
+        self.free = [name for name in dict.fromkeys(named) if name not in search.follows]
+        if not self.free:
+            raise CaseInputError("every segment follows another: nothing is free to move")
+        skull = planning.patient.landmarks.get("skull", {})
+        surfaces = {s.name: np.asarray(s.surface.vertices) for s in planning.patient.segments}
+        self.skull, self.surfaces = skull, surfaces
+        self.points = {name: self.stated(name, np.eye(4)).point for name in self.free}
+        # What takes a follower from its leader's place to its own: the final bite.
+        self.bites = {
+            follower: (leader, np.linalg.inv(reference[leader]) @ reference[follower])
+            for follower, leader in search.follows.items()
+        }
+
+    def stated(self, name: str, motion: Floats) -> ClinicalMotion:
+        return clinical_motion(name, motion, landmarks=self.skull, vertices=self.surfaces.get(name))
+
+    def numbers_of_reference(self) -> Floats:
+        rows = [self.stated(name, np.asarray(self.reference[name])) for name in self.free]
+        return np.array([getattr(row, number) for row in rows for number in NUMBERS])
+
+    def plan(self, numbers: Floats) -> dict[str, Floats]:
+        plan = {name: np.asarray(motion) for name, motion in self.reference.items()}
+        for index, name in enumerate(self.free):
+            shift, turn = numbers[6 * index : 6 * index + 3], numbers[6 * index + 3 : 6 * index + 6]
+            point = self.points[name]
+            place = np.zeros(3) if point is None else point
+            plan[name] = planned_motion(place, shift=shift, turn=turn)
+        for follower, (leader, bite) in self.bites.items():
+            plan[follower] = plan[leader] @ bite
+        return plan
+
+    @property
+    def labels(self) -> list[str]:
+        return [f"{name}: {number}" for name in self.free for number in NUMBERS]
+
+
+def _prior(search: FaceSearch, segments: int) -> Floats:
+    """What the numbers are multiplied by in the residuals of the prior; 0 for none."""
+    shift = 0.0 if search.prior_shift is None else 1.0 / search.prior_shift
+    turn = 0.0 if search.prior_turn is None else 1.0 / search.prior_turn
+    return np.tile([shift] * 3 + [turn] * 3, segments)

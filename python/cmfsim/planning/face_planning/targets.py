@@ -1,0 +1,295 @@
+"""What is wished of a face: places of points, values of measures, a whole surface."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim._core import Surface, SurfaceMotion
+from cmfsim.checks import Floats, as_positive, as_rows
+from cmfsim.errors import CaseInputError
+from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, measure_sites
+from cmfsim.planning.replanning import Motions, PlanningModel
+from cmfsim.values.prediction import carried_share
+from cmfsim.values.scene import SurfaceData
+
+__all__ = [
+    "CarriedPoints",
+    "MeasureTarget",
+    "PointTarget",
+    "SurfaceTarget",
+    "Target",
+    "Wish",
+    "wish_of",
+]
+
+# A point of the face further from the wished surface than this, mm, has no partner on it.
+MOST_APART = 25.0
+# A point whose partner lies on the border of the wished surface, within this of it, mm, has none.
+BORDER = 1.0
+# A node that a shift of 1 mm moves by less than this, mm, belongs to no face that plans change.
+MOVES = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class PointTarget:
+    """Points of the face that should come to given places.
+
+    Attributes
+    ----------
+    points : (n, 3) float64, mm
+        On the skin, before the operation.
+    goals : (n, 3) float64, mm
+        Where they should be.
+    std : float, mm
+        How much a point may be off, along each axis.
+    directions : (n, 3) float64 or None
+        Where given, only the way along these unit vectors counts: (0, 1, 0) and (0, 0, 1) for
+        points of a profile photograph.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) No point, another count of goals or directions, NaN, a direction of 0.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> chin = cmfsim.PointTarget([[0, -100, -80]], [[0, -96, -80]], std=0.3)
+    >>> chin.goals.tolist()
+    [[0.0, -96.0, -80.0]]
+    """
+
+    points: ArrayLike
+    goals: ArrayLike
+    std: float = 0.5
+    directions: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        points = as_rows("target points", self.points, 3)
+        goals = as_rows("target goals", self.goals, 3)
+        if len(points) != len(goals) or not len(points):
+            raise CaseInputError(
+                f"{len(points)} target points and {len(goals)} goals: one goal for each point"
+            )
+        as_positive("target std", self.std)
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "goals", goals)
+        if self.directions is not None:
+            directions = as_rows("target directions", self.directions, 3)
+            sizes = np.linalg.norm(directions, axis=1, keepdims=True)
+            if len(directions) != len(points) or not (sizes > 0.0).all():
+                raise CaseInputError("target directions: one that is not zero for each point")
+            object.__setattr__(self, "directions", directions / sizes)
+
+
+@dataclass(frozen=True)
+class MeasureTarget:
+    """A measure of the face that should have a value.
+
+    Attributes
+    ----------
+    key : str
+        As in `MEASURES`, such as "nasolabial_angle".
+    value : float, mm or degrees
+    std : float, mm or degrees
+        How much it may be off.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Another measure; a value that is not finite.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.MeasureTarget("nasolabial_angle", 105.0, std=2.0).key
+    'nasolabial_angle'
+    """
+
+    key: str
+    value: float
+    std: float = 0.5
+
+    def __post_init__(self) -> None:
+        known = [measure.key for measure in MEASURES]
+        if self.key not in known:
+            raise CaseInputError(f"measure is {self.key!r}: one of {', '.join(known)} is needed")
+        if not np.isfinite(self.value):
+            raise CaseInputError(f"target of {self.key} is {self.value}: must be finite")
+        as_positive("target std", self.std)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceTarget:
+    """A surface that the face should come to lie on.
+
+    Points of the face are drawn evenly over its vertices; each counts by its distance from the
+    nearest point of the surface along the surface's normal there, so that it may slide on it.
+
+    Attributes
+    ----------
+    surface : SurfaceData
+        The wished face, in the frame of the case, outward.
+    std : float, mm
+    points : int
+        Points of the face that are drawn.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> wish = cmfsim.SurfaceTarget(cmfsim.read_surface("wished.stl"))  # doctest: +SKIP
+    """
+
+    surface: SurfaceData
+    std: float = 0.5
+    points: int = 400
+
+    def __post_init__(self) -> None:
+        as_positive("target std", self.std)
+        as_positive("target points", self.points)
+
+
+Target: TypeAlias = PointTarget | MeasureTarget | SurfaceTarget
+
+
+@dataclass(frozen=True, eq=False)
+class Wish:
+    """A target ready for the search.
+
+    Attributes
+    ----------
+    points : (n, 3) float64, mm
+        Of the face before the operation; may be none.
+    rows : callable
+        Of their places (n, 3), mm, and the plan: the residuals in standard deviations.
+    """
+
+    points: Floats
+    rows: Callable[[Floats, Motions], Floats]
+
+
+def wish_of(planning: PlanningModel, target: Target) -> Wish:
+    """What a target asks of a patient's face.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A measure whose sites the face lacks; points away from the tissue that
+        is simulated; a surface without a partner for any point.
+    """
+    if isinstance(target, PointTarget):
+        return _points_wish(planning, target)
+    if isinstance(target, MeasureTarget):
+        return _measure_wish(planning, target)
+    return _surface_wish(planning, target)
+
+
+class CarriedPoints:
+    """The displacements of a few points under plans: columns and triangles that carry them alone.
+
+    The same as `PlanningModel.carried`, at the cost of the points.
+    """
+
+    def __init__(self, planning: PlanningModel, points: Floats) -> None:
+        before = planning.skin_before
+        skin = Surface(before.vertices, before.triangles)
+        closest, _, triangles = skin.closest(points)
+        self.share = carried_share(skin, np.linalg.norm(closest - points, axis=1))
+        corners = np.asarray(before.triangles)[np.unique(triangles)]
+        nodes, numbers = np.unique(corners, return_inverse=True)
+        self.points = points
+        self._places = np.asarray(before.vertices)[nodes]
+        self._surface = Surface(self._places, numbers.reshape(corners.shape))
+        columns = planning.columns
+        self._columns = columns
+        self._matrix = columns.matrix[nodes].reshape(3 * len(nodes), -1)
+        self._offset = columns.offset[nodes].ravel()
+
+    def displacements(self, plan: Motions) -> Floats:
+        """How the points move, (n, 3) mm."""
+        moved = self._offset + self._matrix @ self._columns.numbers(plan)
+        motion = SurfaceMotion(self._surface, self._places + moved.reshape(-1, 3))
+        return np.asarray(self.share[:, None] * motion.displacement(self.points))
+
+
+def _points_wish(planning: PlanningModel, target: PointTarget) -> Wish:
+    points, goals = np.asarray(target.points), np.asarray(target.goals)
+    share = CarriedPoints(planning, points).share
+    if not (share > 0.0).all():
+        place = points[int(np.argmin(share))].round(1).tolist()
+        raise CaseInputError(
+            f"target point {place} mm lies away from the tissue of the model: no plan moves it"
+        )
+
+    def rows(places: Floats, _: Motions) -> Floats:
+        off = places - goals
+        if target.directions is not None:
+            off = (off * np.asarray(target.directions)).sum(axis=1)
+        return np.asarray(off.ravel() / target.std)
+
+    return Wish(points, rows)
+
+
+def _measure_wish(planning: PlanningModel, target: MeasureTarget) -> Wish:
+    sites = face_sites(planning.patient)
+    measure = next(measure for measure in MEASURES if measure.key == target.key)
+    why = sites.why_absent(measure.sites)
+    if why:
+        raise CaseInputError(f"{target.key} cannot be a target: {why}")
+    names = [name for name in measure.sites if name in sites.skin]
+
+    def rows(places: Floats, plan: Motions) -> Floats:
+        found = {**dict(zip(names, places, strict=True)), **_bone_places(sites, plan)}
+        value = measure_sites({name: found[name] for name in measure.sites})[target.key]
+        # Every site is there: the value is a number.
+        return np.array([(float(value or 0.0) - target.value) / target.std])
+
+    return Wish(np.array([sites.skin[name] for name in names]).reshape(-1, 3), rows)
+
+
+def _bone_places(sites: FaceSites, plan: Motions) -> dict[str, Floats]:
+    found = {}
+    for name, site in sites.bone.items():
+        motion = np.asarray(plan.get(site.segment, np.eye(4)), dtype=np.float64)
+        found[name] = motion[:3, :3] @ site.place + motion[:3, 3]
+    return found
+
+
+def _surface_wish(planning: PlanningModel, target: SurfaceTarget) -> Wish:
+    before = np.asarray(planning.skin_before.vertices)
+    chosen = np.flatnonzero(np.abs(planning.columns.matrix).max(axis=(1, 2)) > MOVES)
+    points = before[chosen[:: max(1, len(chosen) // int(target.points))]]
+    surface = Surface(target.surface.vertices, target.surface.triangles)
+    kept = points[_has_partner(surface, _border_points(target.surface), points)]
+    if not len(kept):
+        raise CaseInputError(
+            f"the wished surface lies more than {MOST_APART:g} mm from the face: both must be in "
+            "the frame of the case"
+        )
+
+    def rows(places: Floats, _: Motions) -> Floats:
+        closest, normals, _triangles = surface.closest(places)
+        return np.asarray(((places - closest) * normals).sum(axis=1) / target.std)
+
+    return Wish(kept, rows)
+
+
+def _has_partner(surface: Surface, rim: Floats, points: Floats) -> NDArray[np.bool_]:
+    closest, _, _ = surface.closest(points)
+    near = np.linalg.norm(closest - points, axis=1) <= MOST_APART
+    if len(rim):
+        from_rim = [float(np.linalg.norm(rim - place, axis=1).min()) for place in closest]
+        near &= np.array(from_rim) > BORDER
+    return np.asarray(near)
+
+
+def _border_points(surface: SurfaceData) -> Floats:
+    """The vertices on the border of a surface, where a face was cut off."""
+    triangles = np.asarray(surface.triangles).astype(np.int64)
+    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    rim: Floats = np.asarray(surface.vertices)[np.unique(unique[count == 1])]
+    return rim

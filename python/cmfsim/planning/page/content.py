@@ -1,0 +1,340 @@
+"""What a planning page holds of a patient: surfaces, operator, sites, errors, as plain values."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import Surface, __version__
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError, LandmarkInputError
+from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, midline_profile
+from cmfsim.planning.page.segment_points import segment_points
+from cmfsim.planning.page.tooth_rows import tooth_rows
+from cmfsim.planning.replanning import ExpectedError, Motions, PlanningModel, segment_boxes
+from cmfsim.surfaces.levels import simplified_surface
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.prediction import Prediction, carried_share
+from cmfsim.values.scene import SurfaceData
+
+__all__ = ["PageContent", "page_content"]
+
+# Triangles that the page draws of the face, and of all bones together.
+FACE_TRIANGLES, BONE_TRIANGLES, LEAST_BONE = 40_000, 60_000, 500
+# Most nodes of the skin that a page holds: a larger file is slow to open and to send.
+MOST_NODES = 60_000
+# A node moves if a plan of the range moves it by this, mm: a tenth of what rounding does.
+STILL = 4e-4
+# Motions that decide whether a node moves: entries of R − I, and shifts in mm.
+LARGE_TURN, LARGE_SHIFT = 0.5, 30.0
+# How far behind its foremost point the profile is drawn, mm.
+PROFILE_DEPTH = 60.0
+# How much of the height of the face a picture shows, and the least, mm.
+SPAN_SHARE, LEAST_SPAN = 1.15, 60.0
+
+
+@dataclass(frozen=True, eq=False)
+class PageContent:
+    """What a page is written from.
+
+    Attributes
+    ----------
+    values : mapping
+        Plain values, ready for JSON.
+    arrays : mapping of str to array
+        float32, float16 and uint32.
+    findings : tuple of Finding
+        What was simplified or left out.
+    """
+
+    values: Mapping[str, Any]
+    arrays: Mapping[str, NDArray[Any]]
+    findings: tuple[Finding, ...] = field(default=())
+
+
+def page_content(
+    planning: PlanningModel,
+    reference: Prediction,
+    errors: ExpectedError,
+    *,
+    variants: Mapping[str, Motions] | None = None,
+) -> PageContent:
+    """What the page of a planning model holds.
+
+    Parameters
+    ----------
+    planning : PlanningModel
+    reference : Prediction
+        The exact solution of its reference plan.
+    errors : ExpectedError
+    variants : mapping of str to plan, optional
+        Plans by name that the page begins with, besides the reference.
+
+    Returns
+    -------
+    PageContent
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) More nodes on the skin than a page can hold; fast-simplification is
+        missing where a surface has to be simplified.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> exact = planning.solve(planning.reference)  # doctest: +SKIP
+    >>> errors = cmfsim.expected_error(planning)  # doctest: +SKIP
+    >>> content = cmfsim.page_content(planning, exact, errors)  # doctest: +SKIP
+    """
+    patient = planning.patient
+    findings: list[Finding] = []
+    skin = planning.skin_before
+    count = len(np.asarray(skin.vertices))
+    if count > MOST_NODES:
+        raise CaseInputError(
+            f"the skin has {count} nodes, a page holds {MOST_NODES}: give a larger "
+            "edge_length in [mesh], or --edge-length"
+        )
+    face = _fewer("face", patient.face or skin, FACE_TRIANGLES, findings)
+    sites = face_sites(patient)
+    arrays: dict[str, NDArray[Any]] = {
+        "nodes": _singles(skin.vertices),
+        "skin_triangles": _indices(skin.triangles),
+        "face": _singles(face.vertices),
+        "face_triangles": _indices(face.triangles),
+        **_operator(planning, reference),
+        **_carried("face", skin, np.asarray(face.vertices)),
+        **_carried("site", skin, _rows(sites.skin.values())),
+        "sites": _singles(_rows(sites.skin.values())),
+    }
+    bones = _bones(planning, arrays, findings)
+    profile = _profile(planning, face, arrays)
+    teeth = _teeth(planning, arrays)
+    values = {
+        "case": patient.name,
+        "model": planning.model,
+        "version": __version__,
+        "built_for": str(patient.summary.get("plan_key") or "a patient without a case file"),
+        "segments": _segments(planning),
+        "bones": bones,
+        **_measured(planning, sites),
+        "variants": [
+            {
+                "name": name,
+                "motions": [m.ravel().tolist() for m in planning.whole(plan).values()],
+            }
+            for name, plan in (variants or {}).items()
+        ],
+        **profile,
+        **teeth,
+        "expected_error": errors.as_dict(),
+        **_framing(skin, arrays["active"]),
+    }
+    return PageContent(values, arrays, tuple(findings))
+
+
+def _singles(rows: Any) -> NDArray[np.float32]:
+    return np.asarray(rows, dtype=np.float32)
+
+
+def _indices(rows: Any) -> NDArray[np.uint32]:
+    return np.asarray(rows, dtype=np.uint32)
+
+
+def _rows(places: Any) -> Floats:
+    return np.array([*places], dtype=np.float64).reshape(-1, 3)
+
+
+def _fewer(name: str, surface: SurfaceData, most: int, findings: list[Finding]) -> SurfaceData:
+    """The surface, simplified with a finding where it has more triangles than are drawn."""
+    count = len(np.asarray(surface.triangles))
+    if count <= most:
+        return surface
+    fewer = simplified_surface(name, surface, most)
+    there = Surface(surface.vertices, surface.triangles)
+    closest, _, _ = there.closest(fewer.vertices)
+    away = float(np.linalg.norm(closest - np.asarray(fewer.vertices), axis=1).max())
+    findings.append(
+        Finding(
+            "note",
+            "page-simplified",
+            f"{name} has {count} triangles: the page draws "
+            f"{len(np.asarray(fewer.triangles))}, at most {away:.2f} mm away",
+            name,
+            "a page with all of them is slow to open and to send",
+            "nothing: predictions are made with all of them",
+        )
+    )
+    return fewer
+
+
+def _operator(planning: PlanningModel, reference: Prediction) -> dict[str, NDArray[Any]]:
+    """The columns of the nodes that move, in half precision, and the reference in single."""
+    columns = planning.columns
+    largest = np.tile([LARGE_TURN] * 9 + [LARGE_SHIFT] * 3, len(columns.segments))
+    moves = (np.abs(columns.matrix) * largest).max(axis=2).max(axis=1) > STILL
+    moves |= np.abs(columns.offset).max(axis=1) > STILL
+    active = np.flatnonzero(moves)
+    with np.errstate(over="ignore"):
+        half = columns.matrix[active].astype(np.float16)
+    return {
+        "active": _indices(active),
+        "columns": half,
+        "reference_shift": _singles(reference.skin_displacements[active]),
+    }
+
+
+def _carried(part: str, skin: SurfaceData, points: Floats) -> dict[str, NDArray[Any]]:
+    """How points hang on the skin: as `carried_points` of a prediction does it."""
+    there = Surface(skin.vertices, skin.triangles)
+    closest, _, triangles = there.closest(points)
+    corners = np.asarray(skin.vertices)[np.asarray(skin.triangles)[triangles]]
+    barycentric = _barycentric(corners, closest)
+    offset = points - closest
+    share = carried_share(there, np.linalg.norm(offset, axis=1))
+    return {
+        f"{part}_triangle": _indices(triangles),
+        f"{part}_barycentric": _singles(barycentric),
+        f"{part}_offset": _singles(offset),
+        f"{part}_share": _singles(share),
+    }
+
+
+def _barycentric(corners: Floats, points: Floats) -> Floats:
+    """Barycentric coordinates (k, 3) of points on triangles (k, 3, 3)."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    normal = np.cross(b - a, c - a)
+    square = (normal * normal).sum(axis=1)
+    of_b = (np.cross(points - a, c - a) * normal).sum(axis=1) / square
+    of_c = (np.cross(b - a, points - a) * normal).sum(axis=1) / square
+    return np.stack([1.0 - of_b - of_c, of_b, of_c], axis=1)
+
+
+def _segments(planning: PlanningModel) -> list[dict[str, Any]]:
+    skull = planning.patient.landmarks.get("skull", {})
+    surfaces = {segment.name: segment.surface for segment in planning.patient.segments}
+    boxes = segment_boxes(planning)
+    found = []
+    for name, centre in zip(planning.segments, planning.columns.centres, strict=True):
+        points = segment_points(name, skull, np.asarray(surfaces[name].vertices))
+        found.append(
+            {
+                "name": name,
+                "label": name.replace("_", " "),
+                "centre": centre.tolist(),
+                "box": [boxes[name].min(axis=0).tolist(), boxes[name].max(axis=0).tolist()],
+                "points": [{"label": p.label, "place": p.place.tolist()} for p in points],
+                "reference": np.asarray(planning.reference[name]).ravel().tolist(),
+            }
+        )
+    return found
+
+
+def _bones(
+    planning: PlanningModel, arrays: dict[str, NDArray[Any]], findings: list[Finding]
+) -> list[dict[str, Any]]:
+    """The bones, those that stay included; each gets triangles in proportion to what it has."""
+    segments = planning.patient.segments
+    counts = [len(np.asarray(segment.surface.triangles)) for segment in segments]
+    found: list[dict[str, Any]] = []
+    for number, segment in enumerate(segments):
+        most = max(LEAST_BONE, BONE_TRIANGLES * counts[number] // sum(counts))
+        surface = _fewer(segment.name, segment.surface, most, findings)
+        arrays[f"bone_{number}"] = _singles(surface.vertices)
+        arrays[f"bone_{number}_triangles"] = _indices(surface.triangles)
+        moves = segment.name in planning.segments
+        found.append(
+            {
+                "name": segment.name,
+                "segment": planning.segments.index(segment.name) if moves else None,
+            }
+        )
+    return found
+
+
+def _measured(planning: PlanningModel, sites: FaceSites) -> dict[str, Any]:
+    found = ", ".join(name.replace("_", " ") for name in sites.found)
+    notes = [
+        (
+            "Heights are along S of the data, not in natural head position. Sites are points of "
+            "the tissue: they are not found again on the moved face."
+        )
+    ]
+    if found:
+        notes.append(f"Found on profile and bone, not given by the case: {found}.")
+    return {
+        "skin_sites": [{"name": name} for name in sites.skin],
+        "bone_sites": [
+            {
+                "name": name,
+                "place": site.place.tolist(),
+                "segment": planning.segments.index(site.segment)
+                if site.segment in planning.segments
+                else None,
+            }
+            for name, site in sites.bone.items()
+        ],
+        "measures": [
+            {
+                "key": measure.key,
+                "label": measure.label,
+                "unit": measure.unit,
+                "formula": measure.formula,
+                "sites": list(measure.sites),
+                "about": measure.about,
+                "absent": sites.why_absent(measure.sites),
+            }
+            for measure in MEASURES
+        ],
+        "measure_notes": notes,
+    }
+
+
+def _profile(
+    planning: PlanningModel, face: SurfaceData, arrays: dict[str, NDArray[Any]]
+) -> dict[str, Any]:
+    try:
+        profile = midline_profile(face, planning.patient.landmarks.get("skin", {}))
+    except LandmarkInputError as error:
+        arrays["profile_ends"] = np.zeros((0, 2), dtype=np.uint32)
+        arrays["profile_share"] = np.zeros(0, dtype=np.float32)
+        return {"has_profile": False, "profile_absent": str(error)}
+    # Without scalp and neck, which would make the drawing small.
+    shown = profile.points[:, 1] <= profile.points[:, 1].min() + PROFILE_DEPTH
+    arrays["profile_ends"] = _indices(profile.ends[shown])
+    arrays["profile_share"] = _singles(profile.share[shown])
+    return {"has_profile": True, "profile_absent": ""}
+
+
+def _teeth(planning: PlanningModel, arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    try:
+        rows = tooth_rows(planning.patient)
+    except CaseInputError as error:
+        return {"occlusion": None, "occlusion_absent": str(error)}
+    arrays["occlusion_points"] = _singles(rows.points)
+    arrays["occlusion_depth"] = _singles(rows.depth.values)
+    number = {name: index for index, name in enumerate(planning.segments)}
+    return {
+        "occlusion": {
+            "upper": number.get(rows.upper),
+            "lower": number.get(rows.lower),
+            "origin": rows.depth.lowest.tolist(),
+            "spacing": float(np.asarray(rows.depth.spacing)[0]),
+            "shape": list(rows.depth.values.shape),
+        },
+        "occlusion_absent": "",
+    }
+
+
+def _framing(skin: SurfaceData, active: NDArray[Any]) -> dict[str, Any]:
+    """Where the picture looks, and how much it shows, mm: what moves, and some of the head."""
+    vertices = np.asarray(skin.vertices)
+    moving = vertices[active] if len(active) else vertices
+    low, high = moving.min(axis=0), moving.max(axis=0)
+    return {
+        "target": (0.5 * (low + high)).tolist(),
+        "span": max(LEAST_SPAN, SPAN_SHARE * float((high - low).max())),
+    }

@@ -1,0 +1,113 @@
+"""Where surgeons measure how a segment moves: incisors, canines, molars, pogonion, menton."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from cmfsim.checks import Floats
+from cmfsim.values.clinical_motion import clinical_motion
+
+__all__ = ["SegmentPoint", "segment_points"]
+
+# A piece of a bone that was separated has the bone's name with a number.
+NUMBERED = re.compile(r"_\d+$")
+# A landmark that several segments could have belongs to one within this of its surface, mm.
+ON_SEGMENT = 6.0
+# Canines stand at this share of half the width of the arch of second molars: intercanine to
+# intermolar widths of 0.6 (Moyers 1988), on a parabola through incisors and molars.
+CANINE_SHARE = 0.6
+UPPER = (
+    ("supradentale", "upper incisors"),
+    ("upper_canine_L", "left upper canine"),
+    ("upper_canine_R", "right upper canine"),
+    ("supra_m2_L", "left upper second molar"),
+    ("supra_m2_R", "right upper second molar"),
+)
+LOWER = (
+    ("infradentale", "lower incisors"),
+    ("lower_canine_L", "left lower canine"),
+    ("lower_canine_R", "right lower canine"),
+    ("sub_m2_L", "left lower second molar"),
+    ("sub_m2_R", "right lower second molar"),
+)
+CHIN = (("pogonion", "pogonion"), ("menton", "menton"))
+SITES: Mapping[str, tuple[tuple[str, str], ...]] = MappingProxyType(
+    {
+        "maxilla": UPPER,
+        "midface": UPPER,
+        "mandible": LOWER + CHIN,
+        "mandible_body": LOWER + CHIN,
+        "chin": CHIN,
+        "ramus_left": (("gonion_L", "left gonion"),),
+        "ramus_right": (("gonion_R", "right gonion"),),
+    }
+)
+# Arches from which canines are estimated: front, left and right.
+ARCHES = {
+    "upper_canine": ("supradentale", "supra_m2_L", "supra_m2_R"),
+    "lower_canine": ("infradentale", "sub_m2_L", "sub_m2_R"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentPoint:
+    """A point at which a segment's movement is stated.
+
+    Attributes
+    ----------
+    label : str
+    place : (3,) float64, mm
+        Before the operation.
+    """
+
+    label: str
+    place: Floats
+
+
+def segment_points(
+    segment: str, landmarks: Mapping[str, Floats], vertices: Floats
+) -> tuple[SegmentPoint, ...]:
+    """The points of a segment: first that of its clinical motion, last the middle of its surface.
+
+    Parameters
+    ----------
+    segment : str
+    landmarks : mapping of str to (3,) float64, mm
+        Skull landmarks.
+    vertices : (v, 3) float64, mm
+        Of the segment's surface, before.
+    """
+    known = {**_canines(landmarks), **landmarks}
+    stated = clinical_motion(segment, np.eye(4), landmarks=landmarks, vertices=vertices)
+    points = []
+    if stated.point is not None:
+        points.append(SegmentPoint(stated.place, np.asarray(stated.point)))
+    for name, label in SITES.get(NUMBERED.sub("", segment), ()):
+        place = known.get(name)
+        if place is None or np.linalg.norm(vertices - place, axis=1).min() > ON_SEGMENT:
+            continue
+        if any(np.array_equal(place, point.place) for point in points):
+            continue
+        estimated = "" if name in landmarks else " (estimated)"
+        points.append(SegmentPoint(f"{label}{estimated}", np.asarray(place)))
+    middle = vertices.mean(axis=0)
+    if not any(np.allclose(middle, point.place) for point in points):
+        points.append(SegmentPoint("middle of its surface", middle))
+    return tuple(points)
+
+
+def _canines(landmarks: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Canines on a parabola through incisors and second molars, where these are known."""
+    found = {}
+    for name, arch in ARCHES.items():
+        if not all(site in landmarks for site in arch):
+            continue
+        tip, left, right = (np.asarray(landmarks[site], dtype=np.float64) for site in arch)
+        middle, half = 0.5 * (left + right), 0.5 * (left - right)
+        back = (middle - tip) * CANINE_SHARE**2
+        found[f"{name}_L"] = tip + back + CANINE_SHARE * half
+        found[f"{name}_R"] = tip + back - CANINE_SHARE * half
+    return found

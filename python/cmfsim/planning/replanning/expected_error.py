@@ -1,0 +1,227 @@
+"""How far the plan operator deviates from exact solutions, away from its reference plan."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cmfsim.checks import Floats, as_positive
+from cmfsim.errors import CaseInputError, ContactError, SolverError
+from cmfsim.planning.replanning.model import Motions, PlanningModel
+from cmfsim.values.motion import rigid_motion
+
+__all__ = ["ExpectedError", "PlanTrial", "expected_error", "plan_distance", "segment_boxes"]
+
+# Plans are tried at these shares of the range, one after the other.
+SHARES = (1.0, 0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class PlanTrial:
+    """One plan, by the product and solved exactly.
+
+    Attributes
+    ----------
+    plan : mapping of str to (4, 4) float64, mm
+    distance : float, mm
+        From the reference plan, as `plan_distance`.
+    mean, p95, largest : float or None, mm
+        Distance between the two answers over the vertices of the skin; None where `failed`.
+    failed : str
+        Why the plan could not be solved; empty where it could.
+    seconds : float
+        Of the exact solution.
+    """
+
+    plan: Mapping[str, Floats]
+    distance: float
+    mean: float | None
+    p95: float | None
+    largest: float | None
+    failed: str
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedError:
+    """What exact solutions around the reference say about the product; an estimate, no bound.
+
+    Attributes
+    ----------
+    trials : tuple of PlanTrial
+    shift, turn : float, mm and degrees
+        The range: along each axis, and about any axis.
+    slides : bool
+        Whether tissue slides; without, the product is exact.
+    """
+
+    trials: tuple[PlanTrial, ...]
+    shift: float
+    turn: float
+    slides: bool
+
+    @property
+    def reach(self) -> float:
+        """The largest distance from the reference at which a plan was solved, mm."""
+        return max((t.distance for t in self.trials if not t.failed), default=0.0)
+
+    def at(self, distance: float) -> tuple[float, float] | None:
+        """Mean and largest error to expect at a distance from the reference, mm.
+
+        The largest ratio of error to distance that was seen, times the distance: error grows
+        faster than the distance, so that this is too large near the reference. None beyond
+        `reach`, where nothing was tried.
+        """
+        if not self.slides:
+            return 0.0, 0.0
+        if distance > self.reach:
+            return None
+        solved = [t for t in self.trials if t.mean is not None and t.largest is not None]
+        means = [t.mean / t.distance for t in solved if t.mean is not None]
+        worst = [t.largest / t.distance for t in solved if t.largest is not None]
+        return distance * max(means, default=0.0), distance * max(worst, default=0.0)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return {
+            "shift_mm": self.shift,
+            "turn_degrees": self.turn,
+            "slides": self.slides,
+            "reach_mm": self.reach,
+            "trials": [
+                {
+                    "distance_mm": t.distance,
+                    "mean_mm": t.mean,
+                    "p95_mm": t.p95,
+                    "largest_mm": t.largest,
+                    "failed": t.failed,
+                    "seconds": t.seconds,
+                }
+                for t in self.trials
+            ],
+        }
+
+
+def plan_distance(planning: PlanningModel, plan: Motions) -> float:
+    """How far a plan is from the reference, mm.
+
+    The largest distance between where the two take a corner of the box around a segment's surface.
+    """
+    whole = planning.whole(plan)
+    return max(
+        float(
+            np.linalg.norm(
+                corners @ (whole[name] - planning.reference[name])[:3, :3].T
+                + (whole[name] - planning.reference[name])[:3, 3],
+                axis=1,
+            ).max()
+        )
+        for name, corners in segment_boxes(planning).items()
+    )
+
+
+def segment_boxes(planning: PlanningModel) -> dict[str, Floats]:
+    """The eight corners of the box around the surface of each segment, (8, 3) mm, before."""
+    found = {}
+    for segment in planning.patient.segments:
+        if segment.name in planning.segments:
+            vertices = np.asarray(segment.surface.vertices)
+            low, high = vertices.min(axis=0), vertices.max(axis=0)
+            ends = np.array([[(n >> axis) & 1 for axis in range(3)] for n in range(8)])
+            found[segment.name] = np.where(ends, high, low)
+    return found
+
+
+def expected_error(
+    planning: PlanningModel,
+    *,
+    trials: int = 6,
+    shift: float = 5.0,
+    turn: float = 5.0,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> ExpectedError:
+    """How far the product deviates from exact solutions at plans around the reference.
+
+    Every segment that the reference moves (all, if it moves none) is shifted by up to `shift` along
+    each axis and turned by up to `turn` about a random axis through the middle of its surface, each
+    segment by itself; every second plan by half of that. Without sliding tissue one plan is solved,
+    as a check.
+
+    Parameters
+    ----------
+    planning : PlanningModel
+    trials : int
+        Plans that are solved exactly.
+    shift : float, mm
+    turn : float, degrees
+    seed : int
+    progress : callable, optional
+        Called with the name of each stage as it begins.
+
+    Returns
+    -------
+    ExpectedError
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Fewer than one trial; a range that is not above 0.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> found = cmfsim.expected_error(planning)  # doctest: +SKIP
+    >>> found.at(3.0)  # doctest: +SKIP
+    (0.012, 0.19)
+    """
+    shift, turn = as_positive("shift", shift), as_positive("turn", turn)
+    if isinstance(trials, bool) or not isinstance(trials, int) or trials < 1:
+        raise CaseInputError(f"trials is {trials!r}: a whole number from 1 on is needed")
+    rng = np.random.default_rng(seed)
+    found = []
+    for number in range(trials if planning.slides else 1):
+        if progress is not None:
+            progress(f"solving a plan nearby exactly ({number + 1})")
+        share = SHARES[number % len(SHARES)]
+        plan = _plan_near(planning, rng, share * shift, share * turn)
+        found.append(_trial(planning, plan))
+    return ExpectedError(tuple(found), shift, turn, planning.slides)
+
+
+def _plan_near(
+    planning: PlanningModel, rng: np.random.Generator, shift: float, turn: float
+) -> dict[str, Floats]:
+    moving = [n for n, m in planning.reference.items() if not np.array_equal(m, np.eye(4))]
+    boxes = segment_boxes(planning)
+    plan = {name: np.asarray(motion) for name, motion in planning.reference.items()}
+    for name in moving or planning.segments:
+        centre = boxes[name].mean(axis=0)
+        more = rigid_motion(
+            rng.uniform(-shift, shift, 3), turn * rng.uniform(), rng.normal(size=3), centre
+        )
+        plan[name] = plan[name] @ more
+    return plan
+
+
+def _trial(planning: PlanningModel, plan: dict[str, Floats]) -> PlanTrial:
+    distance = plan_distance(planning, plan)
+    begun = time.perf_counter()
+    try:
+        exact = planning.solve(plan).skin_displacements
+    except (ContactError, SolverError) as error:
+        seconds = time.perf_counter() - begun
+        return PlanTrial(plan, distance, None, None, None, str(error), seconds)
+    seconds = time.perf_counter() - begun
+    away = np.linalg.norm(planning.displacements(plan) - exact, axis=1)
+    return PlanTrial(
+        plan,
+        distance,
+        float(away.mean()),
+        float(np.percentile(away, 95)),
+        float(away.max()),
+        "",
+        seconds,
+    )

@@ -1,0 +1,202 @@
+"""A patient's planning model: the face under any rigid plan, by a product or solved exactly."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim._core import StaticSolver
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError
+from cmfsim.planning.replanning.columns import PlanColumns, plan_columns
+from cmfsim.solving.models import model_scene, predict_patient
+from cmfsim.solving.simulation import scene_plan, scene_solver
+from cmfsim.values.motion import rigid_matrix
+from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.prediction import Prediction, carried_points
+from cmfsim.values.scene import MovedSurface, Scene, SurfaceData
+
+__all__ = ["Motions", "PlanningModel", "planning_model"]
+
+# Rigid motions by segment, (4, 4) mm each.
+Motions = Mapping[str, ArrayLike]
+
+
+@dataclass(frozen=True, eq=False)
+class PlanningModel:
+    """The face of one patient under any rigid plan.
+
+    Two answers to a plan: `displacements`, `skin`, `face` and `carried` by one product with the
+    columns of the plan operator, in which contact is continued to first order about the reference
+    plan; `solve`, exactly. Both are the same at the reference and wherever no tissue slides.
+
+    Attributes
+    ----------
+    patient : PatientModel
+    model : str
+        "H", "M", "H+S" or "M+S".
+    solver : StaticSolver
+        Factorised once, for every plan.
+    columns : PlanColumns
+        Of the nodes of the skin.
+    reference : mapping of str to (4, 4) float64, mm
+        The plan about which contact is continued.
+    """
+
+    patient: PatientModel
+    model: str
+    solver: StaticSolver
+    columns: PlanColumns
+    reference: Mapping[str, Floats]
+
+    @property
+    def segments(self) -> tuple[str, ...]:
+        """The segments that a plan may move."""
+        return self.columns.segments
+
+    @property
+    def slides(self) -> bool:
+        """Whether tissue slides on a segment: without, the product is exact for every plan."""
+        return any(np.size(segment.sliding) for segment in self._scene.segments.values())
+
+    @cached_property
+    def _scene(self) -> Scene:
+        return model_scene(self.patient, self.model)
+
+    @cached_property
+    def skin_before(self) -> SurfaceData:
+        """The skin before the operation, as the mesh has it."""
+        return self.patient.skin
+
+    def whole(self, plan: Motions) -> dict[str, Floats]:
+        """The plan with every segment in it; those that it does not name stay.
+
+        Raises
+        ------
+        CaseError
+            (also `ValueError`) A segment that the patient does not have.
+        BoundaryError
+            (also `ValueError`) A matrix that is not a rigid motion.
+        """
+        unknown = [name for name in plan if name not in self.segments]
+        if unknown:
+            known = ", ".join(self.segments) or "none"
+            raise CaseInputError(f"the plan moves {unknown[0]!r}; segments are: {known}")
+        return {
+            name: np.asarray(rigid_matrix(plan[name], f"motion of {name!r}"))
+            if name in plan
+            else np.eye(4)
+            for name in self.segments
+        }
+
+    def displacements(self, plan: Motions) -> Floats:
+        """How each vertex of the skin moves under a plan, (k, 3) mm, by one product."""
+        return self.columns.displacements(self.whole(plan))
+
+    def skin(self, plan: Motions) -> SurfaceData:
+        """The skin of the mesh under a plan, by one product."""
+        before = self.skin_before
+        vertices = np.asarray(before.vertices) + self.displacements(plan)
+        return SurfaceData(vertices, before.triangles)
+
+    def carried(self, plan: Motions, points: ArrayLike) -> Floats:
+        """How points on or near the skin move under a plan, (n, 3) mm, as `Prediction.carried`."""
+        return carried_points(self.skin_before, self.displacements(plan), points)
+
+    def face(self, plan: Motions) -> SurfaceData:
+        """The face in full detail under a plan, as `Prediction.face`."""
+        before = self.patient.face or self.skin_before
+        vertices = np.asarray(before.vertices)
+        return SurfaceData(vertices + self.carried(plan, vertices), before.triangles)
+
+    def solve(self, plan: Motions) -> Prediction:
+        """The prediction under a plan, solved exactly, contact included.
+
+        Raises
+        ------
+        ContactError, SolverError
+            Contact does not converge, or the equations are not solved.
+        """
+        patient = self.patient.with_plan(self.whole(plan))
+        return predict_patient(patient, self.model, solver=self.solver)
+
+
+def planning_model(
+    patient: PatientModel | Prediction,
+    model: str | None = None,
+    *,
+    reference: Motions | None = None,
+) -> PlanningModel:
+    """The planning model of a patient: the face under any rigid plan.
+
+    Parameters
+    ----------
+    patient : PatientModel or Prediction
+        What `build_model` makes, or what a prediction holds.
+    model : str, optional
+        "H", "M", "H+S" or "M+S"; that of the prediction, or "M+S", if left out.
+    reference : mapping of str to (4, 4) float64, mm, optional
+        The plan about which contact is continued; the patient's own if left out.
+
+    Returns
+    -------
+    PlanningModel
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) No segment moves; a motion that is given vertex by vertex; kinematics
+        other than linear, in which no product gives the face.
+    ContactError, SolverError
+        The reference plan cannot be solved, or its factorisation does not fit into memory.
+
+    Notes
+    -----
+    Where the scene leaves the method open, the equations are factorised (Cholesky): every further
+    plan then takes a fraction of a second.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> prediction = cmfsim.predict("case.toml")  # doctest: +SKIP
+    >>> planning = cmfsim.planning_model(prediction)  # doctest: +SKIP
+    >>> motion = cmfsim.rigid_motion(translation=(0, -4, 0))
+    >>> planning.skin({"maxilla": motion}).vertices  # doctest: +SKIP
+    """
+    if isinstance(patient, Prediction):
+        model = model or patient.model
+        patient = patient.patient
+    model = model or "M+S"
+    if reference is not None:
+        patient = patient.with_plan(reference)
+    scene = model_scene(patient, model)
+    _check_scene(scene)
+    if scene.options.method == "auto":
+        scene = replace(scene, options=replace(scene.options, method="cholesky"))
+        patient = replace(patient, scene=replace(patient.scene, options=scene.options))
+    solver = scene_solver(scene)
+    plan = scene_plan(scene)
+    operator = solver.plan_operator(nodes=patient.skin_nodes, plan=plan)
+    motions: dict[str, NDArray[np.float64]] = {
+        name: np.asarray(scene.plan[name], dtype=np.float64) for name in scene.segments
+    }
+    return PlanningModel(patient, model, solver, plan_columns(operator), motions)
+
+
+def _check_scene(scene: Scene) -> None:
+    """Refuses a scene of which no product gives the face."""
+    if scene.options.kinematics != "linear":
+        raise CaseInputError(
+            f"the case has {scene.options.kinematics} kinematics, in which no product of a matrix "
+            'gives the face: set kinematics = "linear", or predict each plan'
+        )
+    if not scene.segments:
+        raise CaseInputError("no segment of bone moves: add an osteotomy or a plan to the case")
+    for name, motion in scene.plan.items():
+        if isinstance(motion, MovedSurface) or np.shape(motion) != (4, 4):
+            raise CaseInputError(
+                f"segment {name!r} moves vertex by vertex: a planning model needs rigid motions; "
+                "give it translation, angle, axis and centre, or a transform"
+            )

@@ -1,0 +1,211 @@
+"""The face that a model predicts for a patient: a scene of the paper's four models, solved."""
+
+import hashlib
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import StaticSolver, rigid_fit
+from cmfsim.checks import check_one_of
+from cmfsim.errors import CaseInputError
+from cmfsim.solving.simulation import solve_scene
+from cmfsim.values.clinical_motion import clinical_motion
+from cmfsim.values.motion import decompose_motion
+from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.prediction import MODELS, Prediction
+from cmfsim.values.scene import MovedSurface, Scene, SegmentData
+
+__all__ = ["model_scene", "predict_patient"]
+
+
+def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
+    """The scene of a patient under one of the paper's four models.
+
+    Homogeneous models have the patient's fat everywhere. Models without sliding move the nodes at
+    teeth and mucosa with their bone segment, as those that are joined to it.
+
+    Parameters
+    ----------
+    patient : PatientModel
+    model : str
+        "H", "M", "H+S" or "M+S" (Kim et al. 2010, section 3.2).
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Another name; muscles where the patient has none.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> scene = cmfsim.model_scene(patient, "H+S")  # doctest: +SKIP
+    """
+    check_one_of("model", model, MODELS)
+    if model.startswith("M") and patient.muscles is None:
+        raise CaseInputError(
+            f"model {model} needs muscles, and {patient.name!r} was built without: add [muscles] "
+            "to the case and skull landmarks"
+        )
+    scene = patient.scene
+    if model.startswith("H"):
+        scene = replace(scene, tissue=patient.fat)
+    if model.endswith("+S"):
+        return scene
+    joined = {
+        name: SegmentData(joined=np.union1d(segment.joined, segment.sliding))
+        for name, segment in scene.segments.items()
+    }
+    return replace(scene, segments=joined)
+
+
+def predict_patient(
+    patient: PatientModel, model: str = "M+S", *, solver: StaticSolver | None = None
+) -> Prediction:
+    """The face that a model predicts for a patient who is built already.
+
+    Parameters
+    ----------
+    patient : PatientModel
+    model : str
+        "H", "M", "H+S" or "M+S".
+    solver : StaticSolver, optional
+        Of `model_scene(patient, model)`, whatever its plan, where one is made already: a new plan
+        then takes no factorisation.
+
+    Returns
+    -------
+    Prediction
+
+    Raises
+    ------
+    CaseError, MeshError, MaterialError, BoundaryError, ContactError, SolverError
+        As `model_scene` and `solve_scene`.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> prediction = cmfsim.predict_patient(patient, "H")  # doctest: +SKIP
+    >>> prediction.skin.vertices  # doctest: +SKIP
+    """
+    scene = model_scene(patient, model)
+    begun = time.perf_counter()
+    result = solve_scene(scene, solver=solver)
+    timings = {**patient.summary.get("timings", {}), "solving": time.perf_counter() - begun}
+    moved = np.linalg.norm(np.asarray(result.displacements)[patient.skin_nodes], axis=1)
+    summary = {
+        **patient.summary,
+        "model": model,
+        "case_key": _case_key(patient, scene),
+        "plan": {name: _motion(patient, scene, name) for name in scene.plan},
+        "skin": {
+            "mean": float(moved.mean()),
+            "p95": float(np.percentile(moved, 95)),
+            "largest": float(moved.max()),
+        },
+        "findings": [*patient.summary.get("findings", []), *result.summary["findings"]],
+        "solution": dict(result.summary),
+        "timings": timings,
+        "left_out": _left_out(patient, scene, model),
+    }
+    return Prediction(model, patient, scene, result, summary, predicted_by=predict_patient)
+
+
+def _case_key(patient: PatientModel, scene: Scene) -> str:
+    """The key of what a prediction belongs to, the same for all models of a patient and plan.
+
+    Beyond the key of the case's files it is that of mesh and motions, since a patient may be given
+    another plan in memory.
+    """
+    digest = hashlib.sha256(str(patient.summary.get("inputs_key", "")).encode())
+    for name, array in _arrays(scene):
+        values = np.ascontiguousarray(array)
+        digest.update(f"{name} {values.dtype.str} {values.shape}\n".encode())
+        digest.update(values.tobytes())
+    return digest.hexdigest()
+
+
+def _arrays(scene: Scene) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Mesh and motions of a scene, each with its name."""
+    yield "nodes", np.asarray(scene.nodes)
+    yield "tets", np.asarray(scene.tets)
+    for name, motion in scene.plan.items():
+        if isinstance(motion, MovedSurface):
+            yield f"surface of {name}", np.asarray(motion.surface.vertices)
+            yield f"moved {name}", np.asarray(motion.moved_vertices)
+        else:
+            yield f"motion of {name}", np.asarray(motion)
+
+
+def _motion(patient: PatientModel, scene: Scene, name: str) -> dict[str, Any]:
+    """A segment's motion in a planner's numbers, and in a surgeon's.
+
+    A planner's are those about the segment's own centre (paper, Table 2).
+    """
+    motion = scene.plan[name]
+    surfaces = {segment.name: segment.surface for segment in patient.segments}
+    if isinstance(motion, MovedSurface) or np.shape(motion) == (4, 4):
+        vertices = np.asarray(surfaces[name].vertices)
+    else:
+        vertices = np.asarray(scene.nodes)[np.asarray(scene.segments[name].joined)]
+    clinical = clinical_motion(
+        name,
+        motion,
+        landmarks=patient.landmarks.get("skull"),
+        vertices=vertices,
+        source=patient.summary.get("plan_sources", {}).get(name, ""),
+    ).as_dict()
+    if isinstance(motion, MovedSurface):
+        here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
+        size = np.linalg.norm(there - here, axis=1)
+        fit = rigid_fit(here, there)
+        return {
+            "mean": float(size.mean()),
+            "largest": float(size.max()),
+            # The nearest rigid motion, and what it leaves of the vertices' own.
+            **_rigid_numbers(np.asarray(fit.matrix), here.mean(axis=0)),
+            "bending": float(fit.rms),
+            "clinical": clinical,
+        }
+    matrix = np.asarray(motion, dtype=np.float64)
+    if matrix.shape != (4, 4):
+        size = np.linalg.norm(matrix, axis=1)
+        return {"mean": float(size.mean()), "largest": float(size.max()), "clinical": clinical}
+    return {**_rigid_numbers(matrix, vertices.mean(axis=0)), "clinical": clinical}
+
+
+def _rigid_numbers(matrix: NDArray[np.float64], centre: NDArray[np.float64]) -> dict[str, Any]:
+    parts = decompose_motion(matrix, centre)
+    return {
+        "translation": parts.translation.tolist(),
+        "angle": parts.angle,
+        "axis": parts.axis.tolist(),
+        "centre": parts.centre.tolist(),
+    }
+
+
+def _left_out(patient: PatientModel, scene: Scene, model: str) -> list[str]:
+    """What the scene did not need, as sentences."""
+    left = []
+    if model.startswith("H"):
+        left.append("muscles: the model is homogeneous")
+    elif patient.fraction is not None:
+        share = float(np.mean(patient.fraction == 0.0))
+        left.append(f"muscle law: {100 * share:.0f} % of the tets hold no muscle, and are fat")
+    if not any(np.size(segment.sliding) for segment in scene.segments.values()):
+        left.append("contact: no node slides")
+    still = [name for name, motion in scene.plan.items() if _stays(motion)]
+    if still:
+        left.append(f"motion: {', '.join(still)} stay")
+    return left
+
+
+def _stays(motion: object) -> bool:
+    return not isinstance(motion, MovedSurface) and np.array_equal(np.asarray(motion), np.eye(4))

@@ -1,0 +1,247 @@
+"""From a scene to its solution: the plain values become core objects and come back as arrays."""
+
+import logging
+import math
+import platform
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import (
+    Boundary,
+    MassTensors,
+    Solution,
+    StaticSolver,
+    Surface,
+    SurfaceMotion,
+    TetMesh,
+    Tissue,
+    __version__,
+)
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.scene import MovedSurface, Scene, SceneResult, SurfaceData, TissueData
+
+__all__ = ["scene_plan", "scene_solver", "solve_scene"]
+
+_log = logging.getLogger(__name__)
+
+
+def scene_solver(scene: Scene) -> StaticSolver:
+    """The solver of a scene, ready for its plan and for others.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Returns
+    -------
+    StaticSolver
+        Mesh, tissue and boundary are at `.tensors.mesh`, `.tensors.tissue` and `.boundary`.
+
+    Raises
+    ------
+    MeshError, MaterialError, BoundaryError, ContactError, SolverError
+        (the input errors also `ValueError`) What the core finds wrong with the scene.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> solver = cmfsim.scene_solver(scene)  # doctest: +SKIP
+    >>> solver.solve({"maxilla": cmfsim.rigid_motion((0, -5, 0))})  # doctest: +SKIP
+    """
+    mesh = TetMesh(scene.nodes, scene.tets)
+    _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
+    options = scene.options.as_dict()
+    tensors = MassTensors(mesh, _tissue(scene.tissue), element=options.pop("element"))
+    segments = scene.segments.items()
+    sliding = {name: s.sliding for name, s in segments if np.size(s.sliding)}
+    boundary = Boundary(
+        fixed=scene.fixed,
+        joined={name: s.joined for name, s in segments if np.size(s.joined)},
+        sliding=sliding,
+        contact={name: _surface(s.contact) for name, s in segments if s.contact is not None},
+        gap={name: s.gap for name, s in segments if name in sliding},
+        conflicts=scene.conflicts,
+    )
+    if boundary.conflicts:
+        _log.warning("%d nodes had two kinds; the stronger one was kept", boundary.conflicts)
+    solver = StaticSolver(tensors, boundary, options.pop("method"), **options)
+    _log.info("solver: %s, %d unknowns", solver.method, solver.n_unknowns)
+    return solver
+
+
+def scene_plan(scene: Scene) -> dict[str, NDArray[np.float64] | SurfaceMotion]:
+    """The plan of a scene in the form that `StaticSolver.solve` takes.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Returns
+    -------
+    dict of str to (4, 4) float64, (j, 3) float64 or SurfaceMotion
+
+    Raises
+    ------
+    MeshError
+        (also `ValueError`) A moved surface with degenerate triangles.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> plan = cmfsim.scene_plan(scene)  # doctest: +SKIP
+    """
+    plan: dict[str, NDArray[np.float64] | SurfaceMotion] = {}
+    for name, motion in scene.plan.items():
+        if isinstance(motion, MovedSurface):
+            plan[name] = SurfaceMotion(_surface(motion.surface), motion.moved_vertices)
+        else:
+            plan[name] = np.asarray(motion, dtype=np.float64)
+    return plan
+
+
+def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneResult:
+    """The solution of a scene under its own plan, loads and options.
+
+    Parameters
+    ----------
+    scene : Scene
+    solver : StaticSolver, optional
+        Of this scene, whatever its plan, where `scene_solver` has made one already.
+
+    Returns
+    -------
+    SceneResult
+        Where large deformation leaves tets inverted, `summary["inverted_tets"]` counts them and
+        `summary["findings"]` says which is worst and what to do. In linear kinematics the count is
+        None: it would mean nothing there.
+
+    Raises
+    ------
+    MeshError, MaterialError, BoundaryError, ContactError, SolverError
+        (the input errors also `ValueError`) What is wrong with the scene, or that the solution did
+        not converge and how far it came.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> scene = cmfsim.Scene(
+    ...     nodes=[[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    ...     tets=[[0, 1, 2, 3]],
+    ...     tissue=cmfsim.TissueData("isotropic", young=1.0, poisson=0.0),
+    ...     fixed=[0, 1, 2],
+    ...     segments={"tip": cmfsim.SegmentData(joined=[3])},
+    ...     plan={"tip": cmfsim.rigid_motion(translation=(0, 0, 0.1))},
+    ... )
+    >>> result = cmfsim.solve_scene(scene)
+    >>> float(round(result.forces[3, 2], 9))  # V E g² u = 1/6 · 1 · 1 · 0.1
+    0.016666667
+    """
+    solver = solver or scene_solver(scene)
+    solution = solver.solve(scene_plan(scene), loads=scene.loads)
+    _log.info(
+        "solved: residual %.2e, error %.2e mm (estimated)",
+        solution.residual,
+        solution.error_estimate,
+    )
+    inverted, findings = _inverted(solver, solution)
+    findings += _contact_findings(solution)
+    summary: dict[str, Any] = {
+        "scene_sha256": scene.sha256(),
+        "n_nodes": scene.n_nodes,
+        "n_tets": scene.n_tets,
+        "n_unknowns": solver.n_unknowns,
+        "method": solver.method,
+        "element": solver.tensors.element,
+        "kinematics": solver.kinematics,
+        "contact": scene.options.contact,
+        "conflicts": solver.boundary.conflicts,
+        "residual": _finite(solution.residual),
+        "error_estimate": _finite(solution.error_estimate),
+        "iterations": solution.iterations,
+        "contact_gap": _finite(solution.contact_gap),
+        "contact_unbalanced": _finite(solution.contact_unbalanced),
+        "contact_converged": solution.contact_converged,
+        "contact_iterations": solution.contact_iterations,
+        "inverted_tets": inverted,
+        "findings": findings,
+        "factor_bytes": solver.factor_bytes,
+        "timings": {"set_up": dict(solver.timings), "solve": dict(solution.timings)},
+        "versions": {
+            "cmfsim": __version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+    }
+    mesh = solver.tensors.mesh
+    return SceneResult(
+        nodes=mesh.nodes,
+        tets=mesh.tets,
+        skin_triangles=mesh.boundary_triangles(),
+        displacements=solution.displacements,
+        forces=solution.forces,
+        residual_history=solution.residual_history,
+        contact_nodes=solution.contact_nodes,
+        contact_points=solution.contact_points,
+        contact_normals=solution.contact_normals,
+        contact_forces=solution.contact_forces,
+        contact_gaps=solution.contact_gaps,
+        summary=summary,
+    )
+
+
+def _inverted(solver: StaticSolver, solution: Solution) -> tuple[int | None, list[dict[str, str]]]:
+    """Tets that rest inverted, and what to say of them; linear kinematics has none to count."""
+    if solver.kinematics == "linear":
+        return None, []
+    # A linear scene does not pay for it.
+    from cmfsim.solving.inversion import inversion_finding  # noqa: PLC0415
+
+    count, found = inversion_finding(solver.tensors, solution.all_displacements)
+    return count, [] if found is None else [_told(found)]
+
+
+def _contact_findings(solution: Solution) -> list[dict[str, str]]:
+    """That contact stopped above its tolerance, with figures that no face would show."""
+    if solution.contact_converged:
+        return []
+    found = Finding(
+        "warning",
+        "contact-stopped",
+        f"contact stopped after {solution.contact_iterations} steps with gaps of "
+        f"{solution.contact_gap:.1e} mm and nodes {solution.contact_unbalanced:.1e} mm out of "
+        "balance",
+        "contact",
+        "the tolerance asks for less, though no face would show it",
+        "allow more contact_iterations or a larger contact_tolerance, or smooth the surface",
+    )
+    return [_told(found)]
+
+
+def _told(found: Finding) -> dict[str, str]:
+    """The finding as results hold it, after a warning: the command line prints findings itself."""
+    words = (found.code, found.what, found.where, found.why, found.mend)
+    _log.warning("%s: %s, %s: %s; %s", *words, extra={"is_finding": True})
+    return asdict(found)
+
+
+def _finite(value: float) -> float | None:
+    """A figure as JSON can hold it: null stands for one that is not known."""
+    return value if math.isfinite(value) else None
+
+
+def _tissue(data: TissueData) -> Tissue:
+    arrays = data.arrays()
+    if data.kind == "isotropic":
+        return Tissue.isotropic(**arrays)
+    if data.kind == "transversely_isotropic":
+        return Tissue.transversely_isotropic(**arrays, law=data.law)
+    if data.kind == "stiffness":
+        return Tissue.from_stiffness(arrays["stiffness"])
+    return Tissue.preset(data.preset, arrays["fraction"], arrays.get("fibre"), mixing=data.mixing)
+
+
+def _surface(data: SurfaceData) -> Surface:
+    return Surface(data.vertices, data.triangles, crease_angle=data.crease_angle)

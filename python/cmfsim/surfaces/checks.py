@@ -1,0 +1,328 @@
+"""What is wrong with a triangle surface: borders, debris, orientation, crossings, slivers.
+
+Everything here looks and changes nothing; `surface_repair` mends. Costs are a few sorts of the
+edges, and for crossings a grid over the triangles.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError
+from cmfsim.surfaces.crossings import crossing_pairs
+from cmfsim.surfaces.topology import Edges, component_labels, edges_of, orientation_flips
+from cmfsim.values.scene import SurfaceData
+
+__all__ = [
+    "BorderLoop",
+    "Component",
+    "SurfaceReport",
+    "border_loops",
+    "check_extent",
+    "check_surface",
+]
+
+# Largest coordinate of which areas and volumes are still numbers, mm.
+MAX_COORDINATE = 1e90
+
+# A triangle whose height is below this share of its longest edge is a line, not a triangle: its
+# normal is rounding error for coordinates of some 1000 mm at double precision.
+DEGENERATE_HEIGHT = 1e-9
+# Below this share it is a sliver: distances to it are sound, its normal points anywhere.
+SLIVER_HEIGHT = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class BorderLoop:
+    """One closed border of a surface.
+
+    Attributes
+    ----------
+    vertices : (k,) int64
+        In the order in which the triangles at the border run.
+    length : float, mm
+    centre : (3,) float64, mm
+        Mean of the vertices.
+    """
+
+    vertices: NDArray[np.int64]
+    length: float
+    centre: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """One connected piece of a surface, by shared edges.
+
+    Attributes
+    ----------
+    n_triangles : int
+    area : float, mm²
+    volume : float, mm³
+        Signed, of the triangles as they are; means little if the piece is not closed.
+    centre : (3,) float64, mm
+    is_closed : bool
+    """
+
+    n_triangles: int
+    area: float
+    volume: float
+    centre: Floats
+    is_closed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceReport:
+    """The state of a surface, in counts and places.
+
+    Attributes
+    ----------
+    n_vertices, n_triangles : int
+    lowest, highest : (3,) float64, mm
+        Bounds of the vertices that triangles use.
+    area : float, mm²
+    volume : float, mm³
+        Signed: negative where normals point inwards.
+    degenerate : (k,) int64
+        Triangles without area.
+    duplicate : (k,) int64
+        Triangles with the same corners as an earlier one, either way round.
+    slivers : (k,) int64
+        Triangles far lower than long, degenerate ones left out.
+    non_manifold : (k, 2) int64
+        Edges of more than two triangles, as vertices.
+    inconsistent : int
+        Edges that both their triangles run through in the same direction.
+    orientable : bool
+    borders : tuple of BorderLoop
+        Longest first.
+    components : tuple of Component
+        Largest area first.
+    crossings : (k, 2) int64 or None
+        Pairs of triangles that cut through each other; None if they were not looked for.
+    crossing_points : (k, 3) float64, mm, or None
+        A place near each crossing.
+    """
+
+    n_vertices: int
+    n_triangles: int
+    lowest: Floats
+    highest: Floats
+    area: float
+    volume: float
+    degenerate: NDArray[np.int64]
+    duplicate: NDArray[np.int64]
+    slivers: NDArray[np.int64]
+    non_manifold: NDArray[np.int64]
+    inconsistent: int
+    orientable: bool
+    borders: tuple[BorderLoop, ...]
+    components: tuple[Component, ...]
+    crossings: NDArray[np.int64] | None = None
+    crossing_points: Floats | None = None
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the surface has no border."""
+        return not self.borders
+
+
+def check_extent(vertices: Floats) -> None:
+    """Refuses coordinates so large that areas and volumes would not be numbers.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) With the vertex.
+    """
+    far = np.argwhere(np.abs(vertices) > MAX_COORDINATE)
+    if len(far):
+        vertex, axis = far[0]
+        raise CaseInputError(
+            f"surface vertex {vertex} has the coordinate {vertices[vertex, axis]:g} mm: at most "
+            f"{MAX_COORDINATE:g} is worked with"
+        )
+
+
+def check_surface(surface: SurfaceData, *, crossings: bool = True) -> SurfaceReport:
+    """The state of a surface.
+
+    Parameters
+    ----------
+    surface : SurfaceData
+        With vertices in the same place made one, as `read_surface` does: else every triangle of an
+        STL file has a border of its own.
+    crossings : bool
+        Whether to look for triangles that cut through each other, the costliest check.
+
+    Returns
+    -------
+    SurfaceReport
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A coordinate above 1e90 mm.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> triangle = cmfsim.SurfaceData([[0, 0, 0], [3, 0, 0], [0, 4, 0]], [[0, 1, 2]])
+    >>> report = cmfsim.check_surface(triangle)
+    >>> report.area, report.borders[0].length, report.is_closed
+    (6.0, 12.0, False)
+    """
+    vertices = np.asarray(surface.vertices, dtype=np.float64)
+    triangles = np.asarray(surface.triangles).astype(np.int64)
+    check_extent(vertices)
+    degenerate, slivers = thin_triangles(vertices, triangles)
+    duplicate = duplicate_triangles(triangles)
+    # Repetitions would look like forks. A triangle without area still joins its neighbours, unless
+    # it names a vertex twice, when they are joined without it.
+    keep = has_three_corners(triangles)
+    keep[duplicate] = False
+    kept = triangles[keep]
+    edges = edges_of(kept)
+    used = vertices[np.unique(triangles)] if len(triangles) else np.zeros((1, 3))
+    _, orientable = orientation_flips(edges, len(kept))
+    areas, volumes = _areas_volumes(vertices, kept)
+    found = points = None
+    if crossings:
+        solid = keep.copy()
+        solid[degenerate] = False
+        numbers = np.flatnonzero(solid)
+        pairs = crossing_pairs(vertices, triangles[solid])
+        if pairs is not None:
+            found = numbers[pairs].reshape(-1, 2)
+            points = vertices[triangles[found]].mean(axis=(1, 2))
+    return SurfaceReport(
+        n_vertices=len(vertices),
+        n_triangles=len(triangles),
+        lowest=used.min(axis=0),
+        highest=used.max(axis=0),
+        area=float(areas.sum()),
+        volume=float(volumes.sum()),
+        degenerate=degenerate,
+        duplicate=duplicate,
+        slivers=slivers,
+        non_manifold=edges.ends[edges.counts > 2],
+        inconsistent=int((~edges.opposed).sum()),
+        orientable=orientable,
+        borders=border_loops(vertices, edges),
+        components=_components(vertices, kept, edges, areas, volumes),
+        crossings=found,
+        crossing_points=points,
+    )
+
+
+def thin_triangles(
+    vertices: Floats, triangles: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The triangles without area, and those that are slivers."""
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    longest = np.sqrt(
+        np.maximum.reduce([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))])
+    )
+    twice_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    flat = twice_area <= DEGENERATE_HEIGHT * longest * longest
+    sliver = ~flat & (twice_area < SLIVER_HEIGHT * longest * longest)
+    return np.flatnonzero(flat), np.flatnonzero(sliver)
+
+
+def has_three_corners(triangles: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which triangles name no vertex twice."""
+    a, b, c = triangles.T
+    return np.asarray((a != b) & (b != c) & (c != a), dtype=np.bool_)
+
+
+def duplicate_triangles(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The triangles whose corners an earlier one has too, in any order."""
+    if not len(triangles):
+        return np.zeros(0, dtype=np.int64)
+    _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
+    again = np.ones(len(triangles), dtype=bool)
+    again[first] = False
+    return np.flatnonzero(again)
+
+
+def border_loops(vertices: Floats, edges: Edges) -> tuple[BorderLoop, ...]:
+    """The closed borders of a surface, longest first.
+
+    A walk along the border that comes back to a vertex ends a loop there, so that two loops which
+    touch at a vertex are two.
+    """
+    starts, ends = edges.border.T
+    after: dict[int, list[int]] = {}
+    for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
+        after.setdefault(start, []).append(end)
+    loops: list[list[int]] = []
+    for first in starts.tolist():
+        walk, seen = [first], {first: 0}
+        while after.get(walk[-1]):
+            vertex = after[walk[-1]].pop()
+            if vertex in seen:
+                begin = seen[vertex]
+                loops.append(walk[begin:])
+                for left in walk[begin + 1 :]:
+                    del seen[left]
+                del walk[begin + 1 :]
+            else:
+                seen[vertex] = len(walk)
+                walk.append(vertex)
+        # What is left over here is a border that inconsistent triangles interrupt.
+        if len(walk) > 1:
+            loops.append(walk)
+    found = [_border_loop(vertices, np.array(loop, dtype=np.int64)) for loop in loops]
+    return tuple(sorted(found, key=lambda loop: (-loop.length, int(loop.vertices.min()))))
+
+
+def _border_loop(vertices: Floats, loop: NDArray[np.int64]) -> BorderLoop:
+    points = vertices[loop]
+    steps = np.roll(points, -1, axis=0) - points
+    return BorderLoop(loop, float(np.linalg.norm(steps, axis=1).sum()), points.mean(axis=0))
+
+
+def _areas_volumes(vertices: Floats, triangles: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Area of each triangle, and its share of the signed volume about the middle of the surface."""
+    if not len(triangles):
+        return np.zeros(0), np.zeros(0)
+    # About the middle, or the digits of a small volume far from the origin cancel.
+    middle = vertices[triangles].mean(axis=(0, 1))
+    a, b, c = (vertices[triangles[:, i]] - middle for i in range(3))
+    normals = np.cross(b - a, c - a)
+    volumes = np.asarray((a * np.cross(b, c)).sum(axis=1) / 6.0, dtype=np.float64)
+    return 0.5 * np.linalg.norm(normals, axis=1), volumes
+
+
+def _components(
+    vertices: Floats,
+    triangles: NDArray[np.int64],
+    edges: Edges,
+    areas: Floats,
+    volumes: Floats,
+) -> tuple[Component, ...]:
+    labels = component_labels(edges, len(triangles))
+    if not len(labels):
+        return ()
+    count = int(labels.max()) + 1
+    n_triangles = np.bincount(labels, minlength=count)
+    area = np.bincount(labels, weights=areas, minlength=count)
+    volume = np.bincount(labels, weights=volumes, minlength=count)
+    middles = vertices[triangles].mean(axis=1)
+    centre = np.stack(
+        [np.bincount(labels, weights=middles[:, i], minlength=count) for i in range(3)], axis=1
+    )
+    open_pieces = np.zeros(count, dtype=bool)
+    open_pieces[labels[edges.border_triangles]] = True
+    return tuple(
+        Component(
+            int(n_triangles[i]),
+            float(area[i]),
+            float(volume[i]),
+            centre[i] / n_triangles[i],
+            not open_pieces[i],
+        )
+        for i in np.lexsort((np.arange(count), -area))
+    )

@@ -1,0 +1,312 @@
+"""A mended triangle surface: welded, cleaned, oriented outwards, closed; each mend is a finding."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import Surface
+from cmfsim.checks import Floats, as_number
+from cmfsim.errors import CaseInputError
+from cmfsim.surfaces.capping import cap_loop
+from cmfsim.surfaces.checks import (
+    border_loops,
+    check_extent,
+    duplicate_triangles,
+    has_three_corners,
+    thin_triangles,
+)
+from cmfsim.surfaces.topology import component_labels, connected_labels, edges_of, orientation_flips
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.scene import SurfaceData
+
+__all__ = ["RepairOptions", "clean_surface", "repair_surface"]
+
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class RepairOptions:
+    """Which mends are made.
+
+    Attributes
+    ----------
+    weld_distance : float
+        Vertices closer than this share of the surface's extent become one. 1e-7 is 0.03 µm on a
+        head: below what single precision tells apart.
+    keep_share : float
+        Pieces with less than this share of the largest piece's area are dropped: 0 keeps all, 1
+        keeps the largest alone.
+    close_borders : bool
+        Whether borders are closed by caps.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Out of range.
+    """
+
+    weld_distance: float = 1e-7
+    keep_share: float = 0.01
+    close_borders: bool = True
+
+    def __post_init__(self) -> None:
+        for name, high in (("weld_distance", 0.01), ("keep_share", 1.0)):
+            value = as_number(name, getattr(self, name))
+            if not 0.0 <= value <= high:
+                raise CaseInputError(f"{name} is {value:g}: must be 0 to {high:g}")
+
+
+def clean_surface(surface: SurfaceData) -> SurfaceData:
+    """The surface without triangles that have no area or repeat others, and without stray vertices.
+
+    What remains is fit for `cmfsim.Surface`; it may be empty of triangles.
+    """
+    vertices = np.asarray(surface.vertices)
+    triangles = np.asarray(surface.triangles).astype(np.int64)
+    keep = np.ones(len(triangles), dtype=bool)
+    keep[thin_triangles(vertices, triangles)[0]] = False
+    keep[duplicate_triangles(triangles)] = False
+    return _compact(vertices, triangles[keep], surface.crease_angle)
+
+
+def repair_surface(
+    surface: SurfaceData, name: str, options: RepairOptions | None = None
+) -> tuple[SurfaceData, tuple[Finding, ...]]:
+    """A closed, outward surface made from one that is nearly so, with a finding for each mend.
+
+    Vertices in the same place become one; triangles without area and repeated ones are dropped, and
+    so are small pieces; triangles are turned round until neighbours agree and the largest piece
+    encloses a positive volume; other pieces that enclose a negative one stay if they lie inside the
+    largest (hollows) and are turned if not; borders are closed by caps.
+
+    Parameters
+    ----------
+    surface : SurfaceData
+    name : str
+        What findings call it.
+    options : RepairOptions, optional
+
+    Returns
+    -------
+    SurfaceData
+    tuple of Finding
+        Notes; a warning where a cap is far from flat.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) No triangle with an area is left; a coordinate above 1e90 mm.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    >>> open_tet = cmfsim.SurfaceData(corners, [[0, 1, 2], [0, 3, 1], [0, 2, 3]])
+    >>> closed, findings = cmfsim.repair_surface(open_tet, "tet")
+    >>> len(closed.triangles), [finding.code for finding in findings]
+    (4, ['surface-turned', 'surface-closed'])
+    """
+    options = options or RepairOptions()
+    findings: list[Finding] = []
+
+    def note(code: str, what: str, why: str) -> None:
+        findings.append(Finding("note", code, what, name, why, "look at the result; nothing to do"))
+
+    vertices = np.asarray(surface.vertices)
+    triangles = np.asarray(surface.triangles).astype(np.int64)
+    check_extent(vertices)
+    vertices, triangles, n_welded = _welded(vertices, triangles, options.weld_distance)
+    if n_welded:
+        note("surface-welded", f"{n_welded} vertices became one with others", "they hid edges")
+    triangles, n_flat, n_again = _without_flat(vertices, triangles)
+    if n_flat or n_again:
+        what = f"{n_flat} triangles without area and {n_again} repeated ones are removed"
+        note("surface-cleaned", what, "they have no normal, or count their space twice")
+    if not len(triangles):
+        raise CaseInputError(f"{name}: no triangle with an area is left")
+
+    triangles, dropped = _without_debris(vertices, triangles, options.keep_share)
+    if dropped:
+        what = f"{dropped} small pieces are dropped (below {options.keep_share:.0%} of the largest)"
+        note("surface-debris", what, "debris would become islands of bone or skin")
+    triangles, n_turned = _outward(vertices, triangles)
+    if n_turned:
+        what = f"{n_turned} of {len(triangles)} triangles are turned round"
+        note("surface-turned", what, "normals that point inwards swap inside and outside")
+    if options.close_borders:
+        caps = []
+        for loop in border_loops(vertices, edges_of(triangles)):
+            if len(loop.vertices) < 3:
+                continue
+            cap, bulge = cap_loop(vertices, loop.vertices)
+            # What lies on a line closes a slit that is closed already.
+            cap = np.delete(cap, thin_triangles(vertices, cap)[0], axis=0)
+            if not len(cap):
+                continue
+            caps.append(cap)
+            findings.append(_cap_finding(name, loop.length, loop.centre, bulge))
+        triangles = np.concatenate([triangles, *caps])
+    return _compact(vertices, triangles, surface.crease_angle), tuple(findings)
+
+
+# A cap whose border strays further than this share of its length from a plane covers a region
+# whose shape nobody knows.
+FLAT_SHARE = 0.05
+
+
+def _cap_finding(name: str, length: float, centre: Floats, bulge: float) -> Finding:
+    flat = bulge <= FLAT_SHARE * length
+    place = ", ".join(f"{x:.1f}" for x in centre)
+    return Finding(
+        "note" if flat else "warning",
+        "surface-closed",
+        f"a border of {length:.1f} mm (at most {bulge:.1f} mm from a plane) is closed by a cap",
+        f"{name} at ({place})",
+        "inside and outside are only known for a closed surface"
+        + ("" if flat else "; this cap is far from flat, so its shape is made up"),
+        "look at the cap; if it is wrong, close the surface yourself",
+    )
+
+
+def _compact(vertices: Floats, triangles: Integers, crease_angle: float) -> SurfaceData:
+    used, renumbered = np.unique(triangles, return_inverse=True)
+    return SurfaceData(vertices[used], renumbered.reshape(-1, 3), crease_angle)
+
+
+def _welded(
+    vertices: Floats, triangles: Integers, weld_distance: float
+) -> tuple[Floats, Integers, int]:
+    """Vertices with those nearer than a share of the extent made one, the first of each kept."""
+    if not len(vertices):
+        return vertices, triangles, 0
+    extent = float((vertices.max(axis=0) - vertices.min(axis=0)).max())
+    distance = weld_distance * extent
+    if distance == 0.0:
+        return vertices, triangles, 0
+    labels = connected_labels(_near_pairs(vertices, distance), len(vertices))
+    _, first = np.unique(labels, return_index=True)
+    return vertices[first], labels[triangles], len(vertices) - len(first)
+
+
+def _near_pairs(vertices: Floats, distance: float) -> Integers:
+    """Pairs of vertices that lie within a distance, by grids shifted by half a cell each way.
+
+    Any two nearer than the distance share a cell of twice that width in one of the eight grids.
+    """
+    pairs = [np.zeros((0, 2), dtype=np.int64)]
+    low = vertices.min(axis=0)
+    for corner in range(8):
+        shift = np.array([0.5 * ((corner >> axis) & 1) for axis in range(3)])
+        cells = np.floor((vertices - low) / (2.0 * distance) + shift)
+        order = np.lexsort(cells.T)
+        one, other = order[:-1], order[1:]
+        near = (cells[one] == cells[other]).all(axis=1)
+        near &= np.linalg.norm(vertices[one] - vertices[other], axis=1) <= distance
+        pairs.append(np.stack([one[near], other[near]], axis=1))
+    return np.concatenate(pairs)
+
+
+# Rounds and number of flat triangles up to which they are removed without opening a slit; a surface
+# with more is broken in another way.
+FLAT_ROUNDS, MAX_FLAT = 8, 2000
+# Share of the longest edge below which the shortest is a point.
+POINT_SHARE = 1e-3
+
+
+def _without_flat(vertices: Floats, triangles: Integers) -> tuple[Integers, int, int]:
+    """Triangles without those that have no area or repeat others, and how many of each went.
+
+    Dropping a flat triangle would leave a slit of no width. One with two corners in the same place
+    goes when these become one; one with a corner on its longest edge takes that edge from the
+    triangle across, which is then cut in two at the corner.
+    """
+    n_flat = len(thin_triangles(vertices, triangles)[0])
+    n_again = 0
+    for _ in range(FLAT_ROUNDS):
+        triangles = triangles[has_three_corners(triangles)]
+        before = len(triangles)
+        triangles = np.delete(triangles, duplicate_triangles(triangles), axis=0)
+        n_again += before - len(triangles)
+        flat = thin_triangles(vertices, triangles)[0]
+        if not 0 < len(flat) <= MAX_FLAT:
+            break
+        corners = vertices[triangles[flat]]
+        # Edge i lies opposite corner i.
+        lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1), axis=2)
+        is_point = lengths.min(axis=1) <= POINT_SHARE * lengths.max(axis=1)
+        if is_point.any():
+            short = lengths[is_point].argmin(axis=1)
+            rows = triangles[flat[is_point]]
+            ends = [rows[np.arange(len(rows)), (short + step) % 3] for step in (1, 2)]
+            labels = connected_labels(np.stack(ends, axis=1), len(vertices))
+            _, first = np.unique(labels, return_index=True)
+            triangles = first[labels][triangles]
+        else:
+            triangles = _with_turned_edges(triangles, flat, lengths.argmax(axis=1))
+    flat = thin_triangles(vertices, triangles)[0]
+    triangles = np.delete(triangles, flat, axis=0)
+    return triangles, n_flat, n_again
+
+
+def _with_turned_edges(triangles: Integers, flat: Integers, longest: Integers) -> Integers:
+    """Triangles where each flat one and its neighbour across its longest edge are cut anew."""
+    triangles = triangles.copy()
+    done: set[int] = set()
+    for number, corner in zip(flat.tolist(), longest.tolist(), strict=True):
+        tip, start, end = np.roll(triangles[number], -corner)
+        across = np.flatnonzero(
+            (triangles == start).any(axis=1) & (triangles == end).any(axis=1)
+        ).tolist()
+        others = [t for t in across if t != number]
+        if len(others) != 1 or {number, others[0]} & done:
+            continue
+        other = others[0]
+        far = next(v for v in triangles[other].tolist() if v not in {start, end})
+        # The neighbour runs from end to start; if it does not, the surface is inconsistent there.
+        row = triangles[other].tolist()
+        if row[(row.index(end) + 1) % 3] != start:
+            continue
+        triangles[number] = (tip, start, far)
+        triangles[other] = (tip, far, end)
+        done |= {number, other}
+    return triangles
+
+
+def _without_debris(
+    vertices: Floats, triangles: Integers, keep_share: float
+) -> tuple[Integers, int]:
+    labels = component_labels(edges_of(triangles), len(triangles))
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    areas = np.bincount(labels, weights=0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    keep = areas >= keep_share * areas.max()
+    return triangles[keep[labels]], int((~keep).sum())
+
+
+def _outward(vertices: Floats, triangles: Integers) -> tuple[Integers, int]:
+    """Triangles turned round until neighbours agree and solid pieces enclose positive volumes."""
+    edges = edges_of(triangles)
+    flips, _ = orientation_flips(edges, len(triangles))
+    labels = component_labels(edges, len(triangles))
+    oriented = np.where(flips[:, None], triangles[:, ::-1], triangles)
+    middle = vertices[triangles].mean(axis=(0, 1))
+    a, b, c = (vertices[oriented[:, i]] - middle for i in range(3))
+    volumes = np.bincount(labels, weights=(a * np.cross(b, c)).sum(axis=1) / 6.0)
+    areas = np.bincount(labels, weights=np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    largest = int(np.argmax(areas))
+    turn = np.zeros(len(volumes), dtype=bool)
+    if volumes[largest] < 0.0:
+        # A file that is inside out as a whole keeps its hollows when all of it is turned.
+        turn[:] = True
+        volumes = -volumes
+    inward = [piece for piece in np.flatnonzero(volumes < 0.0) if piece != largest]
+    if inward:
+        turned = turn[labels][:, None]
+        body = np.where(turned, oriented[:, ::-1], oriented)[labels == largest]
+        outer = _compact(vertices, body, 180.0)
+        samples = [vertices[oriented[labels == piece][0]].mean(axis=0) for piece in inward]
+        inside = Surface(outer.vertices, outer.triangles).winding_number(np.array(samples)) > 0.5
+        for piece, hollow in zip(inward, inside, strict=True):
+            turn[piece] ^= not hollow
+    flips ^= turn[labels]
+    return np.where(flips[:, None], triangles[:, ::-1], triangles), int(flips.sum())

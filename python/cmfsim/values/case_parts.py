@@ -1,0 +1,416 @@
+"""The parts of a patient case as its file states them: files, cuts, motions, region, mesh.
+
+Nothing here is read from disk: the files that a case names may be missing, which `cmfsim doctor`
+says. `cmfsim.Case` holds the whole.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim.checks import Floats, as_rows, as_text, check_one_of
+from cmfsim.errors import CaseInputError
+from cmfsim.values.frozen import Frozen
+
+__all__ = [
+    "DIRECTIONS",
+    "FRAMES",
+    "PROCEDURES",
+    "UNITS",
+    "CaseImage",
+    "CaseLandmarks",
+    "CaseMesh",
+    "CaseMotion",
+    "CaseMuscles",
+    "CaseOsteotomy",
+    "CasePostoperative",
+    "CaseSurfaces",
+    "Plane",
+    "Region",
+]
+
+# Units that a surface file may be in, and their length in mm.
+UNITS: Mapping[str, float] = MappingProxyType(
+    {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "inch": 25.4}
+)
+FRAMES = ("LPS", "RAS")
+# What the numbers of a transform file do, in 3D Slicer's words: carry a bone from where it is to
+# where it goes, or the moved bone back.
+DIRECTIONS = ("to-parent", "from-parent")
+# Standard procedures, and the segments that each makes (paper 2.1, 3.1).
+PROCEDURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "le_fort_1": ("maxilla",),
+        "le_fort_3": ("midface",),
+        "bsso": ("mandible_body", "ramus_left", "ramus_right"),
+        "genioplasty": ("chin",),
+    }
+)
+# Distance of the posterior plane behind the roots of the zygomatic arches, mm: behind the whole
+# ramus and its joint, so that the jaw moves inside tissue, and before the mastoid and neck.
+POSTERIOR_DEPTH = 10.0
+# Share of the head's depth, from the foremost point of the skin, in front of the plane where there
+# are no landmarks: the same plane on a head of ordinary proportions.
+POSTERIOR_SHARE = 0.6
+# Landmarks that the posterior plane is placed from: the roots of the arches, in front of the ears.
+POSTERIOR_LANDMARKS = ("supraglenoid_L", "supraglenoid_R")
+# Edge length of the mesh where a case states none, mm: some 400 000 tets of a face with its neck,
+# whose edges are 2.9 mm long on average, half of an edge where tissue is thin.
+EDGE_LENGTH = 4.0
+# Tooth rows rest 2 to 4 mm apart, and a mucoperiosteal flap is lifted about as far at a cut, mm.
+CLEFT = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Plane(Frozen):
+    """A plane in space.
+
+    Attributes
+    ----------
+    point : (3,) float64, mm, LPS
+    normal : (3,) float64
+        Unit vector; given at any length but zero.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Not three finite numbers, a normal of length zero.
+    """
+
+    point: ArrayLike
+    normal: ArrayLike
+
+    def __post_init__(self) -> None:
+        point = as_rows("plane point", np.reshape(self.point, (1, -1)), 3)[0]
+        normal = as_rows("plane normal", np.reshape(self.normal, (1, -1)), 3)[0]
+        largest = float(np.abs(normal).max())
+        if largest == 0.0:
+            raise CaseInputError("plane normal is (0, 0, 0): give its direction, any length")
+        scaled = normal / largest
+        object.__setattr__(self, "point", point)
+        object.__setattr__(self, "normal", scaled / np.linalg.norm(scaled))
+
+    def distance(self, points: ArrayLike) -> Floats:
+        """The signed distances of (n, 3) points from the plane, mm: positive along its normal."""
+        offsets = as_rows("points", points, 3) - np.asarray(self.point)
+        return np.asarray(offsets @ np.asarray(self.normal), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class CaseImage:
+    """A CT and how to read tissue from it; None stands for the default of the imaging stage.
+
+    Attributes
+    ----------
+    file : Path
+        NRRD, NIfTI, MetaImage, or a folder of DICOM slices.
+    skin_threshold, bone_threshold, metal_threshold : float or None, HU
+    working_spacing : float or None, mm
+    series : str or None
+        UID or number of the DICOM series that is meant, where the folder holds several.
+    rescale : tuple of float or None
+        Slope and intercept from the image's values to HU, where they are not HU.
+    """
+
+    file: Path
+    skin_threshold: float | None = None
+    bone_threshold: float | None = None
+    working_spacing: float | None = None
+    metal_threshold: float | None = None
+    series: str | None = None
+    rescale: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class CaseSurfaces:
+    """Ready surfaces of skin and bones.
+
+    Attributes
+    ----------
+    skin : Path
+    bones : mapping of str to Path
+    units : str
+        Of the numbers in every file: "mm", "cm", "m", "um", "inch".
+    frame : str
+        Of the numbers in every file: "LPS" or "RAS".
+    """
+
+    skin: Path
+    bones: Mapping[str, Path]
+    units: str = "mm"
+    frame: str = "LPS"
+
+    def __post_init__(self) -> None:
+        check_one_of("units", self.units, tuple(UNITS))
+        check_one_of("frame", self.frame, FRAMES)
+        object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))
+
+
+@dataclass(frozen=True)
+class CaseLandmarks:
+    """Files of landmarks, 3D Slicer's `.mrk.json` or `.fcsv`.
+
+    Attributes
+    ----------
+    skull, skin : Path or None
+    frame : str or None
+        The frame of files that do not state theirs.
+    """
+
+    skull: Path | None = None
+    skin: Path | None = None
+    frame: str | None = None
+
+
+@dataclass(frozen=True)
+class Region:
+    """The part of the head that is meshed: the face, in front of a posterior plane.
+
+    Attributes
+    ----------
+    posterior_plane : Plane or None
+        Its normal points out of the region, backwards.
+    posterior_depth : float or None, mm
+        Distance of a coronal plane behind the roots of the zygomatic arches (`supraglenoid_L` and
+        `_R`); below 0 in front of them. 10 mm if neither it nor the plane is given.
+    lower, upper : float or None, mm
+        Heights (S axis) that bound the region; None keeps what the skin has.
+    """
+
+    posterior_plane: Plane | None = None
+    posterior_depth: float | None = None
+    lower: float | None = None
+    upper: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.lower is not None and self.upper is not None and self.lower >= self.upper:
+            raise CaseInputError(f"lower is {self.lower:g}, upper {self.upper:g}: lower < upper")
+
+    def plane(self, landmarks: Mapping[str, ArrayLike], foremost: float, hindmost: float) -> Plane:
+        """The posterior plane: as given, or coronal, from landmarks or from the head's depth.
+
+        Parameters
+        ----------
+        landmarks : mapping of str to (3,) float64, mm
+            Skull landmarks; may be empty.
+        foremost, hindmost : float, mm
+            P coordinates of the skin's first and last point.
+
+        Returns
+        -------
+        Plane
+            Its normal points backwards, out of the region.
+        """
+        if self.posterior_plane is not None:
+            return self.posterior_plane
+        depth = POSTERIOR_DEPTH if self.posterior_depth is None else self.posterior_depth
+        roots = [np.asarray(landmarks[n]) for n in POSTERIOR_LANDMARKS if n in landmarks]
+        if len(roots) == len(POSTERIOR_LANDMARKS):
+            height = float(np.mean([root[1] for root in roots])) + depth
+        elif self.posterior_depth is not None:
+            names = " and ".join(POSTERIOR_LANDMARKS)
+            raise CaseInputError(
+                f"posterior_depth is {depth:g} mm behind {names}, which the landmarks lack: "
+                "add them, or give posterior_plane"
+            )
+        else:
+            height = foremost + POSTERIOR_SHARE * (hindmost - foremost)
+        return Plane((0.0, height, 0.0), (0.0, 1.0, 0.0))
+
+
+@dataclass(frozen=True)
+class CaseMesh:
+    """How the soft tissue is meshed, or where its tets come from.
+
+    Attributes
+    ----------
+    edge_length : float, mm
+    refine : bool
+        Smaller tets where tissue is thin, and at the mouth.
+    parting : Path or None
+        A surface that parts the lips where the image or skin shows them as one.
+    cleft : float, mm
+        Tissue of which two segments that part are less than this away, taken together, is left out:
+        between tooth rows and at cuts. 0: none.
+    file : Path or None
+        Tets from elsewhere; edge length, refinement and cleft are then not used.
+    """
+
+    edge_length: float = EDGE_LENGTH
+    refine: bool = True
+    cleft: float = CLEFT
+    parting: Path | None = None
+    file: Path | None = None
+
+
+@dataclass(frozen=True)
+class CaseOsteotomy:
+    """One cut: a standard procedure placed from landmarks, or a plane through a bone.
+
+    Attributes
+    ----------
+    procedure : str or None
+        "le_fort_1", "le_fort_3", "bsso" or "genioplasty".
+    options : mapping of str to plain values
+        Adjustments of the procedure, as the osteotomy stage takes them.
+    plane : Plane or None
+        The side to which its normal points becomes the new segment.
+    bone : str or None
+        The bone that the plane cuts.
+    name : str or None
+        The name of the new segment.
+    """
+
+    procedure: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+    plane: Plane | None = None
+    bone: str | None = None
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        if (self.procedure is None) == (self.plane is None):
+            raise CaseInputError("an osteotomy is either a procedure or a plane")
+        if self.procedure is not None:
+            check_one_of("procedure", self.procedure, tuple(PROCEDURES))
+        else:
+            as_text("bone", self.bone)
+            as_text("name", self.name)
+        object.__setattr__(self, "options", MappingProxyType(dict(self.options)))
+
+    @property
+    def segments(self) -> tuple[str, ...]:
+        """The names of the segments that it makes."""
+        if self.procedure is not None:
+            return PROCEDURES[self.procedure]
+        return (str(self.name),)
+
+
+@dataclass(frozen=True, eq=False)
+class CaseMotion(Frozen):
+    """How one segment moves: a matrix, a transform file, or a surface before and after.
+
+    Attributes
+    ----------
+    matrix : (4, 4) float64, mm, or None
+        In LPS, whatever the frame of the case file's own numbers.
+    transform : Path or None
+        ITK `.tfm` or `.h5`, or a text of 4 × 4 numbers.
+    surface, moved_surface : Path or None
+        Files with the same triangles.
+    centre : (3,) float64, mm, LPS, or None
+        The centre of the turn, where the case states one.
+    direction : str or None
+        What the numbers of the transform file do: one of `DIRECTIONS`; stated for ITK's files.
+    frame : str or None
+        The frame in which the case file, or the transform file, has its numbers, where stated.
+    typed : bool
+        Whether the motion is given by translation, angle, axis and centre.
+    """
+
+    matrix: Floats | None = None
+    transform: Path | None = None
+    surface: Path | None = None
+    moved_surface: Path | None = None
+    centre: Floats | None = None
+    direction: str | None = None
+    frame: str | None = None
+    typed: bool = False
+
+    def source(self, understood: str = "") -> str:
+        """Where the motion comes from and what was assumed, in words; empty for a typed one.
+
+        Parameters
+        ----------
+        understood : str
+            How the transform file was understood, where it is known.
+        """
+        if self.transform is not None:
+            return f"{self.transform.name}{f': {understood}' if understood else ''}"
+        if self.moved_surface is not None:
+            return self.moved_surface.name
+        if not self.typed:
+            return f"matrix: {self.frame}" if self.frame else "matrix: LPS (frame assumed)"
+        words = ["typed in RAS"] if self.frame == "RAS" else []
+        turns = self.matrix is not None and not np.array_equal(self.matrix[:3, :3], np.eye(3))
+        if turns and self.centre is None:
+            words.append("turned about the origin of the coordinates: no centre is given")
+        return "; ".join(words)
+
+
+@dataclass(frozen=True)
+class CaseMuscles:
+    """Where the muscles come from, and how the material of the tets is sampled from them.
+
+    Attributes
+    ----------
+    template : Path or str
+        The folder of a template, or the name of one that comes with the package.
+    smoothing : float
+        Of the thin-plate spline that carries the template to the patient; 0 meets every landmark.
+    preset : str
+        Constants of fat and muscle.
+    mixing : str
+        "moduli" (the paper) or "stiffness".
+    samples : int
+        Points in a tet that a muscle's surface crosses.
+    seed : int
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.CaseMuscles(samples=16).template
+    'default'
+    """
+
+    template: Path | str = "default"
+    smoothing: float = 0.0
+    preset: str = "kim2010"
+    mixing: str = "moduli"
+    samples: int = 64
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class CasePostoperative:
+    """What is known after the operation.
+
+    Attributes
+    ----------
+    skin : Path or None
+        Surface of the skin after the operation.
+    image : Path or None
+        CT after the operation, instead of skin and bones.
+    landmarks : Path or None
+        Skin landmarks on it, for correspondences.
+    bones : mapping of str to Path
+        Surfaces of bones or segments, by name, for the achieved plan.
+    aligned : bool
+        Whether it lies in the frame of the data before the operation already.
+    units, frame : str
+        Of the surface files.
+    series : str or None
+        UID or number of the DICOM series of the image, where its folder holds several.
+    """
+
+    skin: Path | None = None
+    image: Path | None = None
+    landmarks: Path | None = None
+    bones: Mapping[str, Path] = field(default_factory=dict)
+    aligned: bool = True
+    units: str = "mm"
+    frame: str = "LPS"
+    series: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.image is not None and (self.skin is not None or self.bones):
+            raise CaseInputError("after the operation there are surfaces or an image, not both")
+        if self.image is None and self.skin is None and not self.bones:
+            raise CaseInputError("after the operation there is a skin, an image, or a bone")
+        check_one_of("units", self.units, tuple(UNITS))
+        check_one_of("frame", self.frame, FRAMES)
+        object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))

@@ -1,0 +1,98 @@
+"""Findings of one kind as one line: how many, and the worst of them."""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from cmfsim.values.anatomy import SEVERITIES, Finding
+
+__all__ = ["FindingGroup", "counted", "grouped"]
+
+# What several findings of one code have in common. Others are stated by the worst of them.
+TITLES: Mapping[str, str] = {
+    "muscle-cut-off": "{n} muscles partly outside the tissue",
+    "muscle-inside-out": "{n} muscle surfaces were inside out and were turned",
+    "muscle-missed": "{n} muscles hold no sample of the tissue and have no part in it",
+    "muscle-open": "{n} muscle surfaces are not closed",
+    "muscle-sheet": "{n} muscles are sheets, whose outline hardly shows the direction of fibres",
+    "landmark-far": "{n} landmarks lie far from their surface",
+    "surface-closed": "{n} surfaces were open and were closed",
+    "surface-open": "{n} surfaces are open",
+}
+# A size within the text of a finding: the larger, the worse.
+SIZE = re.compile(r"(\d+(?:[.,]\d+)?)\s?(%|mm\b|°)")
+# Characters of a finding's text in a line.
+MOST_TEXT = 300
+
+
+@dataclass(frozen=True)
+class FindingGroup:
+    """Findings of one severity and code, in their order.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        At least one.
+    """
+
+    findings: tuple[Finding, ...]
+
+    @property
+    def severity(self) -> str:
+        """Of all of them: "error", "warning" or "note"."""
+        return self.findings[0].severity
+
+    @property
+    def code(self) -> str:
+        """The code of all of them."""
+        return self.findings[0].code
+
+    @property
+    def worst(self) -> Finding:
+        """The one with the largest size in its text; the first where none has any."""
+        return max(self.findings, key=lambda finding: _size(finding)[0])
+
+    @property
+    def line(self) -> str:
+        """What they state, as one line of text; names in it are those of files."""
+        worst = self.worst
+        what = worst.what if len(worst.what) <= MOST_TEXT else f"{worst.what[:MOST_TEXT]}…"
+        place = f" ({worst.where})" if worst.where and worst.where not in what else ""
+        if len(self.findings) == 1:
+            return f"{what}{place}"
+        count = len(self.findings)
+        if self.code not in TITLES:
+            return f"{what}{place}; and {count - 1} more of this kind [{self.code}]"
+        size = _size(worst)[1]
+        title = TITLES[self.code].format(n=count)
+        if size and worst.where:
+            return f"{title} (largest: {worst.where} {size})"
+        return f"{title} (such as: {what})"
+
+
+def grouped(findings: Iterable[Finding]) -> list[FindingGroup]:
+    """The findings by kind, each once: errors first, then warnings and notes."""
+    kinds: dict[tuple[str, str], list[Finding]] = {}
+    for finding in dict.fromkeys(findings):
+        kinds.setdefault((finding.severity, finding.code), []).append(finding)
+    groups = [FindingGroup(tuple(found)) for found in kinds.values()]
+    return sorted(groups, key=lambda group: SEVERITIES.index(group.severity))
+
+
+def counted(findings: Iterable[Finding]) -> str:
+    """How many of each severity there are, as text: "1 warning, 61 notes"."""
+    severities = [finding.severity for finding in dict.fromkeys(findings)]
+    return ", ".join(
+        f"{count} {severity}{'' if count == 1 else 's'}"
+        for severity in SEVERITIES
+        if (count := severities.count(severity))
+    )
+
+
+def _size(finding: Finding) -> tuple[float, str]:
+    """The first size in a finding's text, as a number and as it is written."""
+    found = SIZE.search(finding.what)
+    if found is None:
+        return 0.0, ""
+    unit = found[2] if found[2] in "%°" else f"{found[2]}"
+    return float(found[1].replace(",", ".")), f"{found[1]} {unit}"

@@ -1,0 +1,152 @@
+"""Muscles as surfaces with what their fibres need to be known: the values that the template makes.
+
+A template's muscles, the same muscles in a patient, and surfaces that a user brings all become a
+`Musculature`, from which the equivalent material of the tets is sampled.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cmfsim._core import MOST_BOXES
+from cmfsim.checks import Floats, as_rows, as_text, check_instance, check_one_of
+from cmfsim.errors import CaseInputError
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.frozen import Frozen
+from cmfsim.values.scene import SurfaceData
+
+__all__ = ["MOST_BOXES", "MUSCLE_KINDS", "MUSCLE_SIDES", "MuscleSurface", "Musculature"]
+
+# How the fibres of a muscle run: along it; spread from a narrow insertion; round an opening; in a
+# layer whose surface does not tell their direction.
+MUSCLE_KINDS = ("strap", "fan", "ring", "sheet")
+MUSCLE_SIDES = ("L", "R", "both")
+
+
+@dataclass(frozen=True, eq=False)
+class MuscleSurface(Frozen):
+    """One muscle: its closed surface and how its fibres run.
+
+    Attributes
+    ----------
+    name : str
+        With its side, such as "masseter_L"; without one where it crosses the midline.
+    side : str
+        "L", "R" (the patient's) or "both".
+    surface : SurfaceData
+        Closed, with outward normals, as well as the atlas has it.
+    kind : str
+        "strap", "fan", "ring" or "sheet".
+    boxes : int or None
+        Number of oriented boxes that its fibre directions are taken from, 1 to 64; None lets the
+        shape decide.
+    course : tuple of (n, 3) float64, mm
+        Fibre lines from origin to insertion, where the template's author knows them; they come
+        before boxes.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) An unknown side or kind, boxes that are not a whole number from 1 to 64,
+        a line of one point.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> sheet = cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    >>> cmfsim.MuscleSurface("masseter_L", "L", sheet).kind
+    'strap'
+    """
+
+    name: str
+    side: str
+    surface: SurfaceData
+    kind: str = "strap"
+    boxes: int | None = None
+    course: tuple[Floats, ...] = ()
+
+    def __post_init__(self) -> None:
+        as_text("muscle name", self.name)
+        check_one_of(f"side of {self.name}", self.side, MUSCLE_SIDES)
+        check_one_of(f"kind of {self.name}", self.kind, MUSCLE_KINDS)
+        check_instance(f"surface of {self.name}", self.surface, SurfaceData)
+        if self.boxes is not None:
+            object.__setattr__(self, "boxes", _checked_boxes(self.name, self.boxes))
+        lines = []
+        for i, line in enumerate(self.course):
+            points = as_rows(f"course {i} of {self.name}", line, 3)
+            if len(points) < 2:
+                raise CaseInputError(f"course {i} of {self.name} has one point: two are needed")
+            lines.append(points)
+        object.__setattr__(self, "course", tuple(lines))
+
+
+def _checked_boxes(name: str, boxes: Any) -> int:
+    """A number of boxes that the core takes, whether from a template, an archive or code."""
+    if isinstance(boxes, bool) or not isinstance(boxes, int | np.integer):
+        raise CaseInputError(
+            f"boxes of {name} is {boxes!r:.40}: a whole number from 1 to {MOST_BOXES} is needed"
+        )
+    count = int(boxes)
+    if not 1 <= count <= MOST_BOXES:
+        shown = str(count) if abs(count) < 10**18 else "a number of more than 18 digits"
+        raise CaseInputError(f"boxes of {name} is {shown}: allowed is 1 to {MOST_BOXES}")
+    return count
+
+
+@dataclass(frozen=True, eq=False)
+class Musculature:
+    """The muscles of one head.
+
+    Attributes
+    ----------
+    muscles : tuple of MuscleSurface
+        Names differ.
+    findings : tuple of Finding
+        What was noticed while they were made: folds, residuals, open surfaces.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A name twice.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> sheet = cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    >>> muscles = cmfsim.Musculature((cmfsim.MuscleSurface("masseter_L", "L", sheet),))
+    >>> muscles["masseter_L"].side, len(muscles)
+    ('L', 1)
+    """
+
+    muscles: tuple[MuscleSurface, ...]
+    findings: tuple[Finding, ...] = ()
+
+    def __post_init__(self) -> None:
+        muscles = tuple(self.muscles)
+        seen: set[str] = set()
+        for i, muscle in enumerate(muscles):
+            check_instance(f"muscles[{i}]", muscle, MuscleSurface)
+            if muscle.name in seen:
+                raise CaseInputError(f"muscles[{i}] is a second {muscle.name!r}: names must differ")
+            seen.add(muscle.name)
+        object.__setattr__(self, "muscles", muscles)
+        object.__setattr__(self, "findings", tuple(self.findings))
+
+    def __len__(self) -> int:
+        """The number of muscles."""
+        return len(self.muscles)
+
+    def __iter__(self) -> Iterator[MuscleSurface]:
+        """The muscles in their order."""
+        return iter(self.muscles)
+
+    def __getitem__(self, name: str) -> MuscleSurface:
+        """The muscle of a name."""
+        for muscle in self.muscles:
+            if muscle.name == name:
+                return muscle
+        names = ", ".join(muscle.name for muscle in self.muscles)
+        raise KeyError(f"no muscle {name!r}; there are: {names}")

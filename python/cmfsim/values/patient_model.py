@@ -1,0 +1,133 @@
+"""The patient's model: what building a case makes, ready to be solved."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim.checks import Floats, Indices
+from cmfsim.errors import CaseInputError
+from cmfsim.surfaces.levels import surface_of_level
+from cmfsim.values.anatomy import Anatomy, BoneSegment, Finding, NodeKinds
+from cmfsim.values.frozen import Frozen
+from cmfsim.values.scene import MovedSurface, Scene, SurfaceData, TissueData
+
+if TYPE_CHECKING:
+    from cmfsim.values.musculature import Musculature
+
+__all__ = ["PatientModel"]
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class PatientModel(Frozen):
+    """A patient's soft tissue with everything that holds and moves it.
+
+    Attributes
+    ----------
+    name : str
+    scene : Scene
+        Mesh, tissue, node kinds, contact surfaces and plan: what `solve_scene` takes.
+    kinds : NodeKinds
+    boundary_triangles : (t, 3) uint32
+        Boundary of the mesh, outward, in node indices.
+    skin_triangles : (s, 3) uint32
+        Those of them that are the patient's skin.
+    segments : tuple of BoneSegment
+        All pieces of bone, those that stay included.
+    anatomy : Anatomy
+    fat : TissueData
+        The tissue of a homogeneous model; `scene.tissue` where there are no muscles.
+    muscles : Musculature or None
+        In the patient's place; None where the case has none.
+    fraction : (m,) float64 or None
+        Share of muscle in each tet.
+    fibre : (m, 3) float64 or None
+        Unit direction of the fibres of each tet; zero where there is no muscle.
+    landmarks : mapping of str to mapping of str to (3,) float64, mm
+        "skull" and "skin", where given.
+    findings : tuple of Finding
+        What every stage noticed.
+    summary : mapping
+        Counts, quality, timings, versions, hashes of the inputs: plain values, ready for JSON.
+    """
+
+    name: str
+    scene: Scene
+    kinds: NodeKinds
+    boundary_triangles: Indices
+    skin_triangles: Indices
+    segments: tuple[BoneSegment, ...]
+    anatomy: Anatomy
+    fat: TissueData
+    muscles: Musculature | None = None
+    fraction: Floats | None = None
+    fibre: Floats | None = None
+    landmarks: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
+    summary: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def skin_nodes(self) -> NDArray[np.uint32]:
+        """The nodes on the skin, (k,) uint32, ascending: vertex i of `skin` is node i of these."""
+        return np.unique(self.skin_triangles).astype(np.uint32)
+
+    @property
+    def skin(self) -> SurfaceData:
+        """The patient's skin as the mesh has it, outward."""
+        nodes = self.skin_nodes
+        triangles = np.searchsorted(nodes, self.skin_triangles)
+        return SurfaceData(np.asarray(self.scene.nodes)[nodes], triangles)
+
+    def with_plan(self, plan: Mapping[str, ArrayLike | MovedSurface]) -> PatientModel:
+        """The patient under another plan; segments that are not named stay.
+
+        Neither mesh nor node kinds depend on how far segments move, so nothing is built again.
+
+        Parameters
+        ----------
+        plan : mapping of str to (4, 4) float64, mm, (j, 3) float64, mm, or MovedSurface
+
+        Raises
+        ------
+        CaseError
+            (also `ValueError`) A segment that the patient does not have; a misshapen motion.
+        """
+        unknown = [name for name in plan if name not in self.scene.segments]
+        if unknown:
+            known = ", ".join(self.scene.segments) or "none"
+            raise CaseInputError(f"the plan moves {unknown[0]!r}; segments are: {known}")
+        motions = {name: plan.get(name, np.eye(4)) for name in self.scene.segments}
+        # What is known of the case's own motions says nothing of these.
+        findings = tuple(f for f in self.findings if not f.code.startswith("plan-"))
+        summary = {k: v for k, v in self.summary.items() if k not in {"achieved", "plan_sources"}}
+        summary["findings"] = [
+            entry
+            for entry in summary.get("findings", ())
+            if not str(entry.get("code", "")).startswith("plan-")
+        ]
+        scene = replace(self.scene, plan=motions)
+        return replace(self, scene=scene, findings=findings, summary=summary)
+
+    @cached_property
+    def face(self) -> SurfaceData | None:
+        """The skin of the whole head in full detail, as it was given or as the image shows it.
+
+        Tets are larger than what one sees of lips and lids. None where scikit-image is missing.
+        Made when it is first asked for: solving does not need it.
+        """
+        given = self.anatomy.surfaces.get("skin")
+        if given is not None:
+            return given
+        if find_spec("skimage") is None:
+            _log.info("no detailed face: scikit-image is not installed")
+            return None
+        return surface_of_level("skin", self.anatomy.skin)

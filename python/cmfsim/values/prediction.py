@@ -1,0 +1,215 @@
+"""What a model predicts for a patient: the value that evaluation and report are made from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim._core import Surface, SurfaceMotion
+from cmfsim.checks import Floats, as_rows, check_one_of
+from cmfsim.errors import CaseInputError
+from cmfsim.values.anatomy import Finding
+from cmfsim.values.frozen import Frozen
+from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.scene import MovedSurface, Scene, SceneResult, SurfaceData
+
+if TYPE_CHECKING:
+    from cmfsim.values.musculature import Musculature
+
+__all__ = ["MODELS", "Prediction", "carried_points", "carried_share"]
+
+# Models of the paper (3.2): homogeneous or with muscles, without or with sliding at teeth and
+# mucosa.
+MODELS = ("H", "M", "H+S", "M+S")
+# Up to so many edges off the mesh's skin a point follows it whole, and from so many on not at all.
+FOLLOWS, FADED = 2.0, 4.0
+
+
+def carried_points(before: SurfaceData, displacements: Floats, points: ArrayLike) -> Floats:
+    """How points on or near a mesh's skin move, (k, 3) mm: as its closest point.
+
+    What lies away from the tissue that was simulated, as the back of the head, stays: from two
+    edges off its movement fades, to nothing at four.
+
+    Parameters
+    ----------
+    before : SurfaceData
+        The mesh's skin.
+    displacements : (v, 3) float64, mm
+        Of its vertices.
+    points : (k, 3) float64, mm
+    """
+    moved = np.asarray(before.vertices) + displacements
+    skin = Surface(before.vertices, before.triangles)
+    places = as_rows("points", points, 3)
+    closest, _, _ = skin.closest(places)
+    share = carried_share(skin, np.linalg.norm(closest - places, axis=1))
+    carried: Floats = share[:, None] * SurfaceMotion(skin, moved).displacement(places)
+    return carried
+
+
+def carried_share(skin: Surface, away: Floats) -> Floats:
+    """The share of the skin's movement that points follow at a distance from it, (k,).
+
+    Parameters
+    ----------
+    skin : Surface
+        The mesh's skin.
+    away : (k,) float64, mm
+        Distances of the points from it.
+    """
+    ends = skin.vertices[skin.triangles]
+    edge = float(np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).mean())
+    return np.clip((FADED - away / edge) / (FADED - FOLLOWS), 0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction(Frozen):
+    """The face that one model predicts for one patient and plan.
+
+    Attributes
+    ----------
+    model : str
+        "H", "M", "H+S" or "M+S".
+    patient : PatientModel
+    scene : Scene
+        What was solved.
+    result : SceneResult
+    summary : mapping
+        Counts, timings, versions, hashes, and what was left out because the scene did not need it:
+        plain values, ready for JSON.
+    predicted_by : callable, optional
+        What predicts a patient's face by a model, as this prediction was made.
+    """
+
+    model: str
+    patient: PatientModel
+    scene: Scene
+    result: SceneResult
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    predicted_by: Callable[[PatientModel, str], Prediction] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        check_one_of("model", self.model, MODELS)
+        object.__setattr__(self, "summary", MappingProxyType(dict(self.summary)))
+
+    @property
+    def name(self) -> str:
+        """The name of the patient's case."""
+        return self.patient.name
+
+    @property
+    def skin_nodes(self) -> NDArray[np.uint32]:
+        """The nodes on the skin, (k,): vertex i of both skins is node i of these."""
+        return self.patient.skin_nodes
+
+    @property
+    def skin_before(self) -> SurfaceData:
+        """The patient's skin before the operation, as the mesh has it."""
+        return self.patient.skin
+
+    @property
+    def skin(self) -> SurfaceData:
+        """The predicted skin: the vertices and triangles of `skin_before`, moved."""
+        before = self.skin_before
+        return SurfaceData(np.asarray(before.vertices) + self.skin_displacements, before.triangles)
+
+    @property
+    def skin_displacements(self) -> Floats:
+        """How each vertex of the skin moves, (k, 3) mm."""
+        return np.asarray(self.result.displacements)[self.skin_nodes]
+
+    def carried(self, points: ArrayLike) -> Floats:
+        """How points on or near the skin move, (k, 3) mm: as `carried_points` has it.
+
+        Parameters
+        ----------
+        points : (k, 3) float64, mm
+            Before the operation: landmarks, or the vertices of any surface of the patient's skin.
+        """
+        return carried_points(self.skin_before, self.skin_displacements, points)
+
+    def replan(self, plan: Mapping[str, ArrayLike | MovedSurface]) -> Prediction:
+        """The prediction of the same model for the same patient under another plan, solved exactly.
+
+        The patient is not built again; the equations are set up and factorised again. For many
+        plans use `planning_model`, which keeps the factorisation.
+
+        Parameters
+        ----------
+        plan : mapping of str to (4, 4) float64, mm, (j, 3) float64, mm, or MovedSurface
+            Segments by name; those that are not named stay.
+
+        Returns
+        -------
+        Prediction
+
+        Raises
+        ------
+        CaseError
+            (also `ValueError`) A segment that the patient does not have; a prediction that was put
+            together by hand, of which nothing says how it was made.
+        BoundaryError, ContactError, SolverError
+            As `solve_scene`.
+
+        Examples
+        --------
+        >>> import cmfsim
+        >>> motion = cmfsim.rigid_motion(translation=(0, -4, 0))
+        >>> other = prediction.replan({"maxilla": motion})  # doctest: +SKIP
+        """
+        if self.predicted_by is None:
+            raise CaseInputError(
+                "this prediction does not record what made it: use predict or predict_patient"
+            )
+        return self.predicted_by(self.patient.with_plan(plan), self.model)
+
+    @property
+    def face_before(self) -> SurfaceData:
+        """The patient's face in full detail, as given or segmented; else as the mesh has it."""
+        return self.patient.face or self.skin_before
+
+    @cached_property
+    def face(self) -> SurfaceData:
+        """The predicted face: the vertices and triangles of `face_before`, carried by the skin."""
+        before = self.face_before
+        vertices = np.asarray(before.vertices)
+        return SurfaceData(vertices + self.carried(vertices), before.triangles)
+
+    @property
+    def bones(self) -> dict[str, tuple[SurfaceData, Floats]]:
+        """Each bone segment with its vertices after the operation, (v, 3) mm, by name.
+
+        A segment whose motion is known vertex by vertex has the surface that it is known on; one
+        whose joined nodes alone have motions stays where it was.
+        """
+        found = {}
+        for segment in self.patient.segments:
+            surface, motion = segment.surface, self.scene.plan.get(segment.name)
+            vertices = np.asarray(surface.vertices, dtype=np.float64)
+            if isinstance(motion, MovedSurface):
+                surface = motion.surface
+                vertices = np.asarray(motion.moved_vertices, dtype=np.float64)
+            elif motion is not None and np.shape(motion) == (4, 4):
+                matrix = np.asarray(motion, dtype=np.float64)
+                if not np.array_equal(matrix, np.eye(4)):
+                    vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+            found[segment.name] = (surface, vertices)
+        return found
+
+    @property
+    def muscles(self) -> Musculature | None:
+        """The muscles that were used; None in a homogeneous model."""
+        return self.patient.muscles if self.model.startswith("M") else None
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What every stage noticed, the solution included."""
+        solved = self.result.summary.get("findings", ())
+        return (*self.patient.findings, *(Finding(**entry) for entry in solved))

@@ -1,0 +1,561 @@
+"""The plain values that stages hand to each other: frozen, checked where they are made, no files.
+
+A `Scene` is everything that one solve needs. Checks here are of shape, range and name, with the
+index and value at fault; what geometry and physics forbid (inverted tets, indefinite materials,
+bodies that are not held) the core finds when the scene is solved.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim.checks import (
+    Floats,
+    Indices,
+    as_floats,
+    as_index_rows,
+    as_indices,
+    as_number,
+    as_positive,
+    as_rows,
+    as_text,
+    check_instance,
+    check_one_of,
+    frozen,
+)
+from cmfsim.errors import CaseInputError
+from cmfsim.values.frozen import Frozen
+from cmfsim.values.motion import rigid_matrix
+
+__all__ = [
+    "MovedSurface",
+    "Scene",
+    "SceneResult",
+    "SegmentData",
+    "SolverOptions",
+    "SurfaceData",
+    "TissueData",
+]
+
+
+# Arrays that each kind of tissue needs, with the number of axes after the first.
+TISSUE_ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = MappingProxyType(
+    {
+        "isotropic": {"young": (), "poisson": ()},
+        "transversely_isotropic": {
+            "young_along": (),
+            "young_across": (),
+            "poisson": (),
+            "fibre": (3,),
+        },
+        "stiffness": {"stiffness": (6, 6)},
+        "preset": {"fraction": (), "fibre": (3,)},
+    }
+)
+# Arrays of the above that may be left out.
+TISSUE_OPTIONAL = frozenset({("preset", "fibre")})
+
+METHODS = ("auto", "cholesky", "pcg", "relaxation")
+ELEMENTS = ("p1", "anp", "p2")
+KINEMATICS = ("linear", "corotational", "hyperelastic")
+CONTACTS = ("bilateral", "unilateral")
+CONFLICTS = ("error", "resolve")
+PRESETS = ("kim2010", "kim2010-swapped")
+MIXINGS = ("moduli", "stiffness")
+
+
+@dataclass(frozen=True, eq=False)
+class TissueData(Frozen):
+    """What the tets are made of, as the arrays that `cmfsim.Tissue` takes.
+
+    Every array holds one value per tet, or a single one for all tets.
+
+    Attributes
+    ----------
+    kind : str
+        "isotropic" (`young`, `poisson`), "transversely_isotropic" (`young_along`, `young_across`,
+        `poisson`, `fibre`, `law`), "stiffness" (`stiffness`) or "preset" (`preset`, `fraction`,
+        `fibre`, `mixing`).
+    young, young_along, young_across : (m,) or (1,) float64, MPa
+    poisson, fraction : (m,) or (1,) float64
+    fibre : (m, 3) or (1, 3) float64
+        Unit vectors.
+    stiffness : (m, 6, 6) or (1, 6, 6) float64, MPa
+        Voigt order xx, yy, zz, yz, xz, xy with engineering shears, global axes.
+    law, preset, mixing : str
+        Names that `cmfsim.Tissue` knows.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Unknown kind, an array missing, not wanted, misshapen or not finite.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> fat = cmfsim.TissueData("isotropic", young=0.003, poisson=0.46)
+    >>> fat.young.shape
+    (1,)
+    """
+
+    kind: str
+    young: ArrayLike | None = None
+    poisson: ArrayLike | None = None
+    young_along: ArrayLike | None = None
+    young_across: ArrayLike | None = None
+    fibre: ArrayLike | None = None
+    stiffness: ArrayLike | None = None
+    fraction: ArrayLike | None = None
+    law: str = "spencer"
+    preset: str = "kim2010"
+    mixing: str = "moduli"
+
+    def __post_init__(self) -> None:
+        check_one_of("tissue kind", self.kind, tuple(TISSUE_ARRAYS))
+        wanted = TISSUE_ARRAYS[self.kind]
+        for name in sorted({n for arrays in TISSUE_ARRAYS.values() for n in arrays}):
+            value = getattr(self, name)
+            if name not in wanted:
+                if value is not None:
+                    raise CaseInputError(f"tissue of kind {self.kind!r} takes no {name!r}")
+            elif value is not None:
+                array = as_floats(f"tissue {name}", value)
+                tail = wanted[name]
+                if array.shape == tail:
+                    array = array[np.newaxis]
+                if array.shape[1:] != tail or array.ndim != 1 + len(tail):
+                    shape = ", ".join(str(n) for n in ("m", *tail))
+                    raise CaseInputError(
+                        f"tissue {name} has shape {array.shape}: ({shape}) is needed"
+                    )
+                object.__setattr__(self, name, frozen(array))
+            elif (self.kind, name) not in TISSUE_OPTIONAL:
+                raise CaseInputError(f"tissue of kind {self.kind!r} lacks {name!r}")
+        for name in ("law", "preset", "mixing"):
+            as_text(f"tissue {name}", getattr(self, name))
+
+    def arrays(self) -> dict[str, Floats]:
+        """The arrays of this kind of tissue, by name."""
+        return {
+            name: np.asarray(getattr(self, name), dtype=np.float64)
+            for name in TISSUE_ARRAYS[self.kind]
+            if getattr(self, name) is not None
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceData(Frozen):
+    """A triangle surface.
+
+    Attributes
+    ----------
+    vertices : (v, 3) float64, mm
+    triangles : (t, 3) uint32
+        Outward normals by the right-hand rule.
+    crease_angle : float, degrees
+        Edges sharper than this keep the normals of their triangles apart.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).vertices.shape
+    (3, 3)
+    """
+
+    vertices: ArrayLike
+    triangles: ArrayLike
+    crease_angle: float = 60.0
+
+    def __post_init__(self) -> None:
+        vertices = as_rows("surface vertices", self.vertices, 3)
+        triangles = as_index_rows("surface triangles", self.triangles, 3, len(vertices), "vertices")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "triangles", triangles)
+        object.__setattr__(self, "crease_angle", as_number("crease_angle", self.crease_angle))
+
+
+@dataclass(frozen=True, eq=False)
+class MovedSurface(Frozen):
+    """A motion of a segment given by a surface before and after.
+
+    Attributes
+    ----------
+    surface : SurfaceData
+    moved_vertices : (v, 3) float64, mm
+        Where each vertex of `surface` goes.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> bone = cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    >>> cmfsim.MovedSurface(bone, bone.vertices + [0, 0, 2.0]).moved_vertices[0].tolist()
+    [0.0, 0.0, 2.0]
+    """
+
+    surface: SurfaceData
+    moved_vertices: ArrayLike
+
+    def __post_init__(self) -> None:
+        moved = as_rows("moved_vertices", self.moved_vertices, 3)
+        count = len(np.asarray(self.surface.vertices))
+        if len(moved) != count:
+            raise CaseInputError(
+                f"moved_vertices has {len(moved)} rows, but the surface has {count} vertices"
+            )
+        object.__setattr__(self, "moved_vertices", moved)
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentData(Frozen):
+    """A bone segment: the nodes that it carries and the surface that others slide on.
+
+    Attributes
+    ----------
+    joined : (j,) uint32
+        Nodes that move with the segment.
+    sliding : (s,) uint32
+        Nodes that slide on `contact`.
+    contact : SurfaceData or None
+        Contact surface (teeth, mucosa) at rest; it moves with the segment.
+    gap : (s,) float64, mm, or float, or "rest"
+        Distance that each sliding node keeps from the surface, negative behind it; "rest" keeps its
+        place over the surface: the offset from it in the undeformed tissue, carried by the segment.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.SegmentData(joined=[0, 4, 7]).joined.tolist()
+    [0, 4, 7]
+    """
+
+    joined: ArrayLike = ()
+    sliding: ArrayLike = ()
+    contact: SurfaceData | None = None
+    gap: ArrayLike | str = 0.0
+
+    def __post_init__(self) -> None:
+        joined = as_indices("joined", self.joined)
+        sliding = as_indices("sliding", self.sliding)
+        if self.contact is not None:
+            check_instance("contact", self.contact, SurfaceData)
+        object.__setattr__(self, "joined", joined)
+        object.__setattr__(self, "sliding", sliding)
+        if isinstance(self.gap, str):
+            check_one_of("gap", self.gap, ("rest",))
+            return
+        gap = as_floats("gap", self.gap)
+        if gap.shape not in {(), (len(sliding),)}:
+            raise CaseInputError(
+                f"gap has shape {gap.shape}: one number or {len(sliding)} (one per sliding node)"
+            )
+        object.__setattr__(self, "gap", frozen(gap))
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """How a scene is solved; the defaults are those of `MassTensors` and `StaticSolver`.
+
+    Attributes
+    ----------
+    method : str
+        "auto", "cholesky", "pcg" or "relaxation".
+    contact : str
+        "bilateral" or "unilateral".
+    tolerance : float
+        Estimated error of the iterative methods, over the length of the motion.
+    max_iterations : int or None
+    contact_tolerance : float, mm
+        Largest distance of a held node from its contact surface; a tenth of it is the way that the
+        force along the surface may still move any node by itself.
+    contact_iterations : int
+        Newton steps of the contact solver.
+    memory_limit : float or None, MB
+    element : str
+        "p1", "anp" or "p2", as `cmfsim.MassTensors` takes it.
+    kinematics : str
+        "linear", "corotational" or "hyperelastic".
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.SolverOptions(method="cholesky").contact
+    'bilateral'
+    """
+
+    method: str = "auto"
+    contact: str = "bilateral"
+    tolerance: float = 1e-8
+    max_iterations: int | None = None
+    contact_tolerance: float = 1e-4
+    contact_iterations: int = 50
+    memory_limit: float | None = None
+    element: str = "p1"
+    kinematics: str = "linear"
+
+    def __post_init__(self) -> None:
+        check_one_of("method", self.method, METHODS)
+        check_one_of("element", self.element, ELEMENTS)
+        check_one_of("kinematics", self.kinematics, KINEMATICS)
+        check_one_of("contact", self.contact, CONTACTS)
+        for name in ("tolerance", "contact_tolerance"):
+            as_positive(name, getattr(self, name))
+        if self.memory_limit is not None:
+            as_positive("memory_limit", self.memory_limit)
+        for name in ("max_iterations", "contact_iterations"):
+            value = getattr(self, name)
+            if value is None and name == "max_iterations":
+                continue
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise CaseInputError(f"{name} is {value!r}: a whole number from 1 on is needed")
+
+    def as_dict(self) -> dict[str, Any]:
+        """The options by name, as `MassTensors` (`element`) and `StaticSolver` take them."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def header(self) -> dict[str, Any]:
+        """The options as a scene file holds them: element and kinematics where unusual.
+
+        So a scene that asks for neither has the content, and the hash, that it has always had.
+        """
+        usual = {"element": "p1", "kinematics": "linear"}
+        return {k: v for k, v in self.as_dict().items() if usual.get(k) != v}
+
+
+@dataclass(frozen=True, eq=False)
+class Scene(Frozen):
+    """Everything that one solve needs: mesh, tissue, node kinds, plan and options.
+
+    Attributes
+    ----------
+    nodes : (n, 3) float64, mm
+    tets : (m, 4) uint32
+        Positively oriented.
+    tissue : TissueData
+    segments : mapping of str to SegmentData
+        Order is kept.
+    plan : mapping of str to (4, 4) float64, (j, 3) float64 or MovedSurface
+        One entry for every segment: a rigid motion (mm; kept as `rigid_matrix` makes it exactly
+        rigid), the displacements of its joined nodes (mm), or a surface before and after.
+    fixed : (f,) uint32
+        Nodes that do not move.
+    loads : (n, 3) float64, N, or None
+        Forces on the nodes.
+    options : SolverOptions
+    conflicts : str
+        "error", or "resolve": fixed wins over joined, joined over sliding.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Misshapen or non-finite arrays, indices out of range, a plan that lacks
+        a segment or names another one.
+    BoundaryError
+        (also `ValueError`) A (4, 4) plan that is not rigid.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> scene = cmfsim.Scene(
+    ...     nodes=[[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    ...     tets=[[0, 1, 2, 3]],
+    ...     tissue=cmfsim.TissueData("isotropic", young=1.0, poisson=0.3),
+    ...     fixed=[0, 1, 2],
+    ...     segments={"tip": cmfsim.SegmentData(joined=[3])},
+    ...     plan={"tip": cmfsim.rigid_motion(translation=(0, 0, 0.1))},
+    ... )
+    >>> scene.n_nodes, scene.n_tets
+    (4, 1)
+    """
+
+    nodes: ArrayLike
+    tets: ArrayLike
+    tissue: TissueData
+    segments: Mapping[str, SegmentData] = field(default_factory=dict)
+    plan: Mapping[str, ArrayLike | MovedSurface] = field(default_factory=dict)
+    fixed: ArrayLike = ()
+    loads: ArrayLike | None = None
+    options: SolverOptions = field(default_factory=SolverOptions)
+    conflicts: str = "error"
+
+    def __post_init__(self) -> None:
+        nodes = as_rows("nodes", self.nodes, 3)
+        tets = as_index_rows("tets", self.tets, 4, len(nodes), "nodes")
+        fixed = as_indices("fixed", self.fixed, len(nodes))
+        check_instance("tissue", self.tissue, TissueData)
+        check_instance("segments", self.segments, Mapping)
+        check_instance("plan", self.plan, Mapping)
+        check_instance("options", self.options, SolverOptions)
+        for name, array in self.tissue.arrays().items():
+            if len(array) not in {1, len(tets)}:
+                raise CaseInputError(
+                    f"tissue {name} has {len(array)} rows: 1 or {len(tets)} (one per tet) needed"
+                )
+        for name, segment in self.segments.items():
+            as_text("segment name", name)
+            check_instance(f"segment {name!r}", segment, SegmentData)
+            for kind in ("joined", "sliding"):
+                as_indices(f"segment {name!r} {kind}", getattr(segment, kind), len(nodes))
+        loads = None if self.loads is None else as_rows("loads", self.loads, 3)
+        if loads is not None and len(loads) != len(nodes):
+            raise CaseInputError(f"loads has {len(loads)} rows for {len(nodes)} nodes")
+        check_one_of("conflicts", self.conflicts, CONFLICTS)
+        object.__setattr__(self, "nodes", nodes)
+        object.__setattr__(self, "tets", tets)
+        object.__setattr__(self, "fixed", fixed)
+        object.__setattr__(self, "loads", loads)
+        object.__setattr__(self, "segments", MappingProxyType(dict(self.segments)))
+        object.__setattr__(self, "plan", MappingProxyType(self._checked_plan()))
+
+    def _checked_plan(self) -> dict[str, Floats | MovedSurface]:
+        for name in self.plan:
+            if name not in self.segments:
+                known = ", ".join(repr(s) for s in self.segments) or "none"
+                raise CaseInputError(f"plan names segment {name!r}; segments are: {known}")
+        checked: dict[str, Floats | MovedSurface] = {}
+        for name, segment in self.segments.items():
+            if name not in self.plan:
+                raise CaseInputError(
+                    f"plan lacks segment {name!r}: give the identity matrix if it stays"
+                )
+            motion = self.plan[name]
+            if isinstance(motion, MovedSurface):
+                checked[name] = motion
+                continue
+            array = as_floats(f"plan of segment {name!r}", motion)
+            joined = len(np.asarray(segment.joined))
+            if array.shape not in {(4, 4), (joined, 3)}:
+                raise CaseInputError(
+                    f"plan of segment {name!r} has shape {array.shape}: a (4, 4) matrix or "
+                    f"({joined}, 3) displacements of its joined nodes are needed"
+                )
+            if array.shape == (4, 4):
+                array = rigid_matrix(array, f"plan of segment {name!r}")
+            checked[name] = frozen(array)
+        return checked
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of nodes."""
+        return len(np.asarray(self.nodes))
+
+    @property
+    def n_tets(self) -> int:
+        """Number of tets."""
+        return len(np.asarray(self.tets))
+
+    def header(self) -> dict[str, Any]:
+        """Names, kinds and options of the scene: what of it is not an array, ready for JSON."""
+        segments = []
+        for name, segment in self.segments.items():
+            entry: dict[str, Any] = {"name": name}
+            if segment.contact is not None:
+                entry["crease_angle"] = segment.contact.crease_angle
+            if isinstance(segment.gap, str):
+                entry["gap"] = segment.gap
+            motion = self.plan[name]
+            if isinstance(motion, MovedSurface):
+                entry["motion"] = "surface"
+                entry["motion_crease_angle"] = motion.surface.crease_angle
+            else:
+                entry["motion"] = "array"
+            segments.append(entry)
+        tissue = {"kind": self.tissue.kind}
+        if self.tissue.kind == "transversely_isotropic":
+            tissue["law"] = self.tissue.law
+        elif self.tissue.kind == "preset":
+            tissue |= {"preset": self.tissue.preset, "mixing": self.tissue.mixing}
+        return {
+            "tissue": tissue,
+            "segments": segments,
+            "conflicts": self.conflicts,
+            "solver": self.options.header(),
+        }
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Every array of the scene by the name it has in a scene file."""
+        return dict(self._arrays())
+
+    def _arrays(self) -> Iterator[tuple[str, NDArray[Any]]]:
+        yield "nodes", np.asarray(self.nodes)
+        yield "tets", np.asarray(self.tets)
+        for name, array in self.tissue.arrays().items():
+            yield f"tissue.{name}", array
+        yield "fixed", np.asarray(self.fixed)
+        if self.loads is not None:
+            yield "loads", np.asarray(self.loads)
+        # Segments are numbered: their names are free text and stay out of the archive's directory.
+        for number, (name, segment) in enumerate(self.segments.items()):
+            key = f"segment.{number}"
+            yield f"{key}.joined", np.asarray(segment.joined)
+            yield f"{key}.sliding", np.asarray(segment.sliding)
+            if segment.contact is not None:
+                yield f"{key}.contact.vertices", np.asarray(segment.contact.vertices)
+                yield f"{key}.contact.triangles", np.asarray(segment.contact.triangles)
+            if not isinstance(segment.gap, str):
+                yield f"{key}.gap", np.asarray(segment.gap)
+            motion = self.plan[name]
+            if isinstance(motion, MovedSurface):
+                yield f"{key}.motion.vertices", np.asarray(motion.surface.vertices)
+                yield f"{key}.motion.triangles", np.asarray(motion.surface.triangles)
+                yield f"{key}.motion.moved_vertices", np.asarray(motion.moved_vertices)
+            else:
+                yield f"{key}.motion", np.asarray(motion)
+
+    def sha256(self) -> str:
+        """The SHA-256 of the scene's content, the same from whichever file it was read."""
+        digest = hashlib.sha256(json.dumps(self.header(), sort_keys=True).encode())
+        for name, array in self._arrays():
+            digest.update(f"\n{name} {array.dtype.str} {array.shape}\n".encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class SceneResult(Frozen):
+    """The answer to a scene, with what is needed to draw it and to trace it back.
+
+    Attributes
+    ----------
+    nodes : (n, 3) float64, mm
+        At rest; deformed = nodes + displacements.
+    tets : (m, 4) uint32
+    skin_triangles : (t, 3) uint32
+        Boundary of the mesh, outward, as node indices.
+    displacements : (n, 3) float64, mm
+    forces : (n, 3) float64, N
+        K u.
+    residual_history : (k,) float64
+    contact_nodes : (s,) uint32
+        From n on with element "p2": in the middle of an edge.
+    contact_points, contact_normals : (s, 3) float64, mm
+        On the moved contact surface.
+    contact_forces : (s,) float64, N
+    contact_gaps : (s,) float64, mm
+    summary : dict
+        Method, residual, estimated error, iterations, largest contact gap, tets that large
+        deformation leaves inverted (None in linear kinematics, where the count means nothing),
+        findings of the solution, timings, versions and the SHA-256 of the scene's content.
+    """
+
+    nodes: Floats
+    tets: Indices
+    skin_triangles: Indices
+    displacements: Floats
+    forces: Floats
+    residual_history: Floats
+    contact_nodes: Indices
+    contact_points: Floats
+    contact_normals: Floats
+    contact_forces: Floats
+    contact_gaps: Floats
+    summary: Mapping[str, Any]
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Every array of the result by its name."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "summary"}

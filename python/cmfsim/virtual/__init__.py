@@ -1,0 +1,21 @@
+"""Virtual patients: made heads, an operation, and the face that it truly makes (*in silico*).
+
+The truth is computed by other means than the models that are tested on it: hyperelastic tissue, a
+finer mesh, the person's own muscles and contact that only pushes, solved with scikit-fem and PyAMG.
+"""
+
+from cmfsim.virtual.equilibrium import EquilibriumOptions
+from cmfsim.virtual.patient_folder import virtual_patients, write_virtual_patient
+from cmfsim.virtual.people import PATIENTS, Relocation, VirtualPatient
+from cmfsim.virtual.truth import PostoperativeTruth, postoperative_truth
+
+__all__ = [
+    "PATIENTS",
+    "EquilibriumOptions",
+    "PostoperativeTruth",
+    "Relocation",
+    "VirtualPatient",
+    "postoperative_truth",
+    "virtual_patients",
+    "write_virtual_patient",
+]

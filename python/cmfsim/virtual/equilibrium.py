@@ -1,0 +1,374 @@
+"""The equilibrium of the true tissue when bones move: Newton's method along the motion."""
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib import import_module
+from itertools import pairwise
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError, SolverError
+from cmfsim.extras import third_party
+from cmfsim.virtual.body import HyperelasticBody
+
+__all__ = ["Contact", "Equilibrium", "EquilibriumOptions", "NoContact", "find_equilibrium"]
+
+_log = logging.getLogger(__name__)
+
+# Forces below this part of stiffness times the area of the body are rounding.
+LEAST_FORCE = 1e-9
+# Halvings of a step before it is given up.
+HALVINGS = 12
+# Share of the fall of energy that the slope promises, asked of a step (Armijo).
+ARMIJO = 1e-4
+# Falls of energy below this part of the shear modulus times volume are lost in rounding: there a
+# full step is taken.
+ROUNDING = 1e-13
+# Where the true stiffness gives way or leads too far, so many steps are taken with a convex one.
+CONVEX_ROUNDS = 4
+# Of the residual, relative, that each linear solve leaves at most; less where Newton's own residual
+# is less, down to the other.
+LOOSEST_SOLVE, TIGHTEST_SOLVE = 0.01, 1e-5
+MOST_ITERATIONS = 400
+
+
+class Contact(Protocol):
+    """What presses on the tissue where bones have moved by a part of their motion."""
+
+    def energy(self, displacements: Floats, part: float) -> float:
+        """N·mm."""
+
+    def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
+        """The gradient of the energy, (n, 3) N, and the stiffness of each node, (n, 3, 3) N/mm."""
+
+
+class NoContact:
+    """Nothing presses."""
+
+    def energy(self, displacements: Floats, part: float) -> float:
+        """Nothing."""
+        del displacements, part
+        return 0.0
+
+    def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
+        """Nothing."""
+        del part
+        return np.zeros_like(displacements), np.zeros((*displacements.shape, 3))
+
+
+@dataclass(frozen=True)
+class EquilibriumOptions:
+    """How the equilibrium is sought.
+
+    Attributes
+    ----------
+    steps : int
+        Parts of the motion.
+    tolerance : float
+        Of the residual at the end: the norm of the forces on free nodes, in the largest that the
+        forces on held nodes had on the way.
+    loose : float
+        The same at the end of each step but the last.
+    most_rounds : int
+        Newton iterations of one step.
+    """
+
+    steps: int = 2
+    tolerance: float = 5e-4
+    loose: float = 0.03
+    most_rounds: int = 60
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.most_rounds < 1:
+            raise CaseInputError("steps and most_rounds: 1 or more are needed")
+        if not 0.0 < self.tolerance <= self.loose < 1.0:
+            raise CaseInputError("tolerance and loose: 0 < tolerance ≤ loose < 1 is needed")
+
+
+@dataclass(frozen=True, eq=False)
+class Equilibrium:
+    """The tissue at rest with its bones moved.
+
+    Attributes
+    ----------
+    displacements : (n, 3) float64, mm
+    residual : float
+        Norm of the forces on free nodes, as `EquilibriumOptions.tolerance` measures it.
+    energy : float, N·mm
+        Elastic, and of the contact.
+    history : tuple of (float, float)
+        Part of the motion and residual of each Newton iteration.
+    last_step : (n, 3) float64, mm
+        What the last Newton iteration changed.
+    linear_iterations : int
+    seconds : float
+    """
+
+    displacements: Floats
+    residual: float
+    energy: float
+    history: tuple[tuple[float, float], ...]
+    last_step: Floats
+    linear_iterations: int = 0
+    seconds: float = field(default=0.0, compare=False)
+
+
+def find_equilibrium(
+    body: HyperelasticBody,
+    held: NDArray[Any],
+    path: Callable[[float], Floats],
+    contact: Contact | None = None,
+    options: EquilibriumOptions | None = None,
+) -> Equilibrium:
+    """The equilibrium of a body whose held nodes have followed a path, free nodes at rest.
+
+    Parameters
+    ----------
+    body : HyperelasticBody
+    held : (k,) whole numbers
+        Nodes that bones hold.
+    path : callable
+        Their displacements (k, 3) mm after a part of the motion, 0 to 1; zero at 0.
+    contact : Contact, optional
+    options : EquilibriumOptions, optional
+
+    Returns
+    -------
+    Equilibrium
+
+    Raises
+    ------
+    SolverError
+        Newton's method does not settle, or a tet is inside out at the end (names it).
+    CaseError
+        (also `ValueError`) PyAMG or scikit-fem is not installed.
+    """
+    return _Search(body, held, path, contact or NoContact(), options or EquilibriumOptions()).run()
+
+
+class _Search:
+    """The state of one search along the motion."""
+
+    def __init__(
+        self,
+        body: HyperelasticBody,
+        held: NDArray[Any],
+        path: Callable[[float], Floats],
+        contact: Contact,
+        options: EquilibriumOptions,
+    ) -> None:
+        self.body, self.path, self.contact, self.options = body, path, contact, options
+        self.held = np.asarray(held, dtype=np.int64)
+        self.free = np.setdiff1d(np.arange(len(body.nodes)), self.held)
+        self.linear = _LinearSolver(body.nodes[self.free])
+        self.u: Floats = np.zeros_like(body.nodes)
+        self.last_step: Floats = np.zeros_like(body.nodes)
+        self.history: list[tuple[float, float]] = []
+        size = float(np.ptp(body.nodes, axis=0).max())
+        self.least_fall = ROUNDING * float(body.tissue.mu @ body.volumes)
+        self.largest_hold = LEAST_FORCE * float(body.tissue.mu.max()) * size**2
+
+    def run(self) -> Equilibrium:
+        begun = time.perf_counter()
+        residual = 0.0
+        parts = np.linspace(0.0, 1.0, self.options.steps + 1)
+        for before, part in pairwise(parts.tolist()):
+            self._advance(before, part)
+            last = part >= 1.0
+            residual = self._settle(part, self.options.tolerance if last else self.options.loose)
+            _log.info("truth: %3.0f %% of the motion, residual %.1e", 100.0 * part, residual)
+        self._check()
+        return Equilibrium(
+            self.u,
+            residual,
+            self._energy(self.u, 1.0),
+            tuple(self.history),
+            self.last_step,
+            self.linear.total,
+            time.perf_counter() - begun,
+        )
+
+    def _energy(self, u: Floats, part: float) -> float:
+        return self.body.energy(u) + self.contact.energy(u, part)
+
+    def _forces(self, u: Floats, part: float) -> tuple[Floats, Floats]:
+        force, stiffness = self.contact.forces(u, part)
+        return self.body.forces(u) + force, stiffness
+
+    def _advance(self, part: float, target: float) -> None:
+        """Goes along the tangent to the target."""
+        forces, added = self._forces(self.u, part)
+        matrix = self.body.stiffness(self.u, added, convex=True)
+        step = np.zeros_like(self.u)
+        step[self.held] = self.path(target) - self.path(part)
+        pull = (matrix @ step.ravel()).reshape(-1, 3)
+        self.linear.take(_free_blocks(matrix, self.free))
+        step[self.free], _ = self.linear.solve(-(forces + pull)[self.free], LOOSEST_SOLVE)
+        self.u = self.u + step
+        self.u[self.held] = self.path(target)
+
+    def _check(self) -> None:
+        """Refuses tissue that is inside out."""
+        ratio = self.body.volume_ratios(self.u)
+        worst = int(np.argmin(ratio))
+        if ratio[worst] <= 0.0:
+            x, y, z = self.body.nodes[self.body.tets[worst]].mean(axis=0)
+            raise SolverError(
+                f"tet {worst} at ({x:.0f}, {y:.0f}, {z:.0f}) mm is inside out after the motion: "
+                "bones close in on tissue there; plan less, or mesh finer"
+            )
+
+    def _settle(self, part: float, tolerance: float) -> float:
+        """Newton's method with line search; the residual reached."""
+        energy = self._energy(self.u, part)
+        convex = 0
+        for _ in range(self.options.most_rounds):
+            forces, added = self._forces(self.u, part)
+            right = -forces[self.free]
+            hold = float(np.linalg.norm(forces[self.held]))
+            self.largest_hold = max(self.largest_hold, hold)
+            residual = float(np.linalg.norm(right)) / self.largest_hold
+            self.history.append((part, residual))
+            if residual <= tolerance:
+                return residual
+            precision = min(LOOSEST_SOLVE, max(residual, TIGHTEST_SOLVE))
+            step, true = self._step(right, added, precision, convex=convex > 0)
+            slope = -float((step[self.free] * right).sum())
+            share = 1.0
+            for _ in range(HALVINGS):
+                there = self._energy(self.u + share * step, part)
+                if there <= energy + ARMIJO * share * slope or (
+                    share == 1.0 and -slope < self.least_fall and there <= energy + self.least_fall
+                ):
+                    break
+                share *= 0.5
+            else:
+                raise SolverError(
+                    f"Newton's method stalls after {part:.0%} of the motion at a residual of "
+                    f"{residual:.1e} ({tolerance:.0e} is needed)"
+                )
+            convex = max(convex - 1, 0) if convex or (true and share == 1.0) else CONVEX_ROUNDS
+            self.last_step = share * step
+            self.u = self.u + self.last_step
+            energy = there
+            _log.debug(
+                "truth: %.3f of the motion, residual %.2e, step of %.3g Newton's%s: %.2e mm",
+                part,
+                residual,
+                share,
+                "" if true else ", convex",
+                float(np.linalg.norm(self.last_step, axis=1).max()),
+            )
+        raise SolverError(
+            f"after {self.options.most_rounds} Newton iterations at {part:.0%} of the motion the "
+            f"residual is {residual:.1e} ({tolerance:.0e} is needed)"
+        )
+
+    def _step(
+        self, right: Floats, added: Floats, precision: float, *, convex: bool
+    ) -> tuple[Floats, bool]:
+        """Newton's step, (n, 3) mm, and whether the true stiffness gave it."""
+        step = np.zeros_like(self.u)
+        for cut in (True,) if convex else (False, True):
+            matrix = self.body.stiffness(self.u, added, convex=cut)
+            self.linear.take(_free_blocks(matrix, self.free))
+            step[self.free], upright = self.linear.solve(right, precision)
+            if upright:
+                break
+        return step, not cut
+
+
+def _free_blocks(matrix: Any, free: NDArray[np.int64]) -> Any:
+    """The rows and columns of free nodes of a matrix in 3 × 3 blocks."""
+    n = matrix.shape[0] // 3
+    number = np.full(n, -1)
+    number[free] = np.arange(len(free))
+    rows = np.repeat(np.arange(n), np.diff(matrix.indptr))
+    kept = (number[rows] >= 0) & (number[matrix.indices] >= 0)
+    starts = np.concatenate([[0], np.cumsum(np.bincount(number[rows[kept]], minlength=len(free)))])
+    sparse = import_module("scipy.sparse")
+    size = 3 * len(free)
+    return sparse.bsr_array(
+        (matrix.data[kept], number[matrix.indices[kept]], starts), shape=(size, size)
+    )
+
+
+class _LinearSolver:
+    """Conjugate gradients with smoothed aggregation (PyAMG; Vaněk, Mandel & Brezina 1996)."""
+
+    def __init__(self, nodes: Floats) -> None:
+        self.total = 0
+        self._modes = _rigid_modes(nodes)
+        self._matrix: Any = None
+        self._cycle: Any = None
+
+    def take(self, matrix: Any) -> None:
+        """Takes a matrix and makes its preconditioner.
+
+        A new one each time: that of the matrix before takes several times the iterations, as tets
+        that are squeezed near bone stiffen by orders of magnitude.
+        """
+        pyamg = third_party("pyamg", "virtual patients are solved", "study")
+        self._matrix = matrix
+        # PyAMG draws the start of its power iterations from numpy's global generator.
+        state = np.random.get_state()  # noqa: NPY002
+        np.random.seed(0)  # noqa: NPY002
+        try:
+            hierarchy = pyamg.smoothed_aggregation_solver(
+                import_module("scipy.sparse").bsr_matrix(matrix),
+                B=self._modes,
+                symmetry="symmetric",
+                strength=("symmetric", {"theta": 0.0}),
+                smooth=("jacobi", {"omega": 1.0, "weighting": "local"}),
+                improve_candidates=None,
+                presmoother=("block_gauss_seidel", {"sweep": "forward"}),
+                postsmoother=("block_gauss_seidel", {"sweep": "backward"}),
+                max_coarse=300,
+            )
+        finally:
+            np.random.set_state(state)  # noqa: NPY002
+        self._cycle = hierarchy.aspreconditioner(cycle="V")
+
+    def solve(self, right: Floats, precision: float) -> tuple[Floats, bool]:
+        """A step (k, 3) that falls in energy, and whether it is the solution.
+
+        It is not where the matrix curves downwards; then it is what was found before.
+        """
+        r = right.ravel().copy()
+        x = np.zeros_like(r)
+        z = self._cycle @ r
+        p = z.copy()
+        rz = float(r @ z)
+        goal = precision * float(np.linalg.norm(r))
+        for count in range(1, MOST_ITERATIONS + 1):
+            q = self._matrix @ p
+            curvature = float(p @ q)
+            if not curvature > 0.0:
+                _log.debug("truth: negative curvature after %d iterations", count)
+                return (x if count > 1 else p).reshape(-1, 3), False
+            length = rz / curvature
+            x += length * p
+            r -= length * q
+            self.total += 1
+            if float(np.linalg.norm(r)) <= goal:
+                break
+            z = self._cycle @ r
+            rz, before = float(r @ z), rz
+            p = z + (rz / before) * p
+        return x.reshape(-1, 3), True
+
+
+def _rigid_modes(nodes: Floats) -> Floats:
+    """The six rigid motions, (3n, 6)."""
+    x, y, z = ((nodes - nodes.mean(axis=0)) / np.abs(nodes).max()).T
+    modes = np.zeros((len(nodes), 3, 6))
+    modes[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    modes[:, 1, 3], modes[:, 2, 3] = -z, y
+    modes[:, 2, 4], modes[:, 0, 4] = -x, z
+    modes[:, 0, 5], modes[:, 1, 5] = -y, x
+    return modes.reshape(-1, 6)

@@ -1,0 +1,406 @@
+"""A virtual patient on disk: the case before the operation, and the truth after it."""
+
+import json
+import logging
+import os
+import platform
+import shutil
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cmfsim._core import __version__
+from cmfsim.checks import Floats, as_number, as_positive
+from cmfsim.errors import CaseInputError
+from cmfsim.io import Case, write_image, write_landmarks, write_surface
+from cmfsim.io.cohorts import COHORT_FORMAT
+from cmfsim.io.files import replacing
+from cmfsim.phantom import make_head
+from cmfsim.values.scene import SurfaceData
+from cmfsim.virtual.carried_skin import scanned
+from cmfsim.virtual.equilibrium import EquilibriumOptions
+from cmfsim.virtual.people import PATIENTS, Relocation, VirtualPatient, patient_named
+from cmfsim.virtual.truth import PostoperativeTruth, postoperative_truth
+
+__all__ = ["case_text", "virtual_patients", "write_virtual_patient"]
+
+_log = logging.getLogger(__name__)
+
+Progress = Callable[[str], None]
+
+# Standard deviations, mm: of a landmark's place along each axis, on the skull as one operator
+# repeats it, on the skin as the mean of several is; of the noise of a surface scanner at a point,
+# and of its waves.
+SKULL_NOISE, SKIN_NOISE = 0.7, 0.3
+SCAN_WHITE, SCAN_SMOOTH = 0.1, 0.2
+# Numbers that keep the draws of one patient apart, beside the seed and the patient's number.
+CT_DRAW, SKULL_DRAW, SKIN_DRAW, SCAN_DRAW, AFTER_DRAW = range(5)
+# Edge length of the mesh that the case file asks for, in that of the truth.
+COARSER = 1.25
+TRUTH = "truth"
+RECORD = "truth.json"
+COHORT = "cohort.toml"
+
+
+def virtual_patients(
+    folder: str | os.PathLike[str],
+    numbers: Iterable[int] = tuple(PATIENTS),
+    *,
+    seed: int = 0,
+    edge_length: float = 6.0,
+    spacing: float = 2.0,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """The case files of virtual patients, each in a folder of its own with the truth.
+
+    A patient who is there already, made with the same settings, is kept. `cohort.toml` in the
+    folder lists those who are complete, for `cmfsim study`.
+
+    Parameters
+    ----------
+    folder : path
+        Patient n goes to `folder/Pn`.
+    numbers : iterable of int
+        1 to 4.
+    seed : int
+        Draws all noise; the same seed gives the same files.
+    edge_length : float, mm
+        Of the true mesh.
+    spacing : float, mm
+        Of the CT.
+    progress : callable, optional
+        Called with the name of each stage as it begins.
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    CmfsimError
+        (also `ValueError` where the input is at fault) As `write_virtual_patient`.
+    OSError
+        A folder cannot be written to.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cases = cmfsim.virtual_patients("insilico", [1, 2])  # doctest: +SKIP
+    """
+    patients = [patient_named(number) for number in numbers]
+    paths = []
+    for patient in patients:
+        place = Path(folder) / patient.name
+        settings = _settings(patient, seed, edge_length, spacing)
+        if _is_made(place, settings):
+            _log.info("%s is there already", patient.name)
+            paths.append(place / "case.toml")
+            continue
+
+        def stage(name: str, of: VirtualPatient = patient) -> None:
+            if progress is not None:
+                progress(f"{of.name}: {name}")
+
+        paths.append(
+            write_virtual_patient(
+                place,
+                patient.number,
+                seed=seed,
+                edge_length=edge_length,
+                spacing=spacing,
+                progress=stage,
+            )
+        )
+    _write_cohort(Path(folder))
+    return paths
+
+
+def _write_cohort(folder: Path) -> None:
+    """The study of every patient who is complete in the folder."""
+    names = [p.name for p in PATIENTS.values() if (folder / p.name / TRUTH / RECORD).exists()]
+    lines = [
+        "# `cmfsim study cohort.toml` predicts every patient by every model.",
+        f'format = "{COHORT_FORMAT}"',
+        "version = 1",
+        'name = "virtual patients"',
+        'note = "in silico: heads made by code and operations computed; no patients"',
+        'output = "study"',
+    ]
+    for name in names:
+        lines += ["", "[[cases]]", f'file = "{name}/case.toml"']
+    with replacing(folder / COHORT) as file:
+        file.write("\n".join([*lines, ""]).encode())
+
+
+def write_virtual_patient(
+    folder: str | os.PathLike[str],
+    number: int,
+    *,
+    seed: int = 0,
+    edge_length: float = 6.0,
+    refine: bool = False,
+    spacing: float = 2.0,
+    grid: float = 1.5,
+    skin_spacing: float = 2.0,
+    options: EquilibriumOptions | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """The `case.toml` of a virtual patient, with CT and landmarks; the truth lies in `truth`.
+
+    *In silico*: a head made by code, an operation computed. Its tissue, mesh, muscles and contact
+    differ from those of the tested models; see docs/virtual_patients.md.
+
+    Parameters
+    ----------
+    folder : path
+        Made if it is not there. An earlier truth in it is replaced once the new one is complete.
+    number : int
+        1 to 4.
+    seed : int
+        Draws the noise of CT, landmarks and scan.
+    edge_length : float, mm
+        Of the true mesh.
+    refine : bool
+        Whether its tets are smaller where tissue is thin.
+    spacing : float, mm
+        Of the CT.
+    grid : float, mm
+        Spacing of the level images that the true mesh is made from.
+    skin_spacing : float, mm
+        Of the marching cubes that draw the skin.
+    options : EquilibriumOptions, optional
+    progress : callable, optional
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) No such patient, a length that is not positive, a missing package of
+        the extra "study".
+    SolverError
+        The equilibrium was not found.
+    OSError
+        The folder cannot be written to.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> case = cmfsim.write_virtual_patient("P1", 1)  # doctest: +SKIP
+    """
+    patient = patient_named(number)
+    for name, value in (("edge_length", edge_length), ("spacing", spacing), ("grid", grid)):
+        as_positive(name, value)
+    as_positive("skin_spacing", skin_spacing)
+    if as_number("seed", seed) < 0 or int(seed) != seed:
+        raise CaseInputError(f"seed is {seed!r}: a whole number from 0 is needed")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    stage = progress or _quiet
+    begun = time.perf_counter()
+    head = make_head(patient.parameters)
+    stage("imaging the head")
+    ct = head.ct((spacing, spacing, spacing), seed=_draw(seed, patient, CT_DRAW))
+    write_image(ct, folder / "ct.nrrd")
+    skull = _placed(head.skull_landmarks, SKULL_NOISE, [seed, patient.number, SKULL_DRAW])
+    write_landmarks(folder / "skull.mrk.json", skull)
+    skin = _placed(head.skin_landmarks, SKIN_NOISE, [seed, patient.number, SKIN_DRAW])
+    write_landmarks(folder / "skin.mrk.json", skin)
+    with replacing(folder / "case.toml") as file:
+        file.write(case_text(patient, skull, COARSER * edge_length).encode())
+    case = Case.load(folder / "case.toml")
+    truth = postoperative_truth(
+        patient,
+        head,
+        case,
+        edge_length=edge_length,
+        refine=refine,
+        grid=grid,
+        skin_spacing=skin_spacing,
+        options=options,
+        progress=progress,
+    )
+    stage("writing the truth")
+    after = _placed(truth.skin_landmarks, SKIN_NOISE, [seed, patient.number, AFTER_DRAW])
+    scan = scanned(
+        truth.skin,
+        white=SCAN_WHITE,
+        smooth=SCAN_SMOOTH,
+        seed=[seed, patient.number, SCAN_DRAW],
+    )
+    fresh = folder / f".{TRUTH}.new"
+    shutil.rmtree(fresh, ignore_errors=True)
+    _write_truth(fresh, truth, scan, after)
+    record = {
+        "what": "in silico: a head made by code and an operation computed; no patient",
+        "settings": _settings(patient, seed, edge_length, spacing),
+        "patient": _described(patient),
+        "motions": {name: matrix.tolist() for name, matrix in truth.motions.items()},
+        "noise_mm": {
+            "skull_landmarks": SKULL_NOISE,
+            "skin_landmarks": SKIN_NOISE,
+            "scan_white": SCAN_WHITE,
+            "scan_smooth": SCAN_SMOOTH,
+        },
+        "truth": _measured(truth),
+        "seconds": time.perf_counter() - begun,
+        "versions": {"cmfsim": __version__, "python": platform.python_version()},
+    }
+    with replacing(fresh / RECORD) as file:
+        file.write(json.dumps(record, indent=1, allow_nan=False).encode())
+    shutil.rmtree(folder / TRUTH, ignore_errors=True)
+    fresh.rename(folder / TRUTH)
+    return folder / "case.toml"
+
+
+def _quiet(stage: str) -> None:
+    del stage
+
+
+def _draw(seed: int, patient: VirtualPatient, draw: int) -> int:
+    """A seed of one draw of one patient."""
+    return int(np.random.SeedSequence([seed, patient.number, draw]).generate_state(1)[0])
+
+
+def _placed(landmarks: Mapping[str, Floats], noise: float, seed: list[int]) -> dict[str, Floats]:
+    """Landmarks as they are placed, off by noise along each axis."""
+    generator = np.random.default_rng(seed)
+    return {
+        label: np.asarray(point) + noise * generator.standard_normal(3)
+        for label, point in landmarks.items()
+    }
+
+
+def case_text(patient: VirtualPatient, skull: Mapping[str, Floats], edge_length: float) -> str:
+    """The text of `case.toml`: turns are about the skull landmarks, the mesh has this edge, mm."""
+    lines = [
+        f"# Virtual patient {patient.name} ({patient.label}), in silico: no patient.",
+        "# `cmfsim evaluate case.toml` predicts the face and compares it with the truth in truth/.",
+        'format = "cmfsim-case"',
+        "version = 1",
+        f'name = "{patient.name}-in-silico"',
+        "",
+        "[image]",
+        'file = "ct.nrrd"',
+        "",
+        "[landmarks]",
+        'skull = "skull.mrk.json"',
+        'skin = "skin.mrk.json"',
+    ]
+    for procedure in patient.osteotomies:
+        lines += ["", "[[osteotomies]]", f'procedure = "{procedure}"']
+    for segment, move in patient.plan.items():
+        lines += ["", f"[plan.{segment}]", *_motion_lines(move, skull)]
+    lines += [
+        "",
+        "[mesh]",
+        f"edge_length = {edge_length:g}",
+        "",
+        "[muscles]",
+        "",
+        "[postoperative]",
+        f'skin = "{TRUTH}/skin.ply"',
+        f'landmarks = "{TRUTH}/skin.mrk.json"',
+        "",
+        "[output]",
+        'folder = "out"',
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _motion_lines(move: Relocation, skull: Mapping[str, Floats]) -> list[str]:
+    lines = [f"translation = {list(move.translation)}"]
+    if move.angle:
+        centre = [round(float(x), 3) for x in skull[move.centre]]
+        lines += [
+            f"angle = {move.angle}",
+            f"axis = {list(move.axis)}",
+            f"centre = {centre}   # {move.centre}",
+        ]
+    return lines
+
+
+def _settings(
+    patient: VirtualPatient, seed: int, edge_length: float, spacing: float
+) -> dict[str, Any]:
+    """What decides the files of a patient."""
+    return {
+        "version": __version__,
+        "patient": patient.number,
+        "seed": int(seed),
+        "edge_length": float(edge_length),
+        "spacing": float(spacing),
+    }
+
+
+def _described(patient: VirtualPatient) -> dict[str, Any]:
+    return {
+        "name": patient.name,
+        "label": patient.label,
+        "head": asdict(patient.parameters),
+        "muscle_thickness": patient.muscle_thickness,
+        "muscle_stiffness": patient.muscle_stiffness,
+        "osteotomies": list(patient.osteotomies),
+        "plan": {name: asdict(move) for name, move in patient.plan.items()},
+    }
+
+
+def _measured(truth: PostoperativeTruth) -> dict[str, Any]:
+    """What the solution says of itself."""
+    found = truth.equilibrium
+    moved = np.asarray(truth.skin.vertices) - np.asarray(truth.skin_before.vertices)
+    return {
+        "nodes": len(truth.nodes),
+        "tets": len(truth.tets),
+        "muscle_fraction": float(truth.fraction.mean()),
+        "stripped_nodes": truth.operation.stripped,
+        "residual": found.residual,
+        "newton_iterations": len(found.history),
+        "linear_iterations": found.linear_iterations,
+        "solve_seconds": found.seconds,
+        "energy_Nmm": found.energy,
+        "penetration_mm": truth.penetration,
+        "last_skin_step_mm": truth.last_step,
+        "volume_ratio": [float(truth.volume_ratios.min()), float(truth.volume_ratios.max())],
+        "largest_skin_move_mm": float(np.linalg.norm(moved, axis=1).max()),
+    }
+
+
+def _write_truth(
+    folder: Path, truth: PostoperativeTruth, scan: SurfaceData, placed: Mapping[str, Floats]
+) -> None:
+    folder.mkdir()
+    write_surface(folder / "skin.ply", scan)
+    write_surface(folder / "skin_exact.ply", truth.skin)
+    write_surface(folder / "skin_before.ply", truth.skin_before)
+    write_landmarks(folder / "skin.mrk.json", placed)
+    write_landmarks(folder / "skin_exact.mrk.json", truth.skin_landmarks)
+    write_landmarks(folder / "skull_exact.mrk.json", truth.skull_landmarks)
+    for name in ("bones", "bones_before"):
+        (folder / name).mkdir()
+    for name, segment in truth.segments.items():
+        before, matrix = np.asarray(segment.surface.vertices), truth.motions[name]
+        after = before @ matrix[:3, :3].T + matrix[:3, 3]
+        write_surface(folder / "bones_before" / f"{name}.ply", segment.surface)
+        write_surface(
+            folder / "bones" / f"{name}.ply", SurfaceData(after, segment.surface.triangles)
+        )
+
+
+def _is_made(folder: Path, settings: Mapping[str, Any]) -> bool:
+    """Whether a patient of these settings is there, complete."""
+    record = folder / TRUTH / RECORD
+    if not record.exists() or not (folder / "case.toml").exists():
+        return False
+    try:
+        found = json.loads(record.read_text(encoding="utf-8"))
+    except ValueError:
+        return False
+    return isinstance(found, dict) and found.get("settings") == settings

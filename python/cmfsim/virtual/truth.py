@@ -1,0 +1,287 @@
+"""The face that an operation truly makes of a virtual patient: mesh, tissue, equilibrium, skin."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import TetMesh
+from cmfsim.checks import Floats, as_positive
+from cmfsim.errors import CaseInputError
+from cmfsim.io import Case
+from cmfsim.phantom import PhantomHead
+from cmfsim.pipeline.building import build_model
+from cmfsim.surfaces.topology import tet_bodies
+from cmfsim.values.anatomy import BoneSegment, ImageData, NodeKinds
+from cmfsim.values.scene import SurfaceData
+from cmfsim.virtual.body import HyperelasticBody
+from cmfsim.virtual.carried_skin import carried
+from cmfsim.virtual.equilibrium import Equilibrium, EquilibriumOptions, find_equilibrium
+from cmfsim.virtual.hyperelastic import HyperelasticTissue
+from cmfsim.virtual.muscle_field import muscle_field, thickened
+from cmfsim.virtual.operation import (
+    Operation,
+    bone_distances,
+    operate,
+    without_bite,
+    without_gaps,
+)
+from cmfsim.virtual.people import VirtualPatient
+
+__all__ = ["PostoperativeTruth", "largest_body", "postoperative_truth"]
+
+Progress = Callable[[str], None]
+
+# Tissue of which the tooth rows together are nearer than the bite's own gap and this, mm, is none.
+BEYOND_BITE = 1.5
+# Tissue is held from this height over the nasion on, mm: no operation of the jaws moves skin there.
+ABOVE_NASION = 20.0
+# Nodes within this distance from the skin lie on it, mm.
+NEAR_SKIN = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class PostoperativeTruth:
+    """A virtual patient after the operation, without the noise of a scanner.
+
+    Attributes
+    ----------
+    nodes, tets : (n, 3) float64, mm, (m, 4) uint32
+        The true mesh at rest.
+    displacements : (n, 3) float64, mm
+    fraction, fibre : (m,) and (m, 3) float64
+        Of muscle, true.
+    skin_before, skin : SurfaceData
+        The whole head's skin before and after, vertex by vertex.
+    skin_landmarks, skull_landmarks : mapping of str to (3,) float64, mm
+        After the operation.
+    segments : mapping of str to BoneSegment
+        Before it.
+    motions : mapping of str to (4, 4) float64, mm
+        Of every segment; those that stay have the identity.
+    equilibrium : Equilibrium
+    operation : Operation
+    volume_ratios : (m,) float64
+        Volume after over before, of each tet.
+    last_step : float, mm
+        The most that the last Newton iteration moved the skin.
+    """
+
+    nodes: Floats
+    tets: NDArray[np.uint32]
+    displacements: Floats
+    fraction: Floats
+    fibre: Floats
+    skin_before: SurfaceData
+    skin: SurfaceData
+    skin_landmarks: Mapping[str, Floats]
+    skull_landmarks: Mapping[str, Floats]
+    segments: Mapping[str, BoneSegment]
+    motions: Mapping[str, Floats]
+    equilibrium: Equilibrium
+    operation: Operation
+    volume_ratios: Floats
+    last_step: float
+
+    @property
+    def penetration(self) -> float:
+        """The deepest that any node lies in a bone, mm."""
+        depths = self.operation.contact.depths(self.displacements, 1.0)
+        return max((float(depth.max(initial=0.0)) for depth in depths.values()), default=0.0)
+
+
+def postoperative_truth(
+    patient: VirtualPatient,
+    head: PhantomHead,
+    case: Case,
+    *,
+    edge_length: float = 6.0,
+    refine: bool = False,
+    grid: float = 1.5,
+    skin_spacing: float = 2.0,
+    options: EquilibriumOptions | None = None,
+    progress: Progress | None = None,
+) -> PostoperativeTruth:
+    """The face after the operation of a case, by other means than those that are tested on it.
+
+    Bones are cut and moved exactly as the case says. All else is the person's own: anatomy from
+    level functions instead of a segmented CT, a mesh of its own edge length, the true muscles,
+    hyperelastic tissue without small-strain limit, contact that pushes and never pulls, periosteum
+    stripped at the cuts, no tissue between the tooth rows.
+
+    Parameters
+    ----------
+    patient : VirtualPatient
+        Says how muscles differ from those that the phantom draws.
+    head : PhantomHead
+    case : Case
+        Osteotomies, plan and landmarks of it are used, its image is not read.
+    edge_length : float, mm
+        Of the true mesh.
+    refine : bool
+        Whether its tets are smaller where tissue is thin.
+    grid : float, mm
+        Spacing of the level images that the mesh is made from.
+    skin_spacing : float, mm
+        Of the marching cubes that draw the skin.
+    options : EquilibriumOptions, optional
+    progress : callable, optional
+        Called with the name of each stage as it begins.
+
+    Raises
+    ------
+    CmfsimError
+        (also `ValueError` where the input is at fault) What a stage cannot work with.
+    """
+    stage = progress or _quiet
+    length = as_positive("edge_length", edge_length)
+    region = replace(case.region, upper=float(head.skull_landmarks["nasion"][2]) + ABOVE_NASION)
+    mesh = replace(case.mesh, edge_length=length, refine=refine)
+    fine = replace(case, region=region, mesh=mesh, muscles=None, postoperative=None)
+    stage("drawing the true anatomy")
+    anatomy = head.anatomy(as_positive("grid", grid))
+    model = build_model(fine, progress=progress, check=False, anatomy=anatomy)
+    segments = {segment.name: segment for segment in model.segments}
+    motions = {name: _motion(case, name) for name in segments}
+
+    stage("opening bite and cuts")
+    distances = bone_distances(np.asarray(model.scene.nodes), segments)
+    opened = _opened(
+        np.asarray(model.scene.nodes),
+        np.asarray(model.scene.tets),
+        model.kinds,
+        distances,
+        motions,
+        head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE,
+    )
+    nodes, tets = opened.nodes, opened.tets
+
+    stage("laying the true muscles")
+    muscles = thickened(head.muscles, patient.muscle_thickness)
+    depth = np.maximum(anatomy.skin.sample(nodes), 0.0)
+    fraction, fibre = muscle_field(head, muscles, nodes, tets, depth)
+    tissue = HyperelasticTissue.mixed(fraction, fibre, stiffness=patient.muscle_stiffness)
+
+    stage("moving the bones")
+    body = HyperelasticBody(nodes, tets, tissue)
+    operation = operate(
+        nodes,
+        tets,
+        TetMesh(nodes, tets).boundary_triangles(),
+        opened.kinds,
+        distances,
+        {name: np.asarray(s.surface.vertices).mean(axis=0) for name, s in segments.items()},
+        motions,
+        opened.bared,
+    )
+    found = find_equilibrium(body, operation.held, operation.path, operation.contact, options)
+
+    stage("carrying the skin along")
+    before = head.surface("skin", skin_spacing)
+    places = np.asarray(before.vertices)
+    after = places + carried(places, nodes, tets, found.displacements)
+    names, points = list(head.skin_landmarks), np.array(list(head.skin_landmarks.values()))
+    moved = points + carried(points, nodes, tets, found.displacements)
+    on_skin = np.abs(anatomy.skin.sample(nodes)) < NEAR_SKIN
+    return PostoperativeTruth(
+        nodes=nodes,
+        tets=tets,
+        displacements=found.displacements,
+        fraction=fraction,
+        fibre=fibre,
+        skin_before=before,
+        skin=SurfaceData(after, before.triangles),
+        skin_landmarks=dict(zip(names, moved, strict=True)),
+        skull_landmarks=_moved_sites(head.skull_landmarks, segments, motions),
+        segments=segments,
+        motions=motions,
+        equilibrium=found,
+        operation=operation,
+        volume_ratios=body.volume_ratios(found.displacements),
+        last_step=float(np.linalg.norm(found.last_step[on_skin], axis=1).max()),
+    )
+
+
+def _quiet(stage: str) -> None:
+    del stage
+
+
+def _motion(case: Case, segment: str) -> Floats:
+    motion = case.plan.get(segment)
+    if motion is None:
+        return np.eye(4)
+    if motion.matrix is None:
+        raise CaseInputError(
+            f"{case.where(f'plan.{segment}')}: a rigid motion in numbers is needed"
+        )
+    return motion.matrix
+
+
+@dataclass(frozen=True, eq=False)
+class _Opened:
+    """The tissue that is left when bite and gaps are open."""
+
+    nodes: Floats
+    tets: NDArray[np.uint32]
+    kinds: NodeKinds
+    bared: NDArray[np.int64]
+
+
+def _opened(
+    nodes: Floats,
+    tets: NDArray[Any],
+    kinds: NodeKinds,
+    distances: Mapping[str, ImageData],
+    motions: Mapping[str, Floats],
+    gap: float,
+) -> _Opened:
+    """The largest body that is left without what lies between tooth rows and parted bones."""
+    kept = without_gaps(nodes, tets, distances, motions)
+    upper = distances.get("maxilla", distances.get("cranium"))
+    lower = distances.get("mandible_body", distances.get("mandible"))
+    if upper is not None and lower is not None:
+        kept &= without_bite(nodes, tets, upper, lower, gap)
+    bared = np.zeros(len(nodes), dtype=bool)
+    bared[tets[~kept]] = True
+    tets = tets[kept]
+    tets = tets[largest_body(tets)]
+    used = np.zeros(len(nodes), dtype=bool)
+    used[tets] = True
+    number = np.cumsum(used) - 1
+    return _Opened(
+        nodes[used],
+        number[tets].astype(np.uint32),
+        NodeKinds(kinds.kind[used], kinds.segment[used], kinds.segments),
+        np.flatnonzero(bared[used]),
+    )
+
+
+def largest_body(tets: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which tets belong to the largest body that holds together by faces, (m,).
+
+    A flap that hangs on an edge or a node would swing without resistance.
+
+    Parameters
+    ----------
+    tets : (m, 4)
+    """
+    body = tet_bodies(tets)
+    return np.asarray(body == np.argmax(np.bincount(body)))
+
+
+def _moved_sites(
+    sites: Mapping[str, Floats],
+    segments: Mapping[str, BoneSegment],
+    motions: Mapping[str, Floats],
+) -> dict[str, Floats]:
+    """Bone landmarks moved with the segment that each lies deepest in."""
+    points = np.array(list(sites.values()))
+    names = list(segments)
+    levels = np.array([segments[name].level.sample(points) for name in names])
+    moved = {}
+    for label, point, owner in zip(sites, points, levels.argmax(axis=0), strict=True):
+        matrix = motions[names[owner]]
+        moved[label] = matrix[:3, :3] @ point + matrix[:3, 3]
+    return moved

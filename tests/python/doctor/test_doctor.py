@@ -1,0 +1,660 @@
+"""Each defect of a case is found and said alone; a clean case gives no error and no warning."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cmfsim
+from cmfsim.cli import main
+from cmfsim.doctor.evidence import gather
+from cmfsim.doctor.muscles import check_muscles
+from cmfsim.registration import REFERENCE_PLACES
+from head_case import HeadCase
+
+DATA = Path(os.environ.get("CMFSIM_DATA") or Path(__file__).parents[4] / "shared/data")
+HALF_TURN = np.array([-1.0, -1.0, 1.0])
+
+
+def diagnosis(folder, head):
+    return cmfsim.diagnose(cmfsim.Case.load(head.write(folder)))
+
+
+def serious(folder, head):
+    """Severity and code of every error and warning."""
+    return [(f.severity, f.code) for f in diagnosis(folder, head) if f.severity != "note"]
+
+
+def notes(folder, head):
+    """The code of every note."""
+    findings = diagnosis(folder, head)
+    assert all(f.severity == "note" for f in findings), findings
+    return [f.code for f in findings]
+
+
+def test_a_clean_case_has_no_findings(tmp_path):
+    """Nothing to say about a head whose files fit together."""
+    assert cmfsim.diagnose(cmfsim.Case.load(HeadCase().write(tmp_path))) == ()
+
+
+def scaled(head, factor, names=("skin", "cranium", "mandible")):
+    for name in names:
+        head.change(name, vertices=lambda v: v * factor)
+
+
+def normalised(head):
+    for name in ("skin", "cranium", "mandible"):
+        head.change(name, vertices=lambda v: (v - [3, -100, 1500]) / 125.0)
+
+
+def turned(head):
+    for name in ("skin", "cranium", "mandible"):
+        head.change(name, vertices=lambda v: v * HALF_TURN)
+
+
+def swapped(labels, names=None):
+    new = dict(labels)
+    for name in names or [n[:-2] for n in labels if n.endswith("_L")]:
+        new[f"{name}_L"], new[f"{name}_R"] = labels[f"{name}_R"], labels[f"{name}_L"]
+    return new
+
+
+def all_turned(head):
+    turned(head)
+    head.skull = {n: p * HALF_TURN for n, p in head.skull.items()}
+    head.skin = {n: p * HALF_TURN for n, p in head.skin.items()}
+
+
+def mirrored(head):
+    for name in ("skin", "cranium", "mandible"):
+        head.change(name, vertices=lambda v: v * [-1, 1, 1], triangles=lambda t: t[:, ::-1])
+    head.skull = {n: p * [-1, 1, 1] for n, p in head.skull.items()}
+    head.skin = {n: p * [-1, 1, 1] for n, p in head.skin.items()}
+
+
+def inconsistent(triangles):
+    triangles[:40] = triangles[:40, ::-1]
+    return triangles
+
+
+def folded(head):
+    """Two neighbours on the skin that have changed places."""
+    a, b = head.surfaces["skin"].triangles[0, :2]
+
+    def swap(vertices):
+        vertices[[a, b]] = vertices[[b, a]]
+        return vertices
+
+    head.change("skin", vertices=swap)
+
+
+def with_debris(head, name):
+    """A piece of its own in the free space under the cranium, with a fifth of a bone's size."""
+    old = head.surfaces[name]
+    centre = np.asarray(old.vertices).mean(axis=0)
+    extra = (np.asarray(old.vertices) - centre) * 0.2 + [3, -60, 1440]
+    head.change(
+        name,
+        vertices=lambda v: np.concatenate([v, extra]),
+        triangles=lambda t: np.concatenate([t, t + len(extra)]),
+    )
+
+
+def with_fork(head):
+    """A tet that hangs on an edge of the cranium, within it."""
+    vertices, triangles = head.surfaces["cranium"].vertices, head.surfaces["cranium"].triangles
+    a, b = triangles[0, :2]
+    c, d = len(vertices), len(vertices) + 1
+    tips = vertices.mean(axis=0) + [[10.0, 0, 0], [0, 10.0, 5.0]]
+    tet = [[a, b, c], [b, a, d], [a, c, d], [c, b, d]]
+    head.change(
+        "cranium",
+        vertices=lambda v: np.concatenate([v, tips]),
+        triangles=lambda t: np.concatenate([t, tet]),
+    )
+
+
+def with_slivers(head):
+    """Triangles of the mandible without common vertices, each pressed almost flat."""
+    triangles = head.surfaces["mandible"].triangles
+
+    def push(vertices):
+        used = set()
+        for a, b, c in triangles:
+            if used & {a, b, c}:
+                continue
+            used |= {a, b, c}
+            vertices[a] = 0.002 * vertices[a] + 0.499 * (vertices[b] + vertices[c])
+        return vertices
+
+    head.change("mandible", vertices=push)
+
+
+def shifted(head, name, offset):
+    """A bone moved with its landmarks left out, which would tell the same."""
+    head.change(name, vertices=lambda v: v + offset)
+    head.replace('skull = "skull.mrk.json"\n', "")
+
+
+def far_landmark(head, distance):
+    head.skull = head.skull | {"nasion": head.skull["nasion"] + [0, -distance, 0]}
+
+
+# Each defect: what is done to a clean case, and the one serious finding it gives.
+DEFECTS = {
+    "metres": (lambda h: scaled(h, 0.001), "error", "surface-units"),
+    "micrometres": (lambda h: scaled(h, 1000.0), "error", "surface-units"),
+    "inches": (lambda h: scaled(h, 1 / 25.4), "error", "surface-units"),
+    "centimetres": (lambda h: scaled(h, 0.1), "error", "surface-units"),
+    "normalised": (normalised, "error", "surface-units"),
+    "bone in metres": (lambda h: scaled(h, 0.001, ["mandible"]), "error", "surface-units"),
+    "ten times too large": (lambda h: scaled(h, 4.0), "error", "surface-size"),
+    "landmarks in metres": (
+        lambda h: setattr(h, "skull", {n: p / 1000 for n, p in h.skull.items()}),
+        "error",
+        "landmark-units",
+    ),
+    "landmarks in RAS": (
+        lambda h: setattr(h, "skull", {n: p * HALF_TURN for n, p in h.skull.items()}),
+        "error",
+        "landmark-frame",
+    ),
+    "landmarks of another patient": (
+        lambda h: setattr(h, "skin", {n: p + [60, 90, 80] for n, p in h.skin.items()}),
+        "error",
+        "landmark-frame",
+    ),
+    "labels swapped": (
+        lambda h: setattr(h, "skin", swapped(h.skin)),
+        "error",
+        "left-right-swapped",
+    ),
+    "one pair swapped": (
+        lambda h: setattr(h, "skull", swapped(h.skull, ["gonion"])),
+        "error",
+        "landmark-pair-swapped",
+    ),
+    "landmark 8 mm off": (lambda h: far_landmark(h, 8.0), "warning", "landmark-far"),
+    "landmark 30 mm off": (lambda h: far_landmark(h, 30.0), "error", "landmark-far"),
+    "skin turned inside out in part": (
+        lambda h: h.change("skin", triangles=inconsistent),
+        "warning",
+        "surface-inconsistent",
+    ),
+    "bone inside out": (
+        lambda h: h.change("mandible", triangles=lambda t: t[:, ::-1]),
+        "warning",
+        "surface-inward",
+    ),
+    "bone open": (
+        lambda h: h.change("mandible", triangles=lambda t: t[30:]),
+        "warning",
+        "surface-open",
+    ),
+    "face mask": (
+        lambda h: h.change(
+            "skin", triangles=lambda t: t[(h.surfaces["skin"].vertices[t][:, :, 1] < -40).all(1)]
+        ),
+        "warning",
+        "surface-open",
+    ),
+    "skin crosses itself": (
+        folded,
+        "warning",
+        "surface-crossing",
+    ),
+    "skin with an island": (lambda h: with_debris(h, "skin"), "warning", "surface-islands"),
+    "fork": (with_fork, "warning", "surface-non-manifold"),
+    "slivers": (with_slivers, "warning", "surface-slivers"),
+    "bone through skin": (
+        lambda h: shifted(h, "cranium", [0, -30.0, 0]),
+        "warning",
+        "bone-through-skin",
+    ),
+    "bone elsewhere": (
+        lambda h: h.change("mandible", vertices=lambda v: v + [400.0, 0, 0]),
+        "error",
+        "bone-elsewhere",
+    ),
+    "bone in RAS": (
+        lambda h: h.change("mandible", vertices=lambda v: v * HALF_TURN),
+        "error",
+        "surface-frame",
+    ),
+    "the same bone twice": (
+        lambda h: shifted(h, "mandible", [0, 10.0, 35.0]),
+        "warning",
+        "bone-overlap",
+    ),
+    "tissue too thin": (
+        lambda h: h.replace("edge_length = 4.0", "edge_length = 20\nrefine = false"),
+        "warning",
+        "edge-length-coarse",
+    ),
+    "plan 30 mm": (
+        lambda h: h.replace("[0, -4, 1]", "[0, 30, 0]"),
+        "warning",
+        "plan-far",
+    ),
+    "plan 400 mm": (
+        lambda h: h.replace("[0, -4, 1]", "[0, -400, 0]"),
+        "error",
+        "plan-far",
+    ),
+    "turn about the origin": (
+        lambda h: h.replace("angle = 2\naxis = [1, 0, 0]\ncentre = [3, -100, 1450]", "angle = 3"),
+        "error",
+        "plan-far",
+    ),
+    "turn by radians' worth": (
+        lambda h: (
+            h.replace("angle = 2", "angle = -28"),
+            h.replace("[3, -100, 1450]", "[3, -128, 1445]"),
+        ),
+        "warning",
+        "plan-turned",
+    ),
+    "bone moved through the skin": (
+        lambda h: (
+            shifted(h, "mandible", [0, -22.0, 0]),
+            h.replace("[0, -4, 1]", "[0, -15, 0]"),
+        ),
+        "warning",
+        "plan-through-skin",
+    ),
+    "no tissue": (
+        lambda h: h.replace("[tissue]", "[region]\nlower = 1480\n\n[tissue]"),
+        "error",
+        "segment-no-tissue",
+    ),
+    "unknown segment": (
+        lambda h: h.replace("[plan.mandible]", "[plan.maxila]"),
+        "error",
+        "plan-unknown-segment",
+    ),
+    "unknown bone": (
+        lambda h: h.replace(
+            "[tissue]",
+            '[[osteotomies]]\nplane = {point = [0, 0, 0], normal = [0, 0, 1]}\nbone = "jaw"\n'
+            'name = "chin"\n\n[tissue]',
+        ),
+        "error",
+        "cut-unknown-bone",
+    ),
+    "depth behind landmarks that are missing": (
+        lambda h: (
+            h.skull.pop("supraglenoid_L"),
+            h.replace("[tissue]", "[region]\nposterior_depth = 5\n\n[tissue]"),
+        ),
+        "error",
+        "region-unplaced",
+    ),
+    "unknown preset": (lambda h: h.replace("kim2010", "kim2011"), "error", "tissue-preset"),
+    "missing skin": (lambda h: h.replace("skin.ply", "face.ply"), "error", "file-missing"),
+    "missing landmarks": (
+        lambda h: h.replace("skull.mrk", "no.mrk"),
+        "error",
+        "file-missing",
+    ),
+    "output is a file": (
+        lambda h: h.replace("[tissue]", '[output]\nfolder = "skin.ply"\n\n[tissue]'),
+        "error",
+        "output-not-writable",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_a_defect_is_said_and_said_alone(name, tmp_path):
+    """One defect in a clean case gives one serious finding, with its reason and its mend."""
+    spoil, severity, code = DEFECTS[name]
+    head = HeadCase()
+    spoil(head)
+    findings = [f for f in diagnosis(tmp_path, head) if f.severity != "note"]
+    assert [(f.severity, f.code) for f in findings] == [(severity, code)]
+    (finding,) = findings
+    assert finding.what
+    assert finding.why
+    assert finding.mend
+    assert "case.toml" in finding.where
+
+
+def test_a_turned_or_mirrored_head_is_said_for_both_sets_of_landmarks(tmp_path):
+    """All data in RAS, or all mirrored: skull and skin landmarks say so."""
+    for spoil, code in ((all_turned, "frame-turned"), (mirrored, "left-right-swapped")):
+        head = HeadCase()
+        spoil(head)
+        assert serious(tmp_path, head) == [("error", code)] * 2
+
+
+def test_a_turned_head_without_landmarks_is_known_by_its_jaw(tmp_path):
+    """The mandible lies in front of the cranium's middle in LPS."""
+    head = HeadCase()
+    turned(head)
+    head.replace('skull = "skull.mrk.json"\nskin = "skin.mrk.json"\n', "")
+    head.replace("centre = [3, -100, 1450]", "centre = [-3, 100, 1450]")
+    assert serious(tmp_path, head) == [("error", "surface-frame")]
+
+
+def test_what_build_mends_without_doubt_is_a_note(tmp_path):
+    """An open neck, doubled and flat triangles, a tet too coarse in a few places when refined."""
+    head = HeadCase()
+    vertices = head.surfaces["skin"].vertices
+    head.change("skin", triangles=lambda t: t[(vertices[t][:, :, 2] > 1390).all(axis=1)])
+    assert notes(tmp_path, head) == ["surface-open"]
+    head = HeadCase()
+    head.change("skin", triangles=lambda t: np.concatenate([t, t[:3], [[5, 5, 6]]]))
+    assert notes(tmp_path, head) == ["surface-degenerate"]
+
+
+def test_units_and_frame_of_the_case_file_are_used(tmp_path):
+    """Surfaces in metres and RAS that say so are as good as in mm and LPS."""
+    head = HeadCase()
+    turned(head)
+    scaled(head, 0.001)
+    head.replace('units = "mm"\nframe = "LPS"', 'units = "m"\nframe = "RAS"')
+    # The plan's own frame must be stated beside surfaces in RAS.
+    head.replace("[plan.mandible]", '[plan.mandible]\nframe = "LPS"')
+    assert serious(tmp_path, head) == []
+
+
+def test_one_bone_alone_has_landmarks_of_the_other_far_away(tmp_path):
+    """The mandible without the skull is a case; landmarks turned about fit it no better."""
+    head = HeadCase()
+    head.replace('cranium = "cranium.ply"\n', "")
+    assert "landmark-frame" not in [code for _, code in serious(tmp_path, head)]
+    head.skull = {n: p * HALF_TURN for n, p in head.skull.items()}
+    assert ("error", "landmark-frame") in serious(tmp_path, head)
+
+
+def test_landmarks_off_the_face_after_the_operation_are_said(tmp_path):
+    """Those of the skin before, on a face that came 20 mm forwards; those on it say nothing."""
+    head = HeadCase()
+    path = head.write(tmp_path)
+    skin = head.surfaces["skin"]
+    after = cmfsim.SurfaceData(skin.vertices + [0.0, -20.0, 0.0], skin.triangles)
+    cmfsim.write_surface(tmp_path / "after.ply", after)
+    places = {"pronasale": after.vertices[np.argmin(after.vertices[:, 1])]}
+    more = '\n[postoperative]\nskin = "after.ply"\nlandmarks = "after.mrk.json"\n'
+    path.write_text(path.read_text(encoding="utf-8") + more, encoding="utf-8")
+    for shift, expected in ((0.0, False), (30.0, True)):
+        moved = {name: place - [0.0, shift, 0.0] for name, place in places.items()}
+        cmfsim.write_landmarks(tmp_path / "after.mrk.json", moved)
+        found = [f.code for f in cmfsim.diagnose(cmfsim.Case.load(path))]
+        assert ("postoperative-landmarks-off" in found) == expected
+
+
+def test_an_unstated_landmark_frame_is_said(tmp_path):
+    """Neither file nor case says whether it is LPS: a warning; if the case says, a note."""
+    head = HeadCase()
+    head.write(tmp_path)
+    path = tmp_path / "bare.mrk.json"
+    text = (tmp_path / "skull.mrk.json").read_text(encoding="utf-8")
+    path.write_text(text.replace('"coordinateSystem": "LPS",', ""), encoding="utf-8")
+    head.replace("skull.mrk.json", "bare.mrk.json")
+    assert serious(tmp_path, head) == [("warning", "landmark-frame-unstated")]
+    head.replace("[landmarks]", '[landmarks]\nframe = "LPS"')
+    assert notes(tmp_path, head) == ["landmark-frame-unstated"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 4\n",
+        b"solid nothing\nendsolid nothing\n",
+        b"\x00" * 500,
+    ],
+)
+def test_a_surface_that_cannot_be_read_is_one_error(content, tmp_path):
+    """Empty, cut short, without triangles, no surface at all: named, and nothing else happens."""
+    path = HeadCase().write(tmp_path)
+    name = "mandible.stl" if content.startswith(b"solid") else "mandible.ply"
+    (tmp_path / name).write_bytes(content)
+    path.write_text(path.read_text("utf-8").replace("mandible.ply", name), encoding="utf-8")
+    before = sorted(p.name for p in tmp_path.iterdir())
+    findings = cmfsim.diagnose(cmfsim.Case.load(path))
+    codes = [f.code for f in findings if f.severity == "error"]
+    assert codes == ["surface-unreadable" if content else "file-missing"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
+
+
+def test_a_truncated_surface_is_unreadable(tmp_path):
+    """A PLY cut in the middle of its triangles."""
+    path = HeadCase().write(tmp_path)
+    whole = (tmp_path / "skin.ply").read_bytes()
+    (tmp_path / "skin.ply").write_bytes(whole[: len(whole) // 2])
+    findings = cmfsim.diagnose(cmfsim.Case.load(path))
+    assert [f.code for f in findings] == ["surface-unreadable"]
+
+
+def test_nan_in_a_surface_is_named_with_its_row(tmp_path):
+    """The finding names the vertex."""
+    path = HeadCase().write(tmp_path)
+    (tmp_path / "skin.obj").write_text("v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n", encoding="utf-8")
+    path.write_text(path.read_text("utf-8").replace("skin.ply", "skin.obj"), encoding="utf-8")
+    (finding,) = cmfsim.diagnose(cmfsim.Case.load(path))
+    assert finding.code == "surface-unreadable"
+    assert "line 2: 'nan' is not finite" in finding.what
+
+
+# Cuts, transforms, images.
+
+
+def with_cut(head, table):
+    head.replace("[tissue]", f"[[osteotomies]]\n{table}\n\n[tissue]")
+
+
+def test_a_procedure_without_its_landmarks_or_with_a_wrong_option_is_said(tmp_path):
+    """Le Fort I needs the second molars' points."""
+    head = HeadCase()
+    with_cut(head, 'procedure = "le_fort_1"')
+    assert serious(tmp_path, head) == []
+    del head.skull["supra_m2_L"]
+    (finding,) = (f for f in diagnosis(tmp_path, head) if f.severity == "error")
+    assert finding.code == "landmark-missing"
+    assert "supra_m2_L" in finding.what
+    head = HeadCase()
+    with_cut(head, 'procedure = "le_fort_1"\nheight = 400')
+    assert serious(tmp_path, head) == [("error", "cut-options")]
+
+
+def test_the_motion_of_a_cut_segment_is_measured_on_its_bone(tmp_path):
+    """A turn about the origin moves the front half of the mandible by more than 60 mm."""
+    head = HeadCase()
+    with_cut(
+        head,
+        "plane = {point = [0, -128, 1445], normal = [0, -1, 0]}\n"
+        'bone = "mandible"\nname = "half"\n[plan.half]\nangle = 3',
+    )
+    (finding,) = (f for f in diagnosis(tmp_path, head) if f.severity != "note")
+    assert (finding.severity, finding.code) == ("error", "plan-far")
+    # 2 sin(θ/2) times the distance from the axis, the L axis, at the front of the mandible.
+    far = 2 * np.sin(np.radians(1.5)) * np.hypot(1463, 158)
+    assert float(finding.what.split(" mm")[0].split()[-1]) == pytest.approx(far, rel=0.02)
+
+
+def test_a_transform_file_is_read_for_its_motion(tmp_path):
+    """A 4 × 4 text moves the bone too far; a broken one cannot be read."""
+    head = HeadCase()
+    motion = "translation = [0, -4, 1]\nangle = 2\naxis = [1, 0, 0]\ncentre = [3, -100, 1450]"
+    head.replace(motion, 'transform = "jaw.txt"')
+    np.savetxt(tmp_path / "jaw.txt", cmfsim.rigid_motion(translation=(0, 30, 0)))
+    assert serious(tmp_path, head) == [("warning", "plan-far")]
+    (tmp_path / "jaw.txt").write_text("1 2 3\n", encoding="utf-8")
+    assert serious(tmp_path, head) == [("error", "transform-unreadable")]
+
+
+def with_muscles(head, kept=None):
+    """The case with muscles, and the landmarks of an average head that are kept."""
+    head.toml += "\n[muscles]\n"
+    places = REFERENCE_PLACES["skull"]
+    # On no surface of the ellipsoids: what is asked for here is names alone.
+    head.skull = {name: places[name] + [3.0, -100.0, 1500.0] for name in kept or places}
+    return head
+
+
+def muscle_findings(folder, head):
+    """Severity, code and text of findings about muscles."""
+    case = cmfsim.Case.load(head.write(folder))
+    codes = ("muscles-landmarks", "muscles-without-landmarks", "template-landmarks-missing")
+    return [(f.severity, f.code, f.what) for f in check_muscles(gather(case)) if f.code in codes]
+
+
+def test_missing_landmarks_are_a_warning_that_names_them(tmp_path):
+    """One of 32 was an error that blocked every model; six are enough, three are not."""
+    names = [*HeadCase().skull]
+    assert muscle_findings(tmp_path, with_muscles(HeadCase())) == []
+    head = with_muscles(HeadCase())
+    del head.skull["nasion"]
+    ((severity, code, what),) = muscle_findings(tmp_path, head)
+    assert (severity, code) == ("warning", "template-landmarks-missing")
+    assert "1 of the template's 32 landmarks are missing: nasion;" in what
+    six = ("nasion", "menton", "gonion_L", "gonion_R", "zygomatic_arch_L", "zygomatic_arch_R")
+    ((severity, _, what),) = muscle_findings(tmp_path, with_muscles(HeadCase(), six))
+    assert severity == "warning"
+    assert "26 of" in what
+    found = muscle_findings(tmp_path, with_muscles(HeadCase(), names[:3]))
+    assert [(s, c) for s, c, _ in found] == [("error", "muscles-landmarks")]
+
+
+def test_muscles_are_checked_only_for_models_that_have_them(tmp_path):
+    """The landmarks lie in one plane: no muscle can be placed, a homogeneous model needs none."""
+    head = HeadCase()
+    head.toml += "\n[muscles]\n"
+    head.skull = {n: head.skull[n] for n in ("nasion", "menton", "pogonion")}
+    for models, count in ((["H"], 0), (["H", "H+S"], 0), (["M"], 1), (["H", "M+S"], 1), (None, 1)):
+        case = cmfsim.Case.load(head.write(tmp_path))
+        found = [f for f in cmfsim.diagnose(case, models=models) if f.code == "muscles-landmarks"]
+        assert len(found) == count, models
+
+
+def image_case(folder, spacing):
+    """The case with an empty image round the head in place of its surfaces."""
+    pytest.importorskip("SimpleITK")
+    head = HeadCase()
+    table = head.toml.split("[surfaces]")[1].split("[landmarks]")[0]
+    head.replace(f"[surfaces]{table}", '[image]\nfile = "ct.nrrd"\n\n')
+    low, high = np.array([-80, -210, 1370.0]), np.array([90, 10, 1630.0])
+    shape = tuple(int(n) for n in np.ceil((high - low) / spacing) + 1)
+    image = cmfsim.ImageData(np.full(shape, -1000, np.int16), (spacing,) * 3, low)
+    cmfsim.write_image(image, folder / "ct.nrrd")
+    return head
+
+
+def test_an_image_is_compared_with_its_landmarks_and_its_voxels_are_looked_at(tmp_path):
+    """Fine and fitting: nothing; coarse, in another frame, of another patient, damaged: said."""
+    head = image_case(tmp_path, 2.5)
+    assert serious(tmp_path, head) == []
+    assert serious(tmp_path, image_case(tmp_path, 3.0)) == [("warning", "ct-spacing-coarse")]
+    head = image_case(tmp_path, 2.5)
+    head.skull = {n: p * HALF_TURN for n, p in head.skull.items()}
+    assert serious(tmp_path, head) == [("error", "landmark-frame")]
+    head.skull = {n: p + [0, 0, 900.0] for n, p in HeadCase().skull.items()}
+    assert serious(tmp_path, head) == [("error", "landmark-outside-image")]
+    (tmp_path / "ct.nrrd").write_bytes(b"NRRD0004\n")
+    head.skull = HeadCase().skull
+    assert serious(tmp_path, head) == [("error", "image-unreadable")]
+
+
+# The command.
+
+
+def test_the_command_prints_plain_lines_and_exits_with_0(tmp_path, capsys):
+    """No colour in a pipe, no errors: 0."""
+    assert main(["doctor", str(HeadCase().write(tmp_path))]) == 0
+    out, err = capsys.readouterr()
+    plan, findings = out.splitlines()
+    assert plan.startswith("plan: mandible: 4.0 mm forwards")
+    assert findings == "nothing found"
+    assert "\x1b" not in out + err
+
+
+def test_the_command_exits_with_2_on_an_error_and_speaks_json(tmp_path, capsys):
+    """`--json` gives every part of every finding and the counts."""
+    head = HeadCase()
+    scaled(head, 0.001)
+    path = head.write(tmp_path)
+    assert main(["doctor", str(path), "--json", "-q"]) == 2
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    assert err == ""
+    assert report["errors"] == 1
+    assert report["findings"][0]["code"] == "surface-units"
+    assert set(report["findings"][0]) == {"severity", "code", "what", "where", "why", "mend"}
+    assert main(["doctor", str(path), "-q"]) == 2
+    assert "surface-units" in capsys.readouterr().out
+
+
+def test_names_from_files_cannot_steer_the_terminal(tmp_path, capsys):
+    """A label with an escape sequence is printed as its code."""
+    head = HeadCase()
+    head.skull = head.skull | {"bad\x1b[2J": head.skull["nasion"] + [0, -40.0, 0]}
+    assert main(["doctor", str(head.write(tmp_path))]) == 2
+    out, _ = capsys.readouterr()
+    assert "\x1b" not in out
+    assert "\\x1b[2J" in out
+
+
+def test_a_case_file_that_cannot_be_read_exits_with_2(tmp_path, capsys):
+    """The error names file and line."""
+    head = HeadCase()
+    head.replace("edge_length = 4.0", "edge_lenght = 4.0")
+    assert main(["doctor", str(head.write(tmp_path))]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "case.toml:19: mesh.edge_lenght is unknown; did you mean 'edge_length'?" in err
+
+
+# Real anatomy.
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no real data at {DATA}")
+@pytest.mark.parametrize("skin", ["skin.ply", "skin_open.ply"])
+def test_the_atlas_head_has_no_error(skin, tmp_path):
+    """Closed and open skin with two bones, landmarks and an ordinary plan."""
+    folder = DATA / "atlas_head"
+    text = f"""format = "cmfsim-case"
+version = 1
+[surfaces]
+skin = "{folder / skin}"
+[surfaces.bones]
+cranium = "{folder / "cranium.ply"}"
+mandible = "{folder / "mandible.ply"}"
+[landmarks]
+skull = "{folder / "skull_landmarks.mrk.json"}"
+skin = "{folder / "skin_landmarks.mrk.json"}"
+[[osteotomies]]
+procedure = "le_fort_1"
+[plan.maxilla]
+translation = [0, -5, 0]
+[plan.mandible]
+translation = [0, -4, 0]
+"""
+    path = tmp_path / "case.toml"
+    path.write_text(text, encoding="utf-8")
+    findings = cmfsim.diagnose(cmfsim.Case.load(path))
+    assert not [f for f in findings if f.severity != "note"]
+    assert any(f.code == "surface-open" for f in findings) == (skin == "skin_open.ply")
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no real data at {DATA}")
+def test_the_ct_of_the_phantom_has_no_error(tmp_path):
+    """Image and landmarks with three procedures, which may have a warning about the chin."""
+    pytest.importorskip("SimpleITK")
+    folder = DATA / "ct_phantom"
+    cuts = ("le_fort_1", "bsso", "genioplasty")
+    text = f"""format = "cmfsim-case"
+version = 1
+[image]
+file = "{folder / "ct.nii.gz"}"
+[landmarks]
+skull = "{folder / "skull_landmarks.mrk.json"}"
+skin = "{folder / "skin_landmarks.mrk.json"}"
+""" + "".join(f'[[osteotomies]]\nprocedure = "{cut}"\n' for cut in cuts)
+    path = tmp_path / "case.toml"
+    path.write_text(text, encoding="utf-8")
+    findings = cmfsim.diagnose(cmfsim.Case.load(path))
+    assert not [f for f in findings if f.severity == "error"]

@@ -1,0 +1,520 @@
+"""The segmentation of heads: a made one with known truth, and variants of a real CT."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cmfsim
+import ct_variants as variants
+from cmfsim import ImageData, ImageError, SegmentOptions, segment_head
+from cmfsim.imaging import intensity
+from synthetic_head import made_head
+
+pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
+measure = pytest.importorskip("skimage.measure", reason="needs scikit-image")
+
+DATA = Path(os.environ.get("CMFSIM_DATA", Path(__file__).parents[4] / "shared/data"))
+PHANTOM = DATA / "ct_phantom"
+
+
+def on_truth(level, head, mask):
+    """The level's inside and the truth, on the level's grid."""
+    steps = np.round((level.lowest - head.image.lowest) / np.asarray(level.spacing)).astype(int)
+    part = tuple(slice(a, a + n) for a, n in zip(steps, level.values.shape, strict=True))
+    return level.values > 0.0, mask[part]
+
+
+def dice(a, b):
+    return 2.0 * np.count_nonzero(a & b) / (np.count_nonzero(a) + np.count_nonzero(b))
+
+
+def codes(anatomy):
+    return {f.code for f in anatomy.findings}
+
+
+def surface_points(level):
+    """Vertices of the zero set, mm."""
+    spacing = np.asarray(level.spacing)
+    values = np.pad(level.values, 1, constant_values=-1.0)
+    points = measure.marching_cubes(values, 0.0, spacing=tuple(spacing))[0]
+    return points + level.lowest - spacing
+
+
+@pytest.fixture(scope="session")
+def head():
+    return made_head()
+
+
+@pytest.fixture(scope="session")
+def anatomy(head):
+    return segment_head(head.image, landmarks=head.landmarks)
+
+
+def test_the_made_head_is_found_within_its_voxels(head, anatomy):
+    inside, truth = on_truth(anatomy.skin, head, head.skin)
+    assert dice(inside, truth) > 0.99
+    found, truth = on_truth(anatomy.bones["mandible"], head, head.mandible)
+    assert dice(found, truth) > 0.9
+
+
+def test_the_couch_is_removed_and_said(anatomy):
+    assert "rest-removed" in codes(anatomy)
+    assert anatomy.skin.values[:, (anatomy.skin.axes()[1] > 112.0).ravel()].max() <= 0.0
+
+
+def test_the_brain_is_inside_the_cranium(head, anatomy):
+    found, brain = on_truth(anatomy.bones["cranium"], head, head.brain)
+    assert np.count_nonzero(found & brain) > 0.995 * np.count_nonzero(brain)
+
+
+def test_the_airway_is_air_inside_the_skin(head, anatomy):
+    found, tube = on_truth(anatomy.air, head, head.airway)
+    inside, _ = on_truth(anatomy.skin, head, head.skin)
+    bone, _ = on_truth(anatomy.bones["cranium"], head, head.skin)
+    # Bone encloses the way past the palate; the nostril's first millimetres lie outside.
+    deep = tube & ~bone & (anatomy.air.axes()[1] > -95.0)
+    assert dice(found, deep) > 0.8
+    assert inside[found].all()
+
+
+def test_no_voxel_is_both_bone_and_outside_or_two_bones(anatomy):
+    cranium, mandible = (anatomy.bones[n].values > 0.0 for n in ("cranium", "mandible"))
+    assert not (cranium & mandible).any()
+    assert (anatomy.skin.values[cranium | mandible] > 0.0).all()
+    assert np.isfinite(anatomy.skin.values).all()
+    assert max(np.abs(level.values).max() for level in anatomy.bones.values()) <= 1.0
+
+
+def test_no_level_comes_near_zero_away_from_its_surface(anatomy):
+    from scipy import ndimage  # noqa: PLC0415
+
+    cube = np.ones((3, 3, 3))
+    levels = {"skin": anatomy.skin, "cranium": anatomy.bones["cranium"], "air": anatomy.air}
+    for level in levels.values():
+        inside = level.values > 0.0
+        deep = ndimage.binary_erosion(inside, cube, iterations=2)
+        far = ndimage.binary_erosion(~inside, cube, iterations=2)
+        assert deep.any()
+        small = np.abs(level.values[deep | far]) < 0.3
+        # A smoothed rim may stand a voxel out from its mask.
+        assert np.count_nonzero(small) < 1e-5 * small.size
+
+
+def test_the_jaws_are_parted_without_landmarks_and_it_is_said(head):
+    guessed = segment_head(head.image)
+    assert "jaws-parted-by-shape" in codes(guessed)
+    found, truth = on_truth(guessed.bones["mandible"], head, head.mandible)
+    assert dice(found, truth) > 0.85
+
+
+def test_the_same_image_gives_the_same_bits(head, anatomy):
+    again = segment_head(head.image, landmarks=head.landmarks)
+    assert again.skin.values.tobytes() == anatomy.skin.values.tobytes()
+    for name, level in anatomy.bones.items():
+        assert again.bones[name].values.tobytes() == level.values.tobytes()
+
+
+def test_one_bone_is_left_where_jaws_are_not_to_be_parted_and_stages_are_named_in_order(head):
+    stages = []
+    whole = segment_head(head.image, SegmentOptions(part_jaws=False), progress=stages.append)
+    assert set(whole.bones) == {"skull"}
+    assert stages == ["grid", "metal", "skin", "bone", "air"]
+
+
+@pytest.mark.parametrize(
+    ("slope", "offset", "dtype"),
+    [(1.0, 1024.0, np.uint16), (1.0, 32768.0, np.uint16), (9.7, 9950.0, np.uint16)],
+)
+def test_other_scales_than_hu_are_recognised_and_said(head, anatomy, slope, offset, dtype):
+    raw = np.clip(np.round(head.image.values * slope + offset), 0, 65535).astype(dtype)
+    found = segment_head(head.image.with_values(raw), landmarks=head.landmarks)
+    assert "ct-not-hu" in codes(found)
+    assert dice(found.skin.values > 0, anatomy.skin.values > 0) > 0.99
+    assert dice(found.bones["mandible"].values > 0, anatomy.bones["mandible"].values > 0) > 0.95
+
+
+def test_values_from_nought_to_one_are_recognised(head, anatomy):
+    scaled = ((head.image.values + 1024.0) / 4000.0).astype(np.float32)
+    found = segment_head(head.image.with_values(scaled), landmarks=head.landmarks)
+    assert "ct-not-hu" in codes(found)
+    assert dice(found.skin.values > 0, anatomy.skin.values > 0) > 0.99
+
+
+def test_a_ct_in_hu_is_left_alone(anatomy):
+    assert "ct-not-hu" not in codes(anatomy)
+
+
+def test_an_mr_image_is_refused(head):
+    rng = np.random.default_rng(0)
+    hu = head.image.values
+    # T1: fat and brain bright and uneven, bone and air dark, Rician background.
+    tissue = np.where((hu > -300) & (hu < 300), rng.uniform(200.0, 900.0, hu.shape), 0.0)
+    mr = np.hypot(tissue + rng.normal(0, 15, hu.shape), rng.normal(0, 15, hu.shape))
+    with pytest.raises(ImageError) as caught:
+        segment_head(head.image.with_values(mr.astype(np.int16)))
+    assert isinstance(caught.value, ValueError)
+    # The same may befall a CT: what to do then.
+    assert "rescale = [1, 0] in [image]" in str(caught.value)
+    stated = intensity.calibration(head.image.values, (1.0, 0.0))
+    assert (stated.slope, stated.offset, stated.findings) == (1.0, 0.0, ())
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        (np.zeros((60, 60, 60)), "0 nearly throughout"),
+        (np.full((60, 60, 60), -1000), "nearly throughout"),
+        (np.zeros((60, 60, 1)), "at least 8 voxels"),
+    ],
+)
+def test_images_without_a_head_are_refused(values, text):
+    with pytest.raises(ImageError, match=text):
+        segment_head(ImageData(values, (2.0, 2.0, 2.0)))
+
+
+def test_voxels_that_are_not_finite_are_refused(head):
+    values = head.image.values.astype(np.float32)
+    values[3, 4, 5] = np.inf
+    with pytest.raises(ImageError, match=r"image\[3, 4, 5\] is inf"):
+        segment_head(head.image.with_values(values))
+
+
+def test_metres_are_refused(head):
+    with pytest.raises(ImageError, match="mm"):
+        segment_head(ImageData(head.image.values, np.full(3, 0.002)))
+
+
+def test_thresholds_must_ascend():
+    with pytest.raises(ImageError, match="ascend"):
+        SegmentOptions(skin_threshold=300.0)
+    with pytest.raises(ValueError, match="closing"):
+        SegmentOptions(closing=0.0)
+
+
+def test_a_flipped_head_is_an_error_finding(head):
+    whole = SegmentOptions(part_jaws=False)
+    back = segment_head(head.image.with_values(head.image.values[:, ::-1].copy()), whole)
+    assert any(f.code == "ct-facing-back" and f.severity == "error" for f in back.findings)
+    turned = segment_head(head.image.with_values(head.image.values[:, :, ::-1].copy()), whole)
+    assert any(f.code == "ct-upside-down" and f.severity == "error" for f in turned.findings)
+
+
+def test_metal_spikes_do_not_leave_the_skin(head):
+    x, y, z = head.image.axes()
+    values = head.image.values.astype(np.float64)
+    layer = np.abs(z + 60.0) < 5.0
+    for side in (-1.0, 1.0):
+        distance = np.sqrt((x - side * 28.0) ** 2 + (y + 40.0) ** 2)
+        angle = np.arctan2(y + 40.0, x - side * 28.0)
+        rays = np.where(np.cos(14.0 * angle) > 0.9, 1.0, np.where(np.cos(14 * angle) < -0.9, -1, 0))
+        values += 1400.0 * rays * np.exp(-distance / 40.0) * layer
+        values[np.broadcast_to((distance < 5.0) & layer, values.shape)] = 3071.0
+    hard = head.image.with_values(np.clip(values, -1024, 3071).astype(np.int16))
+    found = segment_head(hard, landmarks=head.landmarks)
+    assert "metal" in codes(found)
+    inside, truth = on_truth(found.skin, head, head.skin)
+    assert dice(inside, truth) > 0.985
+    spikes = surface_points(found.bones["mandible"])
+    assert np.abs(spikes[:, 0]).max() < 45.0
+    assert spikes[:, 1].min() > -93.0
+
+
+def with_fillings(head, hu):
+    """Two fillings of a value in the tooth rows."""
+    x, y, z = head.image.axes()
+    values = head.image.values.astype(np.float64)
+    for side in (-1.0, 1.0):
+        ball = np.sqrt((x - side * 28.0) ** 2 + (y + 40.0) ** 2 + (z + 60.0) ** 2) < 5.0
+        values[ball] = hu
+    return head.image.with_values(values.astype(np.int16))
+
+
+def test_metal_is_found_where_the_image_is_cut_off_below_the_usual_threshold(head):
+    found = segment_head(with_fillings(head, 2000.0), landmarks=head.landmarks)
+    assert {"metal", "ct-saturated"} <= codes(found)
+    (metal,) = [f for f in found.findings if f.code == "metal"]
+    assert "2 pieces" in metal.what
+    assert "above 1940 HU" in metal.what
+    # What the case sets counts.
+    set_higher = segment_head(with_fillings(head, 2000.0), SegmentOptions(metal_threshold=2400.0))
+    assert not {"metal", "ct-saturated"} & codes(set_higher)
+
+
+def test_an_image_cut_off_too_low_to_tell_metal_is_reported(head):
+    found = segment_head(with_fillings(head, 1500.0), landmarks=head.landmarks)
+    assert "metal" not in codes(found)
+    (finding,) = [f for f in found.findings if f.code == "ct-saturated"]
+    assert finding.severity == "warning"
+    assert "metal_threshold" in finding.mend
+    lower = segment_head(with_fillings(head, 1500.0), SegmentOptions(metal_threshold=1400.0))
+    assert "metal" in codes(lower)
+
+
+def test_one_bright_voxel_is_no_saturation(head):
+    values = head.image.values.copy()
+    values[40, 20, 20] = 2000
+    assert "ct-saturated" not in {
+        f.code
+        for f in segment_head(head.image.with_values(values)).findings
+        if f.severity == "warning"
+    }
+
+
+@pytest.mark.parametrize(("hu", "kind"), [(250.0, "plastic"), (60.0, "other side")])
+def test_a_tube_on_the_cheek_is_reported_and_not_removed(head, anatomy, hu, kind):
+    level = anatomy.skin
+    x, _, z = (a.ravel() for a in level.axes())
+    column = int(np.argmin(np.abs(x - 40.0)))
+    rows = [k for k in range(len(z)) if -75.0 < z[k] < -20.0]
+    first = [int(np.argmax(level.values[column, :, k] > 0.0)) for k in rows]
+    middle = [level.lowest + [0, np.asarray(level.spacing)[1] * j - 4.0, 0] for j in first]
+    path = np.array([[x[column], m[1], z[k]] for m, k in zip(middle, rows, strict=True)])
+    found = segment_head(variants.with_tube(head.image, path, hu), landmarks=head.landmarks)
+    (finding,) = [f for f in found.findings if f.code == "skin-attachment"]
+    assert kind in finding.what
+    assert finding.severity == "warning"
+    place = [float(n) for n in finding.where.split("(")[1].split(")")[0].split(",")]
+    assert np.linalg.norm(np.array(place) - path.mean(axis=0)) < 15.0
+    # It is still skin.
+    assert found.skin.sample([path[len(path) // 2] - [0, 3.0, 0]])[0] > 0.0
+    assert "skin-attachment" not in codes(anatomy)
+
+
+def test_a_part_that_is_too_small_for_a_head_is_refused():
+    x, y, z = np.ogrid[-60:60:2.0, -60:60:2.0, -60:60:2.0]
+    values = np.full((60, 60, 60), -1000, dtype=np.int16)
+    values[(np.hypot(x, y) < 24.0) & (np.abs(z) < 40.0)] = 40
+    values[(np.hypot(x, y) < 9.0) & (np.abs(z) < 40.0)] = 900
+    with pytest.raises(ImageError, match=r"13\d cm³.*at least 250"):
+        segment_head(ImageData(values, (2.0, 2.0, 2.0)))
+
+
+def test_a_stated_scale_is_used_and_checked(head, anatomy):
+    stored = head.image.with_values(head.image.values + np.int16(1024))
+    found = segment_head(stored, SegmentOptions(rescale=(1.0, -1024.0)), landmarks=head.landmarks)
+    assert "ct-not-hu" not in codes(found)
+    np.testing.assert_array_equal(found.skin.values, anatomy.skin.values)
+    with pytest.raises(ImageError, match="correct rescale"):
+        segment_head(stored, SegmentOptions(rescale=(1.0, 0.0)))
+    with pytest.raises(ValueError, match="slope"):
+        SegmentOptions(rescale=(0.0, 0.0))
+
+
+# The real CT -----------------------------------------------------------------------------------
+
+needs_phantom = pytest.mark.skipif(
+    not (PHANTOM / "ct.nii.gz").is_file(), reason=f"needs the head phantom's CT in {PHANTOM}"
+)
+
+
+@pytest.fixture(scope="session")
+def phantom():
+    return cmfsim.read_image(PHANTOM / "ct.nii.gz")
+
+
+@pytest.fixture(scope="session")
+def phantom_landmarks():
+    document = json.loads((PHANTOM / "skull_landmarks.mrk.json").read_text())
+    points = document["markups"][0]["controlPoints"]
+    return {p["label"]: np.array(p["position"]) for p in points}
+
+
+@pytest.fixture(scope="session")
+def phantom_anatomy(phantom, phantom_landmarks):
+    return segment_head(phantom, landmarks=phantom_landmarks)
+
+
+@pytest.fixture(scope="session")
+def coarse_phantom(phantom):
+    return variants.coarser(phantom, (2, 2, 1))
+
+
+@pytest.fixture(scope="session")
+def reference():
+    surfaces = {n: cmfsim.read_surface(PHANTOM / f"{n}.ply") for n in ("skin", "bone", "mandible")}
+    return {n: cmfsim.Surface(s.vertices, s.triangles) for n, s in surfaces.items()}
+
+
+def _distances(points, surface):
+    closest = surface.closest(points)[0]
+    return np.linalg.norm(points - closest, axis=1)
+
+
+def _face(points):
+    """The frontal part of the phantom, from the neck to the vertex."""
+    return points[(points[:, 1] < -200.0) & (points[:, 2] > 322.0) & (points[:, 2] < 520.0)]
+
+
+def _parted(anatomy, reference):
+    """Dice of the mandible with the reference."""
+    level = anatomy.bones["mandible"]
+    grid = np.stack(np.broadcast_arrays(*level.axes()), axis=-1)
+    low, high = np.array([-65.0, -307.0, 322.0]), np.array([70.0, -196.0, 412.0])
+    near = ((grid > low) & (grid < high)).all(axis=-1)
+    truth = reference["mandible"].winding_number(grid[near]) > 0.5
+    assert np.count_nonzero((level.values > 0.0) & ~near) < 0.01 * np.count_nonzero(truth)
+    return dice(level.values[near] > 0.0, truth)
+
+
+@needs_phantom
+def test_the_real_skin_is_that_of_the_reference(phantom_anatomy, reference):
+    distance = _distances(_face(surface_points(phantom_anatomy.skin)), reference["skin"])
+    assert np.median(distance) < 0.1
+    assert np.percentile(distance, 95.0) < 0.5
+    volume = np.count_nonzero(phantom_anatomy.skin.values > 0) * np.prod(
+        phantom_anatomy.skin.spacing
+    )
+    assert volume == pytest.approx(4.197e6, rel=0.01)
+
+
+@needs_phantom
+def test_the_real_bone_is_that_of_the_reference(phantom_anatomy, reference):
+    both = np.maximum(*(level.values for level in phantom_anatomy.bones.values()))
+    level = phantom_anatomy.skin.with_values(both)
+    distance = _distances(_face(surface_points(level)), reference["bone"])
+    assert np.median(distance) < 0.15
+    assert np.percentile(distance, 95.0) < 1.0
+
+
+@needs_phantom
+def test_the_real_jaws_are_parted(phantom_anatomy, reference):
+    assert _parted(phantom_anatomy, reference) > 0.98
+    volume = np.count_nonzero(phantom_anatomy.bones["mandible"].values > 0) * np.prod(
+        phantom_anatomy.skin.spacing
+    )
+    assert volume == pytest.approx(79.9e3, rel=0.05)
+
+
+def _skin_of(image, landmarks, options=None):
+    anatomy = segment_head(image, options, landmarks=landmarks)
+    return anatomy, _face(surface_points(anatomy.skin))
+
+
+VARIANTS = {
+    "metal": (variants.with_metal, {"metal"}, 0.4, 3.0, 0.75),
+    "noise": (lambda i: variants.with_noise(i, 60.0), set(), 0.3, 1.0, 0.85),
+    "pillow": (
+        lambda i: variants.with_pillow(variants.without_couch(i, -107.0)),
+        {"rest-removed"},
+        0.3,
+        1.0,
+        0.9,
+    ),
+    "holder": (
+        lambda i: variants.with_holder(variants.without_couch(i, -107.0)),
+        {"rest-removed"},
+        0.3,
+        1.0,
+        0.9,
+    ),
+    "raw": (
+        lambda i: i.with_values((i.values.astype(np.int32) + 1024).astype(np.uint16)),
+        {"ct-not-hu"},
+        0.3,
+        1.0,
+        0.9,
+    ),
+    "scaled": (
+        lambda i: i.with_values(((i.values.astype(np.float64) + 1024) * 9.7 + 321).astype("u2")),
+        {"ct-not-hu"},
+        0.3,
+        1.0,
+        0.85,
+    ),
+    "slices of 4 mm": (
+        lambda i: variants.coarser(i, (1, 1, 2)),
+        {"ct-spacing-coarse"},
+        0.3,
+        2.0,
+        0.85,
+    ),
+    "chin off": (
+        lambda i: variants.cropped(i, 2, low=352.0),
+        {"ct-cut-bottom"},
+        0.3,
+        1.0,
+        None,
+    ),
+    "forehead off": (
+        lambda i: variants.cropped(i, 2, high=455.0),
+        {"ct-cut-top"},
+        0.3,
+        1.0,
+        0.85,
+    ),
+    "nose off": (
+        lambda i: variants.cropped(i, 1, low=-308.0),
+        {"ct-cut-front"},
+        0.3,
+        3.0,
+        0.9,
+    ),
+}
+
+
+@needs_phantom
+@pytest.mark.parametrize("name", VARIANTS)
+def test_a_hard_variant_of_the_real_ct_keeps_its_face(
+    name, coarse_phantom, phantom_landmarks, reference
+):
+    make, expected, median, p95, parted = VARIANTS[name]
+    anatomy, points = _skin_of(make(coarse_phantom), phantom_landmarks)
+    # Where the image ends the surface is closed flat: that is no skin.
+    low, high = anatomy.skin.lowest + 2.5, anatomy.skin.highest - 2.5
+    points = points[((points > low) & (points < high)).all(axis=1)]
+    distance = _distances(points, reference["skin"])
+    assert expected <= codes(anatomy)
+    assert not [f for f in anatomy.findings if f.severity == "error"]
+    assert np.median(distance) < median
+    assert np.percentile(distance, 95.0) < p95
+    assert {"cranium", "mandible"} == set(anatomy.bones)
+    if parted is not None:
+        assert _parted(anatomy, reference) > parted
+
+
+@needs_phantom
+def test_the_real_face_has_nothing_attached(phantom_anatomy):
+    assert not {"skin-attachment", "ct-saturated", "metal"} & codes(phantom_anatomy)
+
+
+@needs_phantom
+def test_the_real_jaws_are_parted_without_landmarks(coarse_phantom, reference):
+    anatomy = segment_head(coarse_phantom)
+    assert "jaws-parted-by-shape" in codes(anatomy)
+    assert _parted(anatomy, reference) > 0.85
+
+
+@needs_phantom
+@pytest.mark.parametrize(("axis", "code"), [(1, "ct-facing-back"), (2, "ct-upside-down")])
+def test_a_flipped_real_ct_is_found(coarse_phantom, axis, code):
+    flipped = coarse_phantom.with_values(np.flip(coarse_phantom.values, axis))
+    anatomy = segment_head(flipped, SegmentOptions(part_jaws=False))
+    assert code in {f.code for f in anatomy.findings if f.severity == "error"}
+
+
+@needs_phantom
+def test_a_turned_header_gives_the_same_face(
+    tmp_path, coarse_phantom, phantom_landmarks, reference
+):
+    sitk = pytest.importorskip("SimpleITK")
+
+    image = sitk.GetImageFromArray(np.ascontiguousarray(coarse_phantom.values.T))
+    image.SetSpacing(coarse_phantom.spacing.tolist())
+    image.SetOrigin(coarse_phantom.origin.tolist())
+    # Voxels resampled on a tilted grid, as a gantry or another orientation gives them.
+    c, s = np.cos(np.radians(10.0)), np.sin(np.radians(10.0))
+    grid = sitk.Image(image.GetSize(), image.GetPixelID())
+    grid.SetSpacing(image.GetSpacing())
+    grid.SetDirection([1, 0, 0, 0, c, -s, 0, s, c])
+    middle = np.array(coarse_phantom.lowest + coarse_phantom.highest) / 2.0
+    half = np.array(image.GetSize()) * np.array(image.GetSpacing()) / 2.0
+    grid.SetOrigin((middle - np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ half).tolist())
+    sitk.WriteImage(sitk.Resample(image, grid, defaultPixelValue=-1024), str(tmp_path / "t.nrrd"))
+    _, points = _skin_of(cmfsim.read_image(tmp_path / "t.nrrd"), phantom_landmarks)
+    distance = _distances(points[points[:, 2] > 340.0], reference["skin"])
+    # Voxels of 2 mm, interpolated twice.
+    assert np.median(distance) < 0.6
+    assert np.percentile(distance, 95.0) < 1.5

@@ -1,0 +1,343 @@
+"""A case file says what a case is, and an error in it names file, line and key."""
+
+import re
+
+import numpy as np
+import pytest
+
+import cmfsim
+import cmfsim.values.case_parts
+from cmfsim.io.toml_lines import line_of, toml_lines
+
+HEAD = 'format = "cmfsim-case"\nversion = 1\n'
+SURFACES = '[surfaces]\nskin = "skin.ply"\n[surfaces.bones]\nmandible = "jaw.stl"\n'
+FULL = """# A case with everything.
+format = "cmfsim-case"
+version = 1
+name = "P1"
+
+[surfaces]
+skin = "../scans/skin.ply"
+units = "cm"
+frame = "RAS"
+
+[surfaces.bones]
+cranium = "/big/cranium.stl"
+mandible = "jaw.obj"
+
+[landmarks]
+skull = "skull.mrk.json"
+frame = "LPS"
+
+[region]
+posterior_plane = {point = [0, 1, 2], normal = [0, 2, 0]}
+lower = -40
+upper = 120.5
+
+[mesh]
+edge_length = 2.5
+refine = false
+parting = {surface = "lips.ply"}
+
+[[osteotomies]]
+procedure = "le_fort_1"
+height = 4.5
+
+[[osteotomies]]
+plane = {point = [
+    0, 0, 0,  # the symphysis
+  ], normal = [1, 0, 0]}
+bone = "mandible"
+name = "half"
+
+[plan.maxilla]
+translation = [0, -5, 1]
+angle = 90
+axis = [0, 0, 1]
+centre = [1, 0, 0]
+
+[plan.half]
+matrix = [[1, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+[plan.mandible]
+transform = {file = "jaw.tfm", direction = "from-parent", frame = "LPS"}
+
+[node_kinds]
+joined_distance = 1.5
+
+[tissue]
+young = 0.003
+poisson = 0.46
+
+[solver]
+method = "cholesky"
+tolerance = 1e-9
+
+[output]
+folder = "results/first"
+"""
+
+
+def load(folder, text):
+    path = folder / "case.toml"
+    path.write_text(text, encoding="utf-8")
+    return cmfsim.Case.load(path)
+
+
+def test_everything_in_a_case_file_arrives(tmp_path):
+    """Each table, with paths resolved against the folder of the case."""
+    case = load(tmp_path, FULL)
+    assert case.name == "P1"
+    assert case.surfaces.skin == tmp_path / "../scans/skin.ply"
+    assert str(case.surfaces.bones["cranium"]) == "/big/cranium.stl"
+    assert (case.surfaces.units, case.surfaces.frame) == ("cm", "RAS")
+    assert case.landmarks.skull == tmp_path / "skull.mrk.json"
+    assert case.landmarks.skin is None
+    assert case.region.posterior_plane.normal.tolist() == [0.0, 1.0, 0.0]
+    assert (case.region.lower, case.region.upper) == (-40.0, 120.5)
+    assert (case.mesh.edge_length, case.mesh.refine) == (2.5, False)
+    assert case.mesh.parting == tmp_path / "lips.ply"
+    assert case.osteotomies[0].segments == ("maxilla",)
+    assert dict(case.osteotomies[0].options) == {"height": 4.5}
+    assert case.osteotomies[1].segments == ("half",)
+    # A quarter turn about (1, 0, 0), then the translation.
+    moved = case.plan["maxilla"].matrix @ [2, 0, 0, 1]
+    assert moved.tolist() == [1.0, -4.0, 1.0, 1.0]
+    assert case.plan["half"].matrix[0, 3] == 2.0
+    jaw = case.plan["mandible"]
+    assert jaw.transform == tmp_path / "jaw.tfm"
+    assert (jaw.direction, jaw.frame) == ("from-parent", "LPS")
+    assert case.node_kinds["joined_distance"] == 1.5
+    assert case.tissue.kind == "isotropic"
+    assert case.solver.method == "cholesky"
+    assert case.output == tmp_path / "results/first"
+
+
+def test_what_a_case_file_leaves_out_has_its_default(tmp_path):
+    """Fat of the paper, 3 mm, refinement, an output folder beside the file."""
+    case = load(tmp_path, HEAD + SURFACES)
+    assert case.name == tmp_path.name
+    assert case.tissue.preset == "kim2010"
+    assert case.tissue.fraction.tolist() == [0.0]
+    assert case.mesh == cmfsim.values.case_parts.CaseMesh(edge_length=4.0, refine=True)
+    assert case.output == tmp_path / "out"
+    assert (case.osteotomies, dict(case.plan)) == ((), {})
+
+
+def test_an_image_may_stand_in_place_of_surfaces(tmp_path):
+    """With its thresholds and working spacing."""
+    text = '[image]\nfile = "ct.nii.gz"\nskin_threshold = -250\nworking_spacing = 1.0\n'
+    case = load(tmp_path, HEAD + text)
+    assert case.surfaces is None
+    assert case.image.file == tmp_path / "ct.nii.gz"
+    assert (case.image.skin_threshold, case.image.bone_threshold) == (-250.0, None)
+    more = "metal_threshold = 1900\nseries = 3\nrescale = [1, -1024]\n"
+    case = load(tmp_path, HEAD + text + more)
+    assert case.image.metal_threshold == 1900.0
+    assert (case.image.series, case.image.rescale) == ("3", (1.0, -1024.0))
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("series = [3]", "number or UID"),
+        ("series = true", "number or UID"),
+        ('series = ""', "number or UID"),
+        ("rescale = 1", r"\[slope, intercept\]"),
+        ("rescale = [0, -1024]", "slope must be above 0"),
+        ("rescale = [1, 1e9]", "intercept within"),
+        ("metal_threshold = 5000", "metal_threshold"),
+        ("metal_threshold = 200\nbone_threshold = 250", "must be below"),
+    ],
+)
+def test_what_an_image_s_table_cannot_mean_is_refused(tmp_path, line, words):
+    """With the file, the line and the key."""
+    with pytest.raises(cmfsim.CaseError, match=words):
+        load(tmp_path, HEAD + f'[image]\nfile = "ct"\n{line}\n')
+
+
+WRONG = {
+    "format": ('format = "cmfsim-case"', 'format = "cmfsim-scene"', 2, "format is 'cmfsim-scene'"),
+    "version": ("version = 1", "version = 2", 3, "version is 2: this cmfsim reads 1"),
+    "version flag": ("version = 1", "version = true", 3, "version is True"),
+    "unknown table": ("[landmarks]", "[landmark]", 15, "landmark is unknown; did you mean 'landm"),
+    "unknown key": ("edge_length", "edge_lenght", 25, "did you mean 'edge_length'"),
+    "units": ('"cm"', '"parsec"', 8, "surfaces.units is 'parsec'"),
+    "frame": ('"RAS"', '"ras"', 9, "surfaces.frame is 'ras'"),
+    "no text": ('"../scans/skin.ply"', "3", 7, "surfaces.skin is 3: a text"),
+    "no number": ("edge_length = 2.5", 'edge_length = "2.5"', 25, "holds '2.5': a number"),
+    "range": ("edge_length = 2.5", "edge_length = -2.5", 25, "is -2.5: must be at least 0.3"),
+    "infinity": ("edge_length = 2.5", "edge_length = inf", 25, "must be finite"),
+    "nan": ("lower = -40", "lower = nan", 21, "region.lower holds nan"),
+    "swapped bounds": ("upper = 120.5", "upper = -41", 21, "lower is -40, upper -41"),
+    "flag": ("refine = false", "refine = 0", 26, "mesh.refine is 0: true or false"),
+    "plane": ("normal = [0, 2, 0]", "normal = [0, 0, 0]", 20, "normal is (0, 0, 0)"),
+    "two numbers": ("point = [0, 1, 2]", "point = [0, 1]", 20, "three numbers [x, y, z]"),
+    "procedure": ('"le_fort_1"', '"le_fort_2"', 30, "did you mean 'le_fort_"),
+    "no osteotomy": ('procedure = "le_fort_1"', "", 29, "osteotomies[0] needs procedure"),
+    "same segment": ('name = "half"', 'name = "maxilla"', 33, "as the one on line 29 does"),
+    "name": ('name = "half"', 'name = "../half"', 38, "osteotomies[1].name is no name"),
+    "unknown motion": ("angle = 90", "angel = 90", 42, "did you mean 'angle'"),
+    "zero axis": ("axis = [0, 0, 1]", "axis = [0, 0, 0]", 43, "axis is (0, 0, 0)"),
+    "no rotation": ("[[1, 0, 0, 2]", "[[2, 0, 0, 2]", 47, "matrix is not rigid"),
+    "three rows": (", [0, 0, 0, 1]]", "]", 47, "four rows of four numbers"),
+    "poisson": ("poisson = 0.46", "poisson = 0.5", 57, "must be above -1 and at most 0.4999"),
+    "one modulus": ("poisson = 0.46\n", "", 55, "needs both young (MPa) and poisson"),
+    "method": ('"cholesky"', '"cholesk"', 60, "did you mean 'cholesky'"),
+    "tolerance": ("tolerance = 1e-9", "tolerance = 0", 61, "tolerance is 0"),
+    "output up": ('"results/first"', '"../out"', 64, "a folder below the case's own"),
+    "output absolute": ('"results/first"', '"/tmp"', 64, "a folder below the case's own"),
+    "output itself": ('"results/first"', '"."', 64, "a folder below the case's own"),
+    "syntax": ("lower = -40", "lower = = 40", 21, "is not TOML"),
+    "twice": ("lower = -40", "lower = 1\nlower = 2", 22, "is not TOML"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_faulty_case_file_is_refused_with_line_and_key(name, tmp_path):
+    """A CaseError that is a ValueError too: file, line, key, value and what is allowed."""
+    old, new, line, words = WRONG[name]
+    assert FULL.count(old) >= 1
+    with pytest.raises(cmfsim.CaseError, match=re.escape(words)) as caught:
+        load(tmp_path, FULL.replace(old, new, 1))
+    assert isinstance(caught.value, ValueError)
+    assert str(caught.value).startswith(f"case.toml:{line}: ")
+
+
+def test_a_typed_matrix_is_made_exactly_rigid(tmp_path):
+    """Four decimals pass the case file, and the solver gets what `rigid_matrix` makes of them."""
+    typed = cmfsim.rigid_motion((2, 0, 0), 8, (1, 2, 0), (0, 0, 900)).round(4).tolist()
+    old = "[[1, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+    case = load(tmp_path, FULL.replace(old, str(typed), 1))
+    kept = [motion.matrix for motion in case.plan.values() if motion.matrix is not None]
+    assert any(np.array_equal(m, cmfsim.rigid_matrix(typed)) for m in kept)
+    assert np.abs(np.asarray(typed) - cmfsim.rigid_matrix(typed)).max() > 0
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "lacks 'format'"),
+        (HEAD, r"lacks \[image\] or \[surfaces\]"),
+        (HEAD + SURFACES + '[image]\nfile = "ct.nrrd"\n', "stands beside"),
+        (HEAD + '[surfaces]\nskin = "skin.ply"\n', "names no bone|lacks|bones"),
+        (HEAD + SURFACES + "plan = 3\n", "case.toml:7: surfaces.bones.plan|is 3"),
+        (HEAD + "osteotomies = 3\n" + SURFACES, r"write \[\[osteotomies\]\]"),
+        (HEAD + SURFACES + "[plan.x]\nangle = [1]\n", "plan.x.angle holds"),
+        ("\x00", "is not TOML"),
+        ("a = " + "[" * 50_000, "TOML|nested"),
+        ("x = 1" + "0" * 5000 + "\n" + HEAD, "TOML|unknown"),
+    ],
+)
+def test_a_case_file_that_is_none_is_refused(text, words, tmp_path):
+    """Empty, incomplete, of other types, hostile."""
+    with pytest.raises(cmfsim.CaseError, match=words):
+        load(tmp_path, text)
+
+
+def test_files_that_are_no_case_files_are_refused(tmp_path):
+    """No file, a folder, another ending, too large, not UTF-8."""
+    with pytest.raises(FileNotFoundError):
+        cmfsim.Case.load(tmp_path / "none.toml")
+    with pytest.raises(cmfsim.CaseError, match="is a folder"):
+        cmfsim.Case.load(tmp_path)
+    (tmp_path / "case.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(cmfsim.CaseError, match=r"ends in \.toml"):
+        cmfsim.Case.load(tmp_path / "case.json")
+    (tmp_path / "big.toml").write_bytes(b"# " + b"x" * 2**20)
+    with pytest.raises(cmfsim.CaseError, match="bytes"):
+        cmfsim.Case.load(tmp_path / "big.toml")
+    (tmp_path / "raw.toml").write_bytes(b'name = "\xff"')
+    with pytest.raises(cmfsim.CaseError, match="UTF-8"):
+        cmfsim.Case.load(tmp_path / "raw.toml")
+
+
+def test_the_posterior_plane_is_given_or_placed_from_landmarks_or_depth():
+    """Coronal, 10 mm behind the roots of the arches; without them at 0.6 of the depth."""
+    region = cmfsim.values.case_parts.Region()
+    roots = {"supraglenoid_L": np.array([60, -100, 0.0]), "supraglenoid_R": np.array([-60, -96, 0])}
+    plane = region.plane(roots, -200.0, 0.0)
+    assert plane.point.tolist() == [0.0, -88.0, 0.0]
+    assert plane.normal.tolist() == [0.0, 1.0, 0.0]
+    assert region.plane({}, -200.0, 0.0).point.tolist() == [0.0, -80.0, 0.0]
+    near = cmfsim.values.case_parts.Region(posterior_depth=-5.0)
+    assert near.plane(roots, -200.0, 0.0).point.tolist() == [0.0, -103.0, 0.0]
+    with pytest.raises(cmfsim.CaseError, match="supraglenoid_L and supraglenoid_R"):
+        near.plane({}, -200.0, 0.0)
+
+
+def test_lines_are_found_through_texts_comments_and_arrays():
+    """Multi-line values, quotes in them, dotted and quoted keys, arrays of tables."""
+    text = (
+        "a = 1 # [x]\n"
+        'b = """\n[not]\nc = 2 \\""" "still"\n"""\n'
+        "d = [\n  1, # ] }\n  '#',\n]\n"
+        "e.f = {g = [1,\n2]}\n"
+        "\n[[t]]\nk = '''x\n'''\n"
+        '  [[t]]\n"k 2".l = 1\n'
+        "[t.u]\nv = '''it''''\nw = 3"
+    )
+    lines = toml_lines(text)
+    assert lines["a",] == 1
+    assert lines["b",] == 2
+    assert ("not",) not in lines
+    assert lines["d",] == 6
+    assert lines["e", "f"] == 10
+    assert lines["t",] == lines["t", 0] == 13
+    assert lines["t", 0, "k"] == 14
+    assert lines["t", 1] == 16
+    assert lines["t", 1, "k 2", "l"] == 17
+    assert lines["t", 1, "u", "v"] == 19
+    assert lines["t", 1, "u", "w"] == 20
+    assert line_of(lines, ("e", "f", "g")) == 10
+    assert line_of(lines, ("nowhere",)) == 1
+
+
+def test_a_note_is_kept_and_must_be_text(tmp_path):
+    path = tmp_path / "case.toml"
+    text = 'format = "cmfsim-case"\nversion = 1\n[image]\nfile = "ct.nrrd"\n'
+    path.write_text(text, encoding="utf-8")
+    assert cmfsim.Case.load(path).note == ""
+    path.write_text('note = "a made head"\n' + text, encoding="utf-8")
+    assert cmfsim.Case.load(path).note == "a made head"
+    path.write_text("note = 3\n" + text, encoding="utf-8")
+    with pytest.raises(cmfsim.CaseError, match=r"case\.toml:1: note is 3"):
+        cmfsim.Case.load(path)
+
+
+@pytest.mark.parametrize(
+    ("motion", "complaint"),
+    [
+        ('transform = "a.tfm"', 'case.toml:8: plan.x.transform is an ITK file.*file = "a.tfm"'),
+        ('transform = "a.H5"', "does not record its direction.*from-parent.*to-parent"),
+        ('transform = {file = "a.h5"}', "case.toml:8: plan.x.transform lacks direction"),
+        ('transform = {file = "a.tfm", direction = "both"}', "use one of: to-parent, from-parent"),
+        (
+            'transform = {file = "a.tfm", direction = "to-parent", frame = "RAS"}',
+            'plan.x.transform.frame is "RAS", but ITK files',
+        ),
+        ('transform = {file = "a.txt", frame = "LAS"}', "use one of: LPS, RAS"),
+        ('transform = {direction = "to-parent"}', "lacks 'file'"),
+        ("transform = 3", "a text is needed"),
+        ('translation = [1, 2, 3]\nframe = "LAS"', "use one of: LPS, RAS"),
+    ],
+)
+def test_which_way_a_transform_carries_points_is_stated(motion, complaint, tmp_path):
+    """3D Slicer and ITK write the same format in opposite directions: nothing is assumed."""
+    with pytest.raises(cmfsim.CaseError, match=complaint):
+        load(tmp_path, f"{HEAD}{SURFACES}[plan.x]\n{motion}\n")
+
+
+def test_a_plan_typed_in_ras_is_the_same_motion_in_lps(tmp_path):
+    """5 mm forwards is +A in RAS and −P in LPS; x and y of the centre change sign as well."""
+    rows = "[[1, 0, 0, 1], [0, 1, 0, 5], [0, 0, 1, 2], [0, 0, 0, 1]]"
+    turn = "angle = 90\naxis = [0, 0, 1]\ncentre = [10, 20, 30]"
+    plans = [
+        f'[plan.a]\nmatrix = {rows}\nframe = "RAS"\n',
+        f'[plan.b]\ntranslation = [1, 5, 2]\n{turn}\nframe = "RAS"\n',
+        f"[plan.c]\ntranslation = [-1, -5, 2]\n{turn.replace('[10, 20', '[-10, -20')}\n",
+    ]
+    plan = load(tmp_path, HEAD + SURFACES + "".join(plans)).plan
+    assert plan["a"].matrix[:3, 3].tolist() == [-1.0, -5.0, 2.0]
+    np.testing.assert_allclose(plan["b"].matrix, plan["c"].matrix, rtol=0, atol=1e-12)
+    assert plan["b"].centre.tolist() == plan["c"].centre.tolist()

@@ -1,0 +1,132 @@
+"""`plan = "achieved"`: a case takes its plan from the bones after the operation."""
+
+import re
+
+import numpy as np
+import pytest
+
+import cmfsim
+from cmfsim.cli.study_commands import achieved_text
+from cmfsim.pipeline.building import read_postoperative
+from head_case import HeadCase, ellipsoid
+
+pytest.importorskip("meshio")
+pytest.importorskip("scipy")
+
+JAW = cmfsim.rigid_motion((1.0, -5.0, 1.0), 4.0, (1, 0.3, 0), (3, -128, 1445))
+BONES = """[postoperative.bones]
+mandible = "mandible_after.ply"
+cranium = "cranium_after.ply"
+"""
+FRAME = cmfsim.rigid_motion((12.0, -6.0, 6.0), 8.0, (1, 2, 3), (3, -100, 1500))
+
+
+def carried(surface, matrix):
+    vertices = np.asarray(surface.vertices) @ matrix[:3, :3].T + matrix[:3, 3]
+    return cmfsim.SurfaceData(vertices, surface.triangles)
+
+
+def knobbly(surface, centre):
+    """A surface with bumps, so that it has no symmetry that would leave its place open."""
+    vertices = np.asarray(surface.vertices)
+    offset = vertices - centre
+    away = np.linalg.norm(offset, axis=1, keepdims=True)
+    wave = np.sin(offset @ [0.17, 0.05, 0.11]) + np.cos(offset @ [-0.06, 0.13, 0.21])
+    return cmfsim.SurfaceData(vertices + 1.5 * wave[:, None] * offset / away, surface.triangles)
+
+
+def operated(frame=None, rounds=4, *, aligned=True):
+    """The head with all of it after the operation: the jaw moved, the cranium left alone."""
+    head = HeadCase(rounds=3)
+    after = {"mandible": ellipsoid("mandible", rounds), "cranium": ellipsoid("cranium", rounds)}
+    for name, centre in (("mandible", (3, -128, 1445)), ("cranium", (3, -95, 1530))):
+        head.surfaces[name] = knobbly(head.surfaces[name], np.array(centre))
+        after[name] = knobbly(after[name], np.array(centre))
+    after["mandible"] = carried(after["mandible"], JAW)
+    after["face"] = head.surfaces["skin"]
+    back = np.eye(4) if frame is None else np.linalg.inv(frame)
+    for name, surface in after.items():
+        head.surfaces[f"{name}_after"] = carried(surface, back)
+    plan = head.toml[head.toml.index("[plan.mandible]") : head.toml.index("[tissue]")]
+    head.replace(plan, "")
+    head.replace("version = 1\n", 'version = 1\nplan = "achieved"\n')
+    head.toml = head.toml.replace("edge_length = 4.0", "edge_length = 14.0")
+    head.toml += f'\n[postoperative]\nskin = "face_after.ply"\naligned = {str(aligned).lower()}\n'
+    head.toml += BONES
+    return head
+
+
+def off(found, true):
+    rest = cmfsim.decompose_motion(np.asarray(found) @ np.linalg.inv(true), (3, -128, 1445))
+    return float(np.linalg.norm(rest.translation)), rest.angle
+
+
+def test_bones_of_other_triangles_tell_the_plan(tmp_path):
+    """Coarser before than after; the grid of a coarse mesh knows bone to half a millimetre."""
+    case = cmfsim.Case.load(operated().write(tmp_path))
+    assert case.achieved
+    model = cmfsim.build_model(case, check=False)
+    assert off(model.scene.plan["mandible"], JAW)[0] < 0.3
+    assert off(model.scene.plan["mandible"], JAW)[1] < 0.5
+    np.testing.assert_array_equal(model.scene.plan["cranium"], np.eye(4))
+    text = achieved_text(model.summary["achieved"])
+    assert re.search(r"mandible +\+[01]\.\d\d +-[45]\.\d\d", text)
+    moved = cmfsim.predict_patient(model, "H").skin_displacements
+    assert 2.0 < np.linalg.norm(moved, axis=1).max() < 8.0
+
+
+def test_bones_of_the_same_triangles_tell_it_vertex_by_vertex(tmp_path):
+    case = cmfsim.Case.load(operated(rounds=3).write(tmp_path))
+    model = cmfsim.build_model(case, check=False)
+    assert isinstance(model.scene.plan["mandible"], cmfsim.MovedSurface)
+    assert "achieved" not in model.summary
+    result = cmfsim.predict_patient(model, "H").result
+    joined = np.asarray(model.scene.segments["mandible"].joined)
+    nodes = np.asarray(model.scene.nodes)[joined]
+    went = nodes @ JAW[:3, :3].T + JAW[:3, 3]
+    np.testing.assert_allclose(nodes + np.asarray(result.displacements)[joined], went, atol=1e-9)
+
+
+@pytest.mark.parametrize("rounds", [3, 4])
+def test_surfaces_in_another_frame_are_laid_on_by_the_skull(rounds, tmp_path):
+    """15 mm and 8° away; skin and landmarks come along."""
+    case = cmfsim.Case.load(operated(FRAME, rounds, aligned=False).write(tmp_path))
+    found = read_postoperative(case)
+    assert off(found.alignment, FRAME)[0] < 0.3
+    assert off(found.alignment, FRAME)[1] < 0.3
+    before = np.asarray(HeadCase(rounds=3).surfaces["skin"].vertices)
+    apart = np.linalg.norm(np.asarray(found.skin.vertices) - before, axis=1)
+    assert apart.max() < 0.6
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"achieved"', '"achived"', "case.toml:3: plan is 'achived': tables [plan.SEGMENT]"),
+        ('"achieved"', "3", "case.toml:3: plan is 3"),
+        (BONES, "", "case.toml:3: plan is achieved, and there is no bone"),
+        ('skin = "face_after.ply"', 'image = "ct.nrrd"', "stands beside image"),
+    ],
+)
+def test_an_achieved_plan_is_checked_where_the_case_is_read(old, new, words, tmp_path):
+    head = operated()
+    head.replace(old, new)
+    with pytest.raises(cmfsim.CaseError, match=re.escape(words)):
+        cmfsim.Case.load(head.write(tmp_path))
+
+
+def test_what_cannot_be_read_off_is_named(tmp_path):
+    head = operated(aligned=False)
+    head.replace('cranium = "cranium_after.ply"\n', "")
+    with pytest.raises(cmfsim.CaseError, match="laid on one another by the skull"):
+        read_postoperative(cmfsim.Case.load(head.write(tmp_path)))
+    head = operated()
+    head.replace('mandible = "mandible_after.ply"', 'jaw = "mandible_after.ply"')
+    with pytest.raises(cmfsim.CaseError, match="no bone or segment 'jaw'"):
+        cmfsim.build_model(cmfsim.Case.load(head.write(tmp_path)), check=False)
+    head.replace('skin = "face_after.ply"\n', "")
+    with pytest.raises(cmfsim.CaseError, match="no face to compare with"):
+        cmfsim.evaluate(cmfsim.Case.load(head.write(tmp_path)), ["H"])
+    head.replace('"mandible_after.ply"', '"gone.ply"')
+    findings = cmfsim.diagnose(cmfsim.Case.load(head.write(tmp_path)))
+    assert "postoperative.bones.jaw" in findings[0].where

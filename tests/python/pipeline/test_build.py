@@ -1,0 +1,676 @@
+"""The whole way from a case to a scene, on a head that is known exactly, and where it breaks."""
+
+import contextlib
+import dataclasses
+import errno
+import io
+import json
+import logging
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cmfsim
+import phantom_case
+from cmfsim.cli import main
+from cmfsim.io import models
+from cmfsim.pipeline.building import case_model, tissue_mesh
+from head_case import HeadCase
+
+pytest.importorskip("skimage", reason="needs scikit-image (pip install 'cmfsim[imaging]')")
+meshio = pytest.importorskip("meshio", reason="needs meshio (pip install 'cmfsim[mesh]')")
+
+EDGE = 7.0
+PICTURES = {"anatomy.png", "node_kinds.png"}
+
+
+def run(*words):
+    """The exit code of a command, and what it wrote to its two streams."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main([str(word) for word in words])
+    return code, out.getvalue(), err.getvalue()
+
+
+def built(path):
+    """A case built by the command line: its model, folder and all that was said."""
+    models_built = []
+
+    def build_model(case, **options):
+        models_built.append(build(case, **options))
+        return models_built[-1]
+
+    build = case_model.build_model
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(case_model, "build_model", build_model)
+        code, out, err = run("build", path)
+    assert code == 0, err
+    folder = path.parent / "out"
+    summary = json.loads((folder / "build.json").read_text(encoding="utf-8"))
+    return types.SimpleNamespace(
+        model=models_built[0], folder=folder, summary=summary, out=out, err=err, case=path
+    )
+
+
+@pytest.fixture(scope="session")
+def head():
+    return cmfsim.make_head()
+
+
+@pytest.fixture(scope="session")
+def truth(head):
+    """The head as it was drawn, as levels."""
+    return head.anatomy(2.0)
+
+
+@pytest.fixture(scope="session")
+def from_surfaces(head, truth, tmp_path_factory):
+    return built(phantom_case.surface_case(tmp_path_factory.mktemp("surfaces"), head, truth))
+
+
+@pytest.fixture(scope="session")
+def from_ct(head, tmp_path_factory):
+    pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
+    return built(phantom_case.ct_case(tmp_path_factory.mktemp("ct"), head))
+
+
+@pytest.fixture(params=["from_surfaces", "from_ct"])
+def made(request):
+    return request.getfixturevalue(request.param)
+
+
+def plane_of(head):
+    """The height of the posterior plane, which the roots of the arches place."""
+    roots = [head.skull_landmarks[f"supraglenoid_{side}"][1] for side in "LR"]
+    return np.mean(roots) + 10.0
+
+
+def on_planes(head, nodes):
+    """Which nodes lie where the tissue was cut off: behind and at the neck."""
+    ends = np.abs(nodes[:, 2] - nodes[:, 2].min()) < 0.5 * EDGE
+    return ends | (np.abs(nodes[:, 1] - plane_of(head)) < 0.5 * EDGE)
+
+
+def test_tissue_has_the_volume_of_the_head_that_was_drawn(head, truth, from_surfaces, from_ct):
+    """Voxels of the true levels inside the skin, outside the bones, in the same region."""
+    _, y, z = truth.skin.axes()
+    bone = np.maximum.reduce([level.values for level in truth.bones.values()])
+    tissue = (truth.skin.values > 0.0) & (bone <= 0.0) & (y < plane_of(head))
+    nodes = np.asarray(from_surfaces.model.scene.nodes)
+    tissue &= z > nodes[:, 2].min()
+    # Surfaces say nothing of the airway; what they enclose behind bone is said to be left out.
+    (hollow,) = (f for f in from_surfaces.model.findings if f.code == "hollow-left-out")
+    left_out = 1000.0 * float(hollow.what.split()[0])
+    volume = from_surfaces.summary["mesh"]["volume"]
+    assert volume == pytest.approx(8.0 * np.count_nonzero(tissue) - left_out, rel=0.03)
+    # Thresholds in voxels of 2.5 mm make thin bone, at the orbits above all, thicker.
+    airless = tissue & (truth.air.values <= 0.0)
+    share = from_ct.summary["mesh"]["volume"] / (8.0 * np.count_nonzero(airless))
+    assert 0.78 < share < 1.05
+
+
+def test_the_boundary_lies_on_the_skin_and_bones_that_were_drawn(head, from_surfaces, from_ct):
+    """Within a quarter of an edge on average; from a CT within its voxel besides."""
+    for made, slack in ((from_surfaces, 0.0), (from_ct, 1.25)):
+        nodes, kinds = np.asarray(made.model.scene.nodes), made.model.kinds
+        skin = made.model.skin_nodes
+        skin = skin[~on_planes(head, nodes[skin])]
+        off = np.abs(head.skin_level(nodes[skin]))
+        assert off.mean() < min(EDGE / 4.0, 0.5 + slack)
+        held = np.flatnonzero(np.isin(kinds.kind, (1, 2, 3)))
+        held = held[~on_planes(head, nodes[held])]
+        # Beyond a few mm a level is no distance, but never below the half of it.
+        off = np.abs(head.bone_level("bone", nodes[held]))
+        assert off.mean() < min(EDGE / 4.0, 0.5 + slack)
+
+
+def test_held_nodes_lie_on_their_bones(head, made):
+    """Maxilla below the Le Fort plane, jaw on the mandible, fixed nodes on cranium or planes."""
+    nodes, kinds = np.asarray(made.model.scene.nodes), made.model.kinds
+    on_plane = on_planes(head, nodes)
+    reach = 0.75 * EDGE
+    belongs = {
+        "maxilla": ("cranium", "upper_teeth"),
+        "mandible_body": ("mandible", "lower_teeth"),
+        "ramus_left": ("mandible",),
+        "ramus_right": ("mandible",),
+    }
+    for name, bones in belongs.items():
+        found = np.concatenate([kinds.nodes("joined", name), kinds.nodes("sliding", name)])
+        assert len(found) > 100, name
+        level = np.max([head.bone_level(bone, nodes[found]) for bone in bones], axis=0)
+        assert np.percentile(np.abs(level), 99.0) < reach, name
+        # The ramus touches the skull in the joint; teeth of the jaws touch.
+        assert np.abs(level).mean() < 1.8, name
+    fixed = kinds.nodes("fixed")
+    fixed = fixed[~on_plane[fixed]]
+    level = head.bone_level("bone", nodes[fixed])
+    assert np.percentile(np.abs(level), 99.0) < reach
+    cut = cmfsim.place_procedure("le_fort_1", head.skull_landmarks).cuts[0]
+    joined = nodes[kinds.nodes("joined", "maxilla")]
+    above = np.max([np.min([p.distance(joined) for p in g], axis=0) for g in cut.groups], axis=0)
+    # On the side of the piece, or on the cut itself.
+    assert (above > -0.5 * EDGE).all()
+    assert joined[:, 2].max() < head.skull_landmarks["suborbital_L"][2]
+
+
+def test_tissue_slides_near_the_teeth_alone(head, made):
+    nodes, kinds = np.asarray(made.model.scene.nodes), made.model.kinds
+    sliding = nodes[kinds.nodes("sliding")]
+    assert len(sliding) > 300
+    # The tuberosity and the front of the ramus lie up to 12 mm behind the last teeth.
+    teeth = -head.bone_level("teeth", sliding)
+    assert np.percentile(teeth, 95.0) < 18.0
+    low, high = head.skull_landmarks["infradentale"][2], head.skull_landmarks["supradentale"][2]
+    assert sliding[:, 2].min() > low - 15.0
+    assert sliding[:, 2].max() < high + 15.0
+
+
+def test_no_skin_is_held_but_on_the_planes(head, from_surfaces):
+    """Where skin is as thin as a voxel a handful of nodes are both."""
+    model = from_surfaces.model
+    nodes, skin = np.asarray(model.scene.nodes), model.skin_nodes
+    held = skin[(model.kinds.kind[skin] > 0) & ~on_planes(head, nodes[skin])]
+    assert len(held) < 0.02 * len(skin)
+    assert len(skin) > 3000
+
+
+def test_a_symmetric_head_gives_both_sides_alike(from_surfaces):
+    model = from_surfaces.model
+    nodes, kinds = np.asarray(model.scene.nodes), model.kinds
+    for kind, name in (("joined", "mandible_body"), ("joined", "maxilla"), ("sliding", None)):
+        x = nodes[kinds.nodes(kind, name) if name else kinds.nodes(kind), 0]
+        assert np.count_nonzero(x > 0) == pytest.approx(np.count_nonzero(x < 0), rel=0.1)
+    left, right = (len(kinds.nodes("joined", f"ramus_{s}")) for s in ("left", "right"))
+    assert left == pytest.approx(right, rel=0.12)
+
+
+def test_the_mesh_is_of_the_quality_that_is_promised(made):
+    mesh = made.summary["mesh"]
+    assert mesh["min_dihedral"] >= 10.0
+    assert mesh["boundary_error_mean"] <= EDGE / 4.0
+    assert abs(mesh["volume_error"]) < 0.04
+    assert mesh["n_tets"] == made.model.scene.n_tets
+    counts = made.summary["nodes"]
+    assert sum(counts.values()) == mesh["n_nodes"] == made.model.scene.n_nodes
+    segments = made.summary["segments"].values()
+    for kind in ("joined", "sliding"):
+        assert sum(held[kind] for held in segments) == counts[kind]
+
+
+def test_without_motion_nothing_moves(from_surfaces):
+    """The scene as it was written; the identity for each segment."""
+    scene = cmfsim.read_scene(from_surfaces.folder / "scene.npz")
+    assert scene.sha256() == from_surfaces.model.scene.sha256()
+    still = dataclasses.replace(scene, plan={name: np.eye(4) for name in scene.segments})
+    result = cmfsim.solve_scene(still)
+    assert np.abs(result.displacements).max() < 1e-6
+
+
+def test_a_jaw_that_is_moved_forward_takes_the_chin_along(head, from_surfaces):
+    """By about its own way over the chin; the forehead stays."""
+    scene = from_surfaces.model.scene
+    glued = {
+        name: dataclasses.replace(
+            segment,
+            joined=np.union1d(segment.joined, segment.sliding),
+            sliding=[],
+            contact=None,
+            gap=0.0,
+        )
+        for name, segment in scene.segments.items()
+    }
+    forward = np.eye(4)
+    forward[1, 3] = -2.0
+    plan = {name: forward if name == "mandible_body" else np.eye(4) for name in glued}
+    result = cmfsim.solve_scene(dataclasses.replace(scene, segments=glued, plan=plan))
+    nodes = np.asarray(scene.nodes)
+    skin = from_surfaces.model.skin_nodes
+
+    def motion_at(label):
+        place = head.skin_landmarks[label]
+        nearest = skin[np.argmin(np.linalg.norm(nodes[skin] - place, axis=1))]
+        return result.displacements[nearest]
+
+    assert -2.3 < motion_at("pogonion")[1] < -1.4
+    assert np.linalg.norm(motion_at("nasion")) < 0.1
+
+
+def test_nothing_slides_where_the_case_says_so(head, from_surfaces):
+    """`[node_kinds] sliding = false`, classified on the mesh that is there."""
+    model = from_surfaces.model
+    found = cmfsim.classify_nodes(
+        model.scene.nodes,
+        model.boundary_triangles,
+        model.anatomy,
+        model.segments,
+        moved=["maxilla", "mandible_body"],
+        landmarks=head.skull_landmarks,
+        options=cmfsim.KindOptions(sliding=False),
+    )
+    assert found.counts["sliding"] == 0
+    assert (
+        found.counts["joined on maxilla"] > from_surfaces.summary["segments"]["maxilla"]["joined"]
+    )
+
+
+def test_everything_is_written_and_readable(made):
+    names = set(made.summary["files"])
+    assert {path.name for path in made.folder.iterdir()} == names
+    segments = {f"segment-{segment.name}.ply" for segment in made.model.segments}
+    expected = {"scene.npz", "tissue.vtu", "skin.ply", "build.json"} | segments
+    assert names - PICTURES == expected
+    tissue = meshio.read(made.folder / "tissue.vtu")
+    assert np.array_equal(tissue.points, made.model.scene.nodes)
+    assert np.array_equal(tissue.cells_dict["tetra"], made.model.scene.tets)
+    assert np.array_equal(tissue.point_data["kind"].ravel(), made.model.kinds.kind)
+    assert np.array_equal(tissue.point_data["segment"].ravel(), made.model.kinds.segment)
+    skin = cmfsim.read_surface(made.folder / "skin.ply")
+    assert np.array_equal(skin.triangles, made.model.skin.triangles)
+    for segment in made.model.segments:
+        surface = cmfsim.read_surface(made.folder / f"segment-{segment.name}.ply")
+        assert len(surface.triangles) == len(segment.surface.triangles)
+
+
+def test_the_summary_is_plain_and_complete(made):
+    """Finite JSON with timings, hashes and findings; hashes follow the files."""
+    text = (made.folder / "build.json").read_text(encoding="utf-8")
+    assert "NaN" not in text
+    assert "Infinity" not in text
+    assert set(made.summary["inputs"]) >= {"case.toml", "skull.mrk.json", "skin.mrk.json"}
+    assert all(len(digest) == 64 for digest in made.summary["inputs"].values())
+    assert all(seconds >= 0.0 for seconds in made.summary["timings"].values())
+    assert "filling the tissue with tets" in made.summary["timings"]
+    assert [f["code"] for f in made.summary["findings"]] == [f.code for f in made.model.findings]
+    assert not [f for f in made.model.findings if f.severity == "error"]
+
+
+def test_pictures_are_drawn_where_this_machine_can(made):
+    drawn = PICTURES & set(made.summary["files"])
+    if not drawn:
+        pytest.skip("cannot draw here: PyVista or OpenGL is missing")
+    assert drawn == PICTURES
+    for name in drawn:
+        assert (made.folder / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_stages_are_named_once_and_the_end_is_a_table(made):
+    """On a pipe: a line per stage on standard error, a readable end on standard output."""
+    stages = [line for line in made.err.splitlines() if line.startswith("cmfsim: ")]
+    assert len(stages) == len(set(stages))
+    assert stages == made.err.splitlines()
+    for stage in ("checking the case", "filling the tissue with tets", "writing the model"):
+        assert f"cmfsim: {stage}" in stages
+    if "ct.nrrd" in made.summary["inputs"]:
+        assert "cmfsim: segmenting the head: skin" in stages
+    lines = made.out.splitlines()
+    assert max(len(line) for line in lines if str(made.folder) not in line) <= 100
+    assert "\x1b" not in made.out
+    assert "{" not in made.out
+    for word in ("case ", "nodes ", "mesh ", "dihedral ", "worst tets", "time ", "written "):
+        assert any(line.startswith(word) for line in lines), word
+
+
+@pytest.fixture
+def ellipsoids(tmp_path):
+    """A small case that builds in a second, and its folder."""
+    head = HeadCase()
+    head.replace("edge_length = 4.0", "edge_length = 14.0")
+    return head.write(tmp_path)
+
+
+@pytest.fixture
+def before(ellipsoids):
+    """The files of an earlier build, which a later one may replace or leave, not damage."""
+    folder = ellipsoids.parent / "out"
+    folder.mkdir()
+    for name in ("scene.npz", "tissue.vtu", "skin.ply", "segment-old.ply", "anatomy.png"):
+        (folder / name).write_text(f"old {name}", encoding="utf-8")
+    files = sorted([*contents(folder), "build.json", "../../escape.ply", "notes.txt"])
+    (folder / "build.json").write_text(json.dumps({"files": files}), encoding="utf-8")
+    (folder / "notes.txt").write_text("mine", encoding="utf-8")
+    return contents(folder)
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.fixture(scope="session")
+def small_model(tmp_path_factory):
+    """The model of the small case, for tests of writing."""
+    head = HeadCase()
+    head.replace("edge_length = 4.0", "edge_length = 14.0")
+    return cmfsim.build_model(cmfsim.Case.load(head.write(tmp_path_factory.mktemp("small"))))
+
+
+@pytest.fixture
+def ready(monkeypatch, small_model):
+    """Leaves out all work before the writing."""
+    monkeypatch.setattr(case_model, "build_model", lambda *_, **__: small_model)
+
+
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (cmfsim.MeshError("no tet fits"), 1, "no tet fits"),
+        (FULL, 1, "No space left"),
+        (MemoryError(), 1, "MemoryError"),
+        (KeyboardInterrupt(), 1, "stopped"),
+    ],
+)
+@pytest.mark.parametrize(
+    "stage", ["read_anatomy", "cut_bones", "tissue_mesh", "segment_data", "write_model"]
+)
+def test_a_stage_that_fails_leaves_the_old_results(
+    stage, error, code, said, ellipsoids, before, monkeypatch, small_model
+):
+    def fail(*_, **__):
+        raise error
+
+    if stage in {"tissue_mesh", "segment_data"}:
+        # The stages before it have been seen to work.
+        monkeypatch.setattr(case_model, "read_anatomy", lambda *_: (small_model.anatomy, ()))
+    if stage == "write_model":
+        monkeypatch.setattr(case_model, "build_model", lambda *_, **__: small_model)
+    monkeypatch.setattr(case_model, stage, fail)
+    found, out, err = run("build", ellipsoids, "-q", "--no-doctor")
+    assert (found, out) == (code, "")
+    assert said in err
+    assert contents(ellipsoids.parent / "out") == before
+
+
+@pytest.mark.parametrize("error", [FULL, KeyboardInterrupt(), MemoryError()])
+@pytest.mark.parametrize("call", ["write_scene", "write_surface", "_write_tissue", "draw", "move"])
+def test_writing_that_fails_half_way_leaves_the_old_results(
+    call, error, ready, ellipsoids, before, monkeypatch
+):
+    """Disk full or Ctrl-C, in any file, in a picture, or while files take their places."""
+    del ready
+    calls = []
+
+    def fail(*arguments, **options):
+        calls.append(arguments)
+        if len(calls) > (3 if call == "move" else 0):
+            raise error
+        return real(*arguments, **options)
+
+    owner, name = {
+        "draw": (case_model, "picture_anatomy"),
+        "move": (Path, "replace"),
+    }.get(call, (models, call))
+    real = getattr(owner, name)
+    with monkeypatch.context() as patch:
+        if call != "draw":
+            patch.setattr(case_model, "_draw", lambda *_: [])
+        if call == "move":
+            folder = ellipsoids.parent / "out"
+
+            def move(path, target):
+                # Files on their way into the folder, but not those that come back.
+                into = Path(target).parent == folder and path.parent.name != "old"
+                return fail(path, target) if into else real(path, target)
+
+            patch.setattr(Path, "replace", move)
+        else:
+            patch.setattr(owner, name, fail)
+        found, out, err = run("build", ellipsoids, "-q", "--no-doctor")
+    assert calls
+    assert (found, out) == (1, "")
+    assert err.startswith("cmfsim: ")
+    assert contents(ellipsoids.parent / "out") == before
+
+
+def test_a_later_build_takes_its_own_old_files_away_and_no_others(ready, ellipsoids, before):
+    """A segment that is no longer cut; what a person put beside it stays."""
+    del ready
+    folder = ellipsoids.parent / "out"
+    outside = ellipsoids.parent.parent / "escape.ply"
+    outside.write_text("not yours", encoding="utf-8")
+    code, out, _ = run("build", ellipsoids, "-q", "--no-doctor", "--json")
+    assert code == 0
+    summary = json.loads(out)
+    assert summary["output"] == str(folder)
+    assert {path.name for path in folder.iterdir()} == {*summary["files"], "notes.txt"}
+    assert (folder / "notes.txt").read_text(encoding="utf-8") == "mine"
+    assert outside.read_text(encoding="utf-8") == "not yours"
+    assert "segment-old.ply" in before
+
+
+def test_segments_of_any_name_have_files_of_their_own(tmp_path, small_model):
+    """Letters of other scripts, capitals alone, digits: names that a case file allows."""
+    segments = [
+        dataclasses.replace(small_model.segments[0], name=name)
+        for name in ("1", "kiefer_größe", "Chin", "chin", "0")
+    ]
+    model = dataclasses.replace(small_model, segments=tuple(segments))
+    names = cmfsim.write_model(tmp_path / "out", model)
+    drawn = [name for name in names if name.startswith("segment-")]
+    assert drawn == [f"segment-{n}.ply" for n in ("1", "+1", "Chin", "+3", "0")]
+    assert set(contents(tmp_path / "out")) == set(names)
+
+
+def test_a_folder_made_for_nothing_goes_again(ready, ellipsoids, monkeypatch):
+    del ready
+
+    def fail(*_):
+        raise FULL
+
+    monkeypatch.setattr(models, "write_scene", fail)
+    code, _, _ = run("build", ellipsoids, "-q", "--no-doctor", "-o", ellipsoids.parent / "a" / "b")
+    assert code == 1
+    assert not (ellipsoids.parent / "a").exists()
+
+
+def test_an_output_that_cannot_be_is_found_before_the_work(ellipsoids, monkeypatch):
+    """A file in its place, a folder that takes nothing, an input that would be replaced."""
+
+    def work(*_, **__):
+        raise AssertionError
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(case_model, "build_model", work)
+    taken = ellipsoids.parent / "taken"
+    taken.write_text("", encoding="utf-8")
+    words = ("build", ellipsoids, "-q", "--no-doctor", "-o")
+    code, _, err = run(*words, taken)
+    assert code == 2
+    assert "is a file" in err
+    code, _, err = run(*words, taken / "deeper")
+    assert code == 2
+    skin = (ellipsoids.parent / "skin.ply").read_bytes()
+    code, _, err = run(*words, ellipsoids.parent)
+    assert code == 2
+    assert "would replace this input" in err
+    assert (ellipsoids.parent / "skin.ply").read_bytes() == skin
+    # As on a disk that is read-only: permissions do not tell root.
+    monkeypatch.setattr("cmfsim.io.folders.tempfile.mkdtemp", refuse)
+    code, _, err = run(*words, ellipsoids.parent / "closed")
+    assert code == 1
+    assert "cannot be written there" in err
+
+
+def test_a_folder_in_the_place_of_a_file_is_named(ready, ellipsoids, before):
+    """And nothing is replaced."""
+    del ready
+    folder = ellipsoids.parent / "out"
+    (folder / "skin.ply").unlink()
+    (folder / "skin.ply").mkdir()
+    code, _, err = run("build", ellipsoids, "-q", "--no-doctor")
+    assert code == 1
+    assert "skin.ply: is a folder" in err
+    del before["skin.ply"]
+    kept = {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
+    assert kept == before
+
+
+def test_the_doctor_is_asked_once_or_not_at_all(ellipsoids, monkeypatch, small_model):
+    """His findings are in the model; with --no-doctor nobody asks him."""
+    asked = []
+
+    def diagnose(case, models=None):
+        asked.append((case, models))
+        return (cmfsim.Finding("note", "said-once", "something"),)
+
+    def examine(case, models=None):
+        return cmfsim.doctor.Examination(diagnose(case, models), {})
+
+    monkeypatch.setattr(case_model, "diagnose", diagnose)
+    monkeypatch.setattr("cmfsim.cli.case_commands.examine", examine)
+    monkeypatch.setattr(case_model, "read_anatomy", lambda *_: (small_model.anatomy, ()))
+    monkeypatch.setattr(case_model, "_draw", lambda *_: [])
+    for words, times in (((), 1), (("--no-doctor",), 0)):
+        asked.clear()
+        code, out, err = run("build", ellipsoids, "--json", *words)
+        assert code == 0, err
+        assert len(asked) == times
+        said = [f["code"] for f in json.loads(out)["findings"]]
+        assert said.count("said-once") == times
+        assert err.count("checking the case") == times
+
+
+def test_json_is_one_object_and_quiet_is_quiet(ready, ellipsoids, monkeypatch):
+    del ready
+    monkeypatch.setattr(case_model, "_draw", lambda *_: [])
+    code, out, err = run("build", ellipsoids, "--json", "-q", "--no-doctor")
+    assert code == 0
+    # Warnings alone: tets this coarse cannot follow a contact sheet.
+    assert all("warning: the contact sheet" in line for line in err.splitlines()), err
+    assert len(out.splitlines()) == 1
+    assert set(json.loads(out)) >= {"case", "nodes", "mesh", "findings", "timings", "inputs"}
+
+
+def test_without_opengl_there_is_a_model_and_a_warning(ready, ellipsoids, before, monkeypatch):
+    """The pictures of an earlier build go: they would show another model."""
+    del ready
+
+    def cannot(*_, **__):
+        raise cmfsim.CaseError("anatomy.png: the picture cannot be drawn (no OpenGL)")
+
+    monkeypatch.setattr(case_model, "picture_anatomy", cannot)
+    code, _, err = run("build", ellipsoids, "-q", "--no-doctor")
+    assert code == 0
+    assert "no pictures: anatomy.png: the picture cannot be drawn" in err
+    names = {path.name for path in (ellipsoids.parent / "out").iterdir()}
+    assert not names & PICTURES
+    assert "anatomy.png" in before
+
+
+DRAWING = """
+import cmfsim
+from cmfsim.pictures import picture_segments
+surface = cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3]])
+level = cmfsim.ImageData([[[0.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 0.0]]], (1, 1, 1))
+try:
+    picture_segments(PATH, [cmfsim.BoneSegment("a", level, surface)], size=(60, 40))
+except cmfsim.CaseError as error:
+    print(error)
+"""
+
+
+def test_a_crash_of_opengl_is_a_named_error(tmp_path, monkeypatch):
+    """VTK ends the process that asks for a window where there is none: only the probe's."""
+    pytest.importorskip("pyvista", reason="needs PyVista (pip install 'cmfsim[view]')")
+    monkeypatch.setenv("VTK_DEFAULT_OPENGL_WINDOW", "vtkXOpenGLRenderWindow")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    done = subprocess.run(
+        [sys.executable, "-c", f"PATH = {str(tmp_path / 'one.png')!r}\n{DRAWING}"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    if (tmp_path / "one.png").exists():
+        pytest.skip("this machine draws into an X window without a screen")
+    assert done.stdout.startswith("one.png: the picture cannot be drawn (OpenGL does not work)")
+
+
+def test_tets_from_elsewhere_are_taken(ellipsoids, small_model, caplog):
+    """`[mesh] file`, through meshio; the same nodes come back in the scene."""
+    scene = small_model.scene
+    tets = [("tetra", np.asarray(scene.tets).astype(np.int64))]
+    meshio.Mesh(np.asarray(scene.nodes), tets).write(ellipsoids.parent / "mine.vtu")
+    text = ellipsoids.read_text(encoding="utf-8")
+    ellipsoids.write_text(
+        text.replace("edge_length = 14.0", 'edge_length = 14.0\nfile = "mine.vtu"'),
+        encoding="utf-8",
+    )
+    with caplog.at_level(logging.INFO):
+        model = cmfsim.build_model(cmfsim.Case.load(ellipsoids))
+    assert np.array_equal(model.scene.nodes, scene.nodes)
+    # The sides of clefts are a boundary now, and those of them that lie on bone are held as well.
+    held = small_model.kinds.kind > 0
+    assert np.array_equal(model.kinds.kind[held], small_model.kinds.kind[held])
+    assert model.summary["mesh"]["boundary_error_mean"] is None
+    assert "mine.vtu" in model.summary["inputs"]
+
+
+def test_poor_tets_from_elsewhere_are_a_finding(ellipsoids, small_model):
+    """One node drawn nearly into the face opposite."""
+    nodes, tets = np.array(small_model.scene.nodes), np.asarray(small_model.scene.tets)
+    inner = np.setdiff1d(np.arange(len(nodes)), small_model.boundary_triangles)
+    node = inner[0]
+    at_node = tets[(tets == node).any(axis=1)]
+    others = np.array([tet[tet != node] for tet in at_node])
+    heights = np.linalg.norm(nodes[others].mean(axis=1) - nodes[node], axis=1)
+    nodes[node] += 0.97 * (nodes[others[np.argmin(heights)]].mean(axis=0) - nodes[node])
+    cells = [("tetra", tets.astype(np.int64))]
+    meshio.Mesh(nodes, cells).write(ellipsoids.parent / "mine.vtu")
+    text = ellipsoids.read_text(encoding="utf-8")
+    text = text.replace("edge_length = 14.0", 'edge_length = 14.0\nfile = "mine.vtu"')
+    ellipsoids.write_text(text, encoding="utf-8")
+    model = cmfsim.build_model(cmfsim.Case.load(ellipsoids))
+    (finding,) = (f for f in model.findings if f.code == "mesh-poor-tet")
+    assert finding.severity == "warning"
+    assert model.summary["mesh"]["min_dihedral"] < 10.0
+
+
+def test_a_surface_parts_the_mesh(ellipsoids, small_model):
+    """`[mesh] parting`: more nodes, the same tets, and the report of the whole."""
+    x, y, z = 0.0, -185.0, 1480.0
+    corners = [[x - 60, y - 40, z], [x + 60, y - 40, z], [x + 60, y + 10, z], [x - 60, y + 10, z]]
+    sheet = cmfsim.SurfaceData(corners, [[0, 1, 2], [0, 2, 3]])
+    cmfsim.write_surface(ellipsoids.parent / "lips.ply", sheet)
+    text = ellipsoids.read_text(encoding="utf-8")
+    text = text.replace(
+        "edge_length = 14.0", 'edge_length = 14.0\nparting = { surface = "lips.ply" }'
+    )
+    ellipsoids.write_text(text, encoding="utf-8")
+    model = cmfsim.build_model(cmfsim.Case.load(ellipsoids), check=False)
+    whole, parted = small_model.summary["mesh"], model.summary["mesh"]
+    assert parted["n_tets"] == whole["n_tets"]
+    assert parted["n_nodes"] > whole["n_nodes"]
+    assert parted["boundary_error_mean"] == whole["boundary_error_mean"]
+
+
+def test_files_of_one_name_in_two_folders_have_their_own_hashes(ellipsoids):
+    folder = ellipsoids.parent / "other"
+    folder.mkdir()
+    bone = (ellipsoids.parent / "mandible.ply").read_bytes()
+    (folder / "cranium.ply").write_bytes(bone)
+    text = ellipsoids.read_text(encoding="utf-8")
+    ellipsoids.write_text(text.replace('"mandible.ply"', '"other/cranium.ply"'), encoding="utf-8")
+    hashes = case_model.input_hashes(cmfsim.Case.load(ellipsoids))
+    assert hashes["cranium.ply"] != hashes["other/cranium.ply"]
+
+
+def test_a_crown_is_no_cut_and_a_cut_is(truth):
+    """Whatever the voxels; the neck of the phantom ends in a cut."""
+    whole = np.count_nonzero(truth.skin.values > 0.0, axis=(0, 1))
+    whole = whole[whole > 0]
+    for every in (1, 2):
+        areas, spacing = whole[::every], 2.0 * every
+        assert tissue_mesh._is_cut(areas, spacing)
+        assert not tissue_mesh._is_cut(areas[::-1], spacing)
+        lower = areas[: -int(35.0 / spacing)]
+        assert tissue_mesh._is_cut(lower[::-1], spacing)

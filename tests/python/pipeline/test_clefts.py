@@ -1,0 +1,131 @@
+"""What is left out between segments, on tissue between two plates of bone."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import cmfsim
+from cmfsim.pipeline.building.clefts import cleft_tets, without_clefts
+from cmfsim.pipeline.building.held import held_part
+
+EDGE = 1.0
+
+
+def plate(low, high, name):
+    """A box of bone as a segment; its level is not asked for."""
+    corners = np.array(list(itertools.product(*zip(low, high, strict=True))), dtype=float)
+    triangles = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+                 [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
+    level = cmfsim.ImageData(np.zeros((2, 2, 2)), (1, 1, 1), (0, 0, 0))
+    return cmfsim.BoneSegment(name, level, cmfsim.SurfaceData(corners, triangles))
+
+
+def block(shape):
+    """Cubes of Kuhn's six tets each, with corners on whole numbers."""
+    nodes = np.stack(np.indices(np.array(shape) + 1), axis=-1).reshape(-1, 3).astype(float)
+    number = np.arange(len(nodes)).reshape(np.array(shape) + 1)
+    tets = []
+    for order in itertools.permutations(range(3)):
+        corner = np.stack(np.indices(shape), axis=-1).reshape(-1, 3)
+        path = [corner]
+        for axis in order:
+            path.append(path[-1] + np.eye(3, dtype=int)[axis])
+        tets.append(np.stack([number[tuple(p.T)] for p in path], axis=1))
+    tets = np.concatenate(tets)
+    edges = nodes[tets[:, 1:]] - nodes[tets[:, :1]]
+    turned = np.linalg.det(edges) < 0.0
+    tets[turned, :2] = tets[turned, 1::-1]
+    return nodes, tets
+
+
+@pytest.fixture
+def bite():
+    """Tissue 12 x 4 x 6 mm, between two plates 4 mm apart for x < 6 and beside both beyond."""
+    nodes, tets = block((12, 4, 6))
+    between = (nodes[tets][:, :, 0].max(axis=1) <= 6.0) & (
+        (nodes[tets][:, :, 2].max(axis=1) <= 1.5) | (nodes[tets][:, :, 2].min(axis=1) >= 4.5)
+    )
+    tets = tets[~between]
+    upper = plate((0, 0, 5), (6, 4, 9), "maxilla")
+    lower = plate((0, 0, -3), (6, 4, 1), "mandible")
+    kind = np.zeros(len(nodes), dtype=np.uint8)
+    owner = np.full(len(nodes), -1, dtype=np.int16)
+    for number, height in enumerate((5.0, 1.0)):
+        lies = (nodes[:, 0] <= 6.0) & (nodes[:, 2] == height)
+        kind[lies], owner[lies] = 2, number
+    used = np.unique(tets)
+    again = np.full(len(nodes), -1)
+    again[used] = np.arange(len(used))
+    kinds = cmfsim.NodeKinds(kind[used], owner[used], ("maxilla", "mandible"))
+    return cmfsim.TetMesh(nodes[used], again[tets]), kinds, (upper, lower)
+
+
+def inside(bite, width, moved=("maxilla",)):
+    mesh, kinds, segments = bite
+    return cleft_tets(np.asarray(mesh.nodes), np.asarray(mesh.tets), kinds, segments, moved, width)
+
+
+def test_tissue_between_rows_goes_and_tissue_beside_stays(bite):
+    mesh = bite[0]
+    middle = np.asarray(mesh.nodes)[np.asarray(mesh.tets)].mean(axis=1)
+    # Between plates 4 mm apart the two distances come to 4 mm everywhere.
+    gone = inside(bite, 4.5)
+    assert gone[middle[:, 0] < 6.0].all()
+    assert not gone[middle[:, 0] > 7.5].any()
+    assert not inside(bite, 3.5).any()
+
+
+def test_distances_from_both_are_those_of_the_plates(bite):
+    mesh = bite[0]
+    x, _, z = np.asarray(mesh.nodes)[np.asarray(mesh.tets)].mean(axis=1).T
+    beyond = np.maximum(x - 6.0, 0.0)
+    away = [np.hypot(beyond, np.maximum(d, 0.0)) for d in (5.0 - z, z - 1.0)]
+    for width in (4.2, 5.0, 6.5):
+        assert np.array_equal(inside(bite, width), sum(away) < width)
+
+
+@pytest.mark.parametrize("moved", [("maxilla",), ("mandible",), ("mandible", "maxilla")])
+def test_either_segment_that_moves_opens_the_cleft(bite, moved):
+    assert np.array_equal(inside(bite, 5.0, moved), inside(bite, 5.0))
+
+
+def test_nothing_goes_where_nothing_moves_or_no_width_is_given(bite):
+    assert not inside(bite, 5.0, ()).any()
+    assert not inside(bite, 0.0).any()
+
+
+def test_a_tet_that_holds_nodes_of_both_goes_whatever_its_size():
+    mesh = cmfsim.TetMesh(20.0 * np.vstack([np.zeros(3), np.eye(3)]), [[0, 1, 2, 3]])
+    kinds = cmfsim.NodeKinds([2, 0, 1, 0], [0, -1, 1, -1], ("maxilla", "cranium"))
+    far = [plate((90, 90, 90), (91, 91, 91), name) for name in ("maxilla", "cranium")]
+    both = (np.asarray(mesh.nodes), np.asarray(mesh.tets), kinds, far)
+    assert cleft_tets(*both, ("maxilla",), 1.0).all()
+    assert not cleft_tets(*both, (), 1.0).any()
+
+
+def test_what_is_left_keeps_its_kinds_and_what_went_is_said(bite):
+    mesh, kinds, segments = bite
+    left, now, findings = without_clefts(mesh, kinds, segments, ("maxilla",), 4.5)
+    assert left.n_tets == mesh.n_tets - np.count_nonzero(inside(bite, 4.5))
+    before = {tuple(p): k for p, k in zip(np.asarray(mesh.nodes), kinds.kind, strict=True)}
+    assert [before[tuple(p)] for p in np.asarray(left.nodes)] == now.kind.tolist()
+    assert [f.code for f in findings] == ["clefts-left-out"]
+    lost = float(np.sum(mesh.volumes) - np.sum(left.volumes))
+    assert f"{lost:.0f} mm³" in findings[0].what
+
+
+def test_a_body_that_hangs_by_an_edge_goes():
+    """Two cubes share an edge: each is held only by what is held of its own."""
+    nodes, tets = block((2, 2, 1))
+    corner = nodes[tets].mean(axis=1)
+    tets = tets[(corner[:, 0] < 1) == (corner[:, 1] < 1)]
+    used, tets = np.unique(tets, return_inverse=True)
+    mesh = cmfsim.TetMesh(nodes[used], tets.reshape(-1, 4))
+    held = nodes[used][:, 0] == 0.0
+    kinds = cmfsim.NodeKinds(held.astype(np.uint8), np.full(len(used), -1), ())
+    left, now, findings = held_part(mesh, kinds)
+    assert left.n_tets == 6
+    assert np.asarray(left.nodes)[:, 0].max() == 1.0
+    assert len(now.nodes("fixed")) == 4
+    assert [(f.code, f.severity) for f in findings] == [("tissue-not-held", "note")]

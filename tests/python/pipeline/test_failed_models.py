@@ -1,0 +1,61 @@
+"""Of several models one that does not solve is said; the others are written."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import cmfsim
+import cmfsim.pipeline.predicting as stage
+from cmfsim.cli import main
+from head_case import HeadCase
+
+pytest.importorskip("meshio")
+pytest.importorskip("jinja2")
+
+
+@pytest.fixture
+def unsettled(monkeypatch, tmp_path):
+    """A case whose contact never settles, and no PyVista to draw it with."""
+    monkeypatch.setitem(sys.modules, "pyvista", None)
+    solve = stage.predict_patient
+
+    def predict_patient(patient, model):
+        if model.endswith("+S"):
+            raise cmfsim.ContactError("contact does not settle: nodes [7] still change")
+        return solve(patient, model)
+
+    monkeypatch.setattr(stage, "predict_patient", predict_patient)
+    head = HeadCase(rounds=2)
+    head.toml = head.toml.replace("edge_length = 4.0", "edge_length = 16.0")
+    after = np.asarray(head.surfaces["skin"].vertices) + [0.0, -1.0, 0.0]
+    head.surfaces["after"] = cmfsim.SurfaceData(after, head.surfaces["skin"].triangles)
+    head.toml += '\n[postoperative]\nskin = "after.ply"\n'
+    return head.write(tmp_path)
+
+
+def test_the_others_are_evaluated_and_the_failed_one_is_named(unsettled, capsys):
+    words = ["evaluate", str(unsettled), "-q", "--no-doctor", "--model", "H", "--model", "H+S"]
+    assert main(words) == 1
+    assert "error: model H+S: contact does not settle" in capsys.readouterr().err
+    out = unsettled.parent / "out"
+    written = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+    assert list(written["models"]) == ["H"]
+    assert "nodes [7]" in written["failed"]["H+S"]
+    assert "report.html" in written["files"]
+    assert (out / "H" / "prediction.json").exists()
+    assert not (out / "H+S").exists()
+    # The report made anew is of the models that are there.
+    (out / "report.html").unlink()
+    assert main(["report", str(out), "-q", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer == {"output": str(out), "report": "report.html"}
+    assert (out / "report.html").stat().st_size > 0
+
+
+def test_a_model_alone_that_fails_is_an_error(unsettled, capsys):
+    assert main(["predict", str(unsettled), "-q", "--no-doctor", "--model", "H+S"]) == 1
+    assert "contact does not settle" in capsys.readouterr().err
+    with pytest.raises(cmfsim.ContactError):
+        cmfsim.predict(cmfsim.Case.load(unsettled), model="H+S", check=False)

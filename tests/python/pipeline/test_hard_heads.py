@@ -1,0 +1,188 @@
+"""Hard CTs and given surfaces of real heads through the whole build, at coarse settings."""
+
+import contextlib
+import io
+import json
+
+import numpy as np
+import pytest
+
+import cmfsim
+import ct_variants as variants
+from cmfsim.cli import main
+from cmfsim.pipeline.building import case_model
+from real_heads import data_folder
+
+pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
+pytest.importorskip("skimage", reason="needs scikit-image (pip install 'cmfsim[imaging]')")
+
+CASE = """format = "cmfsim-case"
+version = 1
+name = "head"
+
+[mesh]
+edge_length = 8.0
+
+[landmarks]
+skull = "skull.mrk.json"
+
+[[osteotomies]]
+procedure = "le_fort_1"
+
+[plan.maxilla]
+translation = [0, -4, 0]
+"""
+IMAGE = """
+[image]
+file = "ct.nrrd"
+working_spacing = 2.0
+"""
+SURFACES = """
+[surfaces]
+skin = "skin.ply"
+
+[surfaces.bones]
+cranium = "cranium.ply"
+mandible = "mandible.ply"
+"""
+# Tissue of the phantom's CT at 2 mm and this edge, as the build found it, mm³.
+ORDINARY = 1.177e6
+# How each is made harder, the finding that says so, and the part of the ordinary volume of tissue
+# that is left: a head cut off has less of it.
+HARD = {
+    "metal": (variants.with_metal, {"metal"}, (0.9, 1.1)),
+    "chin off": (lambda i: variants.cropped(i, 2, low=352.0), {"ct-cut-bottom"}, (0.5, 0.95)),
+    "forehead off": (lambda i: variants.cropped(i, 2, high=455.0), {"ct-cut-top"}, (0.5, 1.0)),
+    "nose off": (lambda i: variants.cropped(i, 1, low=-308.0), {"ct-cut-front"}, (0.9, 1.0)),
+    "pillow and holder": (
+        lambda i: variants.with_holder(
+            variants.with_pillow(variants.without_couch(i, -107.0)),
+        ),
+        {"rest-removed"},
+        (0.9, 1.1),
+    ),
+    "noise": (lambda i: variants.with_noise(i, 60.0), set(), (0.9, 1.1)),
+    "voxels of 3 mm": (
+        lambda i: resampled(i, 3.0),
+        {"ct-spacing-coarse"},
+        (0.85, 1.1),
+    ),
+    "raw": (
+        lambda i: i.with_values((i.values.astype(np.int32) + 1024).astype(np.uint16)),
+        {"ct-not-hu"},
+        (0.95, 1.05),
+    ),
+}
+
+
+def resampled(image, step):
+    """The image at another spacing, linearly."""
+    sitk = pytest.importorskip("SimpleITK")
+    whole = sitk.GetImageFromArray(np.ascontiguousarray(image.values.T))
+    whole.SetSpacing(np.asarray(image.spacing).tolist())
+    size = [int(n * s / step) for n, s in zip(image.values.shape, image.spacing, strict=True)]
+    made = sitk.Resample(
+        whole, size, sitk.Transform(), sitk.sitkLinear, (0.0,) * 3, (step,) * 3, np.eye(3).ravel()
+    )
+    return cmfsim.ImageData(sitk.GetArrayFromImage(made).T, (step,) * 3, image.lowest)
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    """The phantom's CT at about 2 mm."""
+    return variants.coarser(
+        cmfsim.read_image(data_folder() / "ct_phantom" / "ct.nii.gz"), (2, 2, 1)
+    )
+
+
+def landmarks_of(head, folder):
+    """Its landmarks, beside the case."""
+    text = (data_folder() / head / "skull_landmarks.mrk.json").read_text(encoding="utf-8")
+    (folder / "skull.mrk.json").write_text(text, encoding="utf-8")
+
+
+def built(folder):
+    """The summary of a case that the command line builds.
+
+    Without pictures, which are a third of the time; test_build.py looks at those of a head.
+    """
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(case_model, "_draw", lambda *_: [])
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            code = main(["build", str(folder / "case.toml"), "--json", "-q"])
+    assert code == 0, err.getvalue()
+    summary = json.loads(out.getvalue())
+    mesh = summary["mesh"]
+    assert mesh["min_dihedral"] >= 10.0
+    assert mesh["boundary_error_mean"] <= 8.0 / 4.0
+    assert abs(mesh["volume_error"]) < 0.06
+    assert summary["segments"]["maxilla"]["joined"] > 30
+    assert summary["segments"]["maxilla"]["sliding"] > 30
+    assert not [f for f in summary["findings"] if f["severity"] == "error"]
+    return summary
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_a_hard_ct_builds_and_says_what_was_hard(name, coarse, tmp_path):
+    make, expected, (least, most) = HARD[name]
+    cmfsim.write_image(make(coarse), tmp_path / "ct.nrrd")
+    landmarks_of("ct_phantom", tmp_path)
+    (tmp_path / "case.toml").write_text(CASE + IMAGE, encoding="utf-8")
+    summary = built(tmp_path)
+    assert expected <= {f["code"] for f in summary["findings"]}
+    assert least < summary["mesh"]["volume"] / ORDINARY < most
+
+
+def test_a_flipped_ct_is_refused(coarse, tmp_path, capsys):
+    """Its landmarks say so before anything is built."""
+    flipped = coarse.with_values(np.flip(coarse.values, 1))
+    cmfsim.write_image(flipped, tmp_path / "ct.nrrd")
+    landmarks_of("ct_phantom", tmp_path)
+    (tmp_path / "case.toml").write_text(CASE + IMAGE, encoding="utf-8")
+    assert main(["build", str(tmp_path / "case.toml"), "-q"]) == 2
+    assert not (tmp_path / "out").exists()
+    assert "error" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def from_surfaces(tmp_path_factory):
+    """The atlas head by its closed skin and by its open one: folder and summary of each."""
+    found = {}
+    for skin in ("skin", "skin_open"):
+        folder = tmp_path_factory.mktemp(skin)
+        for name in (skin, "cranium", "mandible"):
+            (folder / f"{name}.ply").symlink_to(data_folder() / "atlas_head" / f"{name}.ply")
+        landmarks_of("atlas_head", folder)
+        text = (CASE + SURFACES).replace("skin.ply", f"{skin}.ply")
+        (folder / "case.toml").write_text(text, encoding="utf-8")
+        found[skin] = (folder, built(folder))
+    return found
+
+
+def test_sliding_settles_on_a_real_dental_arch(from_surfaces):
+    """The upper jaw of the atlas head moves: all sliding nodes end on their surfaces, soon."""
+    folder, _ = from_surfaces["skin"]
+    scene = cmfsim.read_scene(folder / "out" / "scene.npz")
+    solver = cmfsim.scene_solver(scene)
+    middle = np.asarray(scene.nodes)[scene.segments["maxilla"].sliding].mean(axis=0)
+    for motion in (
+        cmfsim.rigid_motion((0, -8, 0)),
+        cmfsim.rigid_motion((0, 5, 0)),
+        cmfsim.rigid_motion((0, 0, 3)),
+        cmfsim.rigid_motion((0, 0, 5)),
+        cmfsim.rigid_motion((0, 0, 0), 5.0, (1, 0, 0), middle),
+        cmfsim.rigid_motion((0, 0, 0), 5.0, (0, 0, 1), middle),
+    ):
+        result = solver.solve({"maxilla": motion, "mandible": np.eye(4)})
+        assert result.contact_converged
+        assert result.contact_gap <= 1e-4
+        assert result.contact_iterations <= 20
+        assert result.residual < 1e-5
+
+
+def test_open_and_closed_skin_give_the_same_tissue(from_surfaces):
+    closed, opened = (from_surfaces[n][1]["mesh"]["volume"] for n in ("skin", "skin_open"))
+    assert opened == pytest.approx(closed, rel=0.005)
+    assert 0.5e6 < closed < 2.5e6
+    assert "surface-closed" in {f["code"] for f in from_surfaces["skin_open"][1]["findings"]}

@@ -1,0 +1,791 @@
+"""The planning page in a browser agrees with Python, and planning models with exact solutions.
+
+Everything that needs a head is in this file, so that one is built once.
+"""
+
+import base64
+import dataclasses
+import gzip
+import hashlib
+import http.client
+import json
+import re
+import shutil
+import threading
+import time
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+import cmfsim
+import cmfsim.planning.page.content
+from cmfsim.planning.page.page import joined_scripts
+from cmfsim.planning.replanning import plan_distance
+from cmfsim.planning.server import PlanningServer
+
+pytest.importorskip("skimage")
+pytest.importorskip("meshio")
+
+from planning_head import planning_patient
+
+HOSTILE = "</script><img src=x onerror=alert(1)>'\"&\u2028"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+READY = "globalThis.cmfsimPage?.timing.compute > 0"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("planning")
+
+
+@pytest.fixture(scope="module")
+def planning(folder):
+    return cmfsim.planning_model(planning_patient(folder / "case"), "H+S")
+
+
+@pytest.fixture(scope="module")
+def reference(planning):
+    return planning.solve(planning.reference)
+
+
+@pytest.fixture(scope="module")
+def errors(planning):
+    return cmfsim.expected_error(planning, trials=2)
+
+
+@pytest.fixture(scope="module")
+def content(planning, reference, errors):
+    """Drawn with few triangles: browsers here draw by software."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cmfsim.planning.page.content, "FACE_TRIANGLES", 10_000)
+        patch.setattr(cmfsim.planning.page.content, "BONE_TRIANGLES", 6_000)
+        return cmfsim.page_content(planning, reference, errors)
+
+
+@pytest.fixture(scope="module")
+def page_file(folder, content):
+    path = folder / "plan.html"
+    cmfsim.write_planning_page(path, content)
+    return path
+
+
+def other_plan(planning, size=1.0):
+    """Maxilla and mandible away from the reference, by mm and degrees of an ordinary plan."""
+    skull = planning.patient.landmarks["skull"]
+    plan = dict(planning.reference)
+    plan["maxilla"] = cmfsim.planned_motion(
+        skull["supradentale"], shift=(3.0 * size, 2.0, -1.0), turn=(-3.0, 2.0 * size, 1.0)
+    )
+    plan["mandible_body"] = cmfsim.planned_motion(
+        skull["pogonion"], shift=(-2.0 * size, 1.0, -1.5), turn=(1.0, 1.5, -2.0 * size)
+    )
+    return plan
+
+
+# The planning model ---------------------------------------------------------------------------
+
+
+def test_the_product_is_the_exact_solution_at_the_reference(planning, reference):
+    product = planning.displacements(planning.reference)
+    # Contact ends at 1e-4 mm.
+    np.testing.assert_allclose(product, reference.skin_displacements, atol=2e-4)
+
+
+def test_the_columns_are_the_operator_of_the_core(planning):
+    plan = other_plan(planning)
+    operator = planning.solver.plan_operator(
+        nodes=planning.patient.skin_nodes, plan=dict(planning.reference)
+    )
+    np.testing.assert_allclose(planning.displacements(plan), operator(plan), atol=1e-9)
+
+
+def test_without_sliding_the_product_is_exact_for_every_plan(planning):
+    model = cmfsim.planning_model(planning.patient, "H")
+    plan = other_plan(model, 3.0)
+    exact = model.solve(plan).skin_displacements
+    assert np.abs(exact).max() > 5.0
+    np.testing.assert_allclose(model.displacements(plan), exact, atol=1e-8)
+    found = cmfsim.expected_error(model)
+    assert not found.slides
+    assert len(found.trials) == 1
+    assert found.trials[0].largest < 1e-8
+    assert found.at(100.0) == (0.0, 0.0)
+
+
+def test_a_prediction_is_planned_again_as_the_model_solves_it(planning, reference):
+    plan = {"maxilla": other_plan(planning)["maxilla"]}
+    again, exact = reference.replan(plan), planning.solve(plan)
+    np.testing.assert_allclose(again.skin_displacements, exact.skin_displacements, atol=1e-6)
+    # Segments that are not named stay, and nothing is said of where the case's motions came from.
+    np.testing.assert_array_equal(again.scene.plan["mandible_body"], np.eye(4))
+    assert again.summary["plan"]["maxilla"]["clinical"]["source"] == ""
+    assert again.summary["case_key"] != reference.summary["case_key"]
+    with pytest.raises(cmfsim.CaseError, match="'skull'; segments are"):
+        reference.replan({"skull": np.eye(4)})
+    with pytest.raises(cmfsim.CaseError, match="does not record what made it"):
+        dataclasses.replace(reference, predicted_by=None).replan({})
+
+
+def test_the_expected_error_is_that_of_the_trials(planning, errors):
+    trial = errors.trials[0]
+    exact = planning.solve(trial.plan).skin_displacements
+    away = np.linalg.norm(planning.displacements(trial.plan) - exact, axis=1)
+    assert trial.largest == pytest.approx(away.max(), rel=1e-6)
+    assert trial.mean == pytest.approx(away.mean(), rel=1e-6)
+    assert trial.distance == pytest.approx(plan_distance(planning, trial.plan))
+    mean, largest = errors.at(trial.distance)
+    assert mean >= trial.mean * (1 - 1e-12)
+    assert largest >= trial.largest * (1 - 1e-12)
+    assert errors.at(0.0) == (0.0, 0.0)
+    assert errors.at(1.01 * errors.reach) is None
+    # Trials differ from the reference, by no more than what was asked for.
+    assert 1.0 < trial.distance < 5.0 * 3**0.5 + 15.0
+
+
+def test_scenes_without_a_linear_rigid_answer_are_refused(planning):
+    scene = planning.patient.scene
+    options = dataclasses.replace(scene.options, kinematics="corotational")
+    bent = dataclasses.replace(planning.patient, scene=dataclasses.replace(scene, options=options))
+    with pytest.raises(cmfsim.CaseError, match="corotational kinematics"):
+        cmfsim.planning_model(bent, "H")
+    name = "maxilla"
+    shifts = np.zeros((len(scene.segments[name].joined), 3))
+    torn = planning.patient.with_plan({name: shifts})
+    with pytest.raises(cmfsim.CaseError, match="'maxilla' moves vertex by vertex"):
+        cmfsim.planning_model(torn, "H+S")
+    with pytest.raises(cmfsim.BoundaryError):
+        planning.displacements({name: 2.0 * np.eye(4)})
+    with pytest.raises(ValueError, match="trials is 0"):
+        cmfsim.expected_error(planning, trials=0)
+
+
+def test_tooth_rows_pass_through_each_other_when_the_jaw_closes(planning):
+    rows = cmfsim.planning.page.tooth_rows(planning.patient)
+    maxilla = next(s for s in planning.patient.segments if s.name == "maxilla")
+    surface = cmfsim.Surface(maxilla.surface.vertices, maxilla.surface.triangles)
+    found = []
+    for up in (0.0, 4.0, 7.0):
+        shift = cmfsim.rigid_motion((0.0, 0.0, up))
+        places = rows.points + [0.0, 0.0, up]
+        inside = np.asarray(surface.winding_number(places)) > 0.5
+        away = np.linalg.norm(surface.closest(places)[0] - places, axis=1)
+        depth = rows.passing({"mandible_body": shift})
+        # A grid of 1 mm, against the surface itself.
+        assert depth == pytest.approx(max(away[inside], default=0.0), abs=0.25)
+        found.append(depth)
+    assert found[0] < 0.3 < found[1] < found[2]
+    # Both jaws together: nothing changes between them.
+    both = cmfsim.rigid_motion((3, -2, 9), 7, (1, 2, 3))
+    together = rows.passing({"maxilla": both, "mandible_body": both})
+    assert together == pytest.approx(found[0], abs=1e-6)
+
+
+# The file -------------------------------------------------------------------------------------
+
+
+def test_the_page_allows_its_own_script_and_no_network(page_file):
+    text = page_file.read_text(encoding="utf-8")
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
+    script = re.search(r'<script type="module">(.*?)</script>', text, re.DOTALL)[1]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    assert f"'sha256-{digest}'" in policy
+    assert "unsafe" not in policy
+    assert "connect-src" not in policy
+    addresses = set(re.findall(r"""(?:src|href)=["']?([^"'\s>]+)""", text))
+    assert not addresses
+    assert not re.search(r"https?://(?!www\.w3\.org)", script)
+    assert "not a medical device" in text
+    assert page_file.stat().st_size < 12e6
+
+
+def test_equal_content_gives_equal_bytes(content):
+    first, second = (cmfsim.page_text(content) for _ in range(2))
+    assert first == second
+
+
+def test_numbers_that_are_not_finite_are_refused(content):
+    arrays = {**content.arrays, "nodes": np.full((4, 3), np.nan, dtype=np.float32)}
+    with pytest.raises(cmfsim.CaseError, match="'nodes' of the page holds numbers"):
+        cmfsim.page_text(dataclasses.replace(content, arrays=arrays))
+
+
+def test_packed_numbers_are_those_of_the_content(content, page_file):
+    text = page_file.read_text(encoding="utf-8")
+    packed = re.search(r'id="page-numbers">([^<]*)<', text)[1]
+    block = gzip.decompress(base64.b64decode(packed))
+    table = json.loads(re.search(r'id="page-values">([^<]*)<', text)[1])["arrays"]
+    assert [entry["name"] for entry in table] == list(content.arrays)
+    for entry in table:
+        given = content.arrays[entry["name"]]
+        count = int(np.prod(entry["shape"]))
+        found = np.frombuffer(block, entry["type"], count, entry["start"])
+        np.testing.assert_array_equal(found.reshape(given.shape), given)
+
+
+def test_scripts_that_cannot_be_joined_are_refused():
+    with pytest.raises(cmfsim.CaseError, match=r"main\.js → a\.js → main\.js"):
+        joined_scripts(
+            {
+                "main.js": 'import { a } from "./a.js";\n',
+                "a.js": 'import { b } from "./main.js";\nexport const a = 1;\n',
+            }
+        )
+    with pytest.raises(cmfsim.CaseError, match=r"no script 'b\.js'"):
+        joined_scripts({"main.js": 'import { b } from "./b.js";\n'})
+    with pytest.raises(cmfsim.CaseError, match=r"a\.js and main\.js both define 'a'"):
+        joined_scripts(
+            {"main.js": 'import { a } from "./a.js";\nconst a = 2;\n', "a.js": "const a = 1;\n"}
+        )
+
+
+def test_a_skin_too_fine_for_a_page_is_refused_and_a_fine_face_simplified(
+    planning, reference, errors, monkeypatch
+):
+    fine = cmfsim.planning.page.content
+    monkeypatch.setattr(fine, "FACE_TRIANGLES", 8_000)
+    found = cmfsim.page_content(planning, reference, errors)
+    assert len(found.arrays["face_triangles"]) <= 8_100
+    text = next(f.what for f in found.findings if f.where == "face")
+    away = float(re.search(r"at most ([0-9.]+) mm away", text)[1])
+    assert away < 2.0
+    monkeypatch.setattr(fine, "MOST_NODES", 1000)
+    with pytest.raises(cmfsim.CaseError, match="give a larger edge_length"):
+        cmfsim.page_content(planning, reference, errors)
+
+
+# In a browser ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
+        pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
+    with playwright.sync_playwright() as driver:
+        # Without its sandbox: tests may run as root, and open pages that they have made.
+        chromium = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture(scope="module")
+def page(browser, page_file):
+    """One page for all tests; in the end it must have had no error and asked for nothing."""
+    yield from open_page(browser, page_file)
+
+
+@pytest.fixture
+def opened(page):
+    """The page as it was when it was opened."""
+    page.evaluate("() => { cmfsimPage.reset(); cmfsimPage.plans.past.length = 0; }")
+    page.evaluate("cmfsimPage.panel.choose(0)")
+    page.locator("#turns-about").select_option("0")
+    settle(page)
+    return page
+
+
+def open_page(browser, path):
+    # Small: pictures are drawn by software here.
+    context = browser.new_context(viewport={"width": 920, "height": 420}, accept_downloads=True)
+    page = context.new_page()
+    page.set_default_timeout(20_000)
+    troubles, asked = [], []
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    page.on("console", lambda line: troubles.append(line.text) if line.type == "error" else None)
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(path.as_uri())
+    until(page, READY)
+    yield page
+    assert not troubles
+    # Files that are saved are blobs of the page.
+    assert [url for url in asked if not url.startswith("blob:")] == [path.as_uri()]
+    context.close()
+
+
+def until(page, expression, seconds=20.0):
+    """Waits for an expression to be true; the policy of the page allows no other way."""
+    end = time.monotonic() + seconds
+    while not page.evaluate(expression):
+        assert time.monotonic() < end, expression
+        page.wait_for_timeout(20)
+
+
+def type_number(page, key, value):
+    page.locator(f"#number-{key}").fill(str(value))
+    page.locator(f"#number-{key}").press("Enter")
+
+
+def motions_of(page, planning):
+    rows = page.evaluate("cmfsimPage.motions")
+    return {n: np.array(m).reshape(4, 4) for n, m in zip(planning.segments, rows, strict=True)}
+
+
+def settle(page):
+    """Until the plan on the page has its face."""
+    until(page, "!cmfsimPage.frame && !cmfsimPage.work")
+
+
+def saved(page, button):
+    with page.expect_download() as download:
+        page.locator(button).click()
+    return download.value
+
+
+def test_a_typed_plan_moves_the_vertices_as_python_does(opened, planning, content):
+    skull = planning.patient.landmarks["skull"]
+    numbers = {"forwards": 7.3, "up": -2, "left": 1.5, "pitch": 4, "yaw": -3, "roll": 2.5}
+    opened.get_by_role("tab", name="maxilla").click()
+    for key, value in numbers.items():
+        type_number(opened, key, value)
+    settle(opened)
+    plan = motions_of(opened, planning)
+    wanted = cmfsim.planned_motion(skull["supradentale"], shift=(7.3, -2, 1.5), turn=(4, -3, 2.5))
+    np.testing.assert_allclose(plan["maxilla"], wanted, atol=1e-9)
+    stated = cmfsim.clinical_motion("maxilla", plan["maxilla"], landmarks=skull)
+    for key, value in numbers.items():
+        assert getattr(stated, key) == pytest.approx(value, abs=1e-9)
+    after = np.array(opened.evaluate("[...cmfsimPage.after]")).reshape(-1, 3)
+    before = np.asarray(content.arrays["face"], dtype=np.float64)
+    moved = planning.carried(plan, before)
+    assert np.abs(moved).max() > 5.0
+    np.testing.assert_allclose(after - before, moved, atol=0.01)
+
+
+def test_the_measures_are_those_of_python(opened, planning):
+    sites = cmfsim.face_sites(planning.patient)
+    names = list(sites.skin)
+    places = np.array([sites.skin[name] for name in names])
+    for motions in (planning.reference, other_plan(planning)):
+        rows = [np.asarray(motions[name]).ravel().tolist() for name in planning.segments]
+        found = opened.evaluate("m => cmfsimPage.face.measures(m)", rows)
+        moved = dict(zip(names, places + planning.carried(motions, places), strict=True))
+        for name, site in sites.bone.items():
+            matrix = motions[site.segment]
+            moved[name] = matrix[:3, :3] @ site.place + matrix[:3, 3]
+        wanted = cmfsim.measure_sites(moved)
+        assert sum(value is not None for value in found) >= 12
+        for measure, value in zip(cmfsim.MEASURES, found, strict=True):
+            if wanted[measure.key] is None:
+                assert value is None
+            else:
+                limit = 0.05 if measure.unit == "°" else 0.01
+                assert value == pytest.approx(wanted[measure.key], abs=limit), measure.key
+
+
+def test_every_view_draws_something_else(opened):
+    pictures = {}
+    for name in ("Front", "Profile", "Left profile", "Three-quarter", "From below"):
+        opened.get_by_role("button", name=name, exact=True).click()
+        settle(opened)
+        # Of all pixels, those that are not the ground.
+        pictures[name] = opened.evaluate(
+            """() => {
+              const { gl, width, height } = cmfsimPage.drawing;
+              cmfsimPage.draw();
+              const pixels = new Uint8Array(4 * width * height);
+              gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+              let drawn = 0;
+              for (let i = 0; i < pixels.length; i += 4) if (pixels[i + 2] < 200) drawn++;
+              return drawn / (width * height);
+            }"""
+        )
+    assert all(0.05 < share < 0.9 for share in pictures.values()), pictures
+    assert len({round(share, 4) for share in pictures.values()}) >= 4
+
+
+def test_undo_and_redo_give_the_very_plans_back(opened, planning):
+    first = motions_of(opened, planning)
+    type_number(opened, "forwards", -6)
+    second = motions_of(opened, planning)
+    type_number(opened, "yaw", 3)
+    third = motions_of(opened, planning)
+    assert not np.array_equal(second["mandible_body"], third["mandible_body"])
+    opened.get_by_role("button", name="Undo").click()
+    assert all(np.array_equal(second[n], m) for n, m in motions_of(opened, planning).items())
+    opened.keyboard.press("Control+z")
+    assert all(np.array_equal(first[n], m) for n, m in motions_of(opened, planning).items())
+    opened.keyboard.press("Control+y")
+    opened.keyboard.press("Control+y")
+    assert all(np.array_equal(third[n], m) for n, m in motions_of(opened, planning).items())
+    settle(opened)
+    assert opened.get_by_role("button", name="Redo").is_disabled()
+
+
+def test_what_is_no_number_or_beyond_the_limits_is_refused(opened, planning):
+    before = motions_of(opened, planning)
+    field = opened.locator("#number-forwards")
+    for typed, said in (("", "Type a number"), ("31", "at most 30 mm"), ("-1e9", "at most 30 mm")):
+        field.fill(typed)
+        field.press("Enter")
+        assert said in opened.locator("#message").inner_text()
+        until(opened, "document.getElementById('number-forwards').value === '-3.50'")
+    after = motions_of(opened, planning)
+    assert all(np.array_equal(before[n], m) for n, m in after.items())
+
+
+def test_a_turn_leaves_the_chosen_centre_in_place(opened, planning):
+    opened.locator("#turns-about").select_option(label="pogonion")
+    place = planning.patient.landmarks["skull"]["pogonion"]
+    before = motions_of(opened, planning)["mandible_body"]
+    type_number(opened, "pitch", 6)
+    after = motions_of(opened, planning)["mandible_body"]
+    centre = [*place, 1.0]
+    np.testing.assert_allclose(after @ centre, before @ centre, atol=1e-9)
+    turn = cmfsim.decompose_motion(after)
+    np.testing.assert_allclose(turn.angle * turn.axis, [-6, 0, 0], atol=1e-9)
+
+
+def test_handles_pull_the_segment_by_what_the_picture_shows(opened, planning):
+    opened.get_by_role("button", name="Profile", exact=True).click()
+    settle(opened)
+    before = motions_of(opened, planning)["mandible_body"]
+    shape = opened.evaluate("cmfsimPage.handles.shapes.find((s) => s.key === 'forwards')")
+    box = opened.locator("#overlay").bounding_box()
+    (x, y), step = shape["points"][1], shape["step"]
+    opened.mouse.move(box["x"] + x, box["y"] + y)
+    opened.mouse.down()
+    # In the profile forwards is to the right.
+    opened.mouse.move(box["x"] + x + 20, box["y"] + y, steps=4)
+    opened.mouse.up()
+    settle(opened)
+    moved = motions_of(opened, planning)["mandible_body"] - before
+    # Kept to a tenth of a millimetre.
+    assert moved[1, 3] == pytest.approx(-20 * step, abs=0.051)
+    assert np.abs(np.delete(moved.ravel(), 7)).max() < 1e-9
+    opened.get_by_role("button", name="Undo").click()
+    assert np.array_equal(motions_of(opened, planning)["mandible_body"], before)
+
+
+def test_a_saved_plan_is_what_predict_reads(opened, planning, folder, tmp_path):
+    type_number(opened, "forwards", -5.25)
+    type_number(opened, "roll", 1.5)
+    file = tmp_path / "plan.toml"
+    saved(opened, "#save-plan").save_as(file)
+    case = cmfsim.Case.load(folder / "case").with_plan(file)
+    plan = motions_of(opened, planning)
+    assert set(case.plan) == set(plan)
+    for name, motion in case.plan.items():
+        np.testing.assert_allclose(motion.matrix, plan[name], atol=1e-12)
+    command = opened.locator("#command").inner_text()
+    assert command == "cmfsim predict case.toml --plan demo-A.toml --model H+S"
+    # Loaded again, it is a variant of its own with the same motions.
+    opened.locator("#plan-file").set_input_files(file)
+    until(opened, "cmfsimPage.plans.now.variants.length === 2")
+    again = motions_of(opened, planning)
+    assert all(np.array_equal(plan[name], again[name]) for name in plan)
+    assert "Loaded" in opened.locator("#message").inner_text()
+    other = tmp_path / "other.toml"
+    other.write_text(
+        re.sub("# made for: .*", f"# made for: {'0' * 64}", file.read_text("utf-8")), "utf-8"
+    )
+    opened.locator("#plan-file").set_input_files(other)
+    until(opened, "cmfsimPage.plans.now.variants.length === 3")
+    assert "another case" in opened.locator("#message").inner_text()
+
+
+def test_plans_that_are_none_are_refused_whole(opened, tmp_path):
+    good = "[plan.maxilla]\nmatrix = [[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    rest = "".join(
+        good.replace("maxilla", name) for name in ("mandible_body", "ramus_left", "ramus_right")
+    )
+    faults = {
+        "moves skull": good.replace("maxilla", "skull") + good + rest,
+        "says nothing of ramus_right": good + rest.rsplit("[plan", 1)[0],
+        "not a rotation": good.replace("[[1.0", "[[-1.0") + rest,
+        "not 4 × 4": good.replace("[0, 1, 0, 0], ", "") + rest,
+        "not numbers": good.replace("1.0", "NaN") + rest,
+        "second time": good + good + rest,
+        "ends within": good + rest + "[plan.more]\n",
+        "not a matrix": good.replace("matrix", "translation") + rest,
+        "at most 30 mm": good.replace("0, 0, 1]", "0, 0, 31]", 1) + rest,
+        "last row": good.replace("[0, 0, 0, 1]", "[0, 0, 0, 2]") + rest,
+    }
+    for number, (said, text) in enumerate(faults.items()):
+        file = tmp_path / f"{number}.toml"
+        file.write_text(text, encoding="utf-8")
+        opened.locator("#plan-file").set_input_files(file)
+        said_of = f"document.getElementById('message').textContent.startsWith('{file.name}')"
+        until(opened, said_of)
+        shown = opened.locator("#message").inner_text()
+        assert said in shown, shown
+        assert "No plan was loaded" in shown
+    assert opened.evaluate("cmfsimPage.plans.now.variants.length") == 1
+
+
+@pytest.mark.parametrize("direction", ["from-parent", "to-parent"])
+def test_a_saved_transform_is_the_motion(opened, planning, tmp_path, direction):
+    type_number(opened, "yaw", 4)
+    opened.locator("#direction").select_option(direction)
+    download = saved(opened, "#save-transform")
+    assert download.suggested_filename == f"demo-A-mandible_body.{direction}.tfm"
+    file = tmp_path / download.suggested_filename
+    download.save_as(file)
+    motion = cmfsim.read_transform(file, direction=direction)
+    wanted = motions_of(opened, planning)["mandible_body"]
+    np.testing.assert_allclose(motion, wanted, atol=1e-9)
+    other = {"from-parent": "to-parent", "to-parent": "from-parent"}[direction]
+    with pytest.raises(cmfsim.CaseError):
+        cmfsim.read_transform(file, direction=other)
+
+
+def test_the_saved_face_is_that_of_the_page(opened, tmp_path):
+    type_number(opened, "forwards", 2)
+    settle(opened)
+    file = tmp_path / "face.stl"
+    saved(opened, "#save-face").save_as(file)
+    surface = cmfsim.read_surface(file)
+    after = np.array(opened.evaluate("[...cmfsimPage.after]")).reshape(-1, 3)
+    corners = np.asarray(surface.vertices)[np.asarray(surface.triangles)]
+    triangles = np.array(opened.evaluate("[...cmfsimPage.face.triangles]")).reshape(-1, 3)
+    np.testing.assert_allclose(corners, after[triangles], atol=1e-4)
+    assert saved(opened, "#save-picture").suggested_filename == "demo-A.png"
+
+
+def test_the_error_is_stated_and_warned_of_beyond_what_was_tried(opened, errors, planning):
+    state = opened.locator("#error-state")
+    assert "solved exactly" in state.inner_text()
+    type_number(opened, "forwards", -4.5)
+    until(opened, "document.getElementById('error-state').textContent.startsWith('Expected')")
+    plan = motions_of(opened, planning)
+    mean, largest = errors.at(plan_distance(planning, plan))
+    assert f"{mean:.2f} mm on average, {largest:.2f} mm at most" in state.inner_text()
+    type_number(opened, "forwards", -28)
+    until(opened, "document.querySelector('#error-state.warning')")
+    assert "further than any that was tried" in state.inner_text()
+
+
+def test_teeth_that_pass_through_each_other_are_warned_of(opened, planning):
+    rows = cmfsim.planning.page.tooth_rows(planning.patient)
+    state = opened.locator("#teeth-state")
+    assert "do not pass" in state.inner_text()
+    type_number(opened, "up", 8)
+    until(opened, "document.querySelector('#teeth-state.warning')")
+    depth = float(re.search(r"by ([0-9.]+) mm", state.inner_text())[1])
+    assert depth == pytest.approx(rows.passing(motions_of(opened, planning)), abs=0.06)
+
+
+def test_variants_are_named_kept_and_compared(opened, planning):
+    opened.get_by_role("button", name="Copy to a new variant").click()
+    opened.locator("#variant-name").fill("Setback 6")
+    opened.locator("#variant-name").press("Enter")
+    type_number(opened, "forwards", -6)
+    settle(opened)
+    table = opened.locator("#differences").inner_text()
+    assert "Setback 6" in table
+    row = next(line for line in table.splitlines() if "mandible body: forwards" in line)
+    assert row.split("\t")[1:] == ["−3.5", "−6.0", "2.5"]
+    opened.get_by_role("button", name="A", exact=True).click()
+    settle(opened)
+    np.testing.assert_allclose(
+        motions_of(opened, planning)["mandible_body"],
+        planning.reference["mandible_body"],
+        atol=1e-12,
+    )
+
+
+def test_the_keyboard_alone_plans_and_looks(opened, planning):
+    opened.locator("#overlay").focus()
+    opened.keyboard.press("2")
+    settle(opened)
+    assert opened.evaluate("cmfsimPage.camera.azimuth") == -90
+    opened.keyboard.press("ArrowRight")
+    assert opened.evaluate("cmfsimPage.camera.azimuth") == -85
+    # From the tabs of the segments to the first number, by Tab alone.
+    opened.get_by_role("tab", name="mandible body").focus()
+    opened.keyboard.press("ArrowRight")
+    assert opened.evaluate("document.activeElement.textContent") == "maxilla"
+    for _ in range(3):
+        opened.keyboard.press("Tab")
+    assert opened.evaluate("document.activeElement.id") == "number-forwards"
+    opened.keyboard.press("Control+a")
+    opened.keyboard.type("4.2")
+    opened.keyboard.press("Enter")
+    skull = planning.patient.landmarks["skull"]
+    motion = motions_of(opened, planning)["maxilla"]
+    stated = cmfsim.clinical_motion("maxilla", motion, landmarks=skull)
+    assert stated.forwards == pytest.approx(4.2, abs=1e-9)
+
+
+def test_hostile_names_stay_text(browser, content, tmp_path):
+    values = json.loads(json.dumps(content.values))
+    values["case"] = HOSTILE
+    values["segments"][0]["label"] = HOSTILE
+    values["segments"][0]["name"] = HOSTILE
+    path = tmp_path / "hostile.html"
+    cmfsim.write_planning_page(
+        path, dataclasses.replace(content, values=values), case_file="a b'$(x).toml"
+    )
+    pages = open_page(browser, path)
+    page = next(pages)
+    page.on("dialog", lambda dialog: pytest.fail(dialog.message))
+    assert page.locator("h1").inner_text().startswith("</script><img src=x")
+    assert page.locator("img").count() == 0
+    assert page.locator("#command").inner_text().startswith("cmfsim predict 'a b'\\''$(x).toml'")
+    file = tmp_path / "hostile.toml"
+    download = saved(page, "#save-plan")
+    assert re.fullmatch(r"[A-Za-z0-9_-]+\.toml", download.suggested_filename)
+    download.save_as(file)
+    tomllib = pytest.importorskip("tomllib")
+    assert HOSTILE.replace("\u2028", " ") in tomllib.loads(file.read_text("utf-8"))["plan"]
+    assert next(pages, None) is None
+
+
+def test_a_large_page_computes_a_face_within_a_frame(browser, content, tmp_path):
+    """20,000 nodes and vertices, four segments: the issue's limit is a frame, 16 ms."""
+    count = 20_000
+    rows = np.arange(count) % len(content.arrays["active"])
+    picked = np.arange(count) % len(content.arrays["face"])
+    nodes = np.arange(count) % len(content.arrays["nodes"])
+    arrays = dict(content.arrays)
+    arrays["nodes"] = arrays["nodes"][nodes]
+    arrays["active"] = np.arange(count, dtype=np.uint32)
+    for name in ("columns", "reference_shift"):
+        arrays[name] = arrays[name][rows]
+    for name in ("face", *(f"face_{p}" for p in ("triangle", "barycentric", "offset", "share"))):
+        arrays[name] = arrays[name][picked]
+    arrays["face_triangles"] = np.tile(arrays["face_triangles"], (5, 1))[: 2 * count]
+    assert len(arrays["face_triangles"]) == 2 * count
+    assert arrays["columns"].shape == (count, 3, 48)
+    path = tmp_path / "large.html"
+    size = cmfsim.write_planning_page(path, dataclasses.replace(content, arrays=arrays))
+    assert size < 12e6
+    pages = open_page(browser, path)
+    page = next(pages)
+    times = page.evaluate(
+        """() => Array.from({ length: 30 }, () => {
+          cmfsimPage.compute(); cmfsimPage.place();
+          return cmfsimPage.timing.compute + cmfsimPage.timing.normals;
+        })"""
+    )
+    # The best of thirty: other programs run on the machine of a test.
+    assert min(times) < 16.0, sorted(times)
+    assert next(pages, None) is None
+
+
+# Served ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def server(planning, content):
+    pytest.importorskip("starlette")
+    pytest.importorskip("uvicorn")
+    running = PlanningServer(planning, content)
+    thread = threading.Thread(target=running.run)
+    thread.start()
+    yield running
+    running.stop()
+    thread.join(timeout=20)
+    assert not thread.is_alive()
+
+
+def asked(url, body=None, method=None, **headers):
+    """Status, body and headers of an answer; names of headers with _ for -."""
+    parts = urlsplit(url)
+    connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=30)
+    own = {"Host": parts.netloc, **{n.replace("_", "-"): v for n, v in headers.items()}}
+    try:
+        connection.request(method or ("GET" if body is None else "POST"), parts.path, body, own)
+        answer = connection.getresponse()
+        return answer.status, answer.read(), answer.headers
+    finally:
+        connection.close()
+
+
+def origin_of(url):
+    return f"http://{urlsplit(url).netloc}"
+
+
+def plan_body(planning, plan):
+    rows = [np.asarray(plan[name]).ravel().tolist() for name in planning.segments]
+    return json.dumps({"motions": rows})
+
+
+def test_a_served_plan_is_solved_exactly(server, planning):
+    status, page, headers = asked(server.url)
+    assert status == 200
+    assert b"connect-src &#x27;self&#x27;" in page or b"connect-src 'self'" in page
+    assert headers["X-Frame-Options"] == "DENY"
+    assert headers["Cache-Control"] == "no-store"
+    plan = other_plan(planning)
+    status, body, headers = asked(
+        f"{server.url}solve",
+        plan_body(planning, plan),
+        Origin=origin_of(server.url),
+        Content_Type="application/json",
+    )
+    assert status == 200
+    shift = np.frombuffer(body, "<f4").reshape(-1, 3)
+    exact = planning.solve(plan).skin_displacements
+    np.testing.assert_allclose(shift, exact, atol=1e-4)
+    assert json.loads(headers["X-Solution"])["contact_converged"]
+
+
+def test_requests_that_are_not_the_pages_own_are_refused(server, planning):
+    good = plan_body(planning, planning.reference)
+    url, origin = server.url, origin_of(server.url)
+    host = urlsplit(url).netloc
+    sent = {"Origin": origin, "Content_Type": "application/json"}
+    port = host.rsplit(":", 1)[1]
+    assert host == f"127.0.0.1:{port}"
+    token = urlsplit(url).path.strip("/")
+    assert len(token) >= 43
+    for path in ("/", "/x/", f"/{token[:-1]}/", f"/{token}x/", "/%00/", f"/{token}/../x"):
+        assert asked(f"{origin}{path}")[0] in {404, 405, 307}, path
+    for other in ("evil.example", f"localhost:{port}", f"evil.example:{port}", "127.0.0.1"):
+        assert asked(url, Host=other)[0] == 403
+    assert asked(url, Origin="http://evil.example")[0] == 403
+    solve = f"{url}solve"
+    wrong = token[:-1] + ("A" if token[-1] != "A" else "B")
+    cases = {
+        404: (f"{origin}/{wrong}/solve", good, sent),
+        403: (solve, good, {**sent, "Origin": "http://evil.example"}),
+        415: (solve, good, {**sent, "Content_Type": "text/plain"}),
+        413: (solve, good + " " * 70_000, sent),
+    }
+    for status, (where, body, headers) in cases.items():
+        assert asked(where, body, **headers)[0] == status
+    assert asked(solve, good, Content_Type="application/json")[0] == 403
+    assert asked(solve, good, **{**sent, "Origin": "null"})[0] == 403
+    assert asked(solve, method="GET")[0] == 405
+
+
+def test_plans_that_are_none_get_an_error_and_no_solution(server, planning):
+    sent = {"Origin": origin_of(server.url), "Content_Type": "application/json"}
+    far = dict(planning.reference) | {"maxilla": cmfsim.rigid_motion((0, 0, 2000))}
+    mirror = dict(planning.reference) | {"maxilla": np.diag([-1.0, 1, 1, 1])}
+    for body, said in (
+        ("[]", b"needed as JSON"),
+        ("{" * 1000, b"needed as JSON"),
+        ('{"motions": [[1, 2]]}', b"16 finite numbers"),
+        (plan_body(planning, planning.reference).replace("1.0", "NaN", 1), b"16 finite"),
+        (plan_body(planning, planning.reference).replace("1.0", "1e999", 1), b"16 finite"),
+        (plan_body(planning, far), b"more than 1000 mm"),
+        (plan_body(planning, mirror), b"maxilla"),
+    ):
+        status, text, _ = asked(f"{server.url}solve", body, **sent)
+        assert status == 400
+        assert said in text, text
+
+
+def test_the_served_page_swaps_in_the_exact_face(browser, server, planning):
+    context = browser.new_context(viewport={"width": 920, "height": 420})
+    page = context.new_page()
+    troubles = []
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    page.goto(server.url)
+    until(page, READY)
+    type_number(page, "forwards", -5.5)
+    until(page, "document.getElementById('error-state').textContent.startsWith('Solved exactly')")
+    settle(page)
+    exact = planning.solve(motions_of(page, planning))
+    before = np.array(page.evaluate("[...cmfsimPage.face.before]")).reshape(-1, 3)
+    after = np.array(page.evaluate("[...cmfsimPage.after]")).reshape(-1, 3)
+    np.testing.assert_allclose(after - before, exact.carried(before), atol=0.01)
+    # Another plan is the operator's again until it is solved.
+    page.get_by_role("button", name="Undo").click()
+    until(page, "document.getElementById('error-state').textContent.includes('case\\'s plan')")
+    assert not troubles
+    context.close()

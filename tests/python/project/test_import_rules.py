@@ -1,0 +1,87 @@
+"""The import rules hold, and the script that checks them finds what breaks them."""
+
+from pathlib import Path
+
+import pytest
+
+import check_imports
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_the_project_keeps_its_import_rules(capsys: pytest.CaptureFixture[str]) -> None:
+    """No file of the project breaks a rule."""
+    assert check_imports.main(ROOT) == 0, capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "complaint"),
+    [
+        ("crates/mtm-core/src/mesh.rs", "use crate::surface::Surface;", "mesh may not import"),
+        ("crates/mtm-core/src/mesh.rs", "\nuse faer::Mat;", "mesh.rs:2: faer belongs in"),
+        ("crates/mtm-core/src/contact.rs", "let t = parry3d_f64::shape();", "parry3d_f64 belongs"),
+        ("crates/mtm-core/src/mesh.rs", "use pyo3::prelude::*;", "pyo3 belongs in crates/mtm-py"),
+        ("crates/mtm-core/src/mesh.rs", "use crate::{error, blocks};", "one `use crate::"),
+        ("crates/mtm-core/src/new.rs", "", "add it to CORE"),
+        ("crates/mtm-core/src/multigrid/new.rs", "", "new.rs: add it to CORE"),
+        ("crates/mtm-core/src/multigrid/mod.rs", "use crate::mesh::M;", "may not import mesh"),
+        ("crates/mtm-core/src/multigrid/scaling.rs", "super::Multigrid;", "not import multigrid "),
+        ("crates/mtm-core/src/multigrid/scaling.rs", "use super::{galerkin};", "one `use super::"),
+        ("crates/mtm-core/src/utils.rs", "", "name the file after its subject"),
+        ("python/cmfsim/checks.py", "from cmfsim import values", "checks may not import values"),
+        ("python/cmfsim/values/scene.py", "from .. import io", "values may not import io"),
+        ("python/cmfsim/meshing/a.py", "import cmfsim.imaging", "meshing may not import imaging"),
+        ("python/cmfsim/report.py", "from cmfsim.study import run", "report may not import study"),
+        ("python/cmfsim/cli/new.py", "from cmfsim import TetMesh", "cli may not import cmfsim"),
+        ("python/cmfsim/report.py", "import matplotlib", "import matplotlib inside"),
+        ("python/cmfsim/new.py", "", "add new to PYTHON"),
+        ("python/cmfsim/io/a.py", "from cmfsim.io.a import b", "io/a: imports itself"),
+        ("tests/python/helpers.py", "", "name the file after its subject"),
+    ],
+)
+def test_a_broken_rule_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], file: str, text: str, complaint: str
+) -> None:
+    """Each rule, broken alone, fails with its file and its reason."""
+    path = tmp_path / file
+    path.parent.mkdir(parents=True)
+    path.write_text(text + "\n", encoding="utf-8")
+    assert check_imports.main(tmp_path) == 1
+    assert complaint in capsys.readouterr().out
+
+
+def test_comments_and_test_modules_are_free(tmp_path: Path) -> None:
+    """What is no code, or code of tests, may name any module."""
+    path = tmp_path / "crates/mtm-core/src/mesh.rs"
+    path.parent.mkdir(parents=True)
+    path.write_text(
+        "// faer::Mat\n/* pyo3::x */\n#[cfg(test)]\nmod tests {\n    use crate::surface::S;\n}\n",
+        encoding="utf-8",
+    )
+    assert check_imports.main(tmp_path) == 0
+
+
+def test_a_circle_of_files_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two files of a folder that import each other, and a third that does no harm."""
+    folder = tmp_path / "python/cmfsim/io"
+    folder.mkdir(parents=True)
+    (folder / "a.py").write_text("from cmfsim.io.b import x\n", encoding="utf-8")
+    (folder / "b.py").write_text("import cmfsim.io.a\n", encoding="utf-8")
+    (folder / "c.py").write_text("from cmfsim.io import a\n", encoding="utf-8")
+    assert check_imports.main(tmp_path) == 1
+    printed = capsys.readouterr().out
+    assert "io/a: imports itself" in printed
+    assert "io/b: imports itself" in printed
+    assert "io/c" not in printed
+
+
+def test_the_core_runs_downhill() -> None:
+    """No file can reach itself through the files that it may import."""
+    table = check_imports.CORE
+    for start, allowed in table.items():
+        seen: set[str] = set()
+        front = set(allowed)
+        while front:
+            seen |= front
+            front = {n for name in front for n in table.get(name, ())} - seen
+        assert start not in seen
