@@ -7,7 +7,7 @@
 //! largest.
 
 #[global_allocator]
-static MEMORY: mtm_core::algebra::memory::HugePages = mtm_core::algebra::memory::HugePages;
+static MEMORY: mtm_core::HugePages = mtm_core::HugePages;
 
 #[path = "scene.rs"]
 mod scene;

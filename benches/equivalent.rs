@@ -5,17 +5,17 @@
 #![allow(missing_docs)] // criterion's macros make public items without any
 
 #[global_allocator]
-static MEMORY: mtm_core::algebra::memory::HugePages = mtm_core::algebra::memory::HugePages;
+static MEMORY: mtm_core::HugePages = mtm_core::HugePages;
 
 use std::hint::black_box;
 use std::sync::Arc;
 use std::time::Instant;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use mtm_core::geometry::winding::WindingTree;
-use mtm_core::muscles::equivalent::{InsideTest, Muscle, SamplingOptions, sample_muscles};
-use mtm_core::muscles::fibre::{MuscleFibres, OrientedBox};
-use mtm_core::{Mixing, Preset, Surface, TetMesh};
+use mtm_core::{
+    InsideTest, Mixing, Muscle, MuscleFibres, OrientedBox, Preset, SamplingOptions, Surface,
+    TetMesh, WindingTree, sample_muscles,
+};
 
 /// Cubes along the axes of the block of tets, of edge 3 mm: 300 000 tets.
 const CUBES: [usize; 3] = [40, 25, 50];

@@ -16,8 +16,7 @@ use std::process::ExitCode;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use mtm_core::error::MtmError;
-use mtm_core::statics::options::Method;
+use mtm_core::{Method, MtmError};
 use rayon::prelude::*;
 
 use random_scenes::{Scene, farthest, largest, refusal};

@@ -10,7 +10,7 @@
 #![allow(missing_docs)]
 
 #[global_allocator]
-static MEMORY: mtm_core::algebra::memory::HugePages = mtm_core::algebra::memory::HugePages;
+static MEMORY: mtm_core::HugePages = mtm_core::HugePages;
 
 #[path = "scene.rs"]
 mod scene;
@@ -20,12 +20,9 @@ mod shell;
 use std::hint::black_box;
 use std::time::Instant;
 
-use mtm_core::MassTensors;
-use mtm_core::algebra::blocks::BlockMatrix;
-use mtm_core::algebra::cholesky::Symbolic;
-use mtm_core::algebra::krylov::Preconditioner;
-use mtm_core::algebra::multigrid::{Multigrid, MultigridOptions};
-use mtm_core::mechanics::tensors::tet_tensor;
+use mtm_core::{
+    BlockMatrix, MassTensors, Multigrid, MultigridOptions, Preconditioner, Symbolic, tet_tensor,
+};
 use rayon::prelude::*;
 use shell::Shell;
 

@@ -4,14 +4,11 @@
 
 use std::sync::Arc;
 
-use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, NodeKind, Plan, Segment};
-use mtm_core::error::{MtmError, Result};
-use mtm_core::geometry::motion::RigidMotion;
-use mtm_core::mechanics::element::Element;
-use mtm_core::mechanics::material::{Elastic, FibreElastic, FibreLaw, Tissue};
-use mtm_core::mechanics::tensors::MassTensors;
-use mtm_core::statics::options::{Method, StaticOptions};
-use mtm_core::statics::solver::StaticSolver;
+use mtm_core::{
+    Boundary, Conflicts, Elastic, Element, FibreElastic, FibreLaw, Gap, MassTensors, Method,
+    Motion, MtmError, NodeKind, Plan, Result, RigidMotion, Segment, StaticOptions, StaticSolver,
+    Tissue,
+};
 
 use crate::meshes::{BoxShape, GO_ON, Numbers, checked, plane, rigid, surface};
 
@@ -104,7 +101,7 @@ impl Scene {
     }
 
     /// What `method` makes of the scene.
-    pub fn solve(&self, method: Method) -> Result<mtm_core::statics::solution::Solution> {
+    pub fn solve(&self, method: Method) -> Result<mtm_core::Solution> {
         let options =
             StaticOptions { method, tolerance: self.tolerance, ..StaticOptions::default() };
         let solver =
@@ -518,7 +515,7 @@ struct BandFactor {
 }
 
 impl BandFactor {
-    fn new(matrix: &mtm_core::algebra::blocks::BlockMatrix, free: &[[bool; 3]]) -> Option<Self> {
+    fn new(matrix: &mtm_core::BlockMatrix, free: &[[bool; 3]]) -> Option<Self> {
         let mut number = vec![[usize::MAX; 3]; free.len()];
         let mut unknowns = Vec::new();
         for (j, free) in free.iter().enumerate() {

@@ -5,14 +5,12 @@
 #![allow(missing_docs)] // criterion's macros make public items without any
 
 #[global_allocator]
-static MEMORY: mtm_core::algebra::memory::HugePages = mtm_core::algebra::memory::HugePages;
+static MEMORY: mtm_core::HugePages = mtm_core::HugePages;
 
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use mtm_core::registration::icp::{Fixed, IcpOptions, icp};
-use mtm_core::registration::nearest::PointTree;
-use mtm_core::{Surface, ThinPlateSpline};
+use mtm_core::{Fixed, IcpOptions, PointTree, Surface, ThinPlateSpline, icp};
 
 const POINTS: usize = 100_000;
 const LANDMARKS: usize = 32;

@@ -4,10 +4,9 @@
 
 use std::sync::Arc;
 
-use mtm_core::algebra::blocks::BlockMatrix;
 use mtm_core::{
-    Boundary, Conflicts, FibreElastic, FibreLaw, Gap, MassTensors, Motion, Plan, RigidMotion,
-    Segment, Surface, TetMesh, Tissue,
+    BlockMatrix, Boundary, Conflicts, FibreElastic, FibreLaw, Gap, MassTensors, Motion, Plan,
+    RigidMotion, Segment, Surface, TetMesh, Tissue,
 };
 
 use super::shell::Shell;

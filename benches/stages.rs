@@ -5,7 +5,7 @@
 #![allow(missing_docs)] // criterion's macros make public items without any
 
 #[global_allocator]
-static MEMORY: mtm_core::algebra::memory::HugePages = mtm_core::algebra::memory::HugePages;
+static MEMORY: mtm_core::HugePages = mtm_core::HugePages;
 
 #[path = "scene.rs"]
 mod scene;
@@ -16,11 +16,10 @@ use std::hint::black_box;
 use std::time::Duration;
 
 use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use mtm_core::algebra::blocks::BlockMatrix;
-use mtm_core::algebra::cholesky::Symbolic;
-use mtm_core::algebra::krylov::{PcgOptions, pcg};
-use mtm_core::algebra::multigrid::{Multigrid, MultigridOptions};
-use mtm_core::{Element, Kinematics, MassTensors, Method, StaticOptions, StaticSolver, TetMesh};
+use mtm_core::{
+    BlockMatrix, Element, Kinematics, MassTensors, Method, Multigrid, MultigridOptions, PcgOptions,
+    StaticOptions, StaticSolver, Symbolic, TetMesh, pcg,
+};
 use shell::Shell;
 
 /// Bytes above which a factor is left to machines with more memory.

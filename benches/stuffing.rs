@@ -5,16 +5,14 @@
 #![allow(missing_docs)] // criterion's macros make public items without any
 
 #[global_allocator]
-static MEMORY: mtm_core::algebra::memory::HugePages = mtm_core::algebra::memory::HugePages;
+static MEMORY: mtm_core::HugePages = mtm_core::HugePages;
 
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use mtm_core::Surface;
-use mtm_core::meshing::signed_distance::signed_distance;
-use mtm_core::meshing::stuffing::distance::squared_distance;
-use mtm_core::meshing::stuffing::level::{Grid, LevelImage};
-use mtm_core::meshing::stuffing::{Halvings, StuffingOptions, stuff};
+use mtm_core::{
+    Grid, Halvings, LevelImage, StuffingOptions, Surface, signed_distance, squared_distance, stuff,
+};
 
 /// The image of the claim: 200 × 130 × 180 voxels of 1 mm.
 const SHAPE: [usize; 3] = [200, 130, 180];

@@ -7,17 +7,11 @@
 
 use std::sync::Arc;
 
-use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, Plan, Segment};
-use mtm_core::contact::{ContactMode, ContactOptions};
-use mtm_core::error::MtmError;
-use mtm_core::geometry::motion::{RigidMotion, SurfaceMotion};
-use mtm_core::geometry::surface::Surface;
-use mtm_core::geometry::winding::WindingTree;
-use mtm_core::mechanics::material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
-use mtm_core::mechanics::tensors::MassTensors;
-use mtm_core::mesh::TetMesh;
-use mtm_core::statics::options::{Method, StaticOptions};
-use mtm_core::statics::solver::StaticSolver;
+use mtm_core::{
+    Boundary, Conflicts, ContactMode, ContactOptions, Elastic, FibreElastic, FibreLaw, Gap,
+    MassTensors, Method, Mixing, Motion, MtmError, Plan, Preset, RigidMotion, Segment,
+    StaticOptions, StaticSolver, Surface, SurfaceMotion, TetMesh, Tissue, WindingTree,
+};
 
 /// Most iterations of a method: an input that converges slowly is an error, not a hang.
 const ITERATIONS: usize = 400;

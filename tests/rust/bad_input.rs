@@ -10,17 +10,12 @@ use meshes::{
     BoxShape, GO_ON, boundary, isotropic, joined, plan, plane, rigid, sliding, solve, solver,
     stays, surface, tensors, with_method,
 };
-use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, Segment};
-use mtm_core::contact::ContactOptions;
-use mtm_core::error::{ErrorKind, MtmError, Result};
-use mtm_core::geometry::motion::{RigidMotion, SurfaceMotion};
-use mtm_core::geometry::surface::Surface;
-use mtm_core::geometry::winding::{WindingOptions, WindingTree};
-use mtm_core::mechanics::material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
-use mtm_core::mechanics::tensors::MassTensors;
-use mtm_core::mesh::TetMesh;
-use mtm_core::statics::options::{Method, StaticOptions};
-use mtm_core::statics::solver::StaticSolver;
+use mtm_core::{
+    Boundary, Conflicts, ContactOptions, Elastic, ErrorKind, FibreElastic, FibreLaw, Gap,
+    MassTensors, Method, Mixing, Motion, MtmError, Preset, Result, RigidMotion, Segment,
+    StaticOptions, StaticSolver, Surface, SurfaceMotion, TetMesh, Tissue, WindingOptions,
+    WindingTree,
+};
 
 const BAD: [f64; 3] = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY];
 

@@ -11,13 +11,10 @@ use meshes::{
     BoxShape, GO_ON, Numbers, Vec3, affine, at, boundary, joined, largest, largest_difference,
     plan, rigid, solve, solver, tensors, with_method,
 };
-use mtm_core::boundary::{Boundary, Motion};
-use mtm_core::geometry::motion::RigidMotion;
-use mtm_core::geometry::surface::Surface;
-use mtm_core::mechanics::material::{Elastic, FibreElastic, FibreLaw, Spencer, Tissue};
-use mtm_core::mechanics::tensors::MassTensors;
-use mtm_core::mesh::TetMesh;
-use mtm_core::statics::options::Method;
+use mtm_core::{
+    Boundary, Elastic, FibreElastic, FibreLaw, MassTensors, Method, Motion, RigidMotion, Spencer,
+    Surface, TetMesh, Tissue,
+};
 use nalgebra::Matrix3;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;

@@ -50,36 +50,54 @@
 //! # }
 //! ```
 
-pub mod algebra;
-pub mod boundary;
-pub mod contact;
-pub mod error;
-pub mod geometry;
-pub mod mechanics;
-pub mod mesh;
-pub mod meshing;
-pub mod muscles;
-pub mod registration;
-pub mod statics;
+mod algebra;
+mod boundary;
+mod contact;
+mod error;
+mod geometry;
+mod mechanics;
+mod mesh;
+mod meshing;
+mod muscles;
+mod registration;
+mod statics;
 mod vector;
 
+pub use algebra::blocks::BlockMatrix;
+pub use algebra::cholesky::Symbolic;
+pub use algebra::krylov::{BlockJacobi, PcgOptions, PcgOutcome, Preconditioner, pcg};
+pub use algebra::memory::HugePages;
+pub use algebra::multigrid::{Multigrid, MultigridOptions};
+pub use algebra::pool;
 pub use boundary::{Boundary, Conflicts, Gap, Motion, NodeKind, Plan, Segment};
 pub use contact::{ContactMode, ContactOptions};
 pub use error::{ErrorKind, MtmError, Result, Shortfall};
 pub use geometry::motion::{RigidMotion, SurfaceMotion, rigid_matrix};
 pub use geometry::surface::{Closest, Surface};
-pub use geometry::winding::WindingTree;
+pub use geometry::triangle::{DEGENERATE_AREA, Feature};
+pub use geometry::winding::{WindingOptions, WindingTree, winding_number_exact};
 pub use mechanics::element::{Element, ElementNodes};
 pub use mechanics::kinematics::Kinematics;
-pub use mechanics::material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
+pub use mechanics::material::{
+    Elastic, FibreElastic, FibreLaw, Lame, Mixing, Preset, Spencer, TetMaterial, Tissue, Voigt,
+};
 pub use mechanics::strain_energy::{EnergyState, StrainEnergy, TangentKind};
-pub use mechanics::tensors::MassTensors;
+pub use mechanics::tensors::{EdgeTensors, MassTensors, tet_tensor};
 pub use mesh::{MeshQuality, TetMesh};
-pub use muscles::equivalent::{Muscle, MuscleShares, SamplingOptions, sample_muscles};
-pub use muscles::fibre::{MuscleFibres, MuscleKind, OrientedBox};
-pub use registration::icp::{IcpFit, IcpOptions};
-pub use registration::rigid::{RigidFit, RigidFitOptions};
-pub use registration::thin_plate::ThinPlateSpline;
+pub use meshing::crack::part;
+pub use meshing::signed_distance::signed_distance;
+pub use meshing::stuffing::distance::squared_distance;
+pub use meshing::stuffing::level::{Grid, LevelImage};
+pub use meshing::stuffing::{Halvings, Stuffed, StuffingOptions, stuff};
+pub use muscles::equivalent::{
+    InsideTest, MOST_SAMPLES, MeanDirection, Muscle, MuscleShares, MuscleVolume, SamplingOptions,
+    Share, TetShares, sample_muscles,
+};
+pub use muscles::fibre::{MOST_BOXES, MuscleFibres, MuscleKind, NearFibres, OrientedBox};
+pub use registration::icp::{Fixed, IcpFit, IcpMethod, IcpOptions, icp};
+pub use registration::nearest::PointTree;
+pub use registration::rigid::{RigidFit, RigidFitOptions, rigid_fit};
+pub use registration::thin_plate::{Folds, ThinPlateSpline};
 pub use statics::options::{Interrupt, Method, StaticOptions};
 pub use statics::replan::PlanOperator;
 pub use statics::solution::{ContactResult, Solution, Timings};

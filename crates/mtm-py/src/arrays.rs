@@ -5,7 +5,7 @@
 
 use std::ops::RangeInclusive;
 
-use mtm_core::error::ErrorKind;
+use mtm_core::ErrorKind;
 use numpy::{
     IntoPyArray, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArrayDyn,
     PyUntypedArrayMethods,

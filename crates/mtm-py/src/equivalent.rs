@@ -2,10 +2,9 @@
 
 use std::sync::Arc;
 
-use mtm_core::error::ErrorKind;
-use mtm_core::mechanics::material::{Mixing, Preset};
-use mtm_core::muscles::equivalent::{
-    InsideTest, MOST_SAMPLES, Muscle, MuscleShares, SamplingOptions, Share, sample_muscles,
+use mtm_core::{
+    ErrorKind, InsideTest, MOST_SAMPLES, Mixing, Muscle, MuscleShares, Preset, SamplingOptions,
+    Share, sample_muscles,
 };
 use numpy::{IntoPyArray, PyArray1, PyArray2};
 use pyo3::prelude::*;

@@ -1,6 +1,6 @@
 //! The exception family: one class per kind, with a `ValueError` twin where the input is at fault.
 
-use mtm_core::error::{ErrorKind, MtmError};
+use mtm_core::{ErrorKind, MtmError};
 use pyo3::exceptions::{PyException, PyKeyboardInterrupt, PyValueError};
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;

@@ -2,8 +2,7 @@
 
 use std::sync::Arc;
 
-use mtm_core::error::ErrorKind;
-use mtm_core::muscles::fibre::{MOST_BOXES, MuscleFibres, MuscleKind, OrientedBox};
+use mtm_core::{ErrorKind, MOST_BOXES, MuscleFibres, MuscleKind, OrientedBox};
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
 

@@ -2,11 +2,10 @@
 
 use std::sync::Arc;
 
-use mtm_core::error::ErrorKind;
-use mtm_core::geometry::motion::{SurfaceMotion, rigid_matrix as core_rigid_matrix};
-use mtm_core::geometry::surface::Surface;
-use mtm_core::geometry::winding::WindingTree;
-use mtm_core::mesh::{MeshQuality, TetMesh};
+use mtm_core::{
+    ErrorKind, MeshQuality, Surface, SurfaceMotion, TetMesh, WindingTree,
+    rigid_matrix as core_rigid_matrix,
+};
 use numpy::{IntoPyArray, PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;

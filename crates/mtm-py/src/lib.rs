@@ -12,7 +12,7 @@ mod running;
 mod stuffing;
 
 #[global_allocator]
-static MEMORY: mtm_core::algebra::memory::HugePages = mtm_core::algebra::memory::HugePages;
+static MEMORY: mtm_core::HugePages = mtm_core::HugePages;
 
 /// The compiled core of cmfsim.
 #[pyo3::pymodule]
@@ -44,6 +44,6 @@ mod _core {
         module.add("KINEMATICS", ("linear", "corotational", "hyperelastic"))?;
         module.add("PRESETS", ("kim2010", "kim2010-swapped"))?;
         module.add("LAWS", ("spencer", "picinbono"))?;
-        module.add("MOST_BOXES", mtm_core::muscles::fibre::MOST_BOXES)
+        module.add("MOST_BOXES", mtm_core::MOST_BOXES)
     }
 }

@@ -2,13 +2,10 @@
 
 use std::sync::Arc;
 
-use mtm_core::algebra::blocks::BlockMatrix;
-use mtm_core::error::{ErrorKind, MtmError};
-use mtm_core::mechanics::element::Element;
-use mtm_core::mechanics::kinematics::Kinematics;
-use mtm_core::mechanics::material::{Elastic, FibreElastic, FibreLaw, Mixing, Preset, Tissue};
-use mtm_core::mechanics::strain_energy::{StrainEnergy, TangentKind};
-use mtm_core::mechanics::tensors::{EdgeTensors, MassTensors};
+use mtm_core::{
+    BlockMatrix, EdgeTensors, Elastic, Element, ErrorKind, FibreElastic, FibreLaw, Kinematics,
+    MassTensors, Mixing, MtmError, Preset, StrainEnergy, TangentKind, Tissue,
+};
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;

@@ -2,15 +2,11 @@
 
 use std::sync::Arc;
 
-use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, Plan, Segment};
-use mtm_core::contact::{ContactMode, ContactOptions};
-use mtm_core::error::{ErrorKind, MtmError};
-use mtm_core::geometry::motion::RigidMotion;
-use mtm_core::mechanics::kinematics::Kinematics;
-use mtm_core::statics::options::{Method, StaticOptions};
-use mtm_core::statics::replan::PlanOperator;
-use mtm_core::statics::solution::{Solution, Timings};
-use mtm_core::statics::solver::StaticSolver;
+use mtm_core::{
+    Boundary, Conflicts, ContactMode, ContactOptions, ErrorKind, Gap, Kinematics, Method, Motion,
+    MtmError, Plan, PlanOperator, RigidMotion, Segment, Solution, StaticOptions, StaticSolver,
+    Timings,
+};
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyString};

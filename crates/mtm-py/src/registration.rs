@@ -2,12 +2,10 @@
 
 use std::sync::Arc;
 
-use mtm_core::error::ErrorKind;
-use mtm_core::geometry::surface::Surface;
-use mtm_core::registration::icp::{Fixed, IcpFit, IcpMethod, IcpOptions, icp as core_icp};
-use mtm_core::registration::nearest::PointTree;
-use mtm_core::registration::rigid::{RigidFit, RigidFitOptions, rigid_fit as core_rigid_fit};
-use mtm_core::registration::thin_plate::{Folds, ThinPlateSpline};
+use mtm_core::{
+    ErrorKind, Fixed, Folds, IcpFit, IcpMethod, IcpOptions, PointTree, RigidFit, RigidFitOptions,
+    Surface, ThinPlateSpline, icp as core_icp, rigid_fit as core_rigid_fit,
+};
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
 

@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::Duration;
 
-use mtm_core::algebra::pool;
-use mtm_core::error::MtmError;
+use mtm_core::MtmError;
+use mtm_core::pool;
 use pyo3::prelude::*;
 
 use crate::errors::{self, Failure};

@@ -2,12 +2,10 @@
 
 use std::sync::Arc;
 
-use mtm_core::error::ErrorKind;
-use mtm_core::meshing::crack::part;
-use mtm_core::meshing::signed_distance::signed_distance;
-use mtm_core::meshing::stuffing::distance::squared_distance;
-use mtm_core::meshing::stuffing::level::{Grid, LevelImage};
-use mtm_core::meshing::stuffing::{Halvings, Stuffed, StuffingOptions, stuff};
+use mtm_core::{
+    ErrorKind, Grid, Halvings, LevelImage, Stuffed, StuffingOptions, part, signed_distance,
+    squared_distance, stuff,
+};
 use numpy::PyArray3;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
-use mtm_core::algebra::blocks::BlockMatrix;
+use mtm_core::BlockMatrix;
 
 /// A reduced elastic system.
 pub struct System {

@@ -5,9 +5,10 @@ mod elastic_box;
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use mtm_core::algebra::krylov::{BlockJacobi, PcgOptions, PcgOutcome, Preconditioner, pcg};
-use mtm_core::algebra::multigrid::{Multigrid, MultigridOptions};
-use mtm_core::error::{MtmError, Result};
+use mtm_core::{
+    BlockJacobi, MtmError, Multigrid, MultigridOptions, PcgOptions, PcgOutcome, Preconditioner,
+    Result, pcg,
+};
 use nalgebra::Matrix3;
 
 use elastic_box::{

@@ -11,12 +11,10 @@ use meshes::{
     BoxShape, Triangles, Vec3, boundary, isotropic, joined, largest_difference, plan, plane, rigid,
     sliding, solve, stays, surface, tensors, with_method,
 };
-use mtm_core::boundary::{Boundary, Gap, Motion, Plan};
-use mtm_core::contact::{ContactMode, ContactOptions};
-use mtm_core::geometry::surface::Surface;
-use mtm_core::mesh::TetMesh;
-use mtm_core::statics::options::{Method, StaticOptions};
-use mtm_core::statics::solution::Solution;
+use mtm_core::{
+    Boundary, ContactMode, ContactOptions, Gap, Method, Motion, Plan, Solution, StaticOptions,
+    Surface, TetMesh,
+};
 
 const POISSON: f64 = 0.45;
 /// Distance from the facets that nodes on their curved surface may have, mm: creases sharper than the tissue's

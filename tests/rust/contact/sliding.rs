@@ -11,16 +11,10 @@ use meshes::{
     joined, largest_difference, near_exact, plan, plane, rigid, sliding, solve, solver, sphere,
     stays, surface, tensors, with_method,
 };
-use mtm_core::boundary::{Boundary, Gap, Motion, Plan};
-use mtm_core::contact::{ContactMode, ContactOptions};
-use mtm_core::error::{ErrorKind, MtmError};
-use mtm_core::geometry::motion::{RigidMotion, SurfaceMotion};
-use mtm_core::geometry::surface::Surface;
-use mtm_core::mechanics::material::FibreElastic;
-use mtm_core::mechanics::tensors::MassTensors;
-use mtm_core::mesh::TetMesh;
-use mtm_core::statics::options::{Method, StaticOptions};
-use mtm_core::statics::solution::Solution;
+use mtm_core::{
+    Boundary, ContactMode, ContactOptions, ErrorKind, FibreElastic, Gap, MassTensors, Method,
+    Motion, MtmError, Plan, RigidMotion, Solution, StaticOptions, Surface, SurfaceMotion, TetMesh,
+};
 use nalgebra::Matrix3;
 
 const METHODS: [Method; 3] = [Method::Cholesky, Method::Pcg, Method::Relaxation];

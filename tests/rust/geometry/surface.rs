@@ -4,10 +4,10 @@
 use std::collections::HashMap;
 use std::f64::consts::PI;
 
-use mtm_core::error::{ErrorKind, MtmError};
-use mtm_core::geometry::motion::{RigidMotion, SurfaceMotion};
-use mtm_core::geometry::surface::{Closest, Feature, Surface};
-use mtm_core::geometry::winding::{WindingOptions, WindingTree, winding_number_exact};
+use mtm_core::{
+    Closest, ErrorKind, Feature, MtmError, RigidMotion, Surface, SurfaceMotion, WindingOptions,
+    WindingTree, winding_number_exact,
+};
 use nalgebra::{Matrix4, Rotation3, Vector3};
 
 type Vec3 = Vector3<f64>;

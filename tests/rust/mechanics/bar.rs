@@ -10,10 +10,7 @@ use meshes::{
     BoxShape, Vec3, affine, along_fibre, boundary, isotropic, joined, largest, largest_difference,
     plan, rigid, solve, tensors, with_method,
 };
-use mtm_core::boundary::Motion;
-use mtm_core::mechanics::material::{FibreElastic, Tissue};
-use mtm_core::mesh::TetMesh;
-use mtm_core::statics::options::Method;
+use mtm_core::{FibreElastic, Method, Motion, TetMesh, Tissue};
 use nalgebra::Matrix3;
 
 const MODULI: FibreElastic = FibreElastic { young_along: 0.5, young_across: 0.79, poisson: 0.43 };

@@ -10,11 +10,7 @@ use meshes::{
     BoxShape, ShellShape, Vec3, along_fibre, at, boundary, isotropic, joined, plan, sliding, solve,
     surface, tensors, with_method,
 };
-use mtm_core::boundary::{Gap, Motion};
-use mtm_core::geometry::motion::SurfaceMotion;
-use mtm_core::mechanics::material::{FibreElastic, Tissue};
-use mtm_core::mesh::TetMesh;
-use mtm_core::statics::options::Method;
+use mtm_core::{FibreElastic, Gap, Method, Motion, SurfaceMotion, TetMesh, Tissue};
 
 /// Weights of a corner and of the others at the four points of the rule that is exact for quadratics
 /// (Keast 1986).

@@ -11,14 +11,10 @@ use meshes::{
     joined, largest, largest_difference, plan, plane, rigid, sliding, solve, solver, surface,
     tissues, with_method,
 };
-use mtm_core::boundary::{Gap, Motion};
-use mtm_core::contact::{ContactMode, ContactOptions};
-use mtm_core::error::MtmError;
-use mtm_core::mechanics::material::{Elastic, FibreElastic, FibreLaw, Tissue, Voigt};
-use mtm_core::mesh::TetMesh;
-use mtm_core::statics::options::{Method, StaticOptions};
 use mtm_core::{
-    Element, Kinematics, MassTensors, RigidMotion, StrainEnergy, SurfaceMotion, TangentKind,
+    ContactMode, ContactOptions, Elastic, Element, FibreElastic, FibreLaw, Gap, Kinematics,
+    MassTensors, Method, Motion, MtmError, RigidMotion, StaticOptions, StrainEnergy, SurfaceMotion,
+    TangentKind, TetMesh, Tissue, Voigt,
 };
 use nalgebra::{DMatrix, Matrix3, SymmetricEigen};
 
@@ -54,7 +50,7 @@ fn layered(mesh: &TetMesh) -> Arc<Tissue> {
     Arc::new(Tissue::from_stiffness(rows).unwrap())
 }
 
-fn dense(matrix: &mtm_core::algebra::blocks::BlockMatrix) -> DMatrix<f64> {
+fn dense(matrix: &mtm_core::BlockMatrix) -> DMatrix<f64> {
     let n = matrix.n_rows();
     let mut out = DMatrix::zeros(3 * n, 3 * n);
     for j in 0..n {

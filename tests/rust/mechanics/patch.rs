@@ -10,13 +10,10 @@ use meshes::{
     BoxShape, Numbers, Vec3, affine, any_stiffness, at, boundary, joined, largest,
     largest_difference, plan, solve, tensors, tissues, with_method,
 };
-use mtm_core::boundary::Motion;
-use mtm_core::mechanics::material::{
-    Elastic, FibreElastic, FibreLaw, Lame, Spencer, TetMaterial, Tissue, Voigt,
+use mtm_core::{
+    Elastic, FibreElastic, FibreLaw, Lame, MassTensors, Method, Motion, Spencer, TetMaterial,
+    TetMesh, Tissue, Voigt, tet_tensor,
 };
-use mtm_core::mechanics::tensors::{MassTensors, tet_tensor};
-use mtm_core::mesh::TetMesh;
-use mtm_core::statics::options::Method;
 use nalgebra::{DMatrix, Matrix3, Matrix6, SMatrix, SymmetricEigen};
 
 /// H of the affine fields: every strain and rotation component differs from zero.

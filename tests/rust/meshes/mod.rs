@@ -4,17 +4,11 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use mtm_core::boundary::{Boundary, Conflicts, Gap, Motion, Plan, Segment};
-use mtm_core::contact::ContactOptions;
-use mtm_core::error::Result;
-use mtm_core::geometry::motion::RigidMotion;
-use mtm_core::geometry::surface::Surface;
-use mtm_core::mechanics::material::{Elastic, FibreElastic, FibreLaw, Tissue, Voigt};
-use mtm_core::mechanics::tensors::MassTensors;
-use mtm_core::mesh::TetMesh;
-use mtm_core::statics::options::{Method, StaticOptions};
-use mtm_core::statics::solution::Solution;
-use mtm_core::statics::solver::StaticSolver;
+use mtm_core::{
+    Boundary, Conflicts, ContactOptions, Elastic, FibreElastic, FibreLaw, Gap, MassTensors, Method,
+    Motion, Plan, Result, RigidMotion, Segment, Solution, StaticOptions, StaticSolver, Surface,
+    TetMesh, Tissue, Voigt,
+};
 use nalgebra::{Matrix3, Matrix6, Rotation3, Unit, Vector3};
 
 pub type Vec3 = Vector3<f64>;

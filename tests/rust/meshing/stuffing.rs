@@ -1,10 +1,9 @@
 //! Isosurface stuffing: shapes, volume, boundary, thin parts, determinism, bad input.
 
-use mtm_core::meshing::crack::part;
-use mtm_core::meshing::signed_distance::signed_distance;
-use mtm_core::meshing::stuffing::level::{Grid, LevelImage};
-use mtm_core::meshing::stuffing::{Halvings, Stuffed, StuffingOptions, stuff};
-use mtm_core::{MtmError, Surface, TetMesh};
+use mtm_core::{
+    Grid, Halvings, LevelImage, MtmError, Stuffed, StuffingOptions, Surface, TetMesh, part,
+    signed_distance, stuff,
+};
 use proptest::prelude::*;
 
 fn image(n: usize, spacing: f64, level: impl Fn([f64; 3]) -> f64) -> LevelImage {
@@ -259,7 +258,7 @@ fn the_signed_distance_of_a_surface_is_that_of_brute_force() {
     for i in (0..grid.len()).step_by(7) {
         let x = grid.centre(i);
         let c = surface.closest_one(x).point;
-        let inside = mtm_core::geometry::winding::winding_number_exact(&surface, &[x])[0] > 0.5;
+        let inside = mtm_core::winding_number_exact(&surface, &[x])[0] > 0.5;
         let d = radius(x, c).min(4.0) * if inside { 1.0 } else { -1.0 };
         assert!((f64::from(level.values()[i]) - d).abs() < 1e-5, "voxel {i}");
     }

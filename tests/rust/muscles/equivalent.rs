@@ -9,13 +9,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use meshes::{BoxShape, GO_ON, Numbers, Triangles, Vec3, sphere, surface};
-use mtm_core::error::{ErrorKind, MtmError};
-use mtm_core::mesh::TetMesh;
-use mtm_core::muscles::equivalent::{
-    InsideTest, Muscle, MuscleShares, SamplingOptions, sample_muscles,
+use mtm_core::{
+    ErrorKind, InsideTest, Mixing, MtmError, Muscle, MuscleFibres, MuscleShares, Preset,
+    SamplingOptions, TetMesh, sample_muscles,
 };
-use mtm_core::muscles::fibre::MuscleFibres;
-use mtm_core::{Mixing, Preset};
 
 /// A muscle whose fibres run along `direction`.
 fn muscle(triangles: Triangles, direction: [f64; 3]) -> Muscle {

@@ -3,8 +3,7 @@
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-use mtm_core::muscles::fibre::{MuscleFibres, MuscleKind, NearFibres, OrientedBox};
-use mtm_core::{ErrorKind, MtmError, Surface};
+use mtm_core::{ErrorKind, MtmError, MuscleFibres, MuscleKind, NearFibres, OrientedBox, Surface};
 use nalgebra::Vector3;
 
 type Point = [f64; 3];

@@ -1,12 +1,10 @@
 //! Splines, rigid fits and closest points against closed forms, brute force and known motions.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
-use mtm_core::error::{ErrorKind, MtmError};
-use mtm_core::registration::icp::{Fixed, IcpMethod, IcpOptions, icp};
-use mtm_core::registration::nearest::PointTree;
-use mtm_core::registration::rigid::{RigidFitOptions, rigid_fit};
-use mtm_core::registration::thin_plate::ThinPlateSpline;
-use mtm_core::{RigidMotion, Surface};
+use mtm_core::{
+    ErrorKind, Fixed, IcpMethod, IcpOptions, MtmError, PointTree, RigidFitOptions, RigidMotion,
+    Surface, ThinPlateSpline, icp, rigid_fit,
+};
 use nalgebra::{Matrix3, Rotation3, Unit, Vector3};
 use proptest::prelude::*;
 

@@ -11,14 +11,10 @@ use meshes::{
     largest_difference, plan, plane, rigid, sliding, solve, solver, stays, surface, tensors,
     with_method,
 };
-use mtm_core::boundary::{Boundary, Gap, Motion, Segment};
-use mtm_core::geometry::motion::SurfaceMotion;
-use mtm_core::geometry::surface::Surface;
-use mtm_core::geometry::winding::{WindingTree, winding_number_exact};
-use mtm_core::mechanics::material::{FibreElastic, FibreLaw, Tissue};
-use mtm_core::mechanics::tensors::MassTensors;
-use mtm_core::mesh::TetMesh;
-use mtm_core::statics::options::{Method, StaticOptions};
+use mtm_core::{
+    Boundary, FibreElastic, FibreLaw, Gap, MassTensors, Method, Motion, Segment, StaticOptions,
+    Surface, SurfaceMotion, TetMesh, Tissue, WindingTree, winding_number_exact,
+};
 
 const METHODS: [Method; 3] = [Method::Cholesky, Method::Pcg, Method::Relaxation];
 
@@ -213,7 +209,7 @@ fn solution_bits(
     tensors: &Arc<MassTensors>,
     bounds: &Arc<Boundary>,
     options: StaticOptions,
-    motion: &mtm_core::boundary::Plan,
+    motion: &mtm_core::Plan,
 ) -> Vec<u64> {
     let found = solve(tensors, bounds, options, motion, None).unwrap();
     let mut out = bits(&found.displacements);

@@ -7,8 +7,7 @@ mod meshes;
 #[allow(dead_code)] // the bench sorts scenes by more than the test
 mod random_scenes;
 
-use mtm_core::error::MtmError;
-use mtm_core::statics::options::Method;
+use mtm_core::{Method, MtmError};
 
 use random_scenes::{Scene, farthest, largest, refusal};
 

@@ -32,9 +32,6 @@ pub struct RelaxationOutcome {
     pub solution: Vec<[f64; 3]>,
     /// Sweeps done.
     pub sweeps: usize,
-    /// Estimate of the error, mm: ρ/(1−ρ) times the last step, with ρ the measured contraction. Not a
-    /// bound: a slow mode that has hardly moved yet does not show in the steps.
-    pub error_estimate: f64,
     /// Largest step of each sweep, mm.
     pub steps: Vec<f64>,
 }
@@ -96,17 +93,14 @@ pub fn relax(
         if step == 0.0 {
             bound = 0.0;
         } else if sweep > WINDOW {
+            // ρ/(1−ρ) times the last step, with ρ the measured contraction. Not a bound: a slow mode that
+            // has hardly moved yet does not show in the steps.
             let ratio = step / steps[sweep - 1 - WINDOW];
             let contraction = ratio.powf(1.0 / WINDOW as f64).min(1.0 - LEAST_PROGRESS);
             bound = options.factor * step * contraction / (1.0 - contraction);
         }
         if bound <= options.tolerance {
-            return Ok(RelaxationOutcome {
-                solution: x,
-                sweeps: sweep,
-                error_estimate: bound,
-                steps,
-            });
+            return Ok(RelaxationOutcome { solution: x, sweeps: sweep, steps });
         }
     }
     Err(MtmError::NotConverged {

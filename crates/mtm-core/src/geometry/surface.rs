@@ -15,8 +15,8 @@ use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result, check_coordinates};
 use crate::geometry::topology::{NO_TRIANGLE, Topology};
+use crate::geometry::triangle::Feature;
 use crate::geometry::triangle::{self, Facet, TrianglePoint};
-pub use crate::geometry::triangle::{DEGENERATE_AREA, Feature};
 use crate::vector::Vec3;
 
 /// Angle between facet normals above which an edge is a crease, rad (60°): box and tooth edges stay
@@ -99,7 +99,7 @@ impl Surface {
     /// # Errors
     /// [`MtmError::Empty`], [`MtmError::NotFinite`], [`MtmError::IndexOutOfRange`], and
     /// [`MtmError::DegenerateTriangle`] for a triangle that names a vertex twice or has an area
-    /// below [`DEGENERATE_AREA`] of its longest edge squared.
+    /// below [`DEGENERATE_AREA`](crate::DEGENERATE_AREA) of its longest edge squared.
     pub fn new(vertices: Vec<[f64; 3]>, triangles: Vec<[u32; 3]>) -> Result<Self> {
         Self::with_crease_angle(vertices, triangles, CREASE_ANGLE)
     }
