@@ -44,11 +44,36 @@ pub struct Segment {
     pub gap: Gap,
 }
 
+/// What the nodes of a [`TouchingPair`] may not enter.
+#[derive(Debug, Clone)]
+pub enum Against {
+    /// The tissue behind these triangles of the mesh's boundary, outward normals; they deform with it.
+    Tissue(Vec<[u32; 3]>),
+    /// Bone behind a surface at rest, normals out of the bone.
+    Bone {
+        /// The surface.
+        surface: Arc<Surface>,
+        /// The segment that it moves with; none for bone that stays where it is.
+        segment: Option<String>,
+    },
+}
+
+/// Nodes that may touch what they do not slide on, and lift off again: without friction, and without a force while
+/// they are apart.
+#[derive(Debug, Clone)]
+pub struct TouchingPair {
+    /// The nodes.
+    pub nodes: Vec<u32>,
+    /// What they may touch.
+    pub against: Against,
+}
+
 /// Kinds of the nodes: every node not named is free, each node has one kind.
 #[derive(Debug, Clone)]
 pub struct Boundary {
     fixed: Vec<u32>,
     segments: Vec<Segment>,
+    touching: Vec<TouchingPair>,
     /// Joined nodes as the caller gave them: rows of a plan's displacements follow this order.
     given: Vec<Vec<u32>>,
     conflicts: usize,
@@ -96,6 +121,7 @@ impl Boundary {
             fixed: unique(&fixed),
             given: segments.iter().map(|s| s.joined.clone()).collect(),
             segments,
+            touching: Vec::new(),
             conflicts: 0,
             inherited: HashMap::new(),
         };
@@ -142,6 +168,35 @@ impl Boundary {
         }
         boundary.conflicts = lost;
         Ok(boundary)
+    }
+
+    /// The boundary with pairs that may touch.
+    ///
+    /// # Errors
+    /// A pair without nodes or without triangles, or with a segment that the boundary does not have.
+    pub fn with_touching(mut self, pairs: Vec<TouchingPair>) -> Result<Self> {
+        for (pair, TouchingPair { nodes, against }) in pairs.iter().enumerate() {
+            let fail = |problem: String| Err(MtmError::TouchingPair { pair, problem });
+            if nodes.is_empty() {
+                return fail("has no nodes: give it some or leave it out".into());
+            }
+            match against {
+                Against::Tissue(triangles) if triangles.is_empty() => {
+                    return fail("has no triangles: give it some or leave it out".into());
+                }
+                Against::Bone { segment: Some(name), .. }
+                    if !self.segments.iter().any(|s| s.name == *name) =>
+                {
+                    return fail(format!(
+                        "faces the bone of segment \"{name}\", which has neither joined nor sliding nodes; \
+                         give none for bone that does not move"
+                    ));
+                }
+                _ => {}
+            }
+        }
+        self.touching = pairs;
+        Ok(self)
     }
 
     /// The boundary with the nodes in the middle of edges: node `n_corners + i` lies between `edges[i]`.
@@ -246,6 +301,11 @@ impl Boundary {
         &self.segments
     }
 
+    /// Pairs that may touch, in the order given.
+    pub fn touching(&self) -> &[TouchingPair] {
+        &self.touching
+    }
+
     /// How many nodes were given two kinds and lost one of them.
     pub fn conflicts(&self) -> usize {
         self.conflicts
@@ -314,7 +374,10 @@ impl Boundary {
                     }
                     let what = format!("plan[\"{}\"]", segment.name);
                     check_coordinates(&what, rows, ErrorKind::Boundary)?;
-                    if !segment.sliding.is_empty() {
+                    let faced = |pair: &TouchingPair| {
+                        matches!(&pair.against, Against::Bone { segment: Some(s), .. } if *s == segment.name)
+                    };
+                    if !segment.sliding.is_empty() || self.touching.iter().any(faced) {
                         return Err(fail(
                             &segment.name,
                             "displacements of joined nodes do not say how its contact surface moves; \

@@ -207,6 +207,14 @@ pub enum MtmError {
         /// What is wrong with it, and the mend.
         problem: String,
     },
+    /// Nodes that may touch something do not fit what they face.
+    #[error("touching pair {pair} {problem}")]
+    TouchingPair {
+        /// Index of the pair.
+        pair: usize,
+        /// What is wrong with it, and the fix.
+        problem: String,
+    },
     /// A plan does not fit the boundary.
     #[error("plan for segment \"{segment}\": {problem}")]
     Plan {
@@ -458,6 +466,7 @@ impl MtmError {
             | Self::FibreNotUnit { .. } => ErrorKind::Material,
             Self::NodeOfTwoKinds { .. }
             | Self::Segment { .. }
+            | Self::TouchingPair { .. }
             | Self::Plan { .. }
             | Self::Unconstrained { .. } => ErrorKind::Boundary,
             Self::ContactSurface { .. } | Self::ContactNotConverged { .. } => ErrorKind::Contact,

@@ -69,7 +69,9 @@ pub use algebra::krylov::{BlockJacobi, PcgOptions, PcgOutcome, Preconditioner, p
 pub use algebra::memory::HugePages;
 pub use algebra::multigrid::{Multigrid, MultigridOptions};
 pub use algebra::pool;
-pub use boundary::{Boundary, Conflicts, Gap, Motion, NodeKind, Plan, Segment};
+pub use boundary::{
+    Against, Boundary, Conflicts, Gap, Motion, NodeKind, Plan, Segment, TouchingPair,
+};
 pub use contact::{ContactMode, ContactOptions};
 pub use error::{ErrorKind, MtmError, Result, Shortfall};
 pub use geometry::motion::{RigidMotion, SurfaceMotion, rigid_matrix};
@@ -100,5 +102,5 @@ pub use registration::rigid::{RigidFit, RigidFitOptions, rigid_fit};
 pub use registration::thin_plate::{Folds, ThinPlateSpline};
 pub use statics::options::{Interrupt, Method, StaticOptions};
 pub use statics::replan::PlanOperator;
-pub use statics::solution::{ContactResult, Solution, Timings};
+pub use statics::solution::{ContactResult, Solution, Timings, TouchResult};
 pub use statics::solver::StaticSolver;

@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result, check_coordinates};
-use crate::vector::{cross, dot, norm, sub};
+use crate::vector::{add, cross, dot, norm, scaled, sub};
 
 /// Volume over longest edge cubed below which a tet counts as degenerate. A sliver with a smallest
 /// dihedral angle of 0.1° is near 2e-4; f64 geometry keeps about three digits at this limit.
@@ -125,6 +125,12 @@ impl TetMesh {
     /// Tets that use node `j`, ascending.
     pub fn tets_of_node(&self, j: usize) -> &[u32] {
         self.incident.of(j)
+    }
+
+    /// Mean of the nodes, mm.
+    pub fn centre(&self) -> [f64; 3] {
+        let share = 1.0 / self.nodes.len() as f64;
+        self.nodes.iter().fold([0.0; 3], |c, &x| add(c, scaled(x, share)))
     }
 
     /// Length of the diagonal of the bounding box, mm: the length that relative tolerances refer to.

@@ -3,9 +3,9 @@
 use std::sync::Arc;
 
 use mtm_core::{
-    Boundary, Conflicts, ContactMode, ContactOptions, ErrorKind, Gap, Kinematics, Method, Motion,
-    MtmError, Plan, PlanOperator, RigidMotion, Segment, Solution, StaticOptions, StaticSolver,
-    Timings,
+    Against, Boundary, Conflicts, ContactMode, ContactOptions, ErrorKind, Gap, Kinematics, Method,
+    Motion, MtmError, Plan, PlanOperator, RigidMotion, Segment, Solution, StaticOptions,
+    StaticSolver, Timings, TouchingPair,
 };
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods};
 use pyo3::prelude::*;
@@ -39,6 +39,12 @@ const MEMORY_SHARE: f64 = 0.8;
 /// gap : dict of str to float, (k,) array_like or "rest", optional
 ///     Distance that sliding nodes keep from the surface, mm, negative behind it; 0 puts them on it,
 ///     "rest" keeps the offset that each has at rest, carried by its segment.
+/// touching : sequence of (nodes, triangles), optional
+///     Nodes that may touch a part of the tissue's own boundary, and lift off again: (k,) int, and (m, 3) int, nodes
+///     of boundary triangles with outward normals. They may not enter the tissue behind the triangles; no friction.
+/// obstacles : sequence of (nodes, segment, Surface), optional
+///     Nodes that may touch bone that they do not slide on: they may not go behind the surface, given at rest with
+///     normals out of the bone, which moves with the segment of that name; None for bone that stays.
 /// conflicts : {"error", "resolve"}
 ///     A node of two kinds is an error, or fixed wins over joined and joined over sliding.
 ///
@@ -55,7 +61,8 @@ pub struct PyBoundary {
 impl PyBoundary {
     #[new]
     #[pyo3(signature = (
-        fixed = None, joined = None, sliding = None, contact = None, *, gap = None, conflicts = "error"
+        fixed = None, joined = None, sliding = None, contact = None, *, gap = None, touching = None,
+        obstacles = None, conflicts = "error"
     ))]
     fn new(
         fixed: Option<&Bound<'_, PyAny>>,
@@ -63,6 +70,8 @@ impl PyBoundary {
         sliding: Option<&Bound<'_, PyAny>>,
         contact: Option<&Bound<'_, PyAny>>,
         gap: Option<&Bound<'_, PyAny>>,
+        touching: Option<&Bound<'_, PyAny>>,
+        obstacles: Option<&Bound<'_, PyAny>>,
         conflicts: &str,
     ) -> PyResult<Self> {
         let fixed = fixed.map_or(Ok(Vec::new()), |f| arrays::nodes(f, Named("fixed", BOUNDARY)))?;
@@ -112,7 +121,11 @@ impl PyBoundary {
                 return Err(errors::input(BOUNDARY, problem));
             }
         };
-        let core = Boundary::new(fixed, segments, conflicts).map_err(Failure)?;
+        let mut pairs = touching_pairs(touching)?;
+        pairs.extend(obstacle_pairs(obstacles)?);
+        let core = Boundary::new(fixed, segments, conflicts)
+            .and_then(|boundary| boundary.with_touching(pairs))
+            .map_err(Failure)?;
         Ok(Self { core: Arc::new(core) })
     }
 
@@ -210,6 +223,47 @@ fn entries<'py>(
     let wrong = || errors::input(BOUNDARY, format!("{what} must be a dict of segment names"));
     let dict = value.cast::<PyDict>().map_err(|_| wrong())?;
     dict.iter().map(|(k, v)| Ok((k.extract::<String>().map_err(|_| wrong())?, v))).collect()
+}
+
+/// Pairs of nodes and triangles of the tissue.
+fn touching_pairs(value: Option<&Bound<'_, PyAny>>) -> PyResult<Vec<TouchingPair>> {
+    let wrong =
+        || errors::input(BOUNDARY, "touching must be a sequence of (nodes, triangles)".to_owned());
+    let Some(value) = value else { return Ok(Vec::new()) };
+    let entries = value.try_iter().map_err(|_| wrong())?;
+    let pair = |(i, entry): (usize, PyResult<Bound<'_, PyAny>>)| {
+        let (nodes, triangles): (Bound<'_, PyAny>, Bound<'_, PyAny>) =
+            entry?.extract().map_err(|_| wrong())?;
+        let what = [format!("touching[{i}] nodes"), format!("touching[{i}] triangles")];
+        Ok(TouchingPair {
+            nodes: arrays::nodes(&nodes, Named(&what[0], BOUNDARY))?,
+            against: Against::Tissue(arrays::triangles(&triangles, Named(&what[1], BOUNDARY))?),
+        })
+    };
+    entries.enumerate().map(pair).collect()
+}
+
+/// Pairs of nodes and surfaces of bone.
+fn obstacle_pairs(value: Option<&Bound<'_, PyAny>>) -> PyResult<Vec<TouchingPair>> {
+    let wrong = || {
+        errors::input(
+            BOUNDARY,
+            "obstacles must be a sequence of (nodes, segment name or None, Surface)".to_owned(),
+        )
+    };
+    let Some(value) = value else { return Ok(Vec::new()) };
+    let entries = value.try_iter().map_err(|_| wrong())?;
+    let pair = |(i, entry): (usize, PyResult<Bound<'_, PyAny>>)| {
+        let (nodes, segment, surface): (Bound<'_, PyAny>, Option<String>, Bound<'_, PyAny>) =
+            entry?.extract().map_err(|_| wrong())?;
+        let surface = surface.cast::<PySurface>().map_err(|_| wrong())?.get().core.clone();
+        let what = format!("obstacles[{i}] nodes");
+        Ok(TouchingPair {
+            nodes: arrays::nodes(&nodes, Named(&what, BOUNDARY))?,
+            against: Against::Bone { surface, segment },
+        })
+    };
+    entries.enumerate().map(pair).collect()
 }
 
 /// The segment called `name`, added where it is new.
@@ -602,6 +656,49 @@ impl PySolution {
     #[getter]
     fn contact_converged(&self) -> bool {
         self.core.contact.converged
+    }
+
+    /// Nodes that met what they may touch, (t,) uint32, pair by pair; a node may meet several surfaces.
+    #[getter]
+    fn touching_nodes<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u32>> {
+        self.core.touching.nodes.clone().into_pyarray(py)
+    }
+
+    /// Distance of each from its surface, less what it has behind it at rest, (t,) float64, mm; negative where it
+    /// penetrates.
+    #[getter]
+    fn touching_gaps<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        self.core.touching.gaps.clone().into_pyarray(py)
+    }
+
+    /// Unit normal of the surface at each, (t, 3) float64.
+    #[getter]
+    fn touching_normals<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+        arrays::rows(py, self.core.touching.normals.clone())
+    }
+
+    /// Force along the normal on each, (t,) float64, N; 0 where they are apart.
+    #[getter]
+    fn touching_forces<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        self.core.touching.forces.clone().into_pyarray(py)
+    }
+
+    /// Rounds of the method of multipliers for what touches; 0 where nothing may.
+    #[getter]
+    fn touching_rounds(&self) -> usize {
+        self.core.touching.rounds
+    }
+
+    /// Whether what touches is within 0.005 mm; False where it is within 0.05 mm alone.
+    #[getter]
+    fn touching_converged(&self) -> bool {
+        self.core.touching.converged || self.core.touching.rounds == 0
+    }
+
+    /// Deepest that a node is behind what it touches, mm.
+    #[getter]
+    fn penetration(&self) -> f64 {
+        self.core.touching.penetration()
     }
 
     /// Seconds of each stage, set-up included; exactly 0 for what the scene does not need.

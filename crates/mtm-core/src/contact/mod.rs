@@ -6,6 +6,7 @@
 
 mod field;
 mod newton;
+pub(crate) mod pairs;
 mod seat;
 
 use crate::boundary::{Boundary, Gap, Motion};

@@ -1,7 +1,7 @@
 //! Motions that a plan prescribes: of a rigid segment, or of a surface whose vertices moved one by
 //! one.
 
-use nalgebra::{Matrix3, Rotation2};
+use nalgebra::{Matrix3, Rotation2, Rotation3};
 use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result};
@@ -58,6 +58,20 @@ impl RigidMotion {
     /// The 4×4 matrix, row by row: exactly rigid to rounding.
     pub fn matrix(&self) -> &[[f64; 4]; 4] {
         &self.matrix
+    }
+
+    /// The motion as far as it has come at `share` of the way: turned by that share of the angle, while the point
+    /// `centre` goes straight.
+    pub fn partial(&self, share: f64, centre: [f64; 3]) -> Self {
+        let rotation = Rotation3::from_matrix_unchecked(Matrix3::from_fn(|i, j| self.matrix[i][j]));
+        let turned = Rotation3::new(rotation.scaled_axis() * share);
+        let (c, way) = (Vec3::from(centre), Vec3::from(self.displacement(centre)) * share);
+        let shift = c + way - turned * c;
+        let mut out = Self::identity();
+        for (i, row) in out.matrix.iter_mut().take(3).enumerate() {
+            *row = [turned[(i, 0)], turned[(i, 1)], turned[(i, 2)], shift[i]];
+        }
+        out
     }
 
     /// Position of `point` after the motion: R x + t, mm.

@@ -13,6 +13,7 @@ use crate::algebra::krylov::{
 };
 use crate::algebra::multigrid::{Multigrid, MultigridOptions};
 use crate::algebra::relaxation::{RelaxationOptions, relax};
+use crate::contact::pairs::Link;
 use crate::contact::{Sliding, Spring};
 use crate::error::{MtmError, Result, Shortfall};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
@@ -296,6 +297,7 @@ impl Iterative {
         mut b: Vec<[f64; 3]>,
         constraints: &[Constraint],
         mut springs: Vec<(usize, Spring)>,
+        links: &[Link],
         reach: f64,
         scale: f64,
         share: Option<f64>,
@@ -327,7 +329,8 @@ impl Iterative {
         let mut unheld = Vec::new();
         let mut left_out = Vec::new();
         let (found, solved) = loop {
-            let product = ProjectedProduct::new(&self.matrix, constraints, &springs);
+            let product =
+                ProjectedProduct::new(&self.matrix, constraints, &springs).with_links(links);
             let confirmed = self.confirmed(&product, &trail.trial);
             let seen = &mut trail.seen;
             match confirmed.solve(&b, &start, &options, share, seen, interrupted)? {
@@ -359,7 +362,8 @@ impl Iterative {
                 b[*row] = add(b[*row], scaled(s.axis, s.stiffness * s.goal));
             }
             springs.extend(left_out);
-            let product = ProjectedProduct::new(&self.matrix, constraints, &springs);
+            let product =
+                ProjectedProduct::new(&self.matrix, constraints, &springs).with_links(links);
             is_carried = carry_on(&product, &b, &unheld, reach, &mut rows);
         }
         Ok(Advance { rows, solved, is_carried })

@@ -12,3 +12,4 @@ pub mod restraint;
 pub mod solution;
 pub mod solver;
 pub(crate) mod system;
+pub(crate) mod touching;

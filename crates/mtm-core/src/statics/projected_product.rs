@@ -5,6 +5,7 @@ use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::constraints::Constraint;
 use crate::algebra::krylov::Operator;
 use crate::contact::Spring;
+use crate::contact::pairs::Link;
 use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Length, relative to what it was, below which nothing but rounding is left of a projected vector.
@@ -13,15 +14,16 @@ const PROJECTION_ROUNDING: f64 = 16.0 * f64::EPSILON;
 /// Share of what the body holds along a direction that springs have to leave.
 const LEAST_HOLD: f64 = 0.05;
 
-/// P (A + Σ k a⊗a) P on the vectors without a component along the normals of held rows.
+/// P (A + Σ k a⊗a + Σ k c⊗c) P on the vectors without a component along the normals of held rows.
 ///
-/// The springs k, a lie across the normals of their rows.
+/// The springs k, a lie across the normals of their rows; the links k, c join several rows.
 pub(crate) struct ProjectedProduct<'a> {
     matrix: &'a BlockMatrix,
     /// Orthonormal on each row.
     constraints: &'a [Constraint],
     /// Row and spring.
     springs: &'a [(usize, Spring)],
+    links: &'a [Link],
 }
 
 impl<'a> ProjectedProduct<'a> {
@@ -31,7 +33,12 @@ impl<'a> ProjectedProduct<'a> {
         constraints: &'a [Constraint],
         springs: &'a [(usize, Spring)],
     ) -> Self {
-        Self { matrix, constraints, springs }
+        Self { matrix, constraints, springs, links: &[] }
+    }
+
+    /// The same with `links` between rows.
+    pub fn with_links(self, links: &'a [Link]) -> Self {
+        Self { links, ..self }
     }
 }
 
@@ -45,6 +52,9 @@ impl Operator for ProjectedProduct<'_> {
         for (row, spring) in self.springs {
             let pull = spring.stiffness * dot(spring.axis, x[*row]);
             y[*row] = add(y[*row], scaled(spring.axis, pull));
+        }
+        for link in self.links {
+            link.add_product(x, y);
         }
         self.project(y);
     }

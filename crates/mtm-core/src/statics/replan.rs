@@ -60,6 +60,14 @@ impl StaticSolver {
                 kind: ErrorKind::Solver,
             });
         }
+        if !self.node_kinds.touching().is_empty() {
+            return Err(MtmError::UnknownName {
+                what: "boundary of a plan operator",
+                found: "touching pairs".into(),
+                known: "one without (what touches changes with the plan; use solve)",
+                kind: ErrorKind::Solver,
+            });
+        }
         let mesh = self.tensors.mesh();
         let places = self.tensors.element_nodes().positions();
         let n = places.len();

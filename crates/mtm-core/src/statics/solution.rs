@@ -32,6 +32,30 @@ pub struct ContactResult {
     pub converged: bool,
 }
 
+/// Nodes that met what they may touch, with the forces between them.
+#[derive(Debug, Clone, Default)]
+pub struct TouchResult {
+    /// The nodes, pair by pair; a node may meet several surfaces.
+    pub nodes: Vec<u32>,
+    /// Distance from the surface, less what the node has behind it at rest, mm; negative where it penetrates.
+    pub gaps: Vec<f64>,
+    /// Unit normal of the surface.
+    pub normals: Vec<[f64; 3]>,
+    /// Force along it, N, not negative.
+    pub forces: Vec<f64>,
+    /// Rounds of the method of multipliers.
+    pub rounds: usize,
+    /// Whether gaps, forces and changes are within the tolerance.
+    pub converged: bool,
+}
+
+impl TouchResult {
+    /// Deepest that a node is behind its surface, mm.
+    pub fn penetration(&self) -> f64 {
+        self.gaps.iter().fold(0.0, |m, gap| m.max(-gap))
+    }
+}
+
 impl Default for ContactResult {
     /// No sliding nodes.
     fn default() -> Self {
@@ -73,6 +97,8 @@ pub struct Solution {
     pub residual_history: Vec<f64>,
     /// Contact at the sliding nodes.
     pub contact: ContactResult,
+    /// What touches, where the boundary has pairs that may.
+    pub touching: TouchResult,
     /// Newton steps of the contact solver, over all of Newton's steps.
     pub contact_iterations: usize,
     /// Seconds by stage.

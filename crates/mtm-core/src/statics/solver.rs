@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use crate::algebra::blocks::{Block, BlockMatrix};
 use crate::boundary::{Boundary, Motion, NodeKind, Plan};
+use crate::contact::pairs::Pairs;
 use crate::contact::{ContactState, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, check_forces};
 use crate::mechanics::kinematics::Kinematics;
@@ -15,7 +16,8 @@ use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::reduction::{NO_ROW, Reduction};
 use crate::statics::restraint::{self, Held};
 use crate::statics::solution::{Clock, ContactResult, Solution, Timings};
-use crate::statics::system::{Begin, Frozen, System};
+use crate::statics::system::{Begin, Frozen, Linked, System, touching_needs_pcg};
+use crate::statics::touching::{Path, Touch, Touched};
 use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Multiple of the correction of a solution by factor that stands for the error of the corrected one.
@@ -27,12 +29,14 @@ pub struct StaticSolver {
     boundary: Arc<Boundary>,
     /// The boundary with the nodes in the middle of edges, where the element has them.
     pub(crate) node_kinds: Arc<Boundary>,
-    options: StaticOptions,
+    pub(super) options: StaticOptions,
     method: Method,
     /// Whether solutions by factor are corrected once.
     refines: bool,
     pub(crate) reduction: Reduction,
     pub(crate) sliding: Option<Sliding>,
+    /// What may touch what.
+    pairs: Option<Pairs>,
     mechanics: Mechanics,
     held: Held,
     /// Coupling of unknown rows with joined nodes: (row, node, tensor).
@@ -48,6 +52,15 @@ enum Mechanics {
     LargeRotation(Box<Equilibrium>),
 }
 
+/// What the unknown rows do under a plan.
+struct Rows {
+    rows: Vec<[f64; 3]>,
+    contact: Option<ContactState>,
+    touching: Touch,
+    /// Time that contact took.
+    seconds: f64,
+}
+
 impl StaticSolver {
     /// The solver of `tensors` under `boundary`.
     ///
@@ -57,10 +70,13 @@ impl StaticSolver {
     pub fn new(
         tensors: Arc<MassTensors>,
         boundary: Arc<Boundary>,
-        options: StaticOptions,
+        mut options: StaticOptions,
         interrupted: Interrupt<'_>,
     ) -> Result<Self> {
         options.check()?;
+        if !boundary.touching().is_empty() {
+            options.method = method_for_touching(&options)?;
+        }
         let mut clock = Clock::new();
         let mesh = tensors.mesh().clone();
         let places = tensors.element_nodes().positions();
@@ -77,7 +93,8 @@ impl StaticSolver {
             stiffness,
             options.contact.mode,
         )?;
-        clock.lap("contact_setup", sliding.is_some());
+        let pairs = Pairs::new(&node_kinds, &mesh, places, &reduction.row_of, stiffness)?;
+        clock.lap("contact_setup", sliding.is_some() || pairs.is_some());
         let normals: Vec<(u32, [f64; 3])> = sliding
             .iter()
             .flat_map(|s| s.nodes().iter().zip(s.rest_normals()))
@@ -126,6 +143,7 @@ impl StaticSolver {
             refines,
             reduction,
             sliding,
+            pairs,
             mechanics,
             held,
             couplings,
@@ -219,7 +237,7 @@ impl StaticSolver {
         clock.lap("plan", true);
 
         let mut effort = Effort::default();
-        let (rows, contact, contact_seconds) =
+        let Rows { rows, contact, touching, seconds: contact_seconds } =
             self.solve_rows(&b, &u, loads, &motions, start, scale, &mut effort, interrupted)?;
         clock.lap("solve", true);
         for (&j, v) in self.reduction.unknowns.iter().zip(&rows) {
@@ -230,7 +248,7 @@ impl StaticSolver {
             self.refine(&mut u, &forces, loads, &mut effort, interrupted)?;
             forces = self.forces(&u)?;
         }
-        let residual = self.residual(&forces, loads, contact.as_ref(), &b);
+        let residual = self.residual(&forces, loads, contact.as_ref(), &touching.forces, &b);
         if !(residual.is_finite() && effort.error_estimate.is_finite()) {
             return Err(MtmError::NotPositiveDefinite {
                 node: 0,
@@ -254,6 +272,7 @@ impl StaticSolver {
             iterations: effort.iterations,
             residual_history: effort.history,
             contact: self.contact_result(contact, &motions),
+            touching: touching.result,
             contact_iterations,
             timings,
         })
@@ -293,8 +312,17 @@ impl StaticSolver {
         Ok(())
     }
 
+    /// Displacements of all nodes: `prescribed` ones, and `rows` at the unknown nodes, mm.
+    pub(super) fn filled(&self, prescribed: &[[f64; 3]], rows: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let mut u = prescribed.to_vec();
+        for (&j, v) in self.reduction.unknowns.iter().zip(rows) {
+            u[j as usize] = *v;
+        }
+        u
+    }
+
     /// Displacements of all nodes with the prescribed ones filled in, mm.
-    fn prescribed(&self, motions: &[&Motion]) -> Result<Vec<[f64; 3]>> {
+    pub(super) fn prescribed(&self, motions: &[&Motion]) -> Result<Vec<[f64; 3]>> {
         let nodes = self.tensors.element_nodes().positions();
         let mut u = vec![[0.0; 3]; nodes.len()];
         for (s, motion) in motions.iter().enumerate() {
@@ -337,7 +365,7 @@ impl StaticSolver {
         Ok(out)
     }
 
-    /// Displacements of the unknown rows, contact, and the seconds it took.
+    /// Displacements of the unknown rows, and contact.
     ///
     /// `b`: forces that joined nodes and loads bring to the rows of the linear system. `u`: displacements
     /// of all nodes, those of joined ones filled in.
@@ -351,8 +379,21 @@ impl StaticSolver {
         scale: f64,
         effort: &mut Effort,
         interrupted: Interrupt<'_>,
-    ) -> Result<(Vec<[f64; 3]>, Option<ContactState>, f64)> {
+    ) -> Result<Rows> {
         let found = match (&self.mechanics, &self.sliding) {
+            (Mechanics::Linear(system), _) if let Some(pairs) = &self.pairs => {
+                let clock = Clock::new();
+                let path = Path { solver: self, system, pairs, motions, loads, scale };
+                return path
+                    .solve(effort, interrupted)
+                    .map(|Touched { rows, contact, touching }| Rows {
+                        rows,
+                        contact,
+                        touching,
+                        seconds: clock.total(),
+                    })
+                    .map_err(|e| by_node(e, &self.reduction.unknowns));
+            }
             (Mechanics::LargeRotation(body), sliding) => {
                 let slide =
                     sliding.as_ref().map(|sliding| Slide { sliding, motions, held: self.held });
@@ -368,6 +409,7 @@ impl StaticSolver {
                 let contact = rest.and_then(|rest| sliding.carried(motions, rest));
                 let found = system.solve_with_contact(
                     b,
+                    Linked::default(),
                     sliding,
                     motions,
                     contact.map(|contact| Begin { rows: &rows, contact }),
@@ -379,7 +421,8 @@ impl StaticSolver {
                 found.map(|(u, state, seconds)| (u, Some(state), seconds))
             }
         };
-        found.map_err(|e| by_node(e, &self.reduction.unknowns))
+        let (rows, contact, seconds) = found.map_err(|e| by_node(e, &self.reduction.unknowns))?;
+        Ok(Rows { rows, contact, touching: Touch::default(), seconds })
     }
 
     /// Force out of balance at the unknown nodes over the forces that the plan brings in: those of joined
@@ -390,6 +433,7 @@ impl StaticSolver {
         forces: &[[f64; 3]],
         loads: Option<&[[f64; 3]]>,
         contact: Option<&ContactState>,
+        touching: &[[f64; 3]],
         b: &[[f64; 3]],
     ) -> f64 {
         let mut rest: Vec<[f64; 3]> = self
@@ -402,6 +446,9 @@ impl StaticSolver {
             })
             .collect();
         let mut scale: f64 = b.iter().map(|v| dot(*v, *v)).sum();
+        for (rest, push) in rest.iter_mut().zip(touching) {
+            *rest = sub(*rest, *push);
+        }
         if let (Some(sliding), Some(state)) = (&self.sliding, contact) {
             for (i, node) in sliding.nodes().iter().enumerate() {
                 let push = scaled(state.normals[i], state.forces[i]);
@@ -474,7 +521,9 @@ impl StaticSolver {
         let scale = u.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
         let b = self.coupled(&u);
         let mut effort = Effort::default();
-        Ok(self.solve_rows(&b, &u, None, &motions, None, scale, &mut effort, interrupted)?.1)
+        let found =
+            self.solve_rows(&b, &u, None, &motions, None, scale, &mut effort, interrupted)?;
+        Ok(found.contact)
     }
 
     /// Unknown rows for several right-hand sides, with contact frozen where there is any.
@@ -491,6 +540,23 @@ impl StaticSolver {
         system
             .solve_columns(columns, scales, self.sliding.as_ref().zip(frozen), interrupted)
             .map_err(|e| by_node(e, &self.reduction.unknowns))
+    }
+}
+
+/// The method for a boundary with pairs that may touch: rounds change its matrix, and a factor would have to be
+/// made for each.
+fn method_for_touching(options: &StaticOptions) -> Result<Method> {
+    if options.kinematics != Kinematics::Linear {
+        return Err(MtmError::UnknownName {
+            what: "kinematics for a boundary with touching pairs",
+            found: options.kinematics.name().into(),
+            known: "linear",
+            kind: ErrorKind::Solver,
+        });
+    }
+    match options.method {
+        Method::Auto | Method::Pcg => Ok(Method::Pcg),
+        other => Err(touching_needs_pcg(other)),
     }
 }
 

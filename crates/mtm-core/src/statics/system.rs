@@ -6,10 +6,11 @@ use crate::algebra::cholesky::{Factor, Symbolic};
 use crate::algebra::constraints::{Constraint, add_offsets, projected, projected_rhs};
 use crate::algebra::row_sums::in_pool;
 use crate::boundary::Motion;
+use crate::contact::pairs::Link;
 use crate::contact::{
     Body, Constraints, ContactRow, ContactStart, ContactState, Response, Sliding, Spring,
 };
-use crate::error::{MtmError, Result};
+use crate::error::{ErrorKind, MtmError, Result};
 use crate::statics::frozen::FrozenContact;
 use crate::statics::iterative::{Advance, Effort, Extremes, Iterative, Trail};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
@@ -57,6 +58,25 @@ pub(crate) struct Begin<'a> {
     /// Displacements of the rows.
     pub rows: &'a [[f64; 3]],
     pub contact: ContactStart,
+}
+
+/// Links between rows: what touches.
+#[derive(Clone, Copy, Default)]
+pub(crate) struct Linked<'a> {
+    pub links: &'a [Link],
+    /// Share of what they change to which the answer may be off; none for one as exact as the tolerance asks.
+    pub share: Option<f64>,
+}
+
+impl Linked<'_> {
+    /// `b` with the goals of the links.
+    fn pulled(&self, b: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let mut out = b.to_vec();
+        for link in self.links {
+            link.add_goal(&mut out);
+        }
+        out
+    }
 }
 
 /// Contact constraints that do not change, for several right-hand sides.
@@ -177,6 +197,7 @@ impl System {
     pub fn solve_with_contact(
         &self,
         b: &[[f64; 3]],
+        linked: Linked<'_>,
         sliding: &Sliding,
         motions: &[&Motion],
         begin: Option<Begin<'_>>,
@@ -188,7 +209,9 @@ impl System {
         let clock = Clock::new();
         let rows = begin.as_ref().map_or(&[][..], |b| b.rows);
         let first = begin.as_ref().map(|b| &b.contact);
-        if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
+        if let (Kept::Direct { symbolic, factor, contact: Some(contact) }, []) =
+            (&self.kept, linked.links)
+        {
             // Each on a thread of the pool, so that loops inside begin without a hand-over; not all at once:
             // interrupts are of the calling thread.
             let answers = in_pool(|| contact.answers(symbolic, factor, b));
@@ -206,13 +229,55 @@ impl System {
             contact.allowed = contact.allowed.max(CONTACT_SHARE * options.tolerance * far);
         }
         let trail = Trail::starting(rows.to_vec());
-        let mut body =
-            Projected { system: self, b, sliding, scale, trail, effort, interrupted, last: None };
+        let mut body = Projected {
+            system: self,
+            b,
+            linked,
+            sliding,
+            scale,
+            trail,
+            effort,
+            interrupted,
+            last: None,
+        };
         let state = sliding.solve(motions, first, &contact, interrupted, &mut body)?;
         // No state without a step.
         let rows = body.last.map_or_else(Vec::new, |last| last.to);
         effort.error_estimate = effort.error_estimate.max(left_by(&state));
         Ok((rows, state, clock.total()))
+    }
+
+    /// Rows under links where no node slides, from displacements `start`; `scale`: as for
+    /// [`solve`](Self::solve).
+    ///
+    /// # Errors
+    /// Any method but conjugate gradients; those of its solve.
+    pub fn solve_linked(
+        &self,
+        b: &[[f64; 3]],
+        linked: Linked<'_>,
+        start: &[[f64; 3]],
+        scale: f64,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Rows> {
+        let Kept::Iterative(iterative) = &self.kept else {
+            return Err(touching_needs_pcg(Method::Cholesky));
+        };
+        let mut trail = Trail::starting(start.to_vec());
+        let found = iterative.solve_projected(
+            linked.pulled(b),
+            &[],
+            Vec::new(),
+            linked.links,
+            f64::INFINITY,
+            scale,
+            linked.share,
+            &mut trail,
+            effort,
+            interrupted,
+        )?;
+        Ok(found.rows)
     }
 
     /// Rows for several right-hand sides; `scales` is the length of each one's prescribed field, mm.
@@ -269,6 +334,7 @@ impl System {
                 let mut trail = Trail::default();
                 let found = self.solve_projected(
                     b,
+                    &[],
                     sliding,
                     c,
                     scale,
@@ -289,6 +355,7 @@ impl System {
     fn solve_projected(
         &self,
         b: &[[f64; 3]],
+        links: &[Link],
         sliding: &Sliding,
         c: &Constraints<'_>,
         scale: f64,
@@ -305,7 +372,17 @@ impl System {
             .map(|(r, &offset)| Constraint { row: row(r.node), normal: r.normal, offset })
             .collect();
         let springs: Vec<(usize, Spring)> = c.springs.iter().map(|&s| (row(s.node), s)).collect();
-        let mut rhs = projected_rhs(self.matrix(), b, &constraints);
+        let mut rhs = if links.is_empty() {
+            projected_rhs(self.matrix(), b, &constraints)
+        } else {
+            let (mut shift, mut pulled) = (vec![[0.0; 3]; b.len()], vec![[0.0; 3]; b.len()]);
+            add_offsets(&mut shift, &constraints);
+            for link in links {
+                link.add_force(&shift, &mut pulled);
+            }
+            let b: Rows = b.iter().zip(&pulled).map(|(b, f)| add(*b, *f)).collect();
+            projected_rhs(self.matrix(), &b, &constraints)
+        };
         for (row, s) in &springs {
             rhs[*row] = add(rhs[*row], scaled(s.axis, s.stiffness * s.goal));
         }
@@ -314,6 +391,7 @@ impl System {
                 rhs,
                 &constraints,
                 springs,
+                links,
                 c.reach,
                 scale,
                 share,
@@ -416,6 +494,7 @@ impl Body for Flexible<'_> {
 struct Projected<'a> {
     system: &'a System,
     b: &'a [[f64; 3]],
+    linked: Linked<'a>,
     sliding: &'a Sliding,
     scale: f64,
     trail: Trail,
@@ -430,6 +509,13 @@ impl Projected<'_> {
         let mut out = self.system.matrix().multiply(x);
         for (f, b) in out.iter_mut().zip(self.b) {
             *f = sub(*f, *b);
+        }
+        let mut pulled = vec![[0.0; 3]; if self.linked.links.is_empty() { 0 } else { x.len() }];
+        for link in self.linked.links {
+            link.add_force(x, &mut pulled);
+        }
+        for (f, pull) in out.iter_mut().zip(pulled) {
+            *f = sub(*f, pull);
         }
         out
     }
@@ -450,12 +536,17 @@ impl Body for Projected<'_> {
             }
         };
         self.trail.rows.clone_from(&from);
+        let share = match self.linked.share {
+            Some(rough) => Some(c.share.max(rough)),
+            None => (c.share > 0.0).then_some(c.share),
+        };
         let found = self.system.solve_projected(
             self.b,
+            self.linked.links,
             self.sliding,
             c,
             self.scale,
-            (c.share > 0.0).then_some(c.share),
+            share,
             &mut self.trail,
             self.effort,
             self.interrupted,
@@ -476,6 +567,7 @@ impl Body for Projected<'_> {
         let step = Step { from, to: x, forces_from, forces_to: forces };
         let slopes = Some(step.slopes());
         self.last = Some(step);
+        let solved = solved || self.linked.share.is_some();
         Ok(Response { displacements, reactions, slopes, solved, is_carried })
     }
 
@@ -489,6 +581,16 @@ impl Body for Projected<'_> {
         if let Some(last) = self.last.take() {
             self.trail.rows = last.to;
         }
+    }
+}
+
+/// That a method cannot solve for parts that touch.
+pub(crate) fn touching_needs_pcg(method: Method) -> MtmError {
+    MtmError::UnknownName {
+        what: "method for a boundary with touching pairs",
+        found: method.name().into(),
+        known: "auto, pcg",
+        kind: ErrorKind::Solver,
     }
 }
 

@@ -15,7 +15,7 @@ use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::reduction::Reduction;
 use crate::statics::restraint::Held;
 use crate::statics::solution::Clock;
-use crate::statics::system::{Begin, System};
+use crate::statics::system::{Begin, Linked, System};
 use crate::vector::{add, sub};
 
 /// Sliding nodes of a body with what their solver asks.
@@ -115,6 +115,7 @@ impl Equilibrium {
             begin.map(|state| Begin { rows: &here, contact: slide.sliding.start_of(state) });
         let (x, state, _) = system.solve_with_contact(
             &b,
+            Linked::default(),
             slide.sliding,
             slide.motions,
             begin,

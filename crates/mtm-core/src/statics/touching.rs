@@ -1,0 +1,307 @@
+//! Plans of bodies with parts that may touch: rounds of the method of multipliers, along the plan in steps.
+//!
+//! What touches is found by closest points, so no step of the plan may take one part through another: bones move
+//! by less than an edge of the tissue at a time. On the way rounds are rough; at the end of the plan they go on
+//! until nothing penetrates and nothing changes.
+
+use std::sync::Arc;
+
+use crate::boundary::Motion;
+use crate::contact::pairs::{Left, Pairs, Round, Touching};
+use crate::contact::{ContactStart, ContactState};
+use crate::error::{MtmError, Result};
+use crate::geometry::motion::SurfaceMotion;
+use crate::statics::iterative::Effort;
+use crate::statics::options::Interrupt;
+use crate::statics::solution::TouchResult;
+use crate::statics::solver::StaticSolver;
+use crate::statics::system::{Begin, Linked, System};
+use crate::vector::{add, between, norm, scaled, sub};
+
+/// Way of the bones in one step, over the mean edge of the tissue that may be touched.
+const STEP_EDGES: f64 = 0.75;
+/// Depth, over the same, to which a step may take a node; half the step where it goes deeper.
+const DEEP_EDGES: f64 = 0.5;
+/// Shortest step, as a share of the plan.
+const SHORTEST_STEP: f64 = 1.0 / 512.0;
+/// Distance that a node may have from what it presses on, mm, and over the diagonal of the mesh: scenes may be
+/// small.
+const CLOSE: f64 = 5e-3;
+const CLOSE_SHARE: f64 = 2e-5;
+/// Multiple of it that is enough on the way, and where the rounds ran out: five hundredths of a millimetre.
+const LOOSE: f64 = 10.0;
+/// Rounds of a step on the way, and of the last one.
+const MOST_ROUNDS_ON_THE_WAY: usize = 6;
+const MOST_ROUNDS: usize = 80;
+/// Rounds of a step that go the whole way.
+const EAGER_ROUNDS: usize = 8;
+/// Share of what a round changes to which it is solved until the last ones: small forces decide what touches.
+const ROUGH_SHARE: f64 = 1e-4;
+/// Most nodes that an error names.
+const NAMED_NODES: usize = 10;
+
+/// The body with what touches, after some share of the plan.
+#[derive(Clone)]
+struct Pose {
+    /// Displacement of every node, mm.
+    u: Vec<[f64; 3]>,
+    /// Those of the unknown rows.
+    rows: Vec<[f64; 3]>,
+    contact: Option<ContactState>,
+    touching: Touching,
+}
+
+/// What a plan does with a body whose parts may touch.
+pub(super) struct Touched {
+    /// Displacements of the unknown rows, mm.
+    pub rows: Vec<[f64; 3]>,
+    pub contact: Option<ContactState>,
+    pub touching: Touch,
+}
+
+/// What touches.
+#[derive(Default)]
+pub(super) struct Touch {
+    pub result: TouchResult,
+    /// Force on each row by what it touches, N; empty where nothing may.
+    pub forces: Vec<[f64; 3]>,
+}
+
+/// A plan on a body whose parts may touch.
+pub(super) struct Path<'a> {
+    pub solver: &'a StaticSolver,
+    pub system: &'a System,
+    pub pairs: &'a Pairs,
+    /// One for each segment.
+    pub motions: &'a [&'a Motion],
+    /// Of every node, N.
+    pub loads: Option<&'a [[f64; 3]]>,
+    /// Largest prescribed displacement, mm.
+    pub scale: f64,
+}
+
+/// The rounds of one step.
+struct Done {
+    round: Round,
+    left: Left,
+    rounds: usize,
+    /// Largest change of a node in the last one, mm.
+    change: f64,
+    converged: bool,
+}
+
+impl Path<'_> {
+    /// The body at the end of the plan.
+    ///
+    /// # Errors
+    /// `ContactNotConverged` where the rounds run out with a gap or penetration that a face would show, or where a
+    /// step penetrates however short it is; those of the solves.
+    pub fn solve(&self, effort: &mut Effort, interrupted: Interrupt<'_>) -> Result<Touched> {
+        let sliding = self.solver.sliding.as_ref();
+        let farthest = sliding.map_or(0.0, |s| s.farthest(self.motions)).max(self.scale);
+        let mut step = 1.0 / (farthest / (STEP_EDGES * self.pairs.mean_edge())).ceil().max(1.0);
+        let (mut pose, mut here, mut rounds) = (self.rest(), 0.0, 0);
+        loop {
+            let there = if here + 1.5 * step >= 1.0 { 1.0 } else { here + step };
+            match self.advance(&pose, here, there, effort, interrupted)? {
+                Some((next, done)) if there == 1.0 => {
+                    rounds += done.rounds;
+                    return self.end(next, &done, rounds, effort);
+                }
+                Some((next, done)) => {
+                    rounds += done.rounds;
+                    (pose, here) = (next, there);
+                }
+                None if step > SHORTEST_STEP => step *= 0.5,
+                None => return Err(self.lost(&pose, rounds, DEEP_EDGES * self.pairs.mean_edge())),
+            }
+        }
+    }
+
+    fn rest(&self) -> Pose {
+        Pose {
+            u: vec![[0.0; 3]; self.solver.tensors.element_nodes().n_nodes()],
+            rows: vec![[0.0; 3]; self.solver.reduction.unknowns.len()],
+            contact: None,
+            touching: self.pairs.at_rest(),
+        }
+    }
+
+    /// Distance that counts as touching, mm.
+    fn close(&self) -> f64 {
+        CLOSE.min(CLOSE_SHARE * self.solver.tensors.mesh().diagonal())
+    }
+
+    /// `pose`, reached at the share `from` of the plan, carried on to the share `to`; nothing where the step is too
+    /// large for closest points.
+    fn advance(
+        &self,
+        pose: &Pose,
+        from: f64,
+        to: f64,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Option<(Pose, Done)>> {
+        let (before, after) = (self.partial(from)?, self.partial(to)?);
+        let motions: Vec<&Motion> = after.iter().collect();
+        let prescribed = self.solver.prescribed(&motions)?;
+        let b = self.forces(&prescribed, to);
+        let is_last = to == 1.0;
+        let most = if is_last { MOST_ROUNDS } else { MOST_ROUNDS_ON_THE_WAY };
+        let close = if is_last { self.close() } else { LOOSE * self.close() };
+        let mut begin = self.carried(pose, &before.iter().collect::<Vec<_>>(), &motions);
+        // Where prescribed nodes go is known before anything is solved.
+        let u = self.solver.filled(&prescribed, &pose.rows);
+        let mut pose = Pose { u, ..pose.clone() };
+        let (mut rough, mut rounds) = (true, 0);
+        loop {
+            rounds += 1;
+            let round = self.pairs.round(&pose.u, &motions, &pose.touching)?;
+            let (rows, contact) = self.linked(
+                &b,
+                &round,
+                &pose.rows,
+                &motions,
+                begin,
+                rough.then_some(close),
+                effort,
+                interrupted,
+            )?;
+            let u = self.solver.filled(&prescribed, &rows);
+            let mut touching = pose.touching.clone();
+            let left = self.pairs.follow(&round, &u, &motions, &mut touching)?;
+            if rounds == 1 && left.penetration > DEEP_EDGES * self.pairs.mean_edge() {
+                return Ok(None);
+            }
+            let change = largest_change(&pose.u, &u);
+            let near = rounds > 1 && left.distance() <= close && change <= 2.0 * close;
+            let converged = near && left.changed == 0 && !rough;
+            let is_over = converged || rounds >= most || (near && !is_last);
+            // Nodes at a rim may meet two facets by turns: half steps lead between them.
+            let share = if is_over || near || rounds < EAGER_ROUNDS { 1.0 } else { 0.5 };
+            let rows = between(&pose.rows, &rows, share);
+            let u = self.solver.filled(&prescribed, &rows);
+            pose = Pose { u, rows, contact, touching };
+            if is_over {
+                return Ok(Some((pose, Done { round, left, rounds, change, converged })));
+            }
+            begin =
+                pose.contact.as_ref().zip(self.solver.sliding.as_ref()).map(|(c, s)| s.start_of(c));
+            rough = !(is_last && (near || rounds + 2 >= most));
+        }
+    }
+
+    /// The body under the links of a round: displacements of the rows, and contact where nodes slide.
+    ///
+    /// `rough`: gap of sliding nodes, mm, that is enough for a round on the way.
+    fn linked(
+        &self,
+        b: &[[f64; 3]],
+        round: &Round,
+        start: &[[f64; 3]],
+        motions: &[&Motion],
+        begin: Option<ContactStart>,
+        rough: Option<f64>,
+        effort: &mut Effort,
+        interrupted: Interrupt<'_>,
+    ) -> Result<(Vec<[f64; 3]>, Option<ContactState>)> {
+        let share = rough.map(|_| ROUGH_SHARE);
+        let linked = Linked { links: &round.links, share };
+        let Some(sliding) = &self.solver.sliding else {
+            let rows =
+                self.system.solve_linked(b, linked, start, self.scale, effort, interrupted)?;
+            return Ok((rows, None));
+        };
+        let mut options = self.solver.options;
+        options.contact.allowed = options.contact.allowed.max(rough.unwrap_or(0.0));
+        let begin = begin.map(|contact| Begin { rows: start, contact });
+        let (rows, contact, _) = self.system.solve_with_contact(
+            b,
+            linked,
+            sliding,
+            motions,
+            begin,
+            &options,
+            self.scale,
+            effort,
+            interrupted,
+        )?;
+        Ok((rows, Some(contact)))
+    }
+
+    /// Each motion as far as it has come at `share` of the plan.
+    fn partial(&self, share: f64) -> Result<Vec<Motion>> {
+        if share == 1.0 {
+            return Ok(self.motions.iter().map(|&m| m.clone()).collect());
+        }
+        let centre = self.solver.tensors.mesh().centre();
+        let part = |motion: &&Motion| {
+            Ok(match motion {
+                Motion::Rigid(rigid) => Motion::Rigid(rigid.partial(share, centre)),
+                Motion::Nodes(rows) => {
+                    Motion::Nodes(rows.iter().map(|u| scaled(*u, share)).collect())
+                }
+                Motion::Surface(motion) => {
+                    let (rest, moved) = (motion.rest(), motion.moved());
+                    let pairs = rest.vertices().iter().zip(moved.vertices());
+                    let part = pairs.map(|(x, y)| add(*x, scaled(sub(*y, *x), share))).collect();
+                    Motion::Surface(Arc::new(SurfaceMotion::new(rest.clone(), part)?))
+                }
+            })
+        };
+        self.motions.iter().map(part).collect()
+    }
+
+    /// Forces on the rows at `share` of the plan, N.
+    fn forces(&self, prescribed: &[[f64; 3]], share: f64) -> Vec<[f64; 3]> {
+        let mut b = self.solver.coupled(prescribed);
+        if let Some(loads) = self.loads {
+            for (b, &j) in b.iter_mut().zip(&self.solver.reduction.unknowns) {
+                *b = add(*b, scaled(loads[j as usize], share));
+            }
+        }
+        b
+    }
+
+    /// Sliding nodes carried with their segments from where `pose` has them.
+    fn carried(&self, pose: &Pose, from: &[&Motion], to: &[&Motion]) -> Option<ContactStart> {
+        let sliding = self.solver.sliding.as_ref()?;
+        let rest = sliding.carried_back(from, pose.contact.as_ref()?)?;
+        sliding.carried(to, &rest)
+    }
+
+    /// The answer, or an error where a face would show what is left.
+    fn end(&self, pose: Pose, done: &Done, rounds: usize, effort: &mut Effort) -> Result<Touched> {
+        let open = done.left.distance().max(done.change);
+        if !done.converged && open > LOOSE * self.close() {
+            return Err(self.lost(&pose, rounds, open));
+        }
+        effort.error_estimate = effort.error_estimate.max(open);
+        let met = self.pairs.met(&done.round, &pose.u, self.motions, &pose.rows)?;
+        let mut forces = vec![[0.0; 3]; pose.rows.len()];
+        for link in &done.round.links {
+            link.add_force(&pose.rows, &mut forces);
+        }
+        let result = TouchResult {
+            nodes: met.iter().map(|m| m.node).collect(),
+            gaps: met.iter().map(|m| m.gap).collect(),
+            normals: met.iter().map(|m| m.normal).collect(),
+            forces: met.iter().map(|m| m.force).collect(),
+            rounds,
+            converged: done.converged,
+        };
+        let touching = Touch { result, forces };
+        Ok(Touched { rows: pose.rows, contact: pose.contact, touching })
+    }
+
+    /// That parts which touch found no equilibrium, with the nodes that press most.
+    fn lost(&self, pose: &Pose, rounds: usize, gap: f64) -> MtmError {
+        let nodes = self.pairs.pressed(&pose.touching, NAMED_NODES);
+        MtmError::ContactNotConverged { iterations: rounds, nodes, gap }
+    }
+}
+
+/// Largest change of a node, mm.
+fn largest_change(from: &[[f64; 3]], to: &[[f64; 3]]) -> f64 {
+    from.iter().zip(to).fold(0.0, |m, (a, b)| m.max(norm(sub(*b, *a))))
+}
