@@ -90,8 +90,8 @@ pub use meshing::stuffing::distance::squared_distance;
 pub use meshing::stuffing::level::{Grid, LevelImage};
 pub use meshing::stuffing::{Halvings, Stuffed, StuffingOptions, stuff};
 pub use muscles::equivalent::{
-    InsideTest, MOST_SAMPLES, MeanDirection, Muscle, MuscleShares, MuscleVolume, SamplingOptions,
-    Share, TetShares, sample_muscles,
+    InsideTest, MOST_SAMPLES, MeanDirection, Muscle, MuscleShares, MuscleVolume, SamplingCounts,
+    SamplingOptions, SamplingTimings, Share, TetShares, sample_muscles,
 };
 pub use muscles::fibre::{MOST_BOXES, MuscleFibres, MuscleKind, NearFibres, OrientedBox};
 pub use registration::icp::{Fixed, IcpFit, IcpMethod, IcpOptions, icp};
