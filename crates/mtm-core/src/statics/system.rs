@@ -1,6 +1,8 @@
 //! The reduced linear system: what a method keeps from one plan to the next, and how it solves with
 //! and without contact.
 
+use std::sync::Arc;
+
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::{Factor, Symbolic};
 use crate::algebra::constraints::{Constraint, add_offsets, projected, projected_rhs};
@@ -40,9 +42,9 @@ type Rows = Vec<[f64; 3]>;
 /// What is kept from one plan to the next.
 enum Kept {
     /// The factor, and with sliding nodes what answers for them.
-    Direct { symbolic: Symbolic, factor: Factor, contact: Option<ContactFactor> },
+    Direct { factor: Factor, contact: Option<ContactFactor> },
     /// The structure of the factor: the values change with the contact normals.
-    Refactored { symbolic: Symbolic, matrix: BlockMatrix },
+    Refactored { symbolic: Arc<Symbolic>, matrix: BlockMatrix },
     /// The preconditioner.
     Iterative(Iterative),
 }
@@ -103,7 +105,7 @@ impl System {
                 && held == Held::ByPrescribed
                 && slide_rows.len() <= MAX_KEPT_SLIDING;
             let dense = kept && slide_rows.len() <= MAX_DENSE_SLIDING;
-            let symbolic = Symbolic::new(&matrix, if dense { &slide_rows } else { &[] })?;
+            let symbolic = Arc::new(Symbolic::new(&matrix, if dense { &slide_rows } else { &[] })?);
             clock.lap("ordering", true);
             if interrupted() {
                 return Err(MtmError::Interrupted);
@@ -117,14 +119,14 @@ impl System {
                 clock.lap("factor", true);
                 let contact = sliding.map(|sliding| {
                     if dense {
-                        ContactFactor::dense(&symbolic, &factor, sliding)
+                        ContactFactor::dense(&factor, sliding)
                     } else {
-                        ContactFactor::by_sweeps(&symbolic, &factor, sliding)
+                        ContactFactor::by_sweeps(&factor, sliding)
                     }
                 });
                 let contact = contact.transpose()?;
                 clock.lap("contact_factor", contact.is_some());
-                return Ok((with(Kept::Direct { symbolic, factor, contact }), method));
+                return Ok((with(Kept::Direct { factor, contact }), method));
             }
             if options.method == Method::Cholesky {
                 return Err(MtmError::OutOfMemory {
@@ -144,8 +146,8 @@ impl System {
     /// Bytes of the factor or preconditioner.
     pub fn bytes(&self) -> usize {
         match &self.kept {
-            Kept::Direct { symbolic, contact, .. } => {
-                symbolic.factor_bytes() + contact.as_ref().map_or(0, ContactFactor::bytes)
+            Kept::Direct { factor, contact } => {
+                factor.bytes() + contact.as_ref().map_or(0, ContactFactor::bytes)
             }
             Kept::Refactored { symbolic, .. } => symbolic.factor_bytes(),
             Kept::Iterative(iterative) => iterative.bytes(),
@@ -161,14 +163,12 @@ impl System {
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         match &self.kept {
-            Kept::Direct { symbolic, factor, .. } => {
-                let x = in_pool(|| symbolic.solve(factor, b));
+            Kept::Direct { factor, .. } => {
+                let x = in_pool(|| factor.solve(b));
                 effort.error_estimate = direct_error(factor, &x);
                 Ok(x)
             }
-            Kept::Refactored { symbolic, matrix } => {
-                Ok(symbolic.solve(&symbolic.factor(matrix)?, b))
-            }
+            Kept::Refactored { symbolic, matrix } => Ok(symbolic.factor(matrix)?.solve(b)),
             Kept::Iterative(iterative) => iterative.solve(b, scale, effort, interrupted),
         }
     }
@@ -188,10 +188,10 @@ impl System {
         let clock = Clock::new();
         let rows = begin.as_ref().map_or(&[][..], |b| b.rows);
         let first = begin.as_ref().map(|b| &b.contact);
-        if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
+        if let Kept::Direct { factor, contact: Some(contact) } = &self.kept {
             // Each on a thread of the pool, so that loops inside begin without a hand-over; not all at once:
             // interrupts are of the calling thread.
-            let answers = in_pool(|| contact.answers(symbolic, factor, b));
+            let answers = in_pool(|| contact.answers(factor, b));
             let tolerance = sliding.gap_limit(&options.contact) / sliding.diagonal;
             let mut body = Flexible { answers, tolerance, last: None, is_known: false };
             let state = sliding.solve(motions, first, &options.contact, interrupted, &mut body)?;
@@ -225,8 +225,8 @@ impl System {
     ) -> Result<Vec<Vec<[f64; 3]>>> {
         let mut effort = Effort::default();
         let Some((sliding, frozen)) = sliding else {
-            if let Kept::Direct { symbolic, factor, .. } = &self.kept {
-                symbolic.solve_many(factor, &mut columns);
+            if let Kept::Direct { factor, .. } = &self.kept {
+                factor.solve_many(&mut columns);
                 return Ok(columns);
             }
             let each = columns.iter().zip(scales);
@@ -249,12 +249,12 @@ impl System {
                 reach,
             })
         };
-        if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
+        if let Kept::Direct { factor, contact: Some(contact) } = &self.kept {
             let kept = contact.tail().map(|t| FrozenContact::new(t, frozen.rows, frozen.springs));
             let kept = kept.transpose()?;
             let solve = |(k, b): (usize, &Rows)| {
                 conditions(k, &mut |c| {
-                    let mut answers = contact.answers(symbolic, factor, b);
+                    let mut answers = contact.answers(factor, b);
                     let forces = match &kept {
                         Some(kept) => kept.forces(answers.free(), c),
                         None => answers.respond(c, 0.0)?.forces,
@@ -327,7 +327,7 @@ impl System {
                     system.add_to_diagonal(*row, s.axis, s.stiffness);
                 }
                 let factor = symbolic.factor(&system)?;
-                let rows = symbolic.solve(&factor, &rhs);
+                let rows = factor.solve(&rhs);
                 effort.error_estimate = direct_error(&factor, &rows);
                 Advance { rows, solved: true, is_carried: false }
             }

@@ -53,7 +53,7 @@ const NEAR_REST: f64 = 0.1;
 
 /// How tangent systems are solved.
 enum TangentSolver {
-    Cholesky(Box<Symbolic>),
+    Cholesky(Arc<Symbolic>),
     Pcg,
 }
 
@@ -190,7 +190,7 @@ impl Equilibrium {
                     advice: "use method=\"pcg\"",
                 });
             }
-            TangentSolver::Cholesky(Box::new(symbolic))
+            TangentSolver::Cholesky(Arc::new(symbolic))
         } else {
             TangentSolver::Pcg
         };
@@ -527,7 +527,7 @@ impl Equilibrium {
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         if let TangentSolver::Cholesky(symbolic) = &self.solver {
-            return Ok(symbolic.solve(&symbolic.factor(matrix)?, rhs));
+            return Ok(symbolic.factor(matrix)?.solve(rhs));
         }
         let positions: Vec<[f64; 3]> = reduction.rows(self.tensors.element_nodes().positions());
         let normals: Vec<(usize, [f64; 3])> =
