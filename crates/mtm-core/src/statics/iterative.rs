@@ -188,7 +188,7 @@ pub(crate) struct Advance {
 /// A system without a factor: the matrix and a multigrid hierarchy for it.
 pub(crate) struct Iterative {
     matrix: BlockMatrix,
-    multigrid: Box<Multigrid>,
+    multigrid: Multigrid,
     /// Whether sweeps solve, and the hierarchy only measures the error they leave.
     sweeps: bool,
     /// Estimated error over the length of the motion.
@@ -213,7 +213,7 @@ impl Iterative {
     ) -> Self {
         Self {
             matrix,
-            multigrid: Box::new(multigrid),
+            multigrid,
             sweeps: method == Method::Relaxation,
             tolerance: options.tolerance,
             max_iterations: options.max_iterations,
@@ -231,7 +231,7 @@ impl Iterative {
     ) -> Confirmed<'a> {
         Confirmed {
             a,
-            preconditioner: self.multigrid.as_ref(),
+            preconditioner: &self.multigrid,
             trial,
             doubtful: self.doubtful,
             relative: self.tolerance,
@@ -259,7 +259,7 @@ impl Iterative {
             return self.relax_to_bound(&self.matrix, b, tolerance, solve);
         }
         let confirmed = self.confirmed(&self.matrix, &self.trial, solve.interrupted);
-        let found = self.from_zero(&confirmed, b, tolerance)?;
+        let found = self.solution(&confirmed, b, tolerance)?;
         solve.effort.error_estimate = found.error_estimate_mm;
         solve.effort.add(found.iterations, found.residual_history);
         Ok(found.solution)
@@ -282,11 +282,11 @@ impl Iterative {
             relative: tolerance / far,
             ..self.confirmed(&self.matrix, &self.trial, interrupted)
         };
-        Ok(self.from_zero(&confirmed, b, tolerance)?.solution)
+        Ok(self.solution(&confirmed, b, tolerance)?.solution)
     }
 
-    /// The solution for `b` by `confirmed`, from no displacements.
-    fn from_zero(
+    /// The solution for `b` by `confirmed`, begun at rest.
+    fn solution(
         &self,
         confirmed: &Confirmed<'_>,
         b: &[[f64; 3]],

@@ -57,7 +57,7 @@ enum Unfactored {
     /// By a factor whose values change with the contact normals.
     Refactored { symbolic: Arc<Symbolic>, matrix: BlockMatrix },
     /// By iteration.
-    Iterative(Iterative),
+    Iterative(Box<Iterative>),
 }
 
 /// The system of the unknown nodes, ready for any right-hand side.
@@ -205,7 +205,7 @@ impl System {
         let multigrid = multigrid(&matrix, body)?;
         let iterative = Iterative::new(matrix, multigrid, body.tissue, method, options);
         clock.lap("preconditioner", true);
-        Ok((with(Kept::Matrix(Unfactored::Iterative(iterative))), method))
+        Ok((with(Kept::Matrix(Unfactored::Iterative(Box::new(iterative)))), method))
     }
 
     /// Bytes of the factor or preconditioner.
