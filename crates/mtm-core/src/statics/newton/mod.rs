@@ -506,8 +506,7 @@ impl Equilibrium {
         let positions = self.reduction.rows(self.tensors.element_nodes().positions());
         let normals: Vec<(usize, [f64; 3])> =
             constraints.iter().map(|c| (c.row, c.normal)).collect();
-        let tissue = Extremes { lame_ratio: 0.0, ..self.tissue };
-        let multigrid = hierarchy(&matrix, &positions, &normals, tissue)?;
+        let multigrid = hierarchy(&matrix, &positions, &normals, self.tissue)?;
         let options =
             StaticOptions { tolerance: STEP_TOLERANCE * self.options.tolerance, ..self.options };
         Ok(Iterative::new(matrix, multigrid, self.tissue, Method::Pcg, &options))
