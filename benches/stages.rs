@@ -71,7 +71,7 @@ fn choices(c: &mut Criterion) {
     let plan = scene::plan(&shell, 0);
     let mut group = c.benchmark_group("choices");
     for element in [Element::Linear, Element::NodalPressure, Element::Quadratic] {
-        for kinematics in [Kinematics::Linear, Kinematics::Corotational, Kinematics::Hyperelastic] {
+        for kinematics in [Kinematics::Linear, Kinematics::Corotational, Kinematics::NEO_HOOKEAN] {
             let options = StaticOptions { kinematics, ..StaticOptions::default() };
             let set_up = || {
                 let tensors = MassTensors::with_element(mesh.clone(), tissue.clone(), element)

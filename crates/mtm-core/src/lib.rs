@@ -77,6 +77,7 @@ pub use geometry::surface::{Closest, Surface};
 pub use geometry::triangle::{DEGENERATE_AREA, Feature};
 pub use geometry::winding::{WindingOptions, WindingTree, winding_number_exact};
 pub use mechanics::element::{Element, ElementNodes};
+pub use mechanics::hyperelastic::HyperelasticLaw;
 pub use mechanics::kinematics::Kinematics;
 pub use mechanics::material::{
     Elastic, FibreElastic, FibreLaw, Lame, Mixing, Preset, Spencer, TetMaterial, Tissue, Voigt,
