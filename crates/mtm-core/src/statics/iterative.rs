@@ -214,7 +214,7 @@ impl Iterative {
         Self {
             matrix,
             multigrid,
-            sweeps: method == Method::Relaxation,
+            sweeps: method.sweeps(),
             tolerance: options.tolerance,
             max_iterations: options.max_iterations,
             doubtful: is_doubtful(tissue.contrast),

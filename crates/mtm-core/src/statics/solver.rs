@@ -123,7 +123,7 @@ impl StaticSolver {
                 .map(|(body, method)| (Mechanics::LargeRotation(Box::new(body)), method))
         };
         let (mechanics, method) = made.map_err(|e| by_node(e, &reduction.unknowns))?;
-        let refines = method == Method::Cholesky
+        let refines = method.has_factor()
             && options.kinematics == Kinematics::Linear
             && is_doubtful(tensors.tissue().contrast());
         Ok(Self {

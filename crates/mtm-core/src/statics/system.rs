@@ -156,7 +156,7 @@ impl System {
     ) -> Result<(Self, Method)> {
         let mut method = options.method.for_unknowns(3 * matrix.n_rows());
         let with = |kept: Kept| Self { kept };
-        if method == Method::Cholesky {
+        if method.has_factor() {
             let slide_rows: Vec<u32> =
                 body.sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
             // Where sliding nodes alone hold a part, there is no flexibility without them.
@@ -192,7 +192,7 @@ impl System {
                 };
                 return Ok((with(kept), method));
             }
-            if options.method == Method::Cholesky {
+            if options.method.has_factor() {
                 return Err(MtmError::OutOfMemory {
                     what: "the Cholesky factor",
                     needed_mb: symbolic.factor_bytes() >> 20,

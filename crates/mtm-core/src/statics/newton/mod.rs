@@ -169,9 +169,11 @@ impl Equilibrium {
                     kind: ErrorKind::Solver,
                 });
             }
-            method => method.for_unknowns(3 * matrix.n_rows()),
+            method @ (Method::Auto | Method::Cholesky | Method::Pcg) => {
+                method.for_unknowns(3 * matrix.n_rows())
+            }
         };
-        let solver = if method == Method::Cholesky {
+        let solver = if method.has_factor() {
             let symbolic = Symbolic::new(matrix, &[])?;
             if let Some(limit) = options.memory_limit
                 && symbolic.factor_bytes() > limit
@@ -187,7 +189,7 @@ impl Equilibrium {
         } else {
             TangentSolver::Pcg
         };
-        clock.lap("ordering", method == Method::Cholesky);
+        clock.lap("ordering", method.has_factor());
         let energy = StrainEnergy::new(tensors.clone(), options.kinematics);
         let tissue = Extremes {
             lame_ratio: tensors.tissue().largest_lame_ratio(),
