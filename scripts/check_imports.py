@@ -10,149 +10,27 @@ import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-# What each file of crates/mtm-core/src may name of the crate. All may name `error`; lib.rs is free.
-# A folder stands for its mod.rs, which may name every file beside it.
+# The files and folders at the top of crates/mtm-core/src, from the ground up, and what each may
+# import. An import may only run towards the ground; lib.rs is free.
 CORE: Mapping[str, frozenset[str]] = {
     name: frozenset(allowed.split())
     for name, allowed in {
         "error": "",
-        "mesh": "",
-        "memory": "",
-        "simd": "",
-        "blocks": "simd",
-        "ordering": "blocks",
-        "triangle": "",
-        "topology": "triangle",
-        "surface": "mesh topology triangle",
-        "winding": "surface mesh triangle",
-        "stuffing/level": "",
-        "stuffing/distance": "stuffing/level",
-        "stuffing/lattice": "keys",
-        "stuffing/cut": "mesh stuffing/lattice stuffing/level",
-        "stuffing/improve": "mesh stuffing/cut stuffing/level",
-        "stuffing/parts": "mesh stuffing/cut",
-        "stuffing": "mesh",
-        "parting": "mesh stuffing/cut surface",
-        "signed_distance": "mesh stuffing/level surface winding",
-        "material": "mesh",
-        "fibre/region": "surface triangle",
-        "fibre/centre_line": "triangle fibre/region",
-        "fibre/parts": "triangle fibre/centre_line fibre/region",
-        "fibre/course": "triangle",
-        "fibre": "surface triangle",
-        "equivalent/aligned_box": "triangle",
-        "equivalent/tet_tree": "equivalent/aligned_box triangle",
-        "equivalent/border": "surface triangle",
-        "equivalent/shape": "equivalent/aligned_box equivalent/border surface triangle winding",
-        "equivalent/crossing": (
-            "equivalent/aligned_box equivalent/shape equivalent/tet_tree mesh triangle"
-        ),
-        "equivalent/sequence": "triangle",
-        "equivalent/packet": "equivalent/sequence equivalent/shape triangle",
-        "equivalent/direction": "triangle",
-        "equivalent/shares": (
-            "equivalent equivalent/crossing equivalent/direction equivalent/packet "
-            "equivalent/sequence equivalent/shape fibre mesh triangle"
-        ),
-        "equivalent/stiffness": "equivalent/shares material",
-        "equivalent": "fibre material mesh surface triangle winding",
-        "element": "mesh",
-        "keys": "",
-        "kinematics": "",
-        "quadratic": "blocks element",
-        "nodal_pressure": "blocks material mesh",
-        "tensors": "blocks element material mesh nodal_pressure quadratic",
-        "polar": "",
-        "pool": "",
-        "density": "kinematics material polar",
-        "strain_energy": "blocks density element kinematics nodal_pressure tensors",
-        "motion": "surface mesh triangle",
-        "registration/spread": "triangle",
-        "registration/thin_plate": "registration/spread triangle",
-        "registration/rigid": "registration/spread triangle",
-        "registration/nearest": "registration/spread",
-        "registration/icp": (
-            "motion registration/nearest registration/rigid registration/spread surface triangle"
-        ),
-        "registration": "",
-        "boundary": "surface motion mesh",
-        "restraint": "mesh",
-        "contact/field": "keys mesh surface",
-        "contact": "boundary mesh motion surface contact/field",
-        "contact/seat": "boundary contact mesh motion surface contact/field",
-        "contact/newton": "boundary contact mesh triangle contact/seat",
-        "constraints": "blocks mesh",
-        "cholesky/workspace": "",
-        "cholesky/structure": "blocks ordering cholesky/workspace",
-        "cholesky/numeric": "blocks cholesky/structure",
-        "cholesky/symmetric": "simd cholesky/workspace",
-        "cholesky/sweep": "simd cholesky/numeric cholesky/symmetric",
-        "cholesky/dense": "cholesky/symmetric",
-        "cholesky/grid": "blocks",
-        "cholesky/normal": "cholesky/symmetric",
-        "cholesky/reach": "cholesky/sweep cholesky/symmetric",
-        "cholesky": (
-            "blocks ordering cholesky/dense cholesky/normal cholesky/numeric cholesky/reach "
-            "cholesky/structure cholesky/sweep cholesky/symmetric cholesky/workspace"
-        ),
-        "row_sums": "blocks",
-        "error_estimate": "",
-        "krylov": "blocks error_estimate row_sums",
-        "multigrid/block_rows": "blocks",
-        "multigrid/small_blocks": "simd",
-        "multigrid/scaling": "multigrid/block_rows multigrid/small_blocks",
-        "multigrid/scaled_matrix": (
-            "error_estimate row_sums simd multigrid/block_rows multigrid/scaling "
-            "multigrid/small_blocks"
-        ),
-        "multigrid/smoother": "simd multigrid/scaled_matrix",
-        "multigrid/aggregation": "multigrid/block_rows multigrid/scaled_matrix",
-        "multigrid/rigid_modes": "multigrid/aggregation",
-        "multigrid/prolongator": (
-            "multigrid/aggregation multigrid/block_rows multigrid/rigid_modes "
-            "multigrid/scaled_matrix"
-        ),
-        "multigrid/galerkin": (
-            "multigrid/block_rows multigrid/prolongator multigrid/rigid_modes multigrid/scaling "
-            "multigrid/small_blocks"
-        ),
-        "multigrid/transfer": (
-            "simd multigrid/prolongator multigrid/rigid_modes multigrid/scaling "
-            "multigrid/small_blocks"
-        ),
-        "multigrid/coarsest": (
-            "multigrid/block_rows multigrid/galerkin multigrid/rigid_modes multigrid/scaling"
-        ),
-        "multigrid": "blocks krylov row_sums",
-        "relaxation": "blocks",
-        "method": "contact kinematics",
-        "reduction": "blocks boundary",
-        "solution": "contact",
-        "projected_product": "blocks constraints contact krylov mesh",
-        "iterative": (
-            "blocks constraints contact krylov mesh method multigrid projected_product relaxation"
-        ),
-        "reaction": "cholesky contact mesh",
-        "frozen": "cholesky contact mesh reaction",
-        "system": (
-            "blocks boundary cholesky constraints contact frozen iterative mesh method reaction "
-            "restraint row_sums solution"
-        ),
-        "equilibrium": (
-            "blocks cholesky constraints contact iterative krylov mesh method multigrid "
-            "reduction solution strain_energy tensors"
-        ),
-        "equilibrium/sliding": (
-            "boundary contact equilibrium iterative mesh method reduction restraint solution "
-            "strain_energy system"
-        ),
-        "statics": (
-            "blocks boundary contact equilibrium iterative kinematics mesh method reduction "
-            "restraint solution system tensors"
-        ),
-        "replan": "boundary contact kinematics mesh method motion reduction statics system",
+        "vector": "",
+        "mesh": "error vector",
+        "geometry": "error vector",
+        "algebra": "error vector",
+        "mechanics": "algebra error mesh vector",
+        "boundary": "error geometry vector",
+        "meshing": "error geometry mesh vector",
+        "muscles": "error geometry mechanics mesh vector",
+        "registration": "error geometry vector",
+        "contact": "boundary error geometry mesh vector",
+        "statics": "algebra boundary contact error geometry mechanics mesh vector",
     }.items()
 }
+# Entries at the top of crates/mtm-core/src beside lib.rs: a reader holds so many in mind.
+MOST_CORE_ENTRIES = 15
 # The one place, below crates/, that may name each outside crate.
 CRATES: Mapping[str, str] = {
     "parry3d_f64": "mtm-core/src/geometry/surface.rs",
@@ -196,8 +74,11 @@ PYTHON_PACKAGES = frozenset({"numpy"})
 NAMELESS = frozenset({"utils", "util", "helpers", "helper", "common", "misc"})
 
 COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
-TEST_MODULE = re.compile(r"^#\[cfg\(test\)\]\s*mod\s.*", re.DOTALL | re.MULTILINE)
-CRATE_PATH = re.compile(r"\b(crate|super)::(\w+)(?:::(\w+))?")
+TEST_MODULE = re.compile(r"^#\[cfg\(test\)\]\s*mod\s+\w+\s*\{.*", re.DOTALL | re.MULTILINE)
+CRATE_PATH = re.compile(r"\b(crate|super)((?:::\w+)+)")
+# A folder's mod.rs lists its files and passes their names on: neither is an import.
+PASSED_ON = re.compile(r"^\s*pub(?:\([^)]*\))?\s+use\s+(?!crate|super)[^;]*;", re.MULTILINE)
+CHILD = re.compile(r"^\s*(?:pub(?:\([^)]*\))?\s+)?mod\s+(\w+);", re.MULTILINE)
 CRATE_GROUP = re.compile(r"\b(?:crate|super)::\{")
 
 
@@ -221,36 +102,99 @@ def check_rust(root: Path) -> Iterator[str]:
                 continue
             for match in re.finditer(rf"\b{crate}\s*::|\buse\s+{crate}\b", text):
                 yield f"{_at(path, root, text, match.start())}: {crate} belongs in crates/{home}"
-        if place.startswith("mtm-core/src/") and place != "mtm-core/src/lib.rs":
-            yield from _check_core_file(path, root, TEST_MODULE.sub(_blank, text))
+    yield from _check_core(root)
 
 
-def _check_core_file(path: Path, root: Path, text: str) -> Iterator[str]:
+def _check_core(root: Path) -> Iterator[str]:
+    """The broken rules of the files of the core among one another."""
     source = root / "crates/mtm-core/src"
-    name = path.relative_to(source).with_suffix("").as_posix().removesuffix("/mod")
-    if name not in CORE:
-        yield f"{path.relative_to(root)}: add it to CORE in scripts/check_imports.py"
-        return
-    for match in CRATE_GROUP.finditer(text):
-        yield f"{_at(path, root, text, match.start())}: write one `use {match[0][:-1]}…` per module"
-    for match in CRATE_PATH.finditer(text):
-        module = _module(source, path, *match.groups())
-        if module not in CORE[name] | {"error", name}:
-            yield (
-                f"{_at(path, root, text, match.start())}: {name} may not import {module} "
-                f"(may: {', '.join(sorted(CORE[name] | {'error'}))})"
-            )
+    files = [path for path in sorted(source.rglob("*.rs")) if path != source / "lib.rs"]
+    graph: dict[str, set[str]] = {}
+    for path in files:
+        name = path.relative_to(source).with_suffix("").as_posix().removesuffix("/mod")
+        entry = name.split("/")[0]
+        graph[name] = set()
+        if entry not in CORE:
+            yield f"{path.relative_to(root)}: add {entry} to CORE in scripts/check_imports.py"
+            continue
+        text = TEST_MODULE.sub(_blank, COMMENT.sub(_blank, path.read_text(encoding="utf-8")))
+        for match in CRATE_GROUP.finditer(text):
+            line = _at(path, root, text, match.start())
+            yield f"{line}: write one `use {match[0][:-1]}…` per module"
+        for offset, module in _core_imports(source, path, text):
+            graph[name] |= {module} - {name}
+            complaint = _core_complaint(entry, module.split("/")[0])
+            if complaint:
+                yield f"{_at(path, root, text, offset)}: {complaint}"
+    entries = sorted({name.split("/")[0] for name in graph})
+    if len(entries) > MOST_CORE_ENTRIES:
+        yield f"crates/mtm-core/src: {len(entries)} entries, at most {MOST_CORE_ENTRIES}"
+    for circle in _circles(graph):
+        yield f"crates/mtm-core/src: a circle of imports: {' → '.join(circle)}"
 
 
-def _module(source: Path, path: Path, start: str, first: str, second: str | None) -> str:
-    """The file, as CORE names it, that `start::first::second` in the file at `path` lies in."""
-    folder = "" if path.parent == source else path.parent.relative_to(source).as_posix()
-    if start == "super" and path.name != "mod.rs" and folder:
-        inside = (source / folder / first).with_suffix(".rs")
-        return f"{folder}/{first}" if inside.exists() else folder
-    if start == "crate" and second and (source / first / second).with_suffix(".rs").exists():
-        return f"{first}/{second}"
-    return first
+def _core_complaint(entry: str, other: str) -> str | None:
+    """Why a file below `entry` may not import one below `other`."""
+    if other == entry:
+        return None
+    if other not in CORE:
+        return f"{entry} may not import {other}, which is none of the crate's"
+    order = list(CORE)
+    if order.index(other) > order.index(entry):
+        return f"{entry} may not import {other}: it runs upwards"
+    if other not in CORE[entry]:
+        return f"{entry} may not import {other} (may: {', '.join(sorted(CORE[entry])) or 'none'})"
+    return None
+
+
+def _core_imports(source: Path, path: Path, text: str) -> Iterator[tuple[int, str]]:
+    """Offset and file, below `source` without its suffix, of each import in the text of a file."""
+    folder = path.parent.relative_to(source).parts
+    for match in CRATE_PATH.finditer(PASSED_ON.sub(_same_length, text)):
+        parts = match[2].split("::")[1:]
+        if match[1] == "super":
+            start = list(folder[:-1] if path.name == "mod.rs" else folder)
+            while parts and parts[0] == "super":
+                start, parts = start[:-1], parts[1:]
+            parts = start + parts
+        module = _core_file(source, parts)
+        if module:
+            yield match.start(), module
+    if path.name == "mod.rs":
+        body = PASSED_ON.sub(_same_length, text)
+        for child in CHILD.findall(text):
+            for match in re.finditer(rf"(?<![:\w]){child}::", body):
+                yield match.start(), "/".join((*folder, child))
+
+
+def _core_file(source: Path, parts: list[str]) -> str:
+    """The file or folder that a path of the crate lies in; its first part where there is none."""
+    for n in range(len(parts), 0, -1):
+        place = source.joinpath(*parts[:n])
+        if place.with_suffix(".rs").exists() or (place / "mod.rs").exists():
+            return "/".join(parts[:n])
+    return parts[0] if parts else ""
+
+
+def _circles(graph: Mapping[str, set[str]]) -> Iterator[list[str]]:
+    """One circle of imports through each file that closes one first, along the names in order."""
+    done: set[str] = set()
+    for start in sorted(graph):
+        trail: list[str] = []
+        stack = [(start, iter(sorted(graph[start])))] if start not in done else []
+        while stack:
+            name, others = stack[-1]
+            if len(trail) < len(stack):
+                trail.append(name)
+            other = next(others, None)
+            if other is None:
+                done.add(name)
+                stack.pop()
+                trail.pop()
+            elif other in trail:
+                yield [*trail[trail.index(other) :], other]
+            elif other not in done and other in graph:
+                stack.append((other, iter(sorted(graph[other]))))
 
 
 def check_python(root: Path) -> Iterator[str]:
@@ -360,6 +304,11 @@ def _sources(root: Path) -> Iterator[Path]:
 def _blank(match: re.Match[str]) -> str:
     """As many lines as the match, so that line numbers stay right."""
     return "\n" * match[0].count("\n")
+
+
+def _same_length(match: re.Match[str]) -> str:
+    """Blanks in place of the match, so that offsets stay right."""
+    return re.sub(r"[^\n]", " ", match[0])
 
 
 def _at(path: Path, root: Path, text: str, offset: int) -> str:

@@ -79,6 +79,7 @@ pub use geometry::surface::{Closest, Surface};
 pub use geometry::triangle::{DEGENERATE_AREA, Feature};
 pub use geometry::winding::{WindingOptions, WindingTree, winding_number_exact};
 pub use mechanics::element::{Element, ElementNodes};
+pub use mechanics::hyperelastic::HyperelasticLaw;
 pub use mechanics::kinematics::Kinematics;
 pub use mechanics::material::{
     Elastic, FibreElastic, FibreLaw, Lame, Mixing, Preset, Spencer, TetMaterial, Tissue, Voigt,
@@ -92,8 +93,8 @@ pub use meshing::stuffing::distance::squared_distance;
 pub use meshing::stuffing::level::{Grid, LevelImage};
 pub use meshing::stuffing::{Halvings, Stuffed, StuffingOptions, stuff};
 pub use muscles::equivalent::{
-    InsideTest, MOST_SAMPLES, MeanDirection, Muscle, MuscleShares, MuscleVolume, SamplingOptions,
-    Share, TetShares, sample_muscles,
+    InsideTest, MOST_SAMPLES, MeanDirection, Muscle, MuscleShares, MuscleVolume, SamplingCounts,
+    SamplingOptions, SamplingTimings, Share, TetShares, sample_muscles,
 };
 pub use muscles::fibre::{MOST_BOXES, MuscleFibres, MuscleKind, NearFibres, OrientedBox};
 pub use registration::icp::{Fixed, IcpFit, IcpMethod, IcpOptions, icp};

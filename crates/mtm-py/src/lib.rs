@@ -17,7 +17,9 @@ static MEMORY: mtm_core::HugePages = mtm_core::HugePages;
 /// The compiled core of cmfsim.
 #[pyo3::pymodule]
 mod _core {
+    use mtm_core::{Kinematics, Method};
     use pyo3::prelude::*;
+    use pyo3::types::PyTuple;
 
     #[pymodule_export]
     use crate::equivalent::{PyMuscleShares, sample};
@@ -39,9 +41,10 @@ mod _core {
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
         crate::errors::register(module)?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))?;
-        module.add("METHODS", ("auto", "cholesky", "pcg", "relaxation"))?;
+        module.add("METHODS", PyTuple::new(module.py(), Method::ALL.map(Method::name))?)?;
         module.add("ELEMENTS", ("p1", "anp", "p2"))?;
-        module.add("KINEMATICS", ("linear", "corotational", "hyperelastic"))?;
+        let kinematics: Vec<&str> = Kinematics::all().map(Kinematics::name).collect();
+        module.add("KINEMATICS", PyTuple::new(module.py(), kinematics)?)?;
         module.add("PRESETS", ("kim2010", "kim2010-swapped"))?;
         module.add("LAWS", ("spencer", "picinbono"))?;
         module.add("MOST_BOXES", mtm_core::MOST_BOXES)

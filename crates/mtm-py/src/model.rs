@@ -352,6 +352,7 @@ pub struct PyStaticSolver {
 
 #[pymethods]
 impl PyStaticSolver {
+    #[expect(clippy::too_many_arguments, reason = "one for each keyword of the Python signature")]
     #[new]
     #[pyo3(
         signature = (

@@ -17,16 +17,21 @@ def test_the_project_keeps_its_import_rules(capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.parametrize(
     ("file", "text", "complaint"),
     [
-        ("crates/mtm-core/src/mesh.rs", "use crate::surface::Surface;", "mesh may not import"),
+        ("crates/mtm-core/src/mesh.rs", "use crate::geometry::surface::Surface;", "runs upwards"),
+        (
+            "crates/mtm-core/src/algebra/mod.rs",
+            "use crate::mesh::M;",
+            "algebra may not import mesh",
+        ),
+        ("crates/mtm-core/src/algebra/krylov.rs", "super::super::contact::Row", "runs upwards"),
+        ("crates/mtm-core/src/mesh.rs", "use crate::nowhere::N;", "none of the crate's"),
         ("crates/mtm-core/src/mesh.rs", "\nuse faer::Mat;", "mesh.rs:2: faer belongs in"),
         ("crates/mtm-core/src/contact.rs", "let t = parry3d_f64::shape();", "parry3d_f64 belongs"),
         ("crates/mtm-core/src/mesh.rs", "use pyo3::prelude::*;", "pyo3 belongs in crates/mtm-py"),
         ("crates/mtm-core/src/mesh.rs", "use crate::{error, blocks};", "one `use crate::"),
-        ("crates/mtm-core/src/new.rs", "", "add it to CORE"),
-        ("crates/mtm-core/src/multigrid/new.rs", "", "new.rs: add it to CORE"),
-        ("crates/mtm-core/src/multigrid/mod.rs", "use crate::mesh::M;", "may not import mesh"),
-        ("crates/mtm-core/src/multigrid/scaling.rs", "super::Multigrid;", "not import multigrid "),
-        ("crates/mtm-core/src/multigrid/scaling.rs", "use super::{galerkin};", "one `use super::"),
+        ("crates/mtm-core/src/algebra/krylov.rs", "use super::{blocks};", "one `use super::"),
+        ("crates/mtm-core/src/new.rs", "", "add new to CORE"),
+        ("crates/mtm-core/src/new/deep.rs", "", "deep.rs: add new to CORE"),
         ("crates/mtm-core/src/utils.rs", "", "name the file after its subject"),
         ("python/cmfsim/checks.py", "from cmfsim import values", "checks may not import values"),
         ("python/cmfsim/values/scene.py", "from .. import io", "values may not import io"),
@@ -50,12 +55,52 @@ def test_a_broken_rule_is_named(
     assert complaint in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("texts", "circle"),
+    [
+        (
+            {
+                "algebra/mod.rs": "pub mod krylov;\npub mod blocks;",
+                "algebra/krylov.rs": "use crate::algebra::blocks::B;",
+                "algebra/blocks.rs": "use super::krylov::K;",
+            },
+            "algebra/blocks → algebra/krylov → algebra/blocks",
+        ),
+        (
+            {
+                "contact/mod.rs": "mod seat;\nuse seat::Seat;\npub struct Sliding;",
+                "contact/seat.rs": "use crate::contact::Sliding;",
+            },
+            "contact → contact/seat → contact",
+        ),
+        (
+            {
+                "contact/mod.rs": "mod seat;\npub use seat::Seat;\npub struct Sliding;",
+                "contact/seat.rs": "use super::Sliding;",
+            },
+            None,
+        ),
+    ],
+)
+def test_a_circle_within_a_folder_is_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], texts: dict[str, str], circle: str | None
+) -> None:
+    """Files of a folder import in one direction; a name that mod.rs passes on is no import."""
+    for file, text in texts.items():
+        path = tmp_path / "crates/mtm-core/src" / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text + "\n", encoding="utf-8")
+    assert check_imports.main(tmp_path) == (1 if circle else 0)
+    if circle:
+        assert f"a circle of imports: {circle}" in capsys.readouterr().out
+
+
 def test_comments_and_test_modules_are_free(tmp_path: Path) -> None:
     """What is no code, or code of tests, may name any module."""
     path = tmp_path / "crates/mtm-core/src/mesh.rs"
     path.parent.mkdir(parents=True)
     path.write_text(
-        "// faer::Mat\n/* pyo3::x */\n#[cfg(test)]\nmod tests {\n    use crate::surface::S;\n}\n",
+        "// faer::Mat\n/* pyo3::x */\n#[cfg(test)]\nmod tests {\n    use crate::statics::S;\n}\n",
         encoding="utf-8",
     )
     assert check_imports.main(tmp_path) == 0

@@ -19,9 +19,9 @@ use mtm_core::{
 use nalgebra::{DMatrix, Matrix3, SymmetricEigen};
 
 const ELEMENTS: [Element; 3] = [Element::Linear, Element::NodalPressure, Element::Quadratic];
-const LARGE: [Kinematics; 2] = [Kinematics::Corotational, Kinematics::Hyperelastic];
+const LARGE: [Kinematics; 2] = [Kinematics::Corotational, Kinematics::NEO_HOOKEAN];
 const ALL: [Kinematics; 3] =
-    [Kinematics::Linear, Kinematics::Corotational, Kinematics::Hyperelastic];
+    [Kinematics::Linear, Kinematics::Corotational, Kinematics::NEO_HOOKEAN];
 
 fn of_element(mesh: &Arc<TetMesh>, tissue: &Arc<Tissue>, element: Element) -> Arc<MassTensors> {
     Arc::new(MassTensors::with_element(mesh.clone(), tissue.clone(), element).unwrap())
@@ -285,7 +285,7 @@ fn confined_and_free_stretch_follow_the_closed_form() {
                 let field = affine(mesh.nodes(), h, Vec3::zeros());
                 let bounds = boundary(vec![], vec![joined("hull", hull.clone())]);
                 let motion = plan([("hull", Motion::Nodes(at(&field, &hull)))]);
-                let options = with_kinematics(Kinematics::Hyperelastic);
+                let options = with_kinematics(Kinematics::NEO_HOOKEAN);
                 let found = solve(&tensors, &bounds, options, &motion, None).unwrap();
                 let places = tensors.element_nodes().positions();
                 let total = |axis: usize| -> f64 {
@@ -521,7 +521,7 @@ fn what_does_not_fit_is_refused_by_name() {
     assert!(name(ready.solve(&motion, Some(&short), GO_ON).unwrap_err()).contains("loads"));
     let corners = vec![[0.0; 3]; mesh.n_nodes()];
     assert!(matches!(tensors.internal_force(&corners), Err(MtmError::Length { .. })));
-    let body = StrainEnergy::new(tensors.clone(), Kinematics::Hyperelastic);
+    let body = StrainEnergy::new(tensors.clone(), Kinematics::NEO_HOOKEAN);
     assert!(matches!(body.state(&corners), Err(MtmError::Length { .. })));
     let mut infinite = vec![[0.0; 3]; tensors.element_nodes().n_nodes()];
     infinite[3][1] = f64::NAN;

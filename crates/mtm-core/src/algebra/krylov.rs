@@ -162,8 +162,18 @@ pub fn pcg(
     interrupted: &(dyn Fn() -> bool + Sync),
 ) -> Result<PcgOutcome> {
     let mut seen = Spectrum::default();
-    let reached = pcg_near(a, b, x0, preconditioner, options, None, &mut seen, interrupted)?;
+    let problem = Problem { a, b, preconditioner, interrupted };
+    let reached = pcg_near(&problem, x0, options, None, &mut seen)?;
     reached.into_outcome()
+}
+
+/// A system `A x = b` with its preconditioner.
+pub(crate) struct Problem<'a> {
+    pub a: &'a dyn Operator,
+    pub b: &'a [[f64; 3]],
+    pub preconditioner: &'a dyn Preconditioner,
+    /// Asked once per iteration, on the calling thread.
+    pub interrupted: &'a (dyn Fn() -> bool + Sync),
 }
 
 /// Where [`pcg_near`] ended.
@@ -203,15 +213,13 @@ impl Reached {
 /// way to another system: the iteration ends as soon as the estimate has fallen to that share of the one at
 /// `x0` (the estimate of the step is then as good as what was seen), unless that lies within the tolerances.
 pub(crate) fn pcg_near(
-    a: &dyn Operator,
-    b: &[[f64; 3]],
+    problem: &Problem<'_>,
     x0: &[[f64; 3]],
-    preconditioner: &dyn Preconditioner,
     options: &PcgOptions,
     share: Option<f64>,
     seen: &mut Spectrum,
-    interrupted: &(dyn Fn() -> bool + Sync),
 ) -> Result<Reached> {
+    let &Problem { a, b, preconditioner, interrupted } = problem;
     let n = a.n_rows();
     for (what, rows) in [("right-hand side", b), ("start vector", x0)] {
         if rows.len() != n {

@@ -182,6 +182,17 @@ struct Problem<'a> {
     options: &'a ContactOptions,
 }
 
+/// A step of the nodes and its contact forces, before the line search.
+struct Way<'a> {
+    state: &'a State,
+    /// Which nodes are held in it.
+    active: &'a [bool],
+    /// Force on each node at its end, N.
+    forces: Vec<f64>,
+    /// Displacement of each node over it, mm.
+    ways: Vec<[f64; 3]>,
+}
+
 impl Problem<'_> {
     fn count(&self) -> usize {
         self.sliding.nodes.len()
@@ -350,25 +361,22 @@ impl Problem<'_> {
         penalty: &mut f64,
     ) -> Option<(State, f64)> {
         let target = along(&response.reactions, &state.touches);
-        let forces: Vec<f64> =
-            (0..self.count()).map(|i| if active[i] { target[i] } else { 0.0 }).collect();
-        let ways: Vec<[f64; 3]> = response
-            .displacements
-            .iter()
-            .zip(&state.displacements)
-            .map(|(to, from)| sub(*to, *from))
-            .collect();
+        let ends = response.displacements.iter().zip(&state.displacements);
+        let way = Way {
+            state,
+            active,
+            forces: (0..self.count()).map(|i| if active[i] { target[i] } else { 0.0 }).collect(),
+            ways: ends.map(|(to, from)| sub(*to, *from)).collect(),
+        };
         let reach = (STEADY_GAP * farthest(&state.touches, active)).max(self.seats.reach());
         // Of the last steps the merit shows little but rounding.
         let negligible = BALANCE_SHARE * self.sliding.gap_limit(self.options);
-        let is_tiny = near || ways.iter().all(|way| norm(*way) <= negligible);
+        let is_tiny = near || way.ways.iter().all(|way| norm(*way) <= negligible);
         let slope = match response.slopes {
-            Some((first, _)) if !is_tiny => {
-                self.slope(state, active, &forces, &ways, first, penalty)?
-            }
+            Some((first, _)) if !is_tiny => self.slope(&way, first, penalty)?,
             _ => 0.0,
         };
-        let work = state.reactions.iter().zip(&response.reactions).zip(&ways);
+        let work = state.reactions.iter().zip(&response.reactions).zip(&way.ways);
         let work: f64 = work.map(|((a, b), way)| (norm(*a) + norm(*b)) * norm(*way)).sum();
         let rounding = MERIT_ROUNDING * work;
         let mut share = 1.0;
@@ -378,7 +386,7 @@ impl Problem<'_> {
             let within = farthest(&touches, active) <= reach;
             let falls = || match response.slopes {
                 Some(slopes) if !is_tiny => {
-                    let rise = self.rise(state, &forces, &touches, slopes, share, *penalty);
+                    let rise = self.rise(&way, &touches, slopes, share, *penalty);
                     rise <= DESCENT * share * slope + rounding
                 }
                 _ => true,
@@ -394,15 +402,10 @@ impl Problem<'_> {
 
     /// Slope of the merit at the start of a step, negative, with the penalty that makes it so; none where no
     /// penalty does.
-    fn slope(
-        &self,
-        state: &State,
-        active: &[bool],
-        forces: &[f64],
-        ways: &[[f64; 3]],
-        energy: f64,
-        penalty: &mut f64,
-    ) -> Option<f64> {
+    ///
+    /// `energy`: the slope of the elastic energy.
+    fn slope(&self, way: &Way<'_>, energy: f64, penalty: &mut f64) -> Option<f64> {
+        let Way { state, active, forces, ways } = way;
         let at = |penalty: f64| {
             let (mut slope, mut closing) = (energy, 0.0);
             for i in 0..self.count() {
@@ -435,15 +438,17 @@ impl Problem<'_> {
     }
 
     /// How much the merit rises over `share` of a step to where the nodes feel `touches`.
+    ///
+    /// `slopes`: of the elastic energy, at the start and at the end of the whole step.
     fn rise(
         &self,
-        state: &State,
-        forces: &[f64],
+        way: &Way<'_>,
         touches: &[Touch],
         (first, last): (f64, f64),
         share: f64,
         penalty: f64,
     ) -> f64 {
+        let Way { state, forces, .. } = way;
         let mut rise = share * first + 0.5 * share * share * (last - first);
         for i in 0..self.count() {
             let rho = penalty * self.sliding.stiffness[i];

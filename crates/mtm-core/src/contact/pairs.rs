@@ -72,6 +72,11 @@ impl Link {
         self.add(self.stiffness * (self.goal - self.along(x)), y);
     }
 
+    /// Takes it off again.
+    pub fn take_force(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
+        self.add(self.stiffness * (self.along(x) - self.goal), y);
+    }
+
     fn add(&self, force: f64, y: &mut [[f64; 3]]) {
         for (row, c) in &self.ends {
             y[*row as usize] = add(y[*row as usize], scaled(*c, force));

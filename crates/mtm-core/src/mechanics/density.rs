@@ -5,17 +5,15 @@
 //! force is the corotational one, R K (Rᵀ x − X) (Müller & Gross 2004); for a fibre it is the one that an
 //! energy has, and leaves no moment behind.
 //!
-//! Hyperelastic: stable neo-Hookean (Smith, de Goes & Kim 2018, eq. 14) for the isotropic stiffness nearest to C
-//! (Fedorov 1968), and ½ e : (C − C_iso) : e for the fibre. At F = I the tangent is C.
+//! Hyperelastic: a law of isotropic tissue for the isotropic stiffness nearest to C (Fedorov 1968), and
+//! ½ e : (C − C_iso) : e for the fibre. At F = I the tangent is C.
 
-use nalgebra::{Cholesky, Matrix3, Matrix6, SMatrix, SymmetricEigen, Vector3};
+use nalgebra::{Cholesky, Matrix3, Matrix6, SymmetricEigen, Vector3};
 
+use crate::mechanics::hyperelastic::{HyperelasticLaw, PointResponse, Tangent, cofactor};
 use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::material::{Lame, TetMaterial, Voigt};
 use crate::mechanics::polar::Polar;
-
-/// Derivatives of the nine entries of F, row by row.
-pub(crate) type Tangent = SMatrix<f64, 9, 9>;
 
 /// Sum of two principal stretches below which rotation about the third axis has no meaning: both sides of
 /// the tet have all but passed each other.
@@ -31,25 +29,9 @@ const VOIGT: [usize; 9] = [0, 5, 4, 5, 1, 3, 4, 3, 2];
 /// Energy density of one material.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Density {
-    neo_hookean: Option<NeoHookean>,
+    /// The hyperelastic law of its isotropic part.
+    isotropic: Option<(HyperelasticLaw, Lame)>,
     stretch: Option<Stiffness>,
-}
-
-/// Constants of the stable neo-Hookean energy
-/// ½ μ (|F|² − 3) − ½ μ ln((|F|² + 1)/4) + ½ λ (J − 1)² − ¾ μ (J − 1), MPa.
-///
-/// Equal to that of the source but for a constant: λ (J − α)²/2 with α = 1 + ¾ μ/λ.
-#[derive(Debug, Clone, Copy)]
-struct NeoHookean {
-    lambda_: f64,
-    mu: f64,
-}
-
-impl From<Lame> for NeoHookean {
-    /// μ' = 4/3 μ and λ' = λ + 5/6 μ make the linear limit that of the Lamé constants.
-    fn from(l: Lame) -> Self {
-        Self { lambda_: l.lambda_ + 5.0 / 6.0 * l.mu, mu: 4.0 / 3.0 * l.mu }
-    }
 }
 
 /// C for the stretch energy, without a detour through a box: it is read at every point.
@@ -69,15 +51,6 @@ pub(crate) struct Volumetric {
     pub slope: Matrix3<f64>,
 }
 
-/// Energy density and stress at a point.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct PointResponse {
-    /// N mm/mm³.
-    pub energy: f64,
-    /// First Piola–Kirchhoff stress ∂W/∂F, MPa.
-    pub stress: Matrix3<f64>,
-}
-
 impl Density {
     /// The energy of `material` under `kinematics`, which is not linear.
     pub fn new(material: &TetMaterial<'_>, kinematics: Kinematics) -> Self {
@@ -85,11 +58,14 @@ impl Density {
             TetMaterial::Isotropic(lame) => Stiffness::Isotropic(*lame),
             other => Stiffness::General(other.voigt()),
         };
-        if kinematics != Kinematics::Hyperelastic {
-            return Self { neo_hookean: None, stretch: Some(stiffness) };
-        }
+        let law = match kinematics {
+            Kinematics::Linear | Kinematics::Corotational => {
+                return Self { isotropic: None, stretch: Some(stiffness) };
+            }
+            Kinematics::Hyperelastic(law) => law,
+        };
         match stiffness {
-            Stiffness::Isotropic(lame) => Self { neo_hookean: Some(lame.into()), stretch: None },
+            Stiffness::Isotropic(lame) => Self { isotropic: Some((law, lame)), stretch: None },
             Stiffness::General(c) => {
                 let lame = nearest_isotropic(&c);
                 let mut rest = c;
@@ -99,7 +75,8 @@ impl Density {
                         *value -= lame.lambda_;
                     }
                 }
-                Self { neo_hookean: Some(lame.into()), stretch: Some(Stiffness::General(rest)) }
+                let stretch = Some(Stiffness::General(rest));
+                Self { isotropic: Some((law, lame)), stretch }
             }
         }
     }
@@ -111,14 +88,10 @@ impl Density {
         kinematics: Kinematics,
         pressure: f64,
     ) -> PointResponse {
-        let mut out = PointResponse { energy: 0.0, stress: Matrix3::zeros() };
-        if let Some(neo) = &self.neo_hookean {
-            let (size, j) = (f.norm_squared(), f.determinant());
-            out.energy += 0.5 * neo.mu * (size - 3.0) - 0.5 * neo.mu * (0.25 * (size + 1.0)).ln()
-                + (0.5 * neo.lambda_ * (j - 1.0) - 0.75 * neo.mu) * (j - 1.0);
-            out.stress += f * (neo.mu * (1.0 - 1.0 / (size + 1.0)))
-                + cofactor(f) * (neo.lambda_ * (j - 1.0) - 0.75 * neo.mu);
-        }
+        let mut out = match &self.isotropic {
+            Some((law, lame)) => law.response(*lame, f),
+            None => PointResponse { energy: 0.0, stress: Matrix3::zeros() },
+        };
         if let Some(stiffness) = &self.stretch {
             let polar = Polar::new(f);
             let strain = stretch_strain(&polar);
@@ -135,20 +108,14 @@ impl Density {
     /// ∂²W/∂F² at `f`, with `pressure` times that of the volumetric measure.
     pub fn tangent(&self, f: &Matrix3<f64>, kinematics: Kinematics, pressure: f64) -> Tangent {
         let mut out = Tangent::zeros();
-        let mut cofactor_stress = 0.0;
-        let mut stretch_pressure = 0.0;
-        if kinematics == Kinematics::Hyperelastic {
-            cofactor_stress += pressure;
-        } else {
-            stretch_pressure += pressure;
-        }
-        if let Some(neo) = &self.neo_hookean {
-            let (size, j) = (f.norm_squared(), f.determinant());
-            let (f9, c9) = (flat(f), flat(&cofactor(f)));
-            out += Tangent::identity() * (neo.mu * (1.0 - 1.0 / (size + 1.0)));
-            out += f9 * f9.transpose() * (2.0 * neo.mu / ((size + 1.0) * (size + 1.0)));
-            out += c9 * c9.transpose() * neo.lambda_;
-            cofactor_stress += neo.lambda_ * (j - 1.0) - 0.75 * neo.mu;
+        let (mut cofactor_stress, stretch_pressure) = match kinematics {
+            Kinematics::Hyperelastic(_) => (pressure, 0.0),
+            Kinematics::Linear | Kinematics::Corotational => (0.0, pressure),
+        };
+        if let Some((law, lame)) = &self.isotropic {
+            let found = law.tangent(*lame, f);
+            out += found.own;
+            cofactor_stress += found.cofactor_stress;
         }
         if cofactor_stress != 0.0 {
             add_cofactor_tangent(&mut out, f, cofactor_stress);
@@ -162,11 +129,15 @@ impl Density {
 
 /// θ and ∂θ/∂F of `kinematics` at `f`.
 pub(crate) fn volumetric(f: &Matrix3<f64>, kinematics: Kinematics) -> Volumetric {
-    if kinematics == Kinematics::Hyperelastic {
-        return Volumetric { value: f.determinant() - 1.0, slope: cofactor(f) };
+    match kinematics {
+        Kinematics::Hyperelastic(_) => {
+            Volumetric { value: f.determinant() - 1.0, slope: cofactor(f) }
+        }
+        Kinematics::Linear | Kinematics::Corotational => {
+            let polar = Polar::new(f);
+            Volumetric { value: polar.stretch.sum() - 3.0, slope: polar.rotation() }
+        }
     }
-    let polar = Polar::new(f);
-    Volumetric { value: polar.stretch.sum() - 3.0, slope: polar.rotation() }
 }
 
 /// `tangent` without negative curvature: steps along it downhill.
@@ -190,8 +161,10 @@ pub(crate) fn definite(tangent: Tangent, kinematics: Kinematics) -> Tangent {
     let mut out = Tangent::zeros();
     for i in 0..9 {
         let (mode, value) = (eigen.eigenvectors.column(i), eigen.eigenvalues[i]);
-        let kept =
-            if kinematics == Kinematics::Hyperelastic { value.abs() } else { value.max(0.0) };
+        let kept = match kinematics {
+            Kinematics::Hyperelastic(_) => value.abs(),
+            Kinematics::Linear | Kinematics::Corotational => value.max(0.0),
+        };
         out += mode * mode.transpose() * kept;
     }
     out
@@ -389,22 +362,10 @@ fn add_cofactor_tangent(out: &mut Tangent, f: &Matrix3<f64>, stress: f64) {
     }
 }
 
-/// ∂J/∂F.
-fn cofactor(f: &Matrix3<f64>) -> Matrix3<f64> {
-    Matrix3::from_fn(|i, j| {
-        let (a, b, c, d) = ((i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3);
-        f[(a, c)] * f[(b, d)] - f[(a, d)] * f[(b, c)]
-    })
-}
-
-/// Entries row by row.
-fn flat(m: &Matrix3<f64>) -> SMatrix<f64, 9, 1> {
-    SMatrix::<f64, 9, 1>::from_fn(|i, _| m[(i / 3, i % 3)])
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mechanics::hyperelastic::flat;
     use crate::mechanics::material::{Elastic, FibreElastic, FibreLaw, Spencer};
 
     /// Deformation gradients: at rest, sheared, turned by a right angle, squeezed, inverted.
@@ -432,7 +393,7 @@ mod tests {
         // Central differences of step h: error near h² and rounding near 1e-16/h.
         const STEP: f64 = 1e-5;
         const TOLERANCE: f64 = 1e-8;
-        for kinematics in [Kinematics::Corotational, Kinematics::Hyperelastic] {
+        for kinematics in Kinematics::all().skip(1) {
             for material in materials() {
                 let density = Density::new(&material, kinematics);
                 for f in gradients() {
@@ -463,7 +424,7 @@ mod tests {
 
     #[test]
     fn the_tangent_at_rest_is_the_stiffness() {
-        for kinematics in [Kinematics::Corotational, Kinematics::Hyperelastic] {
+        for kinematics in Kinematics::all().skip(1) {
             for material in materials() {
                 let density = Density::new(&material, kinematics);
                 let rest = density.response(&Matrix3::identity(), kinematics, 0.0);
@@ -483,7 +444,7 @@ mod tests {
     #[test]
     fn energy_does_not_change_and_stress_turns_with_a_rotation() {
         let turn = *nalgebra::Rotation3::from_euler_angles(1.1, -2.0, 0.4).matrix();
-        for kinematics in [Kinematics::Corotational, Kinematics::Hyperelastic] {
+        for kinematics in Kinematics::all().skip(1) {
             for material in materials() {
                 let density = Density::new(&material, kinematics);
                 for f in gradients() {

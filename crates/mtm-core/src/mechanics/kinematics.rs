@@ -1,6 +1,9 @@
 //! Which strain a solver takes: linear, corotational or of large deformation.
 
+use std::sync::LazyLock;
+
 use crate::error::{ErrorKind, MtmError, Result};
+use crate::mechanics::hyperelastic::HyperelasticLaw;
 
 /// How strain follows from displacement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -11,27 +14,38 @@ pub enum Kinematics {
     Linear,
     /// Stretch without the rotation of each tet, with the constants of the linear law.
     Corotational,
-    /// Stable neo-Hookean tissue with its fibres: the reference for large deformation.
-    Hyperelastic,
+    /// Large deformation with a law for the isotropic part of the tissue, and its fibres by their stretch.
+    Hyperelastic(HyperelasticLaw),
 }
 
-/// Names of the kinematics.
-pub const KINEMATICS: &str = "linear, corotational, hyperelastic";
+/// Names of the kinematics, for messages.
+static KINEMATICS: LazyLock<String> =
+    LazyLock::new(|| Kinematics::all().map(Kinematics::name).collect::<Vec<_>>().join(", "));
 
 impl Kinematics {
+    /// Large deformation of stable neo-Hookean tissue: the reference.
+    pub const NEO_HOOKEAN: Self = Self::Hyperelastic(HyperelasticLaw::NEO_HOOKEAN);
+
+    /// Every kinematics.
+    pub fn all() -> impl Iterator<Item = Self> {
+        [Self::Linear, Self::Corotational]
+            .into_iter()
+            .chain(HyperelasticLaw::all().map(Self::Hyperelastic))
+    }
+
     /// The kinematics called `name`.
+    ///
+    /// # Errors
+    /// [`MtmError::UnknownName`] with the names that there are.
     pub fn from_name(name: &str) -> Result<Self> {
-        match name {
-            "linear" => Ok(Self::Linear),
-            "corotational" => Ok(Self::Corotational),
-            "hyperelastic" => Ok(Self::Hyperelastic),
-            _ => Err(MtmError::UnknownName {
+        Self::all().find(|kinematics| kinematics.name() == name).ok_or_else(|| {
+            MtmError::UnknownName {
                 what: "kinematics",
                 found: name.to_owned(),
-                known: KINEMATICS,
+                known: KINEMATICS.as_str(),
                 kind: ErrorKind::Solver,
-            }),
-        }
+            }
+        })
     }
 
     /// Its name.
@@ -39,7 +53,7 @@ impl Kinematics {
         match self {
             Self::Linear => "linear",
             Self::Corotational => "corotational",
-            Self::Hyperelastic => "hyperelastic",
+            Self::Hyperelastic(law) => law.name(),
         }
     }
 }

@@ -2,6 +2,7 @@
 
 pub mod density;
 pub mod element;
+pub mod hyperelastic;
 pub mod kinematics;
 pub mod material;
 pub(crate) mod nodal_pressure;

@@ -8,8 +8,9 @@ use rayon::prelude::*;
 
 use crate::algebra::blocks::{BlockMatrix, RowTask};
 use crate::error::Result;
-use crate::mechanics::density::{Density, Tangent, definite, volumetric};
+use crate::mechanics::density::{Density, definite, volumetric};
 use crate::mechanics::element::ElementNodes;
+use crate::mechanics::hyperelastic::Tangent;
 use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::nodal_pressure::split;
 use crate::mechanics::tensors::MassTensors;

@@ -7,17 +7,19 @@
 use std::sync::OnceLock;
 
 use crate::algebra::blocks::BlockMatrix;
-use crate::algebra::constraints::{Constraint, projected};
 use crate::algebra::krylov::{
-    Operator, PcgOptions, Preconditioner, Reached, Spectrum, Trial, pcg_near, trial,
+    Operator, PcgOptions, PcgOutcome, Preconditioner, Problem, Reached, Spectrum, Trial, pcg_near,
+    trial,
 };
 use crate::algebra::multigrid::{Multigrid, MultigridOptions};
 use crate::algebra::relaxation::{RelaxationOptions, relax};
+use crate::contact::Spring;
 use crate::contact::pairs::Link;
-use crate::contact::{Sliding, Spring};
 use crate::error::{MtmError, Result, Shortfall};
+use crate::statics::effort::Solve;
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::projected_product::ProjectedProduct;
+use crate::statics::row_conditions::RowConditions;
 use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Over-relaxation of the node-wise iteration.
@@ -51,26 +53,27 @@ pub(crate) fn is_doubtful(contrast: f64) -> bool {
 }
 
 /// Conjugate gradients with an estimate that a trial has confirmed where that is in doubt.
-pub(crate) struct Confirmed<'a> {
-    pub a: &'a dyn Operator,
-    pub preconditioner: &'a dyn Preconditioner,
+struct Confirmed<'a> {
+    a: &'a dyn Operator,
+    preconditioner: &'a dyn Preconditioner,
     /// Where the trial is kept.
-    pub trial: &'a OnceLock<Trial>,
+    trial: &'a OnceLock<Trial>,
     /// Whether there is to be one whatever the spectrum shows.
-    pub doubtful: bool,
+    doubtful: bool,
     /// Tolerance over the length of the motion.
-    pub relative: f64,
+    relative: f64,
+    interrupted: Interrupt<'a>,
 }
 
 impl Confirmed<'_> {
     /// The trial, made if need be.
-    fn trial(&self, options: &PcgOptions, interrupted: Interrupt<'_>) -> Result<&Trial> {
+    fn trial(&self, options: &PcgOptions) -> Result<&Trial> {
         if let Some(made) = self.trial.get() {
             return Ok(made);
         }
         let goal = TRIAL_SHARE * self.relative;
         let most = options.max_iterations;
-        let made = trial(self.a, self.preconditioner, goal, most, interrupted)?;
+        let made = trial(self.a, self.preconditioner, goal, most, self.interrupted)?;
         Ok(self.trial.get_or_init(|| made))
     }
 
@@ -78,20 +81,21 @@ impl Confirmed<'_> {
     ///
     /// # Errors
     /// Those of [`pcg_near`]; `NotConverged` where a known solution came back with too large an error.
-    pub fn solve(
+    fn solve(
         &self,
         b: &[[f64; 3]],
         start: &[[f64; 3]],
         options: &PcgOptions,
         share: Option<f64>,
         seen: &mut Spectrum,
-        interrupted: Interrupt<'_>,
     ) -> Result<Reached> {
+        let Self { a, preconditioner, interrupted, .. } = *self;
+        let problem = Problem { a, b, preconditioner, interrupted };
         let near = |start: &[[f64; 3]], seen: &mut Spectrum| {
-            pcg_near(self.a, b, start, self.preconditioner, options, share, seen, interrupted)
+            pcg_near(&problem, start, options, share, seen)
         };
         let known = |seen: &mut Spectrum| -> Result<f64> {
-            let trial = self.trial(options, interrupted)?;
+            let trial = self.trial(options)?;
             if trial.error * TRIAL_SAFETY > options.slack * self.relative {
                 return Err(not_confirmed(trial, options, self.relative));
             }
@@ -143,17 +147,6 @@ fn not_confirmed(trial: &Trial, options: &PcgOptions, relative: f64) -> MtmError
     }
 }
 
-/// Counters of the iterative solves of one plan.
-#[derive(Default)]
-pub(crate) struct Effort {
-    /// Estimated error of the last solve, mm.
-    pub error_estimate: f64,
-    /// Iterations of all solves.
-    pub iterations: usize,
-    /// Residual measure of each.
-    pub history: Vec<f64>,
-}
-
 /// What the solves of one plan leave to the next, whose constraints differ a little.
 #[derive(Default)]
 pub(crate) struct Trail {
@@ -174,6 +167,17 @@ impl Trail {
     }
 }
 
+/// What a solve under contact conditions may leave to the next one.
+#[derive(Clone, Copy)]
+pub(crate) struct Leave<'a> {
+    /// How far springs that carry nodes on may carry any of them, mm.
+    pub reach: f64,
+    /// Share of the error at the start that suffices; none for the tolerance itself.
+    pub share: Option<f64>,
+    /// Springs between rows.
+    pub links: &'a [Link],
+}
+
 /// What rows do under contact conditions.
 pub(crate) struct Advance {
     /// Displacements, mm.
@@ -187,7 +191,7 @@ pub(crate) struct Advance {
 /// A system without a factor: the matrix and a multigrid hierarchy for it.
 pub(crate) struct Iterative {
     matrix: BlockMatrix,
-    multigrid: Box<Multigrid>,
+    multigrid: Multigrid,
     /// Whether sweeps solve, and the hierarchy only measures the error they leave.
     sweeps: bool,
     /// Estimated error over the length of the motion.
@@ -200,50 +204,41 @@ pub(crate) struct Iterative {
 }
 
 impl Iterative {
-    /// The system of `matrix`, to be solved by `method`; sliding rows are held along their normals at rest.
+    /// The system of `matrix`, to be solved by `method` with the hierarchy for it.
     ///
-    /// `positions`: coordinates of the rows; `tissue`: how extreme the tissue is.
+    /// `tissue`: how extreme the tissue is.
     pub fn new(
         matrix: BlockMatrix,
-        positions: &[[f64; 3]],
-        sliding: Option<&Sliding>,
+        multigrid: Multigrid,
         tissue: Extremes,
         method: Method,
         options: &StaticOptions,
-    ) -> Result<Self> {
-        let normals: Vec<(usize, [f64; 3])> = sliding
-            .iter()
-            .flat_map(|s| s.nodes().iter().zip(s.rest_normals()))
-            .map(|(node, &n)| (node.row as usize, n))
-            .collect();
-        let constraints: Vec<Constraint> =
-            normals.iter().map(|&(row, normal)| Constraint { row, normal, offset: 0.0 }).collect();
-        let held_matrix = (!constraints.is_empty()).then(|| projected(&matrix, &constraints));
-        let multigrid = Box::new(Multigrid::new(
-            held_matrix.as_ref().unwrap_or(&matrix),
-            positions,
-            &normals,
-            &multigrid_options(tissue.lame_ratio),
-        )?);
-        Ok(Self {
+    ) -> Self {
+        Self {
             matrix,
             multigrid,
-            sweeps: method == Method::Relaxation,
+            sweeps: method.sweeps(),
             tolerance: options.tolerance,
             max_iterations: options.max_iterations,
             doubtful: is_doubtful(tissue.contrast),
             trial: OnceLock::new(),
-        })
+        }
     }
 
     /// Conjugate gradients with `a`, whose trial is kept in `trial`.
-    fn confirmed<'a>(&'a self, a: &'a dyn Operator, trial: &'a OnceLock<Trial>) -> Confirmed<'a> {
+    fn confirmed<'a>(
+        &'a self,
+        a: &'a dyn Operator,
+        trial: &'a OnceLock<Trial>,
+        interrupted: Interrupt<'a>,
+    ) -> Confirmed<'a> {
         Confirmed {
             a,
-            preconditioner: self.multigrid.as_ref(),
+            preconditioner: &self.multigrid,
             trial,
             doubtful: self.doubtful,
             relative: self.tolerance,
+            interrupted,
         }
     }
 
@@ -257,72 +252,87 @@ impl Iterative {
         self.multigrid.memory_bytes()
     }
 
-    /// A⁻¹ b; `scale` is the length of the prescribed field, mm.
-    pub fn solve(
-        &self,
-        b: &[[f64; 3]],
-        scale: f64,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
-    ) -> Result<Vec<[f64; 3]>> {
+    /// A⁻¹ b.
+    pub fn solve(&self, b: &[[f64; 3]], solve: &mut Solve<'_>) -> Result<Vec<[f64; 3]>> {
         if is_zero(b) {
             return Ok(vec![[0.0; 3]; b.len()]);
         }
-        let tolerance = self.tolerance * self.reach(b, scale);
+        let tolerance = self.tolerance * self.reach(b, solve.scale);
         if self.sweeps {
-            return self.relax_to_bound(&self.matrix, b, tolerance, effort, interrupted);
+            return self.relax_to_bound(&self.matrix, b, tolerance, solve);
         }
-        let start = vec![[0.0; 3]; b.len()];
-        let options = self.options(tolerance);
-        let found = self
-            .confirmed(&self.matrix, &self.trial)
-            .solve(b, &start, &options, None, &mut Spectrum::default(), interrupted)?
-            .into_outcome()?;
-        effort.error_estimate = found.error_estimate_mm;
-        effort.iterations += found.iterations;
-        effort.history.extend(found.residual_history);
+        let confirmed = self.confirmed(&self.matrix, &self.trial, solve.interrupted);
+        let found = self.solution(&confirmed, b, tolerance)?;
+        solve.effort.error_estimate = found.error_estimate_mm;
+        solve.effort.add(found.iterations, found.residual_history);
         Ok(found.solution)
+    }
+
+    /// A⁻¹ b with an error of `allowed`, mm, or of the tolerance over how far one cycle moves the rows, where
+    /// that is more: a step of Newton's method.
+    pub fn step(
+        &self,
+        b: &[[f64; 3]],
+        allowed: f64,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        let far = self.reach(b, 0.0);
+        if far == 0.0 {
+            return Ok(vec![[0.0; 3]; b.len()]);
+        }
+        let tolerance = allowed.max(self.tolerance * far);
+        let confirmed = Confirmed {
+            relative: tolerance / far,
+            ..self.confirmed(&self.matrix, &self.trial, interrupted)
+        };
+        Ok(self.solution(&confirmed, b, tolerance)?.solution)
+    }
+
+    /// The solution for `b` by `confirmed`, begun at rest.
+    fn solution(
+        &self,
+        confirmed: &Confirmed<'_>,
+        b: &[[f64; 3]],
+        tolerance: f64,
+    ) -> Result<PcgOutcome> {
+        let start = vec![[0.0; 3]; b.len()];
+        let seen = &mut Spectrum::default();
+        confirmed.solve(b, &start, &self.options(tolerance), None, seen)?.into_outcome()
     }
 
     /// Components across the normals of w in P A P w = `b`, with springs.
     ///
     /// `b`: see [`projected_rhs`](crate::algebra::constraints::projected_rhs), with the pull of the springs.
-    /// `reach`: see [`Constraints`](crate::contact::Constraints). `share`: of the error at the start, which
-    /// suffices as long as it is more than the tolerance; see [`pcg_near`].
+    /// `leave`: how far springs may carry rows, and the share of the error at the start that suffices as long as
+    /// it is more than the tolerance; see [`pcg_near`].
     ///
     /// Where springs carry nodes on by more than the body holds, those at fault are left out, and the
     /// solution goes on to their reach along the direction that is not held, downhill.
     pub fn solve_projected(
         &self,
         mut b: Vec<[f64; 3]>,
-        constraints: &[Constraint],
-        mut springs: Vec<(usize, Spring)>,
-        links: &[Link],
-        reach: f64,
-        scale: f64,
-        share: Option<f64>,
+        conditions: RowConditions,
+        leave: Leave<'_>,
         trail: &mut Trail,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
+        solve: &mut Solve<'_>,
     ) -> Result<Advance> {
         if is_zero(&b) {
             let rows = vec![[0.0; 3]; b.len()];
             return Ok(Advance { rows, solved: true, is_carried: false });
         }
-        let length = *trail.reach.get_or_insert_with(|| self.reach(&b, scale));
-        let length = constraints.iter().fold(length, |m, c| m.max(c.offset.abs()));
+        let length = *trail.reach.get_or_insert_with(|| self.reach(&b, solve.scale));
+        let length = conditions.constraints.iter().fold(length, |m, c| m.max(c.offset.abs()));
         let tolerance = self.tolerance * length;
         if self.sweeps {
-            let mut system = projected(&self.matrix, constraints);
-            for (row, spring) in &springs {
-                system.add_to_diagonal(*row, spring.axis, spring.stiffness);
-            }
-            let rows = self.relax_to_bound(&system, &b, tolerance, effort, interrupted)?;
+            let system = conditions.applied_to(&self.matrix);
+            let rows = self.relax_to_bound(&system, &b, tolerance, solve)?;
             return Ok(Advance { rows, solved: true, is_carried: false });
         }
+        let RowConditions { constraints, mut springs } = conditions;
+        let links = leave.links;
         let mut start = trail.rows.clone();
         start.resize(b.len(), [0.0; 3]);
-        for k in constraints {
+        for k in &constraints {
             start[k.row] = sub(start[k.row], scaled(k.normal, dot(k.normal, start[k.row])));
         }
         let options = self.options(tolerance);
@@ -330,31 +340,28 @@ impl Iterative {
         let mut left_out = Vec::new();
         let (found, solved) = loop {
             let product =
-                ProjectedProduct::new(&self.matrix, constraints, &springs).with_links(links);
-            let confirmed = self.confirmed(&product, &trail.trial);
-            let seen = &mut trail.seen;
-            match confirmed.solve(&b, &start, &options, share, seen, interrupted)? {
+                ProjectedProduct::new(&self.matrix, &constraints, &springs).with_links(links);
+            let confirmed = self.confirmed(&product, &trail.trial, solve.interrupted);
+            match confirmed.solve(&b, &start, &options, leave.share, &mut trail.seen)? {
                 Reached::Solution(found) => break (found, true),
                 Reached::Step(found) => break (found, false),
                 Reached::Indefinite(met) => {
                     let out = at_fault(&self.matrix, &mut springs, &met.direction);
-                    if out.is_empty() || reach.is_infinite() {
+                    if out.is_empty() || leave.reach.is_infinite() {
                         return Err(met.error);
                     }
                     for (row, s) in &out {
                         b[*row] = sub(b[*row], scaled(s.axis, s.stiffness * s.goal));
                     }
                     left_out.extend(out);
-                    effort.iterations += met.iterations;
-                    effort.history.extend(met.residual_history);
+                    solve.effort.add(met.iterations, met.residual_history);
                     start = met.solution;
                     unheld.push(met.direction);
                 }
             }
         };
-        effort.error_estimate = found.error_estimate_mm;
-        effort.iterations += found.iterations;
-        effort.history.extend(found.residual_history);
+        solve.effort.error_estimate = found.error_estimate_mm;
+        solve.effort.add(found.iterations, found.residual_history);
         let mut rows = found.solution;
         let mut is_carried = false;
         if !unheld.is_empty() {
@@ -363,8 +370,8 @@ impl Iterative {
             }
             springs.extend(left_out);
             let product =
-                ProjectedProduct::new(&self.matrix, constraints, &springs).with_links(links);
-            is_carried = carry_on(&product, &b, &unheld, reach, &mut rows);
+                ProjectedProduct::new(&self.matrix, &constraints, &springs).with_links(links);
+            is_carried = carry_on(&product, &b, &unheld, leave.reach, &mut rows);
         }
         Ok(Advance { rows, solved, is_carried })
     }
@@ -393,8 +400,7 @@ impl Iterative {
         matrix: &BlockMatrix,
         b: &[[f64; 3]],
         tolerance: f64,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
+        solve: &mut Solve<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         let most = self.max_iterations.unwrap_or(MAX_SWEEPS);
         let (mut x, mut goal, mut sweeps) = (vec![[0.0; 3]; b.len()], tolerance, 0);
@@ -405,10 +411,9 @@ impl Iterative {
                 max_sweeps: most - sweeps,
             };
             let found =
-                relax(matrix, b, &x, &options, interrupted).map_err(|e| gave_up(e, most))?;
+                relax(matrix, b, &x, &options, solve.interrupted).map_err(|e| gave_up(e, most))?;
             (x, sweeps) = (found.solution, sweeps + found.sweeps);
-            effort.iterations += found.sweeps;
-            effort.history.extend(found.steps);
+            solve.effort.add(found.sweeps, found.steps);
             let rest: Vec<[f64; 3]> =
                 b.iter().zip(matrix.multiply(&x)).map(|(&b, f)| sub(b, f)).collect();
             let options = PcgOptions {
@@ -418,14 +423,15 @@ impl Iterative {
             };
             let start = vec![[0.0; 3]; b.len()];
             let trial = OnceLock::new();
-            let left = Confirmed { relative: MEASURED_SHARE, ..self.confirmed(matrix, &trial) }
-                .solve(&rest, &start, &options, None, &mut Spectrum::default(), interrupted)
+            let confirmed = self.confirmed(matrix, &trial, solve.interrupted);
+            let left = Confirmed { relative: MEASURED_SHARE, ..confirmed }
+                .solve(&rest, &start, &options, None, &mut Spectrum::default())
                 .and_then(Reached::into_outcome)
                 .map_err(|e| gave_up(e, sweeps))?;
             let largest = left.solution.iter().fold(0.0_f64, |m, e| m.max(norm(*e)));
             let error = largest + left.error_estimate_mm;
             if error <= tolerance {
-                effort.error_estimate = error;
+                solve.effort.error_estimate = error;
                 return Ok(x);
             }
             if sweeps >= most {
@@ -434,6 +440,17 @@ impl Iterative {
             goal *= (0.5 * tolerance / error).min(0.5);
         }
     }
+}
+
+/// The hierarchy for `matrix`, whose rows at `positions` are held along `normals`, of a tissue as extreme as
+/// that.
+pub(crate) fn hierarchy(
+    matrix: &BlockMatrix,
+    positions: &[[f64; 3]],
+    normals: &[(usize, [f64; 3])],
+    tissue: Extremes,
+) -> Result<Multigrid> {
+    Multigrid::new(matrix, positions, normals, &multigrid_options(tissue.lame_ratio))
 }
 
 /// How extreme a tissue is.

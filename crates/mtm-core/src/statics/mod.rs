@@ -1,5 +1,6 @@
 //! Equilibrium of a body under a plan: options, linear solves, Newton's method, plan operators.
 
+pub(crate) mod effort;
 pub(crate) mod frozen;
 pub(crate) mod iterative;
 pub(crate) mod newton;
@@ -9,6 +10,7 @@ pub(crate) mod reaction;
 pub(crate) mod reduction;
 pub mod replan;
 pub mod restraint;
+pub(crate) mod row_conditions;
 pub mod solution;
 pub mod solver;
 pub(crate) mod system;

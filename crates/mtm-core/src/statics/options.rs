@@ -1,5 +1,7 @@
 //! Options of a solver: which method, how exact, how contact behaves, how much memory.
 
+use std::sync::LazyLock;
+
 use crate::contact::ContactOptions;
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::mechanics::kinematics::Kinematics;
@@ -29,8 +31,8 @@ pub enum Method {
 /// at any size; up to here that weighs more.
 const AUTO_DIRECT_UNKNOWNS: usize = 100_000;
 
-/// Names of the methods.
-pub const METHODS: &str = "auto, cholesky, pcg, relaxation";
+/// Names of the methods, for messages.
+static METHODS: LazyLock<String> = LazyLock::new(|| Method::ALL.map(Method::name).join(", "));
 
 /// Options of a solver.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -66,19 +68,37 @@ impl Default for StaticOptions {
 const MOST_CONTACT_TOLERANCE: f64 = 1.0;
 
 impl Method {
+    /// Every method.
+    pub const ALL: [Self; 4] = [Self::Auto, Self::Cholesky, Self::Pcg, Self::Relaxation];
+
     /// The method called `name`.
+    ///
+    /// # Errors
+    /// [`MtmError::UnknownName`] with the names that there are.
     pub fn from_name(name: &str) -> Result<Self> {
-        match name {
-            "auto" => Ok(Self::Auto),
-            "cholesky" => Ok(Self::Cholesky),
-            "pcg" => Ok(Self::Pcg),
-            "relaxation" => Ok(Self::Relaxation),
-            _ => Err(MtmError::UnknownName {
+        Self::ALL.into_iter().find(|method| method.name() == name).ok_or_else(|| {
+            MtmError::UnknownName {
                 what: "method",
                 found: name.to_owned(),
-                known: METHODS,
+                known: METHODS.as_str(),
                 kind: ErrorKind::Solver,
-            }),
+            }
+        })
+    }
+
+    /// Whether it solves by a factor; [`Method::Auto`] has to be resolved first.
+    pub(crate) fn has_factor(self) -> bool {
+        match self {
+            Self::Cholesky => true,
+            Self::Auto | Self::Pcg | Self::Relaxation => false,
+        }
+    }
+
+    /// Whether it solves by node-wise sweeps.
+    pub(crate) fn sweeps(self) -> bool {
+        match self {
+            Self::Relaxation => true,
+            Self::Auto | Self::Cholesky | Self::Pcg => false,
         }
     }
 
@@ -87,7 +107,7 @@ impl Method {
         match self {
             Self::Auto if unknowns > AUTO_DIRECT_UNKNOWNS => Self::Pcg,
             Self::Auto => Self::Cholesky,
-            named => named,
+            named @ (Self::Cholesky | Self::Pcg | Self::Relaxation) => named,
         }
     }
 

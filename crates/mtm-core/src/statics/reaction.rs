@@ -13,8 +13,7 @@ use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
 use crate::algebra::cholesky::{
     Begun, DenseSymmetric, Factor, Moved, NormalFactor, NormalForces, Precision, Preconditioner,
-    Progress, ROUGH, Reach, RowKey, Symbolic, TailFlexibility, Wanted, conjugate_gradients,
-    hopeless,
+    Progress, ROUGH, Reach, RowKey, TailFlexibility, Wanted, conjugate_gradients, hopeless,
 };
 use crate::contact::{Constraints, ContactRow, Sliding, Spring};
 use crate::error::{MtmError, Result, Shortfall};
@@ -64,8 +63,8 @@ enum Flexibility {
 
 impl ContactFactor {
     /// The whole flexibility of the sliding nodes, which the structure keeps last.
-    pub fn dense(symbolic: &Symbolic, factor: &Factor, sliding: &Sliding) -> Result<Self> {
-        let tail = symbolic.tail_flexibility(factor);
+    pub fn dense(factor: &Factor, sliding: &Sliding) -> Result<Self> {
+        let tail = factor.tail_flexibility();
         let row = |(node, &normal)| ContactRow { node, normal, point: [0.0; 3] };
         let rows: Vec<ContactRow> = sliding.rest_normals().iter().enumerate().map(row).collect();
         let offsets = vec![0.0; rows.len()];
@@ -82,10 +81,10 @@ impl ContactFactor {
     }
 
     /// The flexibility along the normals at rest, and what sweeps need for the rest of it.
-    pub fn by_sweeps(symbolic: &Symbolic, factor: &Factor, sliding: &Sliding) -> Result<Self> {
+    pub fn by_sweeps(factor: &Factor, sliding: &Sliding) -> Result<Self> {
         let rows: Vec<u32> = sliding.nodes().iter().map(|n| n.row).collect();
-        let reach = symbolic.reach(&rows);
-        let (normal, order) = symbolic.reach_flexibility(factor, &reach, sliding.rest_normals());
+        let reach = factor.reach(&rows);
+        let (normal, order) = factor.reach_flexibility(&reach, sliding.rest_normals());
         let mut own = vec![0.0; rows.len()];
         for (c, &i) in order.iter().enumerate() {
             own[i] = normal.column(c)[0];
@@ -106,21 +105,16 @@ impl ContactFactor {
     }
 
     /// Answers to one plan's constraints, whose forces are `b`.
-    pub fn answers<'a>(
-        &'a self,
-        symbolic: &'a Symbolic,
-        factor: &'a Factor,
-        b: &[[f64; 3]],
-    ) -> Answers<'a> {
+    pub fn answers<'a>(&'a self, factor: &'a Factor, b: &[[f64; 3]]) -> Answers<'a> {
         let (free, swept) = match &self.flexibility {
             Flexibility::Dense(tail) => {
-                let (forces, swept) = symbolic.on_tail(factor, b);
+                let (forces, swept) = factor.on_tail(b);
                 (tail.respond(&forces), swept)
             }
             Flexibility::Sweeps { reach, .. } => {
-                let mut swept = symbolic.permuted(b);
-                symbolic.forward(factor, &mut swept);
-                (symbolic.reach_displacements(factor, reach, &mut swept.clone()), swept)
+                let mut swept = factor.permuted(b);
+                factor.forward(&mut swept);
+                (factor.reach_displacements(reach, &mut swept.clone()), swept)
             }
         };
         let work = match &self.flexibility {
@@ -130,7 +124,6 @@ impl ContactFactor {
         let (moved, pushed) = (vec![[0.0; 3]; free.len()], vec![[0.0; 3]; free.len()]);
         Answers {
             contact: self,
-            symbolic,
             factor,
             swept,
             free,
@@ -158,7 +151,6 @@ impl ContactFactor {
 /// Answers of the sliding nodes to one plan's constraints, each begun from the one before.
 pub(crate) struct Answers<'a> {
     contact: &'a ContactFactor,
-    symbolic: &'a Symbolic,
     factor: &'a Factor,
     /// The forces after the sweep to the sliding nodes, in elimination order.
     swept: Vec<f64>,
@@ -311,7 +303,7 @@ impl<'a> Answers<'a> {
             (Flexibility::Dense(tail), Precision::Rough) => tail.respond_roughly(&loads),
             (Flexibility::Dense(tail), Precision::Exact) => tail.respond(&loads),
             (Flexibility::Sweeps { reach, .. }, _) => {
-                self.symbolic.respond(self.factor, reach, &loads, &mut self.work)
+                self.factor.respond(reach, &loads, &mut self.work)
             }
         };
         self.carried = Some(Carried { loads, moved });
@@ -370,7 +362,7 @@ impl<'a> Answers<'a> {
             }
             Flexibility::Dense(tail) => (tail.respond(pushes), precision),
             Flexibility::Sweeps { reach, .. } => {
-                (self.symbolic.respond(self.factor, reach, pushes, work), Precision::Exact)
+                (self.factor.respond(reach, pushes, work), Precision::Exact)
             }
         };
         // What is rough of a change is little of the whole, until that little is what is left to change.
@@ -453,18 +445,18 @@ impl<'a> Answers<'a> {
 
     /// Displacements of all rows of the system with `forces` on the sliding nodes.
     pub fn of_all(self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        let Self { symbolic, factor, mut swept, mut work, .. } = self;
+        let Self { factor, mut swept, mut work, .. } = self;
         match &self.contact.flexibility {
             Flexibility::Dense(tail) => {
                 let moved = tail.respond(forces);
                 let there: Vec<_> =
                     moved.iter().zip(&self.free).map(|(r, f)| add(*r, *f)).collect();
-                symbolic.above_tail(factor, swept, &there)
+                factor.above_tail(swept, &there)
             }
             Flexibility::Sweeps { reach, .. } => {
-                symbolic.add_reach_forces(factor, reach, forces, &mut work, &mut swept);
-                symbolic.backward(factor, &mut swept);
-                symbolic.unpermuted(&swept)
+                factor.add_reach_forces(reach, forces, &mut work, &mut swept);
+                factor.backward(&mut swept);
+                factor.unpermuted(&swept)
             }
         }
     }

@@ -10,14 +10,17 @@ use crate::contact::{ContactState, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, check_forces};
 use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::tensors::MassTensors;
-use crate::statics::iterative::{Effort, Extremes, is_doubtful};
+use crate::statics::effort::Solve;
+use crate::statics::iterative::{Extremes, is_doubtful};
 use crate::statics::newton::{Equilibrium, Slide};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::reduction::{NO_ROW, Reduction};
 use crate::statics::restraint::{self, Held};
 use crate::statics::solution::{Clock, ContactResult, Solution, Timings};
-use crate::statics::system::{Begin, Frozen, Linked, System, touching_needs_pcg};
-use crate::statics::touching::{Path, Touch, Touched};
+use crate::statics::system::{
+    Begin, BodyRows, Frozen, Linked, Settle, Solved, System, touching_needs_pcg,
+};
+use crate::statics::touching::{Path, Touch};
 use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Multiple of the correction of a solution by factor that stands for the error of the corrected one.
@@ -33,7 +36,7 @@ pub struct StaticSolver {
     method: Method,
     /// Whether solutions by factor are corrected once.
     refines: bool,
-    pub(crate) reduction: Reduction,
+    pub(crate) reduction: Arc<Reduction>,
     pub(crate) sliding: Option<Sliding>,
     /// What may touch what.
     pairs: Option<Pairs>,
@@ -52,13 +55,15 @@ enum Mechanics {
     LargeRotation(Box<Equilibrium>),
 }
 
-/// What the unknown rows do under a plan.
-struct Rows {
-    rows: Vec<[f64; 3]>,
-    contact: Option<ContactState>,
-    touching: Touch,
-    /// Time that contact took.
-    seconds: f64,
+/// A plan in the terms of the system.
+struct Posed<'a> {
+    /// Forces that joined nodes and loads bring to the rows of the linear system, N.
+    b: &'a [[f64; 3]],
+    /// Displacements of all nodes, those of joined ones filled in, mm.
+    u: &'a [[f64; 3]],
+    loads: Option<&'a [[f64; 3]]>,
+    motions: &'a [&'a Motion],
+    start: Option<&'a Solution>,
 }
 
 impl StaticSolver {
@@ -82,7 +87,7 @@ impl StaticSolver {
         let places = tensors.element_nodes().positions();
         let node_kinds = with_mid_edges(&tensors, &boundary)?;
         let kinds = node_kinds.kinds(places.len())?;
-        let reduction = Reduction::new(&kinds);
+        let reduction = Arc::new(Reduction::new(&kinds));
         let is_unknown = |j: usize| reduction.row_of[j] != NO_ROW;
         let stiffness = |j: usize| own_stiffness(tensors.matrix(), j);
         let sliding = Sliding::new(
@@ -112,26 +117,23 @@ impl StaticSolver {
             return Err(MtmError::Interrupted);
         }
         let made = if options.kinematics == Kinematics::Linear {
-            System::new(
-                matrix,
-                &reduction.rows(places),
-                sliding.as_ref(),
+            let body = BodyRows {
+                positions: &reduction.rows(places),
+                sliding: sliding.as_ref(),
                 held,
-                Extremes {
+                tissue: Extremes {
                     lame_ratio: tensors.tissue().largest_lame_ratio(),
                     contrast: tensors.tissue().contrast(),
                 },
-                &options,
-                &mut clock,
-                interrupted,
-            )
-            .map(|(system, method)| (Mechanics::Linear(Box::new(system)), method))
+            };
+            System::new(matrix, &body, &options, &mut clock, interrupted)
+                .map(|(system, method)| (Mechanics::Linear(Box::new(system)), method))
         } else {
-            Equilibrium::new(tensors.clone(), &matrix, &options, &mut clock)
+            Equilibrium::new(tensors.clone(), reduction.clone(), &matrix, &options, &mut clock)
                 .map(|(body, method)| (Mechanics::LargeRotation(Box::new(body)), method))
         };
         let (mechanics, method) = made.map_err(|e| by_node(e, &reduction.unknowns))?;
-        let refines = method == Method::Cholesky
+        let refines = method.has_factor()
             && options.kinematics == Kinematics::Linear
             && is_doubtful(tensors.tissue().contrast());
         Ok(Self {
@@ -236,19 +238,21 @@ impl StaticSolver {
         }
         clock.lap("plan", true);
 
-        let mut effort = Effort::default();
-        let Rows { rows, contact, touching, seconds: contact_seconds } =
-            self.solve_rows(&b, &u, loads, &motions, start, scale, &mut effort, interrupted)?;
+        let mut solve = Solve::new(scale, interrupted);
+        let posed = Posed { b: &b, u: &u, loads, motions: &motions, start };
+        let (Solved { rows, contact, contact_seconds }, touch) =
+            self.solve_rows(&posed, &mut solve)?;
         clock.lap("solve", true);
         for (&j, v) in self.reduction.unknowns.iter().zip(&rows) {
             u[j as usize] = *v;
         }
         let mut forces = self.forces(&u)?;
         if self.refines && contact.is_none() {
-            self.refine(&mut u, &forces, loads, &mut effort, interrupted)?;
+            self.refine(&mut u, &forces, loads, &mut solve)?;
             forces = self.forces(&u)?;
         }
-        let residual = self.residual(&forces, loads, contact.as_ref(), &touching.forces, &b);
+        let residual = self.residual(&forces, loads, (contact.as_ref(), &touch.forces), &b);
+        let effort = solve.effort;
         if !(residual.is_finite() && effort.error_estimate.is_finite()) {
             return Err(MtmError::NotPositiveDefinite {
                 node: 0,
@@ -272,7 +276,7 @@ impl StaticSolver {
             iterations: effort.iterations,
             residual_history: effort.history,
             contact: self.contact_result(contact, &motions),
-            touching: touching.result,
+            touching: touch.result,
             contact_iterations,
             timings,
         })
@@ -293,8 +297,7 @@ impl StaticSolver {
         u: &mut [[f64; 3]],
         forces: &[[f64; 3]],
         loads: Option<&[[f64; 3]]>,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
+        solve: &mut Solve<'_>,
     ) -> Result<()> {
         let Mechanics::Linear(system) = &self.mechanics else { return Ok(()) };
         let out_of_balance = |&j: &u32| {
@@ -302,12 +305,13 @@ impl StaticSolver {
             loads.map_or(f, |rows| add(rows[j as usize], f))
         };
         let b: Vec<[f64; 3]> = self.reduction.unknowns.iter().map(out_of_balance).collect();
-        let correction = system.solve(&b, 0.0, &mut Effort::default(), interrupted)?;
+        let correction = system.solve(&b, &mut Solve::new(0.0, solve.interrupted))?;
         let mut largest = 0.0_f64;
         for (&j, d) in self.reduction.unknowns.iter().zip(&correction) {
             u[j as usize] = add(u[j as usize], *d);
             largest = largest.max(norm(*d));
         }
+        let effort = &mut solve.effort;
         effort.error_estimate = effort.error_estimate.max(CORRECTION_SAFETY * largest);
         Ok(())
     }
@@ -365,64 +369,33 @@ impl StaticSolver {
         Ok(out)
     }
 
-    /// Displacements of the unknown rows, and contact.
-    ///
-    /// `b`: forces that joined nodes and loads bring to the rows of the linear system. `u`: displacements
-    /// of all nodes, those of joined ones filled in.
-    fn solve_rows(
-        &self,
-        b: &[[f64; 3]],
-        u: &[[f64; 3]],
-        loads: Option<&[[f64; 3]]>,
-        motions: &[&Motion],
-        start: Option<&Solution>,
-        scale: f64,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
-    ) -> Result<Rows> {
+    /// Displacements of the unknown rows with contact settled, and what touches.
+    fn solve_rows(&self, posed: &Posed<'_>, solve: &mut Solve<'_>) -> Result<(Solved, Touch)> {
+        let &Posed { b, u, loads, motions, start } = posed;
+        if let (Mechanics::Linear(system), Some(pairs)) = (&self.mechanics, &self.pairs) {
+            let path = Path { solver: self, system, pairs, motions, loads };
+            return path.solve(solve).map_err(|e| by_node(e, &self.reduction.unknowns));
+        }
         let found = match (&self.mechanics, &self.sliding) {
-            (Mechanics::Linear(system), _) if let Some(pairs) = &self.pairs => {
-                let clock = Clock::new();
-                let path = Path { solver: self, system, pairs, motions, loads, scale };
-                return path
-                    .solve(effort, interrupted)
-                    .map(|Touched { rows, contact, touching }| Rows {
-                        rows,
-                        contact,
-                        touching,
-                        seconds: clock.total(),
-                    })
-                    .map_err(|e| by_node(e, &self.reduction.unknowns));
-            }
             (Mechanics::LargeRotation(body), sliding) => {
                 let slide =
                     sliding.as_ref().map(|sliding| Slide { sliding, motions, held: self.held });
-                body.solve(&self.reduction, u, loads, slide.as_ref(), scale, effort, interrupted)
+                body.solve(u, loads, slide.as_ref(), solve)
             }
-            (Mechanics::Linear(system), None) => {
-                system.solve(b, scale, effort, interrupted).map(|u| (u, None, 0.0))
-            }
+            (Mechanics::Linear(system), None) => system.solve(b, solve).map(Solved::from),
             (Mechanics::Linear(system), Some(sliding)) => {
                 let rows =
                     start.map_or_else(Vec::new, |start| self.reduction.rows(&start.displacements));
                 let rest = start.and_then(|start| start.contact.at_rest.as_ref());
                 let contact = rest.and_then(|rest| sliding.carried(motions, rest));
-                let found = system.solve_with_contact(
-                    b,
-                    Linked::default(),
-                    sliding,
-                    motions,
-                    contact.map(|contact| Begin { rows: &rows, contact }),
-                    &self.options,
-                    scale,
-                    effort,
-                    interrupted,
-                );
-                found.map(|(u, state, seconds)| (u, Some(state), seconds))
+                let begin = contact.map(|contact| Begin { rows: &rows, contact });
+                let (options, linked) = (&self.options, Linked::default());
+                let settle = Settle { sliding, motions, begin, options, linked };
+                system.solve_with_contact(b, &settle, solve).map(Solved::from)
             }
         };
-        let (rows, contact, seconds) = found.map_err(|e| by_node(e, &self.reduction.unknowns))?;
-        Ok(Rows { rows, contact, touching: Touch::default(), seconds })
+        let found = found.map_err(|e| by_node(e, &self.reduction.unknowns))?;
+        Ok((found, Touch::default()))
     }
 
     /// Force out of balance at the unknown nodes over the forces that the plan brings in: those of joined
@@ -432,8 +405,7 @@ impl StaticSolver {
         &self,
         forces: &[[f64; 3]],
         loads: Option<&[[f64; 3]]>,
-        contact: Option<&ContactState>,
-        touching: &[[f64; 3]],
+        (contact, touching): (Option<&ContactState>, &[[f64; 3]]),
         b: &[[f64; 3]],
     ) -> f64 {
         let mut rest: Vec<[f64; 3]> = self
@@ -520,10 +492,8 @@ impl StaticSolver {
         let u = self.prescribed(&motions)?;
         let scale = u.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
         let b = self.coupled(&u);
-        let mut effort = Effort::default();
-        let found =
-            self.solve_rows(&b, &u, None, &motions, None, scale, &mut effort, interrupted)?;
-        Ok(found.contact)
+        let posed = Posed { b: &b, u: &u, loads: None, motions: &motions, start: None };
+        Ok(self.solve_rows(&posed, &mut Solve::new(scale, interrupted))?.0.contact)
     }
 
     /// Unknown rows for several right-hand sides, with contact frozen where there is any.
@@ -550,7 +520,7 @@ fn method_for_touching(options: &StaticOptions) -> Result<Method> {
         return Err(MtmError::UnknownName {
             what: "kinematics for a boundary with touching pairs",
             found: options.kinematics.name().into(),
-            known: "linear",
+            known: "linear".into(),
             kind: ErrorKind::Solver,
         });
     }

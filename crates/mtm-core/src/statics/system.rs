@@ -1,9 +1,13 @@
 //! The reduced linear system: what a method keeps from one plan to the next, and how it solves with
 //! and without contact.
 
+use std::borrow::Cow;
+use std::sync::Arc;
+
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::{Factor, Symbolic};
 use crate::algebra::constraints::{Constraint, add_offsets, projected, projected_rhs};
+use crate::algebra::multigrid::Multigrid;
 use crate::algebra::row_sums::in_pool;
 use crate::boundary::Motion;
 use crate::contact::pairs::Link;
@@ -11,13 +15,15 @@ use crate::contact::{
     Body, Constraints, ContactRow, ContactStart, ContactState, Response, Sliding, Spring,
 };
 use crate::error::{ErrorKind, MtmError, Result};
+use crate::statics::effort::Solve;
 use crate::statics::frozen::FrozenContact;
-use crate::statics::iterative::{Advance, Effort, Extremes, Iterative, Trail};
+use crate::statics::iterative::{Advance, Extremes, Iterative, Leave, Trail, hierarchy};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::reaction::{Answer, Answers, ContactFactor};
 use crate::statics::restraint::Held;
+use crate::statics::row_conditions::RowConditions;
 use crate::statics::solution::Clock;
-use crate::vector::{add, between, dot, norm, scaled, sub};
+use crate::vector::{between, dot, norm, sub};
 
 /// Most sliding nodes whose whole flexibility is kept (three unknowns each, 12 bytes a pair: doubles and
 /// floats): with it a set of normals costs a few dense products, by sweeps a few passes over the factor.
@@ -40,12 +46,20 @@ type Rows = Vec<[f64; 3]>;
 
 /// What is kept from one plan to the next.
 enum Kept {
-    /// The factor, and with sliding nodes what answers for them.
-    Direct { symbolic: Symbolic, factor: Factor, contact: Option<ContactFactor> },
-    /// The structure of the factor: the values change with the contact normals.
-    Refactored { symbolic: Symbolic, matrix: BlockMatrix },
-    /// The preconditioner.
-    Iterative(Iterative),
+    /// The factor of a body without sliding nodes.
+    Factor(Factor),
+    /// The factor, and what answers for the sliding nodes.
+    Flexible { factor: Factor, contact: ContactFactor },
+    /// The matrix: sliding nodes are constrained in it.
+    Matrix(Unfactored),
+}
+
+/// The matrix of a system that is solved again under each set of constraints.
+enum Unfactored {
+    /// By a factor whose values change with the contact normals.
+    Refactored { symbolic: Arc<Symbolic>, matrix: BlockMatrix },
+    /// By iteration.
+    Iterative(Box<Iterative>),
 }
 
 /// The system of the unknown nodes, ready for any right-hand side.
@@ -53,11 +67,24 @@ pub(crate) struct System {
     kept: Kept,
 }
 
-/// Where a solve with contact starts: the end of one for a plan or a body a little different.
-pub(crate) struct Begin<'a> {
-    /// Displacements of the rows.
-    pub rows: &'a [[f64; 3]],
-    pub contact: ContactStart,
+/// The body whose rows make a system.
+pub(crate) struct BodyRows<'a> {
+    /// Coordinates of the rows, mm.
+    pub positions: &'a [[f64; 3]],
+    pub sliding: Option<&'a Sliding>,
+    pub held: Held,
+    /// How extreme the tissue is.
+    pub tissue: Extremes,
+}
+
+/// What contact is settled for.
+pub(crate) struct Settle<'a> {
+    pub sliding: &'a Sliding,
+    /// One of each segment.
+    pub motions: &'a [&'a Motion],
+    pub begin: Option<Begin<'a>>,
+    pub options: &'a StaticOptions,
+    pub linked: Linked<'a>,
 }
 
 /// Links between rows: what touches.
@@ -68,15 +95,43 @@ pub(crate) struct Linked<'a> {
     pub share: Option<f64>,
 }
 
-impl Linked<'_> {
-    /// `b` with the goals of the links.
-    fn pulled(&self, b: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        let mut out = b.to_vec();
-        for link in self.links {
-            link.add_goal(&mut out);
-        }
-        out
+/// Displacements of the rows with contact settled.
+pub(crate) struct Settled {
+    /// mm.
+    pub rows: Vec<[f64; 3]>,
+    pub contact: ContactState,
+    /// Seconds that contact took.
+    pub contact_seconds: f64,
+}
+
+/// Displacements of the rows after a solve, with contact where nodes slide.
+pub(crate) struct Solved {
+    /// mm.
+    pub rows: Vec<[f64; 3]>,
+    pub contact: Option<ContactState>,
+    /// Seconds that contact took.
+    pub contact_seconds: f64,
+}
+
+impl From<Vec<[f64; 3]>> for Solved {
+    /// Displacements of a body without sliding nodes.
+    fn from(rows: Vec<[f64; 3]>) -> Self {
+        Self { rows, contact: None, contact_seconds: 0.0 }
     }
+}
+
+impl From<Settled> for Solved {
+    fn from(found: Settled) -> Self {
+        let Settled { rows, contact, contact_seconds } = found;
+        Self { rows, contact: Some(contact), contact_seconds }
+    }
+}
+
+/// Where a solve with contact starts: the end of one for a plan or a body a little different.
+pub(crate) struct Begin<'a> {
+    /// Displacements of the rows.
+    pub rows: &'a [[f64; 3]],
+    pub contact: ContactStart,
 }
 
 /// Contact constraints that do not change, for several right-hand sides.
@@ -99,54 +154,71 @@ impl Frozen<'_> {
     }
 }
 
+impl Linked<'_> {
+    /// `b` with the forces of the links where rows stand at their constraints.
+    fn pulled<'b>(&self, b: &'b [[f64; 3]], constraints: &[Constraint]) -> Cow<'b, [[f64; 3]]> {
+        if self.links.is_empty() {
+            return Cow::Borrowed(b);
+        }
+        let (mut shift, mut out) = (vec![[0.0; 3]; b.len()], b.to_vec());
+        add_offsets(&mut shift, constraints);
+        for link in self.links {
+            link.add_force(&shift, &mut out);
+        }
+        Cow::Owned(out)
+    }
+}
+
 impl System {
     /// The system of `matrix`, with what the method of `options` keeps, and the method used.
     ///
-    /// `positions`: coordinates of the rows; `tissue`: how extreme the tissue is. Errors name rows.
+    /// Errors name rows.
     pub fn new(
         matrix: BlockMatrix,
-        positions: &[[f64; 3]],
-        sliding: Option<&Sliding>,
-        held: Held,
-        tissue: Extremes,
+        body: &BodyRows<'_>,
         options: &StaticOptions,
         clock: &mut Clock,
         interrupted: Interrupt<'_>,
     ) -> Result<(Self, Method)> {
         let mut method = options.method.for_unknowns(3 * matrix.n_rows());
         let with = |kept: Kept| Self { kept };
-        if method == Method::Cholesky {
+        if method.has_factor() {
             let slide_rows: Vec<u32> =
-                sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
+                body.sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
             // Where sliding nodes alone hold a part, there is no flexibility without them.
             let kept = !slide_rows.is_empty()
-                && held == Held::ByPrescribed
+                && body.held == Held::ByPrescribed
                 && slide_rows.len() <= MAX_KEPT_SLIDING;
             let dense = kept && slide_rows.len() <= MAX_DENSE_SLIDING;
-            let symbolic = Symbolic::new(&matrix, if dense { &slide_rows } else { &[] })?;
+            let symbolic = Arc::new(Symbolic::new(&matrix, if dense { &slide_rows } else { &[] })?);
             clock.lap("ordering", true);
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
             let fits = options.memory_limit.is_none_or(|limit| symbolic.factor_bytes() <= limit);
-            if fits && sliding.is_some() && !kept {
-                return Ok((with(Kept::Refactored { symbolic, matrix }), method));
+            if fits && body.sliding.is_some() && !kept {
+                let refactored = Unfactored::Refactored { symbolic, matrix };
+                return Ok((with(Kept::Matrix(refactored)), method));
             }
             if fits {
                 let factor = symbolic.factor(&matrix)?;
                 clock.lap("factor", true);
-                let contact = sliding.map(|sliding| {
+                let contact = body.sliding.map(|sliding| {
                     if dense {
-                        ContactFactor::dense(&symbolic, &factor, sliding)
+                        ContactFactor::dense(&factor, sliding)
                     } else {
-                        ContactFactor::by_sweeps(&symbolic, &factor, sliding)
+                        ContactFactor::by_sweeps(&factor, sliding)
                     }
                 });
                 let contact = contact.transpose()?;
                 clock.lap("contact_factor", contact.is_some());
-                return Ok((with(Kept::Direct { symbolic, factor, contact }), method));
+                let kept = match contact {
+                    Some(contact) => Kept::Flexible { factor, contact },
+                    None => Kept::Factor(factor),
+                };
+                return Ok((with(kept), method));
             }
-            if options.method == Method::Cholesky {
+            if options.method.has_factor() {
                 return Err(MtmError::OutOfMemory {
                     what: "the Cholesky factor",
                     needed_mb: symbolic.factor_bytes() >> 20,
@@ -156,99 +228,60 @@ impl System {
             }
             method = Method::Pcg;
         }
-        let iterative = Iterative::new(matrix, positions, sliding, tissue, method, options)?;
+        let multigrid = multigrid(&matrix, body)?;
+        let iterative = Iterative::new(matrix, multigrid, body.tissue, method, options);
         clock.lap("preconditioner", true);
-        Ok((with(Kept::Iterative(iterative)), method))
+        Ok((with(Kept::Matrix(Unfactored::Iterative(Box::new(iterative)))), method))
     }
 
     /// Bytes of the factor or preconditioner.
     pub fn bytes(&self) -> usize {
         match &self.kept {
-            Kept::Direct { symbolic, contact, .. } => {
-                symbolic.factor_bytes() + contact.as_ref().map_or(0, ContactFactor::bytes)
-            }
-            Kept::Refactored { symbolic, .. } => symbolic.factor_bytes(),
-            Kept::Iterative(iterative) => iterative.bytes(),
+            Kept::Factor(factor) => factor.bytes(),
+            Kept::Flexible { factor, contact } => factor.bytes() + contact.bytes(),
+            Kept::Matrix(Unfactored::Refactored { symbolic, .. }) => symbolic.factor_bytes(),
+            Kept::Matrix(Unfactored::Iterative(iterative)) => iterative.bytes(),
         }
     }
 
-    /// A⁻¹ b without sliding nodes; `scale` is the length that the tolerance refers to, mm.
-    pub fn solve(
-        &self,
-        b: &[[f64; 3]],
-        scale: f64,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
-    ) -> Result<Vec<[f64; 3]>> {
+    /// A⁻¹ b without contact.
+    pub fn solve(&self, b: &[[f64; 3]], solve: &mut Solve<'_>) -> Result<Vec<[f64; 3]>> {
         match &self.kept {
-            Kept::Direct { symbolic, factor, .. } => {
-                let x = in_pool(|| symbolic.solve(factor, b));
-                effort.error_estimate = direct_error(factor, &x);
+            Kept::Factor(factor) | Kept::Flexible { factor, .. } => {
+                let x = in_pool(|| factor.solve(b));
+                solve.effort.error_estimate = direct_error(factor, &x);
                 Ok(x)
             }
-            Kept::Refactored { symbolic, matrix } => {
-                Ok(symbolic.solve(&symbolic.factor(matrix)?, b))
+            Kept::Matrix(Unfactored::Refactored { symbolic, matrix }) => {
+                Ok(symbolic.factor(matrix)?.solve(b))
             }
-            Kept::Iterative(iterative) => iterative.solve(b, scale, effort, interrupted),
+            Kept::Matrix(Unfactored::Iterative(iterative)) => iterative.solve(b, solve),
         }
     }
 
-    /// Displacements of the rows with contact settled, the contact, and the seconds that contact took.
+    /// Displacements of the rows with contact settled.
     pub fn solve_with_contact(
         &self,
         b: &[[f64; 3]],
-        linked: Linked<'_>,
-        sliding: &Sliding,
-        motions: &[&Motion],
-        begin: Option<Begin<'_>>,
-        options: &StaticOptions,
-        scale: f64,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
-    ) -> Result<(Vec<[f64; 3]>, ContactState, f64)> {
-        let clock = Clock::new();
-        let rows = begin.as_ref().map_or(&[][..], |b| b.rows);
-        let first = begin.as_ref().map(|b| &b.contact);
-        if let (Kept::Direct { symbolic, factor, contact: Some(contact) }, []) =
-            (&self.kept, linked.links)
-        {
-            // Each on a thread of the pool, so that loops inside begin without a hand-over; not all at once:
-            // interrupts are of the calling thread.
-            let answers = in_pool(|| contact.answers(symbolic, factor, b));
-            let tolerance = sliding.gap_limit(&options.contact) / sliding.diagonal;
-            let mut body = Flexible { answers, tolerance, last: None, is_known: false };
-            let state = sliding.solve(motions, first, &options.contact, interrupted, &mut body)?;
-            let seconds = clock.total();
-            let x = in_pool(|| body.answers.of_all(&state.reactions));
-            effort.error_estimate = direct_error(factor, &x).max(left_by(&state));
-            return Ok((x, state, seconds));
+        settle: &Settle<'_>,
+        solve: &mut Solve<'_>,
+    ) -> Result<Settled> {
+        match &self.kept {
+            Kept::Factor(_) | Kept::Flexible { .. } if !settle.linked.links.is_empty() => {
+                Err(touching_needs_pcg(Method::Cholesky))
+            }
+            Kept::Factor(factor) => {
+                let contact = ContactFactor::by_sweeps(factor, settle.sliding)?;
+                settled_by_flexibility(factor, &contact, b, settle, solve)
+            }
+            Kept::Flexible { factor, contact } => {
+                settled_by_flexibility(factor, contact, b, settle, solve)
+            }
+            Kept::Matrix(system) => system.settled(b, settle, solve),
         }
-        let mut contact = options.contact;
-        if let Kept::Iterative(_) = self.kept {
-            let far = scale.max(sliding.farthest(motions));
-            contact.allowed = contact.allowed.max(CONTACT_SHARE * options.tolerance * far);
-        }
-        let trail = Trail::starting(rows.to_vec());
-        let mut body = Projected {
-            system: self,
-            b,
-            linked,
-            sliding,
-            scale,
-            trail,
-            effort,
-            interrupted,
-            last: None,
-        };
-        let state = sliding.solve(motions, first, &contact, interrupted, &mut body)?;
-        // No state without a step.
-        let rows = body.last.map_or_else(Vec::new, |last| last.to);
-        effort.error_estimate = effort.error_estimate.max(left_by(&state));
-        Ok((rows, state, clock.total()))
     }
 
-    /// Rows under links where no node slides, from displacements `start`; `scale`: as for
-    /// [`solve`](Self::solve).
+    /// Rows under links where no node slides, begun from displacements `start`.
     ///
     /// # Errors
     /// Any method but conjugate gradients; those of its solve.
@@ -257,27 +290,19 @@ impl System {
         b: &[[f64; 3]],
         linked: Linked<'_>,
         start: &[[f64; 3]],
-        scale: f64,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
+        solve: &mut Solve<'_>,
     ) -> Result<Rows> {
-        let Kept::Iterative(iterative) = &self.kept else {
+        let Kept::Matrix(Unfactored::Iterative(iterative)) = &self.kept else {
             return Err(touching_needs_pcg(Method::Cholesky));
         };
+        let mut b = b.to_vec();
+        for link in linked.links {
+            link.add_goal(&mut b);
+        }
+        let leave = Leave { reach: f64::INFINITY, share: linked.share, links: linked.links };
         let mut trail = Trail::starting(start.to_vec());
-        let found = iterative.solve_projected(
-            linked.pulled(b),
-            &[],
-            Vec::new(),
-            linked.links,
-            f64::INFINITY,
-            scale,
-            linked.share,
-            &mut trail,
-            effort,
-            interrupted,
-        )?;
-        Ok(found.rows)
+        let conditions = RowConditions { constraints: Vec::new(), springs: Vec::new() };
+        Ok(iterative.solve_projected(b, conditions, leave, &mut trail, solve)?.rows)
     }
 
     /// Rows for several right-hand sides; `scales` is the length of each one's prescribed field, mm.
@@ -288,14 +313,13 @@ impl System {
         sliding: Option<(&Sliding, Frozen<'_>)>,
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
-        let mut effort = Effort::default();
         let Some((sliding, frozen)) = sliding else {
-            if let Kept::Direct { symbolic, factor, .. } = &self.kept {
-                symbolic.solve_many(factor, &mut columns);
+            if let Kept::Factor(factor) | Kept::Flexible { factor, .. } = &self.kept {
+                factor.solve_many(&mut columns);
                 return Ok(columns);
             }
             let each = columns.iter().zip(scales);
-            return each.map(|(b, &s)| self.solve(b, s, &mut effort, interrupted)).collect();
+            return each.map(|(b, &s)| self.solve(b, &mut Solve::new(s, interrupted))).collect();
         };
         let still = vec![[0.0; 3]; sliding.nodes().len()];
         let conditions = |k: usize, solve: &mut dyn FnMut(&Constraints<'_>) -> Result<Rows>| {
@@ -314,12 +338,12 @@ impl System {
                 reach,
             })
         };
-        if let Kept::Direct { symbolic, factor, contact: Some(contact) } = &self.kept {
+        let flexible = |factor: &Factor, contact: &ContactFactor| {
             let kept = contact.tail().map(|t| FrozenContact::new(t, frozen.rows, frozen.springs));
             let kept = kept.transpose()?;
             let solve = |(k, b): (usize, &Rows)| {
                 conditions(k, &mut |c| {
-                    let mut answers = contact.answers(symbolic, factor, b);
+                    let mut answers = contact.answers(factor, b);
                     let forces = match &kept {
                         Some(kept) => kept.forces(answers.free(), c),
                         None => answers.respond(c, 0.0)?.forces,
@@ -327,102 +351,137 @@ impl System {
                     Ok(answers.of_all(&forces))
                 })
             };
-            return columns.iter().enumerate().map(solve).collect();
-        }
-        let mut solve = |((k, b), &scale): ((usize, &Rows), &f64)| {
-            conditions(k, &mut |c| {
-                let mut trail = Trail::default();
-                let found = self.solve_projected(
-                    b,
-                    &[],
-                    sliding,
-                    c,
-                    scale,
-                    None,
-                    &mut trail,
-                    &mut effort,
-                    interrupted,
-                );
-                found.map(|found| found.rows)
-            })
+            columns.iter().enumerate().map(solve).collect()
         };
-        columns.iter().enumerate().zip(scales).map(&mut solve).collect()
+        match &self.kept {
+            Kept::Factor(factor) => flexible(factor, &ContactFactor::by_sweeps(factor, sliding)?),
+            Kept::Flexible { factor, contact } => flexible(factor, contact),
+            Kept::Matrix(system) => {
+                let solve = |((k, b), &scale): ((usize, &Rows), &f64)| {
+                    let mut solve = Solve::new(scale, interrupted);
+                    conditions(k, &mut |c| {
+                        let mut trail = Trail::default();
+                        let nodes = (sliding, Linked::default());
+                        let found = system.solve_projected(b, nodes, c, &mut trail, &mut solve);
+                        found.map(|found| found.rows)
+                    })
+                };
+                columns.iter().enumerate().zip(scales).map(solve).collect()
+            }
+        }
+    }
+}
+
+impl Unfactored {
+    /// The matrix without constraints.
+    fn matrix(&self) -> &BlockMatrix {
+        match self {
+            Self::Iterative(iterative) => iterative.matrix(),
+            Self::Refactored { matrix, .. } => matrix,
+        }
+    }
+
+    /// Displacements of the rows with contact settled.
+    fn settled(
+        &self,
+        b: &[[f64; 3]],
+        settle: &Settle<'_>,
+        solve: &mut Solve<'_>,
+    ) -> Result<Settled> {
+        let clock = Clock::new();
+        let Settle { sliding, motions, begin, options, linked } = settle;
+        let rows = begin.as_ref().map_or(&[][..], |b| b.rows);
+        let first = begin.as_ref().map(|b| &b.contact);
+        let mut contact = options.contact;
+        if let Self::Iterative(_) = self {
+            let far = solve.scale.max(sliding.farthest(motions));
+            contact.allowed = contact.allowed.max(CONTACT_SHARE * options.tolerance * far);
+        }
+        let trail = Trail::starting(rows.to_vec());
+        let interrupted = solve.interrupted;
+        let linked = *linked;
+        let mut body = Projected { system: self, b, linked, sliding, trail, solve, last: None };
+        let state = sliding.solve(motions, first, &contact, interrupted, &mut body)?;
+        // No state without a step.
+        let rows = body.last.map_or_else(Vec::new, |last| last.to);
+        let effort = &mut body.solve.effort;
+        effort.error_estimate = effort.error_estimate.max(left_by(&state));
+        Ok(Settled { rows, contact: state, contact_seconds: clock.total() })
     }
 
     /// Rows of the projected system, P A P + k (I − P), P = I − n⊗n on held nodes.
-    ///
-    /// `share`: see [`Iterative::solve_projected`].
     fn solve_projected(
         &self,
         b: &[[f64; 3]],
-        links: &[Link],
-        sliding: &Sliding,
+        (sliding, linked): (&Sliding, Linked<'_>),
         c: &Constraints<'_>,
-        scale: f64,
-        share: Option<f64>,
         trail: &mut Trail,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
+        solve: &mut Solve<'_>,
     ) -> Result<Advance> {
-        let row = |node: usize| sliding.nodes()[node].row as usize;
-        let constraints: Vec<Constraint> = c
-            .rows
-            .iter()
-            .zip(c.offsets)
-            .map(|(r, &offset)| Constraint { row: row(r.node), normal: r.normal, offset })
-            .collect();
-        let springs: Vec<(usize, Spring)> = c.springs.iter().map(|&s| (row(s.node), s)).collect();
-        let mut rhs = if links.is_empty() {
-            projected_rhs(self.matrix(), b, &constraints)
-        } else {
-            let (mut shift, mut pulled) = (vec![[0.0; 3]; b.len()], vec![[0.0; 3]; b.len()]);
-            add_offsets(&mut shift, &constraints);
-            for link in links {
-                link.add_force(&shift, &mut pulled);
+        let conditions = RowConditions::new(sliding, c);
+        let b = linked.pulled(b, &conditions.constraints);
+        let mut rhs = projected_rhs(self.matrix(), &b, &conditions.constraints);
+        conditions.add_pull(&mut rhs);
+        let offsets = conditions.constraints.clone();
+        let mut found = match self {
+            Self::Iterative(iterative) => {
+                let share = match linked.share {
+                    Some(rough) => Some(c.share.max(rough)),
+                    None => (c.share > 0.0).then_some(c.share),
+                };
+                let leave = Leave { reach: c.reach, share, links: linked.links };
+                iterative.solve_projected(rhs, conditions, leave, trail, solve)?
             }
-            let b: Rows = b.iter().zip(&pulled).map(|(b, f)| add(*b, *f)).collect();
-            projected_rhs(self.matrix(), &b, &constraints)
-        };
-        for (row, s) in &springs {
-            rhs[*row] = add(rhs[*row], scaled(s.axis, s.stiffness * s.goal));
-        }
-        let mut found = match &self.kept {
-            Kept::Iterative(iterative) => iterative.solve_projected(
-                rhs,
-                &constraints,
-                springs,
-                links,
-                c.reach,
-                scale,
-                share,
-                trail,
-                effort,
-                interrupted,
-            )?,
-            Kept::Refactored { symbolic, matrix } => {
-                let mut system = projected(matrix, &constraints);
-                for (row, s) in &springs {
-                    system.add_to_diagonal(*row, s.axis, s.stiffness);
-                }
-                let factor = symbolic.factor(&system)?;
-                let rows = symbolic.solve(&factor, &rhs);
-                effort.error_estimate = direct_error(&factor, &rows);
+            Self::Refactored { .. } if !linked.links.is_empty() => {
+                return Err(touching_needs_pcg(Method::Cholesky));
+            }
+            Self::Refactored { symbolic, matrix } => {
+                let factor = symbolic.factor(&conditions.applied_to(matrix))?;
+                let rows = factor.solve(&rhs);
+                solve.effort.error_estimate = direct_error(&factor, &rows);
                 Advance { rows, solved: true, is_carried: false }
             }
-            Kept::Direct { .. } => unreachable!("the factor without contact serves there"),
         };
-        add_offsets(&mut found.rows, &constraints);
+        add_offsets(&mut found.rows, &offsets);
         Ok(found)
     }
+}
 
-    /// The matrix without constraints, where it is kept.
-    fn matrix(&self) -> &BlockMatrix {
-        match &self.kept {
-            Kept::Iterative(iterative) => iterative.matrix(),
-            Kept::Refactored { matrix, .. } => matrix,
-            Kept::Direct { .. } => unreachable!("the factor without contact serves there"),
-        }
-    }
+/// The hierarchy for `matrix` with its sliding rows held along their normals at rest.
+fn multigrid(matrix: &BlockMatrix, body: &BodyRows<'_>) -> Result<Multigrid> {
+    let normals: Vec<(usize, [f64; 3])> = body
+        .sliding
+        .iter()
+        .flat_map(|s| s.nodes().iter().zip(s.rest_normals()))
+        .map(|(node, &n)| (node.row as usize, n))
+        .collect();
+    let constraints: Vec<Constraint> =
+        normals.iter().map(|&(row, normal)| Constraint { row, normal, offset: 0.0 }).collect();
+    let held_matrix = (!constraints.is_empty()).then(|| projected(matrix, &constraints));
+    hierarchy(held_matrix.as_ref().unwrap_or(matrix), body.positions, &normals, body.tissue)
+}
+
+/// Displacements of the rows with contact settled by what its sliding nodes do to one another.
+fn settled_by_flexibility(
+    factor: &Factor,
+    contact: &ContactFactor,
+    b: &[[f64; 3]],
+    settle: &Settle<'_>,
+    solve: &mut Solve<'_>,
+) -> Result<Settled> {
+    let clock = Clock::new();
+    let Settle { sliding, motions, begin, options, .. } = settle;
+    let first = begin.as_ref().map(|b| &b.contact);
+    // Each on a thread of the pool, so that loops inside begin without a hand-over; not all at once:
+    // interrupts are of the calling thread.
+    let answers = in_pool(|| contact.answers(factor, b));
+    let tolerance = sliding.gap_limit(&options.contact) / sliding.diagonal;
+    let mut body = Flexible { answers, tolerance, last: None, is_known: false };
+    let state = sliding.solve(motions, first, &options.contact, solve.interrupted, &mut body)?;
+    let contact_seconds = clock.total();
+    let rows = in_pool(|| body.answers.of_all(&state.reactions));
+    solve.effort.error_estimate = direct_error(factor, &rows).max(left_by(&state));
+    Ok(Settled { rows, contact: state, contact_seconds })
 }
 
 /// The body by what its sliding nodes do to one another: every other node follows them exactly.
@@ -491,37 +550,31 @@ impl Body for Flexible<'_> {
 }
 
 /// The body by all its rows, those of held nodes projected.
-struct Projected<'a> {
-    system: &'a System,
+struct Projected<'a, 'i> {
+    system: &'a Unfactored,
     b: &'a [[f64; 3]],
     linked: Linked<'a>,
     sliding: &'a Sliding,
-    scale: f64,
     trail: Trail,
-    effort: &'a mut Effort,
-    interrupted: Interrupt<'a>,
+    solve: &'a mut Solve<'i>,
     last: Option<Step>,
 }
 
-impl Projected<'_> {
-    /// Forces out of balance of all rows, A x − b.
+impl Projected<'_, '_> {
+    /// Forces out of balance of all rows, A x − b less those of the links.
     fn forces(&self, x: &[[f64; 3]]) -> Vec<[f64; 3]> {
         let mut out = self.system.matrix().multiply(x);
         for (f, b) in out.iter_mut().zip(self.b) {
             *f = sub(*f, *b);
         }
-        let mut pulled = vec![[0.0; 3]; if self.linked.links.is_empty() { 0 } else { x.len() }];
         for link in self.linked.links {
-            link.add_force(x, &mut pulled);
-        }
-        for (f, pull) in out.iter_mut().zip(pulled) {
-            *f = sub(*f, pull);
+            link.take_force(x, &mut out);
         }
         out
     }
 }
 
-impl Body for Projected<'_> {
+impl Body for Projected<'_, '_> {
     fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
         let (from, forces_from) = match self.last.take() {
             Some(last) => (last.to, last.forces_to),
@@ -536,21 +589,8 @@ impl Body for Projected<'_> {
             }
         };
         self.trail.rows.clone_from(&from);
-        let share = match self.linked.share {
-            Some(rough) => Some(c.share.max(rough)),
-            None => (c.share > 0.0).then_some(c.share),
-        };
-        let found = self.system.solve_projected(
-            self.b,
-            self.linked.links,
-            self.sliding,
-            c,
-            self.scale,
-            share,
-            &mut self.trail,
-            self.effort,
-            self.interrupted,
-        );
+        let nodes = (self.sliding, self.linked);
+        let found = self.system.solve_projected(self.b, nodes, c, &mut self.trail, self.solve);
         let Advance { rows: x, solved, is_carried } = match found {
             Ok(found) => found,
             Err(error) => {
@@ -567,6 +607,7 @@ impl Body for Projected<'_> {
         let step = Step { from, to: x, forces_from, forces_to: forces };
         let slopes = Some(step.slopes());
         self.last = Some(step);
+        // A rough round is as good as it was asked to be.
         let solved = solved || self.linked.share.is_some();
         Ok(Response { displacements, reactions, slopes, solved, is_carried })
     }

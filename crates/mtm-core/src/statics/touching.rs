@@ -11,11 +11,10 @@ use crate::contact::pairs::{Left, Pairs, Round, Touching};
 use crate::contact::{ContactStart, ContactState};
 use crate::error::{MtmError, Result};
 use crate::geometry::motion::SurfaceMotion;
-use crate::statics::iterative::Effort;
-use crate::statics::options::Interrupt;
-use crate::statics::solution::TouchResult;
+use crate::statics::effort::Solve;
+use crate::statics::solution::{Clock, TouchResult};
 use crate::statics::solver::StaticSolver;
-use crate::statics::system::{Begin, Linked, System};
+use crate::statics::system::{Begin, Linked, Settle, Settled, Solved, System};
 use crate::vector::{add, between, norm, scaled, sub};
 
 /// Way of the bones in one step, over the mean edge of the tissue that may be touched.
@@ -51,14 +50,6 @@ struct Pose {
     touching: Touching,
 }
 
-/// What a plan does with a body whose parts may touch.
-pub(super) struct Touched {
-    /// Displacements of the unknown rows, mm.
-    pub rows: Vec<[f64; 3]>,
-    pub contact: Option<ContactState>,
-    pub touching: Touch,
-}
-
 /// What touches.
 #[derive(Default)]
 pub(super) struct Touch {
@@ -76,8 +67,15 @@ pub(super) struct Path<'a> {
     pub motions: &'a [&'a Motion],
     /// Of every node, N.
     pub loads: Option<&'a [[f64; 3]]>,
-    /// Largest prescribed displacement, mm.
-    pub scale: f64,
+}
+
+/// Where a round starts.
+struct Begun<'a> {
+    /// Forces on the rows, N.
+    b: &'a [[f64; 3]],
+    /// Displacements of the rows, mm.
+    rows: &'a [[f64; 3]],
+    contact: Option<ContactStart>,
 }
 
 /// The rounds of one step.
@@ -96,17 +94,20 @@ impl Path<'_> {
     /// # Errors
     /// `ContactNotConverged` where the rounds run out with a gap or penetration that a face would show, or where a
     /// step penetrates however short it is; those of the solves.
-    pub fn solve(&self, effort: &mut Effort, interrupted: Interrupt<'_>) -> Result<Touched> {
+    pub fn solve(&self, solve: &mut Solve<'_>) -> Result<(Solved, Touch)> {
+        let clock = Clock::new();
         let sliding = self.solver.sliding.as_ref();
-        let farthest = sliding.map_or(0.0, |s| s.farthest(self.motions)).max(self.scale);
+        let farthest = sliding.map_or(0.0, |s| s.farthest(self.motions)).max(solve.scale);
         let mut step = 1.0 / (farthest / (STEP_EDGES * self.pairs.mean_edge())).ceil().max(1.0);
         let (mut pose, mut here, mut rounds) = (self.rest(), 0.0, 0);
         loop {
             let there = if here + 1.5 * step >= 1.0 { 1.0 } else { here + step };
-            match self.advance(&pose, here, there, effort, interrupted)? {
+            match self.advance(&pose, (here, there), solve)? {
                 Some((next, done)) if there == 1.0 => {
                     rounds += done.rounds;
-                    return self.end(next, &done, rounds, effort);
+                    let (mut solved, touch) = self.end(next, &done, rounds, solve)?;
+                    solved.contact_seconds = clock.total();
+                    return Ok((solved, touch));
                 }
                 Some((next, done)) => {
                     rounds += done.rounds;
@@ -137,10 +138,8 @@ impl Path<'_> {
     fn advance(
         &self,
         pose: &Pose,
-        from: f64,
-        to: f64,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
+        (from, to): (f64, f64),
+        solve: &mut Solve<'_>,
     ) -> Result<Option<(Pose, Done)>> {
         let (before, after) = (self.partial(from)?, self.partial(to)?);
         let motions: Vec<&Motion> = after.iter().collect();
@@ -157,16 +156,9 @@ impl Path<'_> {
         loop {
             rounds += 1;
             let round = self.pairs.round(&pose.u, &motions, &pose.touching)?;
-            let (rows, contact) = self.linked(
-                &b,
-                &round,
-                &pose.rows,
-                &motions,
-                begin,
-                rough.then_some(close),
-                effort,
-                interrupted,
-            )?;
+            let begun = Begun { b: &b, rows: &pose.rows, contact: begin };
+            let (rows, contact) =
+                self.linked(&round, begun, &motions, rough.then_some(close), solve)?;
             let u = self.solver.filled(&prescribed, &rows);
             let mut touching = pose.touching.clone();
             let left = self.pairs.follow(&round, &u, &motions, &mut touching)?;
@@ -196,36 +188,22 @@ impl Path<'_> {
     /// `rough`: gap of sliding nodes, mm, that is enough for a round on the way.
     fn linked(
         &self,
-        b: &[[f64; 3]],
         round: &Round,
-        start: &[[f64; 3]],
+        begun: Begun<'_>,
         motions: &[&Motion],
-        begin: Option<ContactStart>,
         rough: Option<f64>,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
+        solve: &mut Solve<'_>,
     ) -> Result<(Vec<[f64; 3]>, Option<ContactState>)> {
-        let share = rough.map(|_| ROUGH_SHARE);
-        let linked = Linked { links: &round.links, share };
+        let Begun { b, rows, contact } = begun;
+        let linked = Linked { links: &round.links, share: rough.map(|_| ROUGH_SHARE) };
         let Some(sliding) = &self.solver.sliding else {
-            let rows =
-                self.system.solve_linked(b, linked, start, self.scale, effort, interrupted)?;
-            return Ok((rows, None));
+            return Ok((self.system.solve_linked(b, linked, rows, solve)?, None));
         };
         let mut options = self.solver.options;
         options.contact.allowed = options.contact.allowed.max(rough.unwrap_or(0.0));
-        let begin = begin.map(|contact| Begin { rows: start, contact });
-        let (rows, contact, _) = self.system.solve_with_contact(
-            b,
-            linked,
-            sliding,
-            motions,
-            begin,
-            &options,
-            self.scale,
-            effort,
-            interrupted,
-        )?;
+        let begin = contact.map(|contact| Begin { rows, contact });
+        let settle = Settle { sliding, motions, begin, options: &options, linked };
+        let Settled { rows, contact, .. } = self.system.solve_with_contact(b, &settle, solve)?;
         Ok((rows, Some(contact)))
     }
 
@@ -271,12 +249,18 @@ impl Path<'_> {
     }
 
     /// The answer, or an error where a face would show what is left.
-    fn end(&self, pose: Pose, done: &Done, rounds: usize, effort: &mut Effort) -> Result<Touched> {
+    fn end(
+        &self,
+        pose: Pose,
+        done: &Done,
+        rounds: usize,
+        solve: &mut Solve<'_>,
+    ) -> Result<(Solved, Touch)> {
         let open = done.left.distance().max(done.change);
         if !done.converged && open > LOOSE * self.close() {
             return Err(self.lost(&pose, rounds, open));
         }
-        effort.error_estimate = effort.error_estimate.max(open);
+        solve.effort.error_estimate = solve.effort.error_estimate.max(open);
         let met = self.pairs.met(&done.round, &pose.u, self.motions, &pose.rows)?;
         let mut forces = vec![[0.0; 3]; pose.rows.len()];
         for link in &done.round.links {
@@ -290,8 +274,8 @@ impl Path<'_> {
             rounds,
             converged: done.converged,
         };
-        let touching = Touch { result, forces };
-        Ok(Touched { rows: pose.rows, contact: pose.contact, touching })
+        let Pose { rows, contact, .. } = pose;
+        Ok((Solved { rows, contact, contact_seconds: 0.0 }, Touch { result, forces }))
     }
 
     /// That parts which touch found no equilibrium, with the nodes that press most.

@@ -12,6 +12,8 @@ mod sweep;
 mod symmetric;
 mod workspace;
 
+use std::sync::Arc;
+
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::sparse::linalg::cholesky::supernodal;
 use faer::{Conj, MatMut};
@@ -48,17 +50,10 @@ pub struct Symbolic {
 
 /// L of P A Pᵀ = L Lᵀ.
 pub struct Factor {
+    symbolic: Arc<Symbolic>,
     values: Vec<f64>,
     /// Relative error with which a known solution came back.
     trial_error: f64,
-}
-
-impl Factor {
-    /// Relative error, in the largest component, with which the factor recovered a known solution: an
-    /// estimate of the digits that the condition of the system leaves.
-    pub fn trial_error(&self) -> f64 {
-        self.trial_error
-    }
 }
 
 impl Symbolic {
@@ -106,7 +101,7 @@ impl Symbolic {
     ///
     /// # Errors
     /// `NotPositiveDefinite` where a pivot is not positive or a known solution is not recovered.
-    pub fn factor(&self, matrix: &BlockMatrix) -> Result<Factor> {
+    pub fn factor(self: &Arc<Self>, matrix: &BlockMatrix) -> Result<Factor> {
         let bytes = self.factor_bytes();
         // Asked for first, so that too little memory is an error and not an abort; then taken zeroed
         // from the system, which touches each page once.
@@ -123,27 +118,77 @@ impl Symbolic {
                         .into(),
             },
         )?;
-        self.tried(matrix, Factor { values, trial_error: 0.0 })
+        Factor { symbolic: self.clone(), values, trial_error: 0.0 }.tried(matrix)
     }
 
-    /// `factor` after it recovered a known solution.
+    /// `b` in elimination order.
+    fn permuted(&self, b: &[[f64; 3]]) -> Vec<f64> {
+        self.order.iter().flat_map(|&j| b[j as usize]).collect()
+    }
+
+    /// `x` back in the order of the system.
+    fn unpermuted(&self, x: &[f64]) -> Vec<[f64; 3]> {
+        let mut out = vec![[0.0; 3]; self.order.len()];
+        for (&j, v) in self.order.iter().zip(x.chunks_exact(3)) {
+            out[j as usize] = [v[0], v[1], v[2]];
+        }
+        out
+    }
+
+    /// First unknown of the tail.
+    fn first_of_tail(&self) -> usize {
+        3 * (self.order.len() - self.n_tail)
+    }
+}
+
+impl Factor {
+    /// Relative error, in the largest component, with which the factor recovered a known solution: an
+    /// estimate of the digits that the condition of the system leaves.
+    pub fn trial_error(&self) -> f64 {
+        self.trial_error
+    }
+
+    /// Bytes that it takes.
+    pub fn bytes(&self) -> usize {
+        self.symbolic.factor_bytes()
+    }
+
+    /// `b` in elimination order.
+    pub fn permuted(&self, b: &[[f64; 3]]) -> Vec<f64> {
+        self.symbolic.permuted(b)
+    }
+
+    /// `x` back in the order of the system.
+    pub fn unpermuted(&self, x: &[f64]) -> Vec<[f64; 3]> {
+        self.symbolic.unpermuted(x)
+    }
+
+    /// What the given rows of the system reach in the factor.
+    pub fn reach(&self, rows: &[u32]) -> Reach {
+        let position = structure::positions(&self.symbolic.order);
+        let places = rows.iter().map(|&row| 3 * position[row as usize] as usize).collect();
+        Reach::new(&self.symbolic.structure, places)
+    }
+
+    /// The factor after it recovered a known solution.
     ///
     /// The residual of a solve does not tell its error; a solution that is known does, at the price of
     /// one product and one solve per factor.
-    fn tried(&self, matrix: &BlockMatrix, factor: Factor) -> Result<Factor> {
-        let known: Vec<[f64; 3]> = (0..self.order.len())
+    fn tried(mut self, matrix: &BlockMatrix) -> Result<Self> {
+        let known: Vec<[f64; 3]> = (0..self.symbolic.order.len())
             .map(|j| [0, 1, 2].map(|i| 1.0 + 0.5 * ((3 * j + i) as f64 * 0.7).sin()))
             .collect();
-        let found = self.solve(&factor, &matrix.multiply(&known));
+        let found = self.solve(&matrix.multiply(&known));
         let trial_error = known
             .iter()
             .zip(&found)
             .flat_map(|(a, b)| (0..3).map(move |i| (a[i] - b[i]).abs()))
             .fold(0.0_f64, |m, e| if e.is_nan() { f64::INFINITY } else { m.max(e) });
         if trial_error <= TRIAL_ERROR {
-            return Ok(Factor { trial_error, ..factor });
+            self.trial_error = trial_error;
+            return Ok(self);
         }
-        let (worst, at) = self.smallest_pivot(matrix, &factor);
+        let (worst, at) = self.smallest_pivot(matrix);
         Err(MtmError::NotPositiveDefinite {
             node: at,
             detail: format!(
@@ -155,14 +200,14 @@ impl Symbolic {
     }
 
     /// Smallest share of its diagonal entry that a pivot keeps, and its row.
-    fn smallest_pivot(&self, matrix: &BlockMatrix, factor: &Factor) -> (f64, usize) {
-        let l = supernodal::SupernodalLltRef::new(&self.structure, &factor.values);
+    fn smallest_pivot(&self, matrix: &BlockMatrix) -> (f64, usize) {
+        let l = supernodal::SupernodalLltRef::new(&self.symbolic.structure, &self.values);
         let (mut worst, mut at) = (f64::INFINITY, 0);
-        for s in 0..self.structure.n_supernodes() {
+        for s in 0..self.symbolic.structure.n_supernodes() {
             let node = l.supernode(s);
             let (first, val) = (node.start(), node.val());
             for i in 0..val.ncols() {
-                let row = self.order[(first + i) / 3] as usize;
+                let row = self.symbolic.order[(first + i) / 3] as usize;
                 let diagonal = matrix.diagonal_block(row)[4 * ((first + i) % 3)];
                 let pivot = val[(i, i)] * val[(i, i)] / diagonal;
                 if pivot.is_nan() || pivot < worst {
@@ -174,116 +219,80 @@ impl Symbolic {
     }
 
     /// A⁻¹ b.
-    pub fn solve(&self, factor: &Factor, b: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        let mut x = self.permuted(b);
-        self.forward(factor, &mut x);
-        self.backward(factor, &mut x);
-        self.unpermuted(&x)
+    pub fn solve(&self, b: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let mut x = self.symbolic.permuted(b);
+        self.forward(&mut x);
+        self.backward(&mut x);
+        self.symbolic.unpermuted(&x)
     }
 
     /// A⁻¹ B for several right-hand sides, each given as rows of three, in place.
-    pub fn solve_many(&self, factor: &Factor, columns: &mut [Vec<[f64; 3]>]) {
-        if self.order.is_empty() {
+    pub fn solve_many(&self, columns: &mut [Vec<[f64; 3]>]) {
+        if self.symbolic.order.is_empty() {
             return;
         }
-        let mut x: Vec<f64> = columns.iter().flat_map(|b| self.permuted(b)).collect();
-        let (n, k) = (3 * self.order.len(), columns.len());
+        let mut x: Vec<f64> = columns.iter().flat_map(|b| self.symbolic.permuted(b)).collect();
+        let (n, k) = (3 * self.symbolic.order.len(), columns.len());
         let par = parallelism(n);
-        let mut memory = MemBuffer::new(self.structure.solve_in_place_scratch::<f64>(k, par));
-        supernodal::SupernodalLltRef::new(&self.structure, &factor.values)
+        let mut memory =
+            MemBuffer::new(self.symbolic.structure.solve_in_place_scratch::<f64>(k, par));
+        supernodal::SupernodalLltRef::new(&self.symbolic.structure, &self.values)
             .solve_in_place_with_conj(
                 Conj::No,
                 MatMut::from_column_major_slice_mut(&mut x, n, k),
                 par,
                 MemStack::new(&mut memory),
             );
-        for (column, x) in columns.iter_mut().zip(x.chunks_exact(3 * self.order.len())) {
-            *column = self.unpermuted(x);
+        for (column, x) in columns.iter_mut().zip(x.chunks_exact(3 * self.symbolic.order.len())) {
+            *column = self.symbolic.unpermuted(x);
         }
-    }
-
-    /// `b` in elimination order.
-    pub fn permuted(&self, b: &[[f64; 3]]) -> Vec<f64> {
-        self.order.iter().flat_map(|&j| b[j as usize]).collect()
-    }
-
-    /// `x` back in the order of the system.
-    pub fn unpermuted(&self, x: &[f64]) -> Vec<[f64; 3]> {
-        let mut out = vec![[0.0; 3]; self.order.len()];
-        for (&j, v) in self.order.iter().zip(x.chunks_exact(3)) {
-            out[j as usize] = [v[0], v[1], v[2]];
-        }
-        out
     }
 
     /// x ← L⁻¹ x in elimination order.
-    pub fn forward(&self, factor: &Factor, x: &mut [f64]) {
-        self.sweep(factor).forward(x);
+    pub fn forward(&self, x: &mut [f64]) {
+        self.sweep().forward(x);
     }
 
     /// x ← L⁻ᵀ x in elimination order.
-    pub fn backward(&self, factor: &Factor, x: &mut [f64]) {
-        self.sweep(factor).backward(x);
+    pub fn backward(&self, x: &mut [f64]) {
+        self.sweep().backward(x);
     }
 
-    fn sweep<'a>(&'a self, factor: &'a Factor) -> Sweep<'a> {
-        Sweep::new((&self.structure, &factor.values), &self.tree)
+    fn sweep(&self) -> Sweep<'_> {
+        Sweep::new((&self.symbolic.structure, &self.values), &self.symbolic.tree)
     }
 
     /// Forces on the tail rows that `b` is to them once all others are eliminated, and what is left of the
     /// elimination for [`Self::above_tail`].
-    pub fn on_tail(&self, factor: &Factor, b: &[[f64; 3]]) -> (Vec<[f64; 3]>, Vec<f64>) {
-        let (mut x, first) = (self.permuted(b), self.first_of_tail());
-        self.sweep(factor).forward_to(first, &mut x);
+    pub fn on_tail(&self, b: &[[f64; 3]]) -> (Vec<[f64; 3]>, Vec<f64>) {
+        let (mut x, first) = (self.symbolic.permuted(b), self.symbolic.first_of_tail());
+        self.sweep().forward_to(first, &mut x);
         (x[first..].chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect(), x)
     }
 
     /// Displacements of all rows, given those of the tail rows.
-    pub fn above_tail(&self, factor: &Factor, mut x: Vec<f64>, tail: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        let first = self.first_of_tail();
+    pub fn above_tail(&self, mut x: Vec<f64>, tail: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let first = self.symbolic.first_of_tail();
         x[first..].copy_from_slice(tail.as_flattened());
-        self.sweep(factor).backward_from(first, &mut x);
-        self.unpermuted(&x)
-    }
-
-    /// First unknown of the tail.
-    fn first_of_tail(&self) -> usize {
-        3 * (self.order.len() - self.n_tail)
-    }
-
-    /// What the given rows of the system reach in the factor.
-    pub fn reach(&self, rows: &[u32]) -> Reach {
-        let position = structure::positions(&self.order);
-        let places = rows.iter().map(|&row| 3 * position[row as usize] as usize).collect();
-        Reach::new(&self.structure, places)
+        self.sweep().backward_from(first, &mut x);
+        self.symbolic.unpermuted(&x)
     }
 
     /// Displacements of the rows of `reach` under forces on them alone; `x`, as long as the unknowns, is
     /// zero before and after.
-    pub fn respond(
-        &self,
-        factor: &Factor,
-        reach: &Reach,
-        forces: &[[f64; 3]],
-        x: &mut [f64],
-    ) -> Vec<[f64; 3]> {
-        let columns = (&self.structure, factor.values.as_slice());
+    pub fn respond(&self, reach: &Reach, forces: &[[f64; 3]], x: &mut [f64]) -> Vec<[f64; 3]> {
+        let columns = (&self.symbolic.structure, self.values.as_slice());
         reach.scatter(forces, x);
         reach.forward(columns, x);
         reach.backward(columns, x);
         let found = reach.gather(x);
-        reach.clear(&self.structure, x);
+        reach.clear(&self.symbolic.structure, x);
         found
     }
 
     /// Displacements of the rows of `reach` from x = L⁻¹ P b; x stays as it is elsewhere.
-    pub fn reach_displacements(
-        &self,
-        factor: &Factor,
-        reach: &Reach,
-        x: &mut [f64],
-    ) -> Vec<[f64; 3]> {
-        reach.backward((&self.structure, &factor.values), x);
+    pub fn reach_displacements(&self, reach: &Reach, x: &mut [f64]) -> Vec<[f64; 3]> {
+        reach.backward((&self.symbolic.structure, &self.values), x);
         reach.gather(x)
     }
 
@@ -291,37 +300,35 @@ impl Symbolic {
     /// after.
     pub fn add_reach_forces(
         &self,
-        factor: &Factor,
         reach: &Reach,
         forces: &[[f64; 3]],
         work: &mut [f64],
         x: &mut [f64],
     ) {
         reach.scatter(forces, work);
-        reach.forward((&self.structure, &factor.values), work);
+        reach.forward((&self.symbolic.structure, &self.values), work);
         for (x, v) in x.iter_mut().zip(work.iter()) {
             *x += v;
         }
-        reach.clear(&self.structure, work);
+        reach.clear(&self.symbolic.structure, work);
     }
 
     /// Flexibility of the rows of `reach` along a unit normal each, mm/N, and the row of the set that each
     /// of its rows is.
     pub fn reach_flexibility(
         &self,
-        factor: &Factor,
         reach: &Reach,
         normals: &[[f64; 3]],
     ) -> (DenseSymmetric, Vec<usize>) {
-        reach.normal_flexibility((&self.structure, &factor.values), normals)
+        reach.normal_flexibility((&self.symbolic.structure, &self.values), normals)
     }
 
     /// Flexibility S⁻¹ of the tail rows, S = L_SS L_SSᵀ their Schur complement, order 3·n_tail, mm/N.
-    pub fn tail_flexibility(&self, factor: &Factor) -> TailFlexibility {
-        let (size, first) = (3 * self.n_tail, self.first_of_tail());
+    pub fn tail_flexibility(&self) -> TailFlexibility {
+        let (size, first) = (3 * self.symbolic.n_tail, self.symbolic.first_of_tail());
         let mut lower = vec![0.0; size * size];
-        let l = supernodal::SupernodalLltRef::new(&self.structure, &factor.values);
-        for s in 0..self.structure.n_supernodes() {
+        let l = supernodal::SupernodalLltRef::new(&self.symbolic.structure, &self.values);
+        for s in 0..self.symbolic.structure.n_supernodes() {
             let node = l.supernode(s);
             let (start, val, pattern) = (node.start(), node.val(), node.pattern());
             let width = val.ncols();
@@ -335,7 +342,7 @@ impl Symbolic {
                 }
             }
         }
-        let rows = self.order[self.order.len() - self.n_tail..].to_vec();
+        let rows = self.symbolic.order[self.symbolic.order.len() - self.symbolic.n_tail..].to_vec();
         TailFlexibility::new(&DenseFactor::from_lower(size, lower), rows)
     }
 }

@@ -191,24 +191,26 @@ fn places_in(child: &[usize], begin: usize, width: usize, pattern: &[usize]) -> 
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
+    use std::sync::Arc;
+
     use super::super::{Symbolic, grid::grid};
 
     #[test]
     fn sweeps_through_the_reach_equal_whole_solves() {
         let matrix = grid(23);
-        let symbolic = Symbolic::new(&matrix, &[]).unwrap();
+        let symbolic = Arc::new(Symbolic::new(&matrix, &[]).unwrap());
         let factor = symbolic.factor(&matrix).unwrap();
         let rows: Vec<u32> = (0..23).map(|i| 23 * i + (i * i) % 5).rev().collect();
-        let reach = symbolic.reach(&rows);
+        let reach = factor.reach(&rows);
         let forces: Vec<[f64; 3]> =
             (0..rows.len()).map(|i| [0, 1, 2].map(|a| ((3 * i + a) as f64).cos())).collect();
         let mut b = vec![[0.0; 3]; matrix.n_rows()];
         for (&row, &f) in rows.iter().zip(&forces) {
             b[row as usize] = f;
         }
-        let whole = symbolic.solve(&factor, &b);
+        let whole = factor.solve(&b);
         let mut x = vec![0.0; 3 * matrix.n_rows()];
-        let found = symbolic.respond(&factor, &reach, &forces, &mut x);
+        let found = factor.respond(&reach, &forces, &mut x);
         let largest = whole.as_flattened().iter().fold(0.0_f64, |m, v| m.max(v.abs()));
         for (&row, v) in rows.iter().zip(&found) {
             for i in 0..3 {
@@ -222,17 +224,17 @@ mod tests {
     #[test]
     fn normal_flexibility_equals_that_of_whole_solves() {
         let matrix = grid(23);
-        let symbolic = Symbolic::new(&matrix, &[]).unwrap();
+        let symbolic = Arc::new(Symbolic::new(&matrix, &[]).unwrap());
         let factor = symbolic.factor(&matrix).unwrap();
         let rows: Vec<u32> = (0..23).map(|i| 23 * i + (i * i) % 5).rev().collect();
         let normals: Vec<[f64; 3]> =
             (0..rows.len()).map(|i| [(i as f64).sin(), (i as f64).cos(), 0.5]).collect();
-        let reach = symbolic.reach(&rows);
-        let (found, order) = symbolic.reach_flexibility(&factor, &reach, &normals);
+        let reach = factor.reach(&rows);
+        let (found, order) = factor.reach_flexibility(&reach, &normals);
         for (c, &j) in order.iter().enumerate() {
             let mut b = vec![[0.0; 3]; matrix.n_rows()];
             b[rows[j] as usize] = normals[j];
-            let u = symbolic.solve(&factor, &b);
+            let u = factor.solve(&b);
             for (&i, v) in order[c..].iter().zip(found.column(c)) {
                 let exact = crate::vector::dot(normals[i], u[rows[i] as usize]);
                 assert!((exact - v).abs() <= 1e-13, "{i} {j}: {exact:e} {v:e}");

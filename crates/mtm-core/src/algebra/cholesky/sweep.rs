@@ -321,6 +321,8 @@ fn add(to: &mut [f64], what: &[f64]) {
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
+    use std::sync::Arc;
+
     use super::super::{Symbolic, grid::grid};
     use super::Sweep;
 
@@ -332,9 +334,9 @@ mod tests {
         let matrix = grid(n);
         let tail: Vec<u32> = (0..n as u32).map(|i| n as u32 * i + 7).collect();
         for (tail, every) in [(&tail[..], 1), (&[], 1), (&tail, 400), (&[], 400)] {
-            let symbolic = Symbolic::new(&matrix, tail).unwrap();
+            let symbolic = Arc::new(Symbolic::new(&matrix, tail).unwrap());
             let factor = symbolic.factor(&matrix).unwrap();
-            let sweep = Sweep { least: 1000, ..symbolic.sweep(&factor) };
+            let sweep = Sweep { least: 1000, ..factor.sweep() };
             let roots = &symbolic.tree.roots;
             assert!(sweep.cut(roots).is_some() || sweep.shared(roots).is_some());
             let force = |j: usize| if j.is_multiple_of(every) { (j as f64).cos() } else { 0.0 };
@@ -350,7 +352,7 @@ mod tests {
             });
             assert!(answers[0] == answers[1] && answers[0] == answers[2]);
             let mut several = vec![b.clone(), b];
-            symbolic.solve_many(&factor, &mut several);
+            factor.solve_many(&mut several);
             let largest = several[0].as_flattened().iter().fold(0.0_f64, |m, v| m.max(v.abs()));
             for (v, w) in answers[0].as_flattened().iter().zip(several[0].as_flattened()) {
                 assert!((v - w).abs() <= 1e-13 * largest, "{v:e} {w:e}");
@@ -364,14 +366,14 @@ mod tests {
         let n = 40;
         let matrix = grid(n);
         let tail: Vec<u32> = (0..n as u32).map(|i| n as u32 * i + 7).collect();
-        let symbolic = Symbolic::new(&matrix, &tail).unwrap();
+        let symbolic = Arc::new(Symbolic::new(&matrix, &tail).unwrap());
         let factor = symbolic.factor(&matrix).unwrap();
         let b: Vec<[f64; 3]> =
             (0..n * n).map(|j| [(j as f64).cos(), 1.0, (2.0 * j as f64).sin()]).collect();
-        let (forces, swept) = symbolic.on_tail(&factor, &b);
-        let there = symbolic.tail_flexibility(&factor).respond(&forces);
-        let found = symbolic.above_tail(&factor, swept, &there);
-        let whole = symbolic.solve(&factor, &b);
+        let (forces, swept) = factor.on_tail(&b);
+        let there = factor.tail_flexibility().respond(&forces);
+        let found = factor.above_tail(swept, &there);
+        let whole = factor.solve(&b);
         let largest = whole.as_flattened().iter().fold(0.0_f64, |m, v| m.max(v.abs()));
         for (v, w) in found.as_flattened().iter().zip(whole.as_flattened()) {
             assert!((v - w).abs() <= 1e-12 * largest, "{v:e} {w:e}");

@@ -88,7 +88,7 @@ impl Smoother {
                 }
             });
         for step in later {
-            step.sweep(a, 0.0, &v.d, &mut v.s, &mut v.d_next, &mut v.x);
+            step.sweep(a, 0.0, &v.d, [&mut v.s, &mut v.d_next, &mut v.x]);
             std::mem::swap(&mut v.d, &mut v.d_next);
         }
         let x = &v.x;
@@ -101,7 +101,7 @@ impl Smoother {
     pub(super) fn smooth_last<const N: usize>(&self, a: &ScaledMatrix<N>, v: &mut Vectors<N>) {
         let mut correction = 1.0;
         for step in &self.steps {
-            step.sweep(a, correction, &v.d, &mut v.r, &mut v.d_next, &mut v.x);
+            step.sweep(a, correction, &v.d, [&mut v.r, &mut v.d_next, &mut v.x]);
             std::mem::swap(&mut v.d, &mut v.d_next);
             correction = 0.0;
         }
@@ -117,16 +117,14 @@ struct SmootherStep {
 }
 
 impl SmootherStep {
-    /// One sweep: r −= A d, then the new direction from r; x takes `correction` times the old
+    /// One sweep of [r, d_next, x]: r −= A d, then the new direction from r; x takes `correction` times the old
     /// direction besides.
     fn sweep<const N: usize>(
         &self,
         a: &ScaledMatrix<N>,
         correction: f64,
         d: &[[f64; N]],
-        r: &mut [[f64; N]],
-        d_next: &mut [[f64; N]],
-        x: &mut [[f64; N]],
+        [r, d_next, x]: [&mut Vec<[f64; N]>; 3],
     ) {
         let rows = a.rows_per_task;
         x.par_chunks_mut(rows)

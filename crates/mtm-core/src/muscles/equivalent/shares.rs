@@ -6,9 +6,9 @@ use crate::mesh::TetMesh;
 use crate::muscles::equivalent::crossing::{Touch, Touches};
 use crate::muscles::equivalent::direction::{DirectionSum, MeanDirection};
 use crate::muscles::equivalent::packet::Packet;
+use crate::muscles::equivalent::sampling::{Muscle, SamplingCounts, SamplingTimings};
 use crate::muscles::equivalent::sequence::Sequence;
 use crate::muscles::equivalent::shape::MuscleShape;
-use crate::muscles::equivalent::{Muscle, SamplingCounts, SamplingTimings};
 use crate::muscles::fibre::NearFibres;
 use crate::vector::Vec3;
 

@@ -6,22 +6,23 @@
 
 mod sliding;
 
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::Symbolic;
 use crate::algebra::constraints::{Constraint, add_offsets, projected, projected_rhs};
-use crate::algebra::krylov::{PcgOptions, Preconditioner, Spectrum};
-use crate::algebra::multigrid::{Multigrid, MultigridOptions};
 use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, Shortfall};
 use crate::mechanics::strain_energy::StrainEnergy;
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::mechanics::tensors::MassTensors;
-use crate::statics::iterative::{Confirmed, Effort, Extremes, is_doubtful};
+use crate::statics::effort::Solve;
+use crate::statics::iterative::{Extremes, Iterative, hierarchy};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::reduction::Reduction;
+use crate::statics::row_conditions::RowConditions;
 use crate::statics::solution::Clock;
+use crate::statics::system::Solved;
 use crate::vector::{add, between, dot, norm, scaled, sub};
 
 pub(crate) use sliding::Slide;
@@ -53,7 +54,7 @@ const NEAR_REST: f64 = 0.1;
 
 /// How tangent systems are solved.
 enum TangentSolver {
-    Cholesky(Box<Symbolic>),
+    Cholesky(Arc<Symbolic>),
     Pcg,
 }
 
@@ -61,34 +62,27 @@ enum TangentSolver {
 pub(crate) struct Equilibrium {
     energy: StrainEnergy,
     tensors: Arc<MassTensors>,
+    reduction: Arc<Reduction>,
     solver: TangentSolver,
     options: StaticOptions,
     tissue: Extremes,
 }
 
 /// A body of large deformation that follows contact conditions, each to its equilibrium.
-struct Followed<'a> {
+struct Followed<'a, 'i> {
     equilibrium: &'a Equilibrium,
-    reduction: &'a Reduction,
     target: Target<'a>,
     sliding: &'a Sliding,
     u: Vec<[f64; 3]>,
     /// Displacements before the last step.
     before: Vec<[f64; 3]>,
-    effort: &'a mut Effort,
-    interrupted: Interrupt<'a>,
+    solve: &'a mut Solve<'i>,
 }
 
-impl Body for Followed<'_> {
+impl Body for Followed<'_, '_> {
     fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
-        (self.target.constraints, self.target.springs) = on_rows(self.sliding, c);
-        let u = self.equilibrium.follow(
-            self.reduction,
-            self.u.clone(),
-            &self.target,
-            self.effort,
-            self.interrupted,
-        )?;
+        self.target.conditions = RowConditions::new(self.sliding, c);
+        let u = self.equilibrium.follow(self.u.clone(), &self.target, self.solve)?;
         let forces = self.equilibrium.forces(&u)?;
         let loads = self.target.loads;
         let reaction = |j: u32| {
@@ -115,19 +109,9 @@ struct Target<'a> {
     prescribed: &'a [[f64; 3]],
     /// Forces on every node, N.
     loads: Option<&'a [[f64; 3]]>,
-    /// Orthonormal on each row.
-    constraints: Vec<Constraint>,
-    springs: Vec<RowSpring>,
+    conditions: RowConditions,
     /// Length that the tolerance refers to, mm.
     scale: f64,
-}
-
-/// A spring on one row of the system.
-struct RowSpring {
-    row: usize,
-    axis: [f64; 3],
-    stiffness: f64,
-    goal: f64,
 }
 
 /// A state with what the next step starts from.
@@ -150,6 +134,14 @@ struct Step {
     slack: f64,
 }
 
+/// How the boundary moves in a step.
+struct Moves<'a> {
+    /// How far each constrained row goes along its normal.
+    constraints: &'a [Constraint],
+    /// How far the nodes go that are no unknowns; none where they stay.
+    change: Option<&'a [[f64; 3]]>,
+}
+
 impl Step {
     /// Largest displacement, mm.
     fn length(&self) -> f64 {
@@ -163,6 +155,7 @@ impl Equilibrium {
     /// `matrix`: the reduced stiffness at rest. Errors name rows.
     pub fn new(
         tensors: Arc<MassTensors>,
+        reduction: Arc<Reduction>,
         matrix: &BlockMatrix,
         options: &StaticOptions,
         clock: &mut Clock,
@@ -176,9 +169,11 @@ impl Equilibrium {
                     kind: ErrorKind::Solver,
                 });
             }
-            method => method.for_unknowns(3 * matrix.n_rows()),
+            method @ (Method::Auto | Method::Cholesky | Method::Pcg) => {
+                method.for_unknowns(3 * matrix.n_rows())
+            }
         };
-        let solver = if method == Method::Cholesky {
+        let solver = if method.has_factor() {
             let symbolic = Symbolic::new(matrix, &[])?;
             if let Some(limit) = options.memory_limit
                 && symbolic.factor_bytes() > limit
@@ -190,17 +185,17 @@ impl Equilibrium {
                     advice: "use method=\"pcg\"",
                 });
             }
-            TangentSolver::Cholesky(Box::new(symbolic))
+            TangentSolver::Cholesky(Arc::new(symbolic))
         } else {
             TangentSolver::Pcg
         };
-        clock.lap("ordering", method == Method::Cholesky);
+        clock.lap("ordering", method.has_factor());
         let energy = StrainEnergy::new(tensors.clone(), options.kinematics);
         let tissue = Extremes {
             lame_ratio: tensors.tissue().largest_lame_ratio(),
             contrast: tensors.tissue().contrast(),
         };
-        Ok((Self { energy, tensors, solver, options: *options, tissue }, method))
+        Ok((Self { energy, tensors, reduction, solver, options: *options, tissue }, method))
     }
 
     /// Bytes of a factor; 0 for conjugate gradients, which keep nothing from one tangent to the next.
@@ -216,27 +211,29 @@ impl Equilibrium {
         Ok(self.energy.state(u)?.forces)
     }
 
-    /// Displacements of the unknown rows with contact settled, the contact, and the seconds that it took.
+    /// Displacements of the unknown rows with contact settled.
     pub fn solve(
         &self,
-        reduction: &Reduction,
         prescribed: &[[f64; 3]],
         loads: Option<&[[f64; 3]]>,
         slide: Option<&Slide<'_>>,
-        scale: f64,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
-    ) -> Result<(Vec<[f64; 3]>, Option<ContactState>, f64)> {
+        solve: &mut Solve<'_>,
+    ) -> Result<Solved> {
         let clock = Clock::new();
-        let target =
-            |constraints, springs| Target { prescribed, loads, constraints, springs, scale };
+        let scale = solve.scale;
+        let target = || Target { prescribed, loads, conditions: RowConditions::default(), scale };
         let mut u = vec![[0.0; 3]; prescribed.len()];
-        let Some(slide) = slide else {
-            u = self.follow(reduction, u, &target(vec![], vec![]), effort, interrupted)?;
-            return Ok((reduction.rows(&u), None, 0.0));
+        let settled = |u: &[[f64; 3]], contact: ContactState| Solved {
+            rows: self.reduction.rows(u),
+            contact: Some(contact),
+            contact_seconds: clock.total(),
         };
-        match self.slide(reduction, &target(vec![], vec![]), slide, effort, interrupted) {
-            Ok((u, state)) => return Ok((reduction.rows(&u), Some(state), clock.total())),
+        let Some(slide) = slide else {
+            u = self.follow(u, &target(), solve)?;
+            return Ok(self.reduction.rows(&u).into());
+        };
+        match self.slide(&target(), slide, solve) {
+            Ok((u, state)) => return Ok(settled(&u, state)),
             // Too far for one go: shares of the way for every set of normals.
             Err(
                 MtmError::NotConverged { .. }
@@ -246,35 +243,25 @@ impl Equilibrium {
             Err(error) => return Err(error),
         }
         let Slide { sliding, motions, .. } = slide;
-        let mut body = Followed {
-            equilibrium: self,
-            reduction,
-            target: target(vec![], vec![]),
-            sliding,
-            before: u.clone(),
-            u,
-            effort,
-            interrupted,
-        };
+        let (target, before, interrupted) = (target(), u.clone(), solve.interrupted);
+        let mut body = Followed { equilibrium: self, target, sliding, before, u, solve };
         let state = sliding.solve(motions, None, &self.options.contact, interrupted, &mut body)?;
-        Ok((reduction.rows(&body.u), Some(state), clock.total()))
+        Ok(settled(&body.u, state))
     }
 
     /// The state that `target` asks for, from the state `u`: at once, or by shares of the way where Newton's
     /// method loses it.
     fn follow(
         &self,
-        reduction: &Reduction,
         u: Vec<[f64; 3]>,
         target: &Target<'_>,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
+        solve: &mut Solve<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         let (mut here, mut done, mut share) = (u, 0.0, 1.0_f64);
         while done < 1.0 {
             // Of the way that is left.
             let part = (share / (1.0 - done)).min(1.0);
-            match self.advance(reduction, &here, target, part, effort, interrupted) {
+            match self.advance(&here, target, part, solve) {
                 Ok(next) => {
                     here = next;
                     done = if part == 1.0 { 1.0 } else { done + share };
@@ -293,62 +280,61 @@ impl Equilibrium {
     /// Equilibrium at `part` of the way from the boundary of `u` to that of `target`.
     fn advance(
         &self,
-        reduction: &Reduction,
         u: &[[f64; 3]],
         target: &Target<'_>,
         part: f64,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
+        solve: &mut Solve<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         // The boundary moves; the unknowns follow as the tangent says.
         let mut moved = target.prescribed.to_vec();
-        for &j in &reduction.unknowns {
+        for &j in &self.reduction.unknowns {
             moved[j as usize] = u[j as usize];
         }
         let change: Vec<[f64; 3]> =
             moved.iter().zip(u).map(|(a, b)| scaled(sub(*a, *b), part)).collect();
-        let start = self.pose(reduction, u.to_vec(), target)?;
-        let along = |c: &Constraint| dot(c.normal, u[reduction.unknowns[c.row] as usize]);
+        let start = self.pose(u.to_vec(), target)?;
+        let along = |c: &Constraint| dot(c.normal, u[self.reduction.unknowns[c.row] as usize]);
         let constraints: Vec<Constraint> = target
+            .conditions
             .constraints
             .iter()
             .map(|c| Constraint { offset: part * (c.offset - along(c)), ..*c })
             .collect();
         let allowed = self.allowed(&start, target, f64::INFINITY);
+        let interrupted = solve.interrupted;
         let (rows, _) = by_tangent(Exact, |kind| {
-            let change = Some(&change[..]);
-            self.step(reduction, &start, target, &constraints, change, (kind, allowed), interrupted)
+            let moves = Moves { constraints: &constraints, change: Some(&change) };
+            self.step(&start, target, &moves, (kind, allowed), interrupted)
         })?;
         let mut ahead = start.u;
         for (value, d) in ahead.iter_mut().zip(&change) {
             *value = add(*value, *d);
         }
-        let pose = self.pose(reduction, moved_by(reduction, &ahead, &rows, 1.0), target)?;
-        effort.iterations += 1;
+        let pose = self.pose(moved_by(&self.reduction, &ahead, &rows, 1.0), target)?;
+        solve.effort.iterations += 1;
 
         let still: Vec<Constraint> =
             constraints.iter().map(|c| Constraint { offset: 0.0, ..*c }).collect();
         let step = |pose: &Pose, how: (TangentKind, f64)| {
-            let rows = self.step(reduction, pose, target, &still, None, how, interrupted)?;
+            let moves = Moves { constraints: &still, change: None };
+            let rows = self.step(pose, target, &moves, how, interrupted)?;
             Ok(Step { slope: along_slope(&rows, pose), slack: 0.0, rows })
         };
-        self.descend(reduction, pose, target, (f64::INFINITY, &[]), step, effort, interrupted)
+        self.descend(pose, target, (f64::INFINITY, &[]), step, solve)
     }
 
-    /// The end of Newton's steps from `pose`, each of which `solve` makes from a pose, the tangent, and the
+    /// The end of Newton's steps from `pose`, each of which `next` makes from a pose, the tangent, and the
     /// error that it may have, mm.
     ///
     /// `last`: the error that the last step may have, mm, and the rows that no step carries further than it
     /// says.
     fn descend(
         &self,
-        reduction: &Reduction,
         mut pose: Pose,
         target: &Target<'_>,
         (finest, on_walls): (f64, &[u32]),
-        mut solve: impl FnMut(&Pose, (TangentKind, f64)) -> Result<Step>,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
+        mut next: impl FnMut(&Pose, (TangentKind, f64)) -> Result<Step>,
+        solve: &mut Solve<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         let by_factor = matches!(self.solver, TangentSolver::Cholesky(_));
         // Length from which the exact tangent is worth trying.
@@ -357,7 +343,7 @@ impl Equilibrium {
         // Error of the state once it is small enough and one step as fine as the last one may be is left.
         let mut ending = None;
         for _ in 0..MAX_STEPS {
-            if interrupted() {
+            if (solve.interrupted)() {
                 return Err(MtmError::Interrupted);
             }
             let mut allowed = self.allowed(&pose, target, length);
@@ -365,14 +351,14 @@ impl Equilibrium {
                 allowed = allowed.min(finest);
             }
             let first = if length <= near { Exact } else { Definite };
-            let (step, kind) = by_tangent(first, |kind| solve(&pose, (kind, allowed)))?;
+            let (step, kind) = by_tangent(first, |kind| next(&pose, (kind, allowed)))?;
             if kind != first {
                 near = RETRY_EXACT * length;
             }
-            effort.iterations += 1;
+            solve.effort.iterations += 1;
             let before = length;
             length = step.length();
-            effort.history.push(length);
+            solve.effort.history.push(length);
             // A tangent that is not the energy's own gains as much each time as the last time.
             let own = kind == Exact || length == 0.0;
             let gain = if own { 1.0 } else { 1.0 - (length / before).min(1.0) };
@@ -381,10 +367,10 @@ impl Equilibrium {
             let bound = ending.filter(|_| length <= goal).unwrap_or(bound);
             ending = (bound <= goal).then_some(bound);
             if ending.is_some() && allowed <= finest {
-                effort.error_estimate = bound;
-                return Ok(moved_by(reduction, &pose.u, &step.rows, 1.0));
+                solve.effort.error_estimate = bound;
+                return Ok(moved_by(&self.reduction, &pose.u, &step.rows, 1.0));
             }
-            pose = self.search(reduction, pose, target, &step, kind, on_walls)?;
+            pose = self.search(pose, target, &step, kind, on_walls)?;
         }
         let limit = self.options.tolerance * reach(&pose, target);
         Err(lost("the estimated error of a node", length, limit, " mm"))
@@ -397,7 +383,6 @@ impl Equilibrium {
     /// `on_walls` stay where the step puts them.
     fn search(
         &self,
-        reduction: &Reduction,
         pose: Pose,
         target: &Target<'_>,
         step: &Step,
@@ -405,14 +390,14 @@ impl Equilibrium {
         on_walls: &[u32],
     ) -> Result<Pose> {
         let at = |share: f64| {
-            let mut u = moved_by(reduction, &pose.u, &step.rows, share);
+            let mut u = moved_by(&self.reduction, &pose.u, &step.rows, share);
             if share > 1.0 {
                 for &row in on_walls {
-                    let j = reduction.unknowns[row as usize] as usize;
+                    let j = self.reduction.unknowns[row as usize] as usize;
                     u[j] = add(pose.u[j], step.rows[row as usize]);
                 }
             }
-            self.pose(reduction, u, target)
+            self.pose(u, target)
         };
         let mut share = 1.0;
         while share >= SHORTEST {
@@ -445,23 +430,22 @@ impl Equilibrium {
     }
 
     /// Merit and slope at displacements `u`.
-    fn pose(&self, reduction: &Reduction, u: Vec<[f64; 3]>, target: &Target<'_>) -> Result<Pose> {
+    fn pose(&self, u: Vec<[f64; 3]>, target: &Target<'_>) -> Result<Pose> {
         let state = self.energy.state(&u)?;
-        let mut slope = reduction.rows(&state.forces);
+        let mut slope = self.reduction.rows(&state.forces);
         let (mut merit, mut size) = (state.energy, state.energy.abs());
         if let Some(loads) = target.loads {
-            for (s, &j) in slope.iter_mut().zip(&reduction.unknowns) {
+            for (s, &j) in slope.iter_mut().zip(&self.reduction.unknowns) {
                 *s = sub(*s, loads[j as usize]);
                 let work = dot(loads[j as usize], u[j as usize]);
                 merit -= work;
                 size += work.abs();
             }
         }
-        for spring in &target.springs {
-            let j = reduction.unknowns[spring.row] as usize;
+        for (row, spring) in &target.conditions.springs {
+            let j = self.reduction.unknowns[*row] as usize;
             let stretch = dot(spring.axis, u[j]) - spring.goal;
-            slope[spring.row] =
-                add(slope[spring.row], scaled(spring.axis, spring.stiffness * stretch));
+            slope[*row] = add(slope[*row], scaled(spring.axis, spring.stiffness * stretch));
             merit += 0.5 * spring.stiffness * stretch * stretch;
         }
         if !merit.is_finite() {
@@ -475,7 +459,6 @@ impl Equilibrium {
     /// side where the other nodes go by `change`.
     fn tangent(
         &self,
-        reduction: &Reduction,
         pose: &Pose,
         kind: TangentKind,
         change: Option<&[[f64; 3]]>,
@@ -483,80 +466,52 @@ impl Equilibrium {
         let full = self.energy.stiffness(&pose.u, kind)?;
         let mut b: Vec<[f64; 3]> = pose.slope.iter().map(|&s| scaled(s, -1.0)).collect();
         if let Some(change) = change {
-            for (b, f) in b.iter_mut().zip(reduction.rows(&full.multiply(change))) {
+            for (b, f) in b.iter_mut().zip(self.reduction.rows(&full.multiply(change))) {
                 *b = sub(*b, f);
             }
         }
-        Ok((reduction.matrix(&full), b))
+        Ok((self.reduction.matrix(&full), b))
     }
 
     /// Newton step from `pose` on the rows.
     ///
-    /// `constraints` say how far each constrained row goes along its normal, `change` how far the other
-    /// nodes go. `how`: the tangent, and the error that the step may have, mm.
+    /// `how`: the tangent, and the error that the step may have, mm.
     fn step(
         &self,
-        reduction: &Reduction,
         pose: &Pose,
         target: &Target<'_>,
-        constraints: &[Constraint],
-        change: Option<&[[f64; 3]]>,
+        moves: &Moves<'_>,
         (kind, allowed): (TangentKind, f64),
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<[f64; 3]>> {
-        let (mut matrix, b) = self.tangent(reduction, pose, kind, change)?;
-        for spring in &target.springs {
-            matrix.add_to_diagonal(spring.row, spring.axis, spring.stiffness);
+        let &Moves { constraints, change } = moves;
+        let (mut matrix, b) = self.tangent(pose, kind, change)?;
+        for (row, spring) in &target.conditions.springs {
+            matrix.add_to_diagonal(*row, spring.axis, spring.stiffness);
         }
         let rhs = projected_rhs(&matrix, &b, constraints);
         if !constraints.is_empty() {
             matrix = projected(&matrix, constraints);
         }
-        let mut x = self.solve_rows(reduction, &matrix, &rhs, constraints, allowed, interrupted)?;
+        let mut x = match &self.solver {
+            TangentSolver::Cholesky(symbolic) => symbolic.factor(&matrix)?.solve(&rhs),
+            TangentSolver::Pcg => {
+                self.by_iteration(matrix, constraints)?.step(&rhs, allowed, interrupted)?
+            }
+        };
         add_offsets(&mut x, constraints);
         Ok(x)
     }
 
-    fn solve_rows(
-        &self,
-        reduction: &Reduction,
-        matrix: &BlockMatrix,
-        rhs: &[[f64; 3]],
-        constraints: &[Constraint],
-        allowed: f64,
-        interrupted: Interrupt<'_>,
-    ) -> Result<Vec<[f64; 3]>> {
-        if let TangentSolver::Cholesky(symbolic) = &self.solver {
-            return Ok(symbolic.solve(&symbolic.factor(matrix)?, rhs));
-        }
-        let positions: Vec<[f64; 3]> = reduction.rows(self.tensors.element_nodes().positions());
+    /// The tangent system of the projected `matrix`, to be solved by conjugate gradients.
+    fn by_iteration(&self, matrix: BlockMatrix, constraints: &[Constraint]) -> Result<Iterative> {
+        let positions = self.reduction.rows(self.tensors.element_nodes().positions());
         let normals: Vec<(usize, [f64; 3])> =
             constraints.iter().map(|c| (c.row, c.normal)).collect();
-        let multigrid = Multigrid::new(matrix, &positions, &normals, &MultigridOptions::default())?;
-        // Where loads alone move the body nothing tells how far: one cycle does, to the order of magnitude.
-        let mut first = vec![[0.0; 3]; rhs.len()];
-        multigrid.apply(rhs, &mut first);
-        let far = first.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
-        if far == 0.0 {
-            return Ok(first);
-        }
-        let defaults = PcgOptions::default();
-        let options = PcgOptions {
-            tolerance: allowed.max(STEP_TOLERANCE * self.options.tolerance * far),
-            max_iterations: self.options.max_iterations.unwrap_or(defaults.max_iterations),
-            ..defaults
-        };
-        let start = vec![[0.0; 3]; rhs.len()];
-        let confirmed = Confirmed {
-            a: matrix,
-            preconditioner: &multigrid,
-            trial: &OnceLock::new(),
-            doubtful: is_doubtful(self.tissue.contrast),
-            relative: options.tolerance / far,
-        };
-        let seen = &mut Spectrum::default();
-        let reached = confirmed.solve(rhs, &start, &options, None, seen, interrupted)?;
-        Ok(reached.into_outcome()?.solution)
+        let multigrid = hierarchy(&matrix, &positions, &normals, self.tissue)?;
+        let options =
+            StaticOptions { tolerance: STEP_TOLERANCE * self.options.tolerance, ..self.options };
+        Ok(Iterative::new(matrix, multigrid, self.tissue, Method::Pcg, &options))
     }
 }
 
@@ -568,23 +523,6 @@ fn lost(quantity: &'static str, value: f64, limit: f64, unit: &'static str) -> M
         shortfall: Shortfall { quantity, value, limit, unit },
         advice: "divide the plan into smaller moves, fix flat tets, or use kinematics=\"linear\"",
     }
-}
-
-/// Contact constraints and springs on the rows of the system.
-fn on_rows(sliding: &Sliding, c: &Constraints<'_>) -> (Vec<Constraint>, Vec<RowSpring>) {
-    let row = |node: usize| sliding.nodes()[node].row as usize;
-    let asked = c
-        .rows
-        .iter()
-        .zip(c.offsets)
-        .map(|(r, &offset)| Constraint { row: row(r.node), normal: r.normal, offset })
-        .collect();
-    let springs = c
-        .springs
-        .iter()
-        .map(|s| RowSpring { row: row(s.node), axis: s.axis, stiffness: s.stiffness, goal: s.goal })
-        .collect();
-    (asked, springs)
 }
 
 /// What `solve` gives under the tangent `first`, or under the definite one where the exact one is not positive

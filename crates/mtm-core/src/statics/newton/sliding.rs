@@ -6,16 +6,15 @@ use crate::boundary::Motion;
 use crate::contact::{ContactState, Sliding};
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Exact};
-use crate::statics::iterative::Effort;
+use crate::statics::effort::Solve;
 use crate::statics::newton::{
     Equilibrium, Pose, STEP_SHARE, STEP_TOLERANCE, Step, TangentSolver, Target, along_slope,
     by_tangent, moved_by, reach,
 };
 use crate::statics::options::{Interrupt, Method, StaticOptions};
-use crate::statics::reduction::Reduction;
 use crate::statics::restraint::Held;
 use crate::statics::solution::Clock;
-use crate::statics::system::{Begin, Linked, System};
+use crate::statics::system::{Begin, BodyRows, Linked, Settle, Settled, System};
 use crate::vector::{add, sub};
 
 /// Sliding nodes of a body with what their solver asks.
@@ -27,6 +26,21 @@ pub(crate) struct Slide<'a> {
     pub held: Held,
 }
 
+/// What each step of a body in contact is solved for.
+struct Wanted<'a> {
+    target: &'a Target<'a>,
+    slide: &'a Slide<'a>,
+}
+
+/// Where a step starts.
+#[derive(Default)]
+struct Start<'a> {
+    /// How far the nodes go that are no unknowns; none where they stay.
+    change: Option<&'a [[f64; 3]]>,
+    /// Where contact was.
+    contact: Option<&'a ContactState>,
+}
+
 impl Equilibrium {
     /// The state that `target` asks for with contact settled, from rest.
     ///
@@ -34,35 +48,34 @@ impl Equilibrium {
     /// `NotConverged` where the steps do not end, whatever contact and the solver report.
     pub(super) fn slide(
         &self,
-        reduction: &Reduction,
         target: &Target<'_>,
         slide: &Slide<'_>,
-        effort: &mut Effort,
-        interrupted: Interrupt<'_>,
+        solve: &mut Solve<'_>,
     ) -> Result<(Vec<[f64; 3]>, ContactState)> {
-        let rest = self.pose(reduction, vec![[0.0; 3]; target.prescribed.len()], target)?;
+        let interrupted = solve.interrupted;
+        let wanted = Wanted { target, slide };
+        let rest = self.pose(vec![[0.0; 3]; target.prescribed.len()], target)?;
         let mut change = target.prescribed.to_vec();
-        for &j in &reduction.unknowns {
+        for &j in &self.reduction.unknowns {
             change[j as usize] = [0.0; 3];
         }
         // Walls move the body also where no node is joined to one.
         let far = slide.sliding.farthest(slide.motions).max(reach(&rest, target));
         let first = far * STEP_SHARE.max(STEP_TOLERANCE * self.options.tolerance);
         let ((rows, mut contact), _) = by_tangent(Exact, |kind| {
-            let change = Some(&change[..]);
-            self.settled(reduction, &rest, target, change, slide, None, (kind, first), interrupted)
+            let start = Start { change: Some(&change), ..Start::default() };
+            self.settled(&rest, &wanted, &start, (kind, first), interrupted)
         })?;
-        effort.iterations += 1;
+        solve.effort.iterations += 1;
         let ahead: Vec<[f64; 3]> = rest.u.iter().zip(&change).map(|(a, b)| add(*a, *b)).collect();
-        let pose = self.pose(reduction, moved_by(reduction, &ahead, &rows, 1.0), target)?;
+        let pose = self.pose(moved_by(&self.reduction, &ahead, &rows, 1.0), target)?;
         // Error of a step that leaves contact as settled as it was asked for, mm.
         let fine = slide.sliding.gap_limit(&self.options.contact);
         let mut before = first;
         let on_walls: Vec<u32> = slide.sliding.nodes().iter().map(|n| n.row).collect();
         let step = |pose: &Pose, how: (TangentKind, f64)| {
-            let begin = Some(&contact);
-            let (rows, state) =
-                self.settled(reduction, pose, target, None, slide, begin, how, interrupted)?;
+            let start = Start { contact: Some(&contact), ..Start::default() };
+            let (rows, state) = self.settled(pose, &wanted, &start, how, interrupted)?;
             contact = ContactState { iterations: contact.iterations + state.iterations, ..state };
             // Walls do no work along themselves, and what they do through gaps is not of the body.
             let gaps = 2.0 * how.1.max(before).max(fine);
@@ -71,27 +84,24 @@ impl Equilibrium {
             Ok(Step { slope: along_slope(&rows, pose).min(0.0), slack, rows })
         };
         let last = (fine, &on_walls[..]);
-        let u = self.descend(reduction, pose, target, last, step, effort, interrupted)?;
+        let u = self.descend(pose, target, last, step, solve)?;
         Ok((u, contact))
     }
 
     /// The step of the rows that solves the tangent system at `pose` with contact settled.
     ///
-    /// `change`: how far the other nodes go. `begin`: where contact was. `how`: the tangent, and the error
-    /// that the step may have, mm.
+    /// `how`: the tangent, and the error that the step may have, mm.
     fn settled(
         &self,
-        reduction: &Reduction,
         pose: &Pose,
-        target: &Target<'_>,
-        change: Option<&[[f64; 3]]>,
-        slide: &Slide<'_>,
-        begin: Option<&ContactState>,
+        wanted: &Wanted<'_>,
+        start: &Start<'_>,
         (kind, allowed): (TangentKind, f64),
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, ContactState)> {
-        let here = reduction.rows(&pose.u);
-        let (matrix, mut b) = self.tangent(reduction, pose, kind, change)?;
+        let &Wanted { target, slide } = wanted;
+        let here = self.reduction.rows(&pose.u);
+        let (matrix, mut b) = self.tangent(pose, kind, start.change)?;
         // K (x − u) = −slope: the contact conditions are on x, the whole displacement.
         for (b, f) in b.iter_mut().zip(matrix.multiply(&here)) {
             *b = add(*b, f);
@@ -101,31 +111,25 @@ impl Equilibrium {
         let share = if far > 0.0 { allowed / far } else { STEP_SHARE };
         let mut options = self.step_options(share);
         options.contact.allowed = allowed;
-        let (system, _) = System::new(
-            matrix,
-            &reduction.rows(self.tensors.element_nodes().positions()),
-            Some(slide.sliding),
-            slide.held,
-            self.tissue,
-            &options,
-            &mut Clock::new(),
-            interrupted,
-        )?;
-        let begin =
-            begin.map(|state| Begin { rows: &here, contact: slide.sliding.start_of(state) });
-        let (x, state, _) = system.solve_with_contact(
-            &b,
-            Linked::default(),
-            slide.sliding,
-            slide.motions,
-            begin,
-            &options,
-            target.scale,
-            &mut Effort::default(),
-            interrupted,
-        )?;
-        let step = x.iter().zip(&here).map(|(x, u)| sub(*x, *u)).collect();
-        Ok((step, state))
+        let body = BodyRows {
+            positions: &self.reduction.rows(self.tensors.element_nodes().positions()),
+            sliding: Some(slide.sliding),
+            held: slide.held,
+            tissue: self.tissue,
+        };
+        let (system, _) = System::new(matrix, &body, &options, &mut Clock::new(), interrupted)?;
+        let contact = start.contact.map(|state| slide.sliding.start_of(state));
+        let settle = Settle {
+            sliding: slide.sliding,
+            motions: slide.motions,
+            begin: contact.map(|contact| Begin { rows: &here, contact }),
+            options: &options,
+            linked: Linked::default(),
+        };
+        let mut solve = Solve::new(target.scale, interrupted);
+        let Settled { rows, contact, .. } = system.solve_with_contact(&b, &settle, &mut solve)?;
+        let step = rows.iter().zip(&here).map(|(x, u)| sub(*x, *u)).collect();
+        Ok((step, contact))
     }
 
     /// Options of the system of one step, whose error may be `share` of the reach.
