@@ -249,10 +249,6 @@ __getattr__, __dir__, __all__ = deferred(
         "values.anatomy": (
             "Anatomy",
             "BoneSegment",
-            "DentalArch",
-            "Finding",
-            "ImageData",
-            "NodeKinds",
         ),
         "values.case_parts": ("CaseMuscles",),
         "values.clinical_motion": (
@@ -260,6 +256,9 @@ __getattr__, __dir__, __all__ = deferred(
             "clinical_motion",
             "planned_motion",
         ),
+        "values.dental_arch": ("DentalArch",),
+        "values.finding": ("Finding",),
+        "values.image_data": ("ImageData",),
         "values.landmark_sites": ("SKULL_LANDMARKS",),
         "values.motion": (
             "RigidMotion",
@@ -271,20 +270,23 @@ __getattr__, __dir__, __all__ = deferred(
             "MuscleSurface",
             "Musculature",
         ),
+        "values.node_kinds": ("NodeKinds",),
         "values.patient_model": ("PatientModel",),
         "values.prediction": (
             "MODELS",
             "Prediction",
         ),
         "values.scene": (
-            "MovedSurface",
             "Scene",
             "SceneResult",
             "SegmentData",
-            "SolverOptions",
-            "SurfaceData",
-            "TissueData",
         ),
+        "values.solver_options": ("SolverOptions",),
+        "values.surface_data": (
+            "MovedSurface",
+            "SurfaceData",
+        ),
+        "values.tissue_data": ("TissueData",),
         "virtual": (
             "virtual_patients",
             "write_virtual_patient",

@@ -187,23 +187,22 @@ from cmfsim.study import SensitivityReport, StudyReport, landmark_trials, run_st
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
 from cmfsim.surfaces.levels import contact_surface
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
-from cmfsim.values.anatomy import Anatomy, BoneSegment, DentalArch, Finding, ImageData, NodeKinds
+from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion, planned_motion
+from cmfsim.values.dental_arch import DentalArch
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.motion import RigidMotion, decompose_motion, rigid_matrix, rigid_motion
 from cmfsim.values.musculature import MuscleSurface, Musculature
+from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
-from cmfsim.values.scene import (
-    MovedSurface,
-    Scene,
-    SceneResult,
-    SegmentData,
-    SolverOptions,
-    SurfaceData,
-    TissueData,
-)
+from cmfsim.values.scene import Scene, SceneResult, SegmentData
+from cmfsim.values.solver_options import SolverOptions
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.tissue_data import TissueData
 from cmfsim.virtual import virtual_patients, write_virtual_patient
 
 __all__ = [

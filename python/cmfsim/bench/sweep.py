@@ -5,10 +5,12 @@ from dataclasses import fields, replace
 from types import MappingProxyType
 from typing import Any
 
+from cmfsim._core import ELEMENTS, KINEMATICS, METHODS
 from cmfsim.bench.choice import Choice
 from cmfsim.errors import CaseInputError
 from cmfsim.values.prediction import MODELS
-from cmfsim.values.scene import CONTACTS, ELEMENTS, KINEMATICS, METHODS, MIXINGS
+from cmfsim.values.solver_options import CONTACTS
+from cmfsim.values.tissue_data import MIXINGS
 
 __all__ = ["EDGES", "FACTORS", "reference_choice", "sweep_choices"]
 

@@ -15,8 +15,10 @@ from cmfsim.checks import as_number, check_instance
 from cmfsim.errors import CaseInputError
 from cmfsim.extras import third_party
 from cmfsim.surfaces.levels import SurfaceOptions, block_of, surface_of_level
-from cmfsim.values.anatomy import BoneSegment, Finding, ImageData
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["CutBones", "CutOptions", "cut_bones", "segments_from_surfaces"]
 

@@ -23,8 +23,8 @@ from cmfsim.io import Case
 from cmfsim.io.models import is_model_file
 from cmfsim.pipeline.building import plan_key
 from cmfsim.pipeline.predicting import case_for_models
-from cmfsim.values.anatomy import SEVERITIES, Finding
 from cmfsim.values.clinical_motion import plan_lines
+from cmfsim.values.finding import SEVERITIES, Finding
 
 _log = logging.getLogger(__name__)
 # What the planning page states of the case that a plan was made for.

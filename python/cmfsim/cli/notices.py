@@ -6,7 +6,7 @@ from dataclasses import asdict
 from typing import Any
 
 from cmfsim.cli.terminal import CLEAR_LINE, escaped, in_colour
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.finding_groups import FindingGroup, counted, grouped
 
 __all__ = ["FindingsError", "Notices"]

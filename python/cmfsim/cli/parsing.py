@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim import __version__
+from cmfsim._core import ELEMENTS, KINEMATICS, METHODS
 from cmfsim.bench import EDGES, FACTORS
 from cmfsim.cli import (
     bench_command,
@@ -21,7 +22,7 @@ from cmfsim.cli import (
 from cmfsim.io import result_suffixes
 from cmfsim.muscles.template import WHERE
 from cmfsim.values.prediction import MODELS
-from cmfsim.values.scene import CONTACTS, ELEMENTS, KINEMATICS, METHODS
+from cmfsim.values.solver_options import CONTACTS
 from cmfsim.virtual import PATIENTS
 
 __all__ = ["make_parser"]

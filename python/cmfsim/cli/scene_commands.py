@@ -16,7 +16,7 @@ from cmfsim.cli.terminal import escaped
 from cmfsim.errors import CaseInputError
 from cmfsim.io import read_plan, read_scene, result_suffixes, write_result
 from cmfsim.solving.simulation import solve_scene
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.scene import Scene
 
 __all__ = ["info", "solve"]

@@ -22,7 +22,7 @@ from cmfsim.muscles.template import (
     template_names,
 )
 from cmfsim.pictures import picture_muscles
-from cmfsim.values.anatomy import SEVERITIES, Finding
+from cmfsim.values.finding import SEVERITIES, Finding
 from cmfsim.values.musculature import Musculature
 
 __all__ = ["check", "import_atlas", "list_templates", "morph", "show"]

@@ -23,8 +23,8 @@ from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
 from cmfsim.doctor.report import findings_text
 from cmfsim.doctor.surfaces import check_image, check_mesh_size, check_surfaces
 from cmfsim.io import CaseOrPath, as_case
-from cmfsim.values.anatomy import SEVERITIES, Finding
 from cmfsim.values.clinical_motion import ClinicalMotion
+from cmfsim.values.finding import SEVERITIES, Finding
 
 __all__ = [
     "Examination",

@@ -9,7 +9,7 @@ from cmfsim.doctor.evidence import Evidence
 from cmfsim.doctor.placement import LANDMARK_WARNING
 from cmfsim.errors import CmfsimError
 from cmfsim.io import read_landmark_file, read_surface
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["check_after"]
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from cmfsim.doctor.evidence import Evidence
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["check_ends"]
 

@@ -17,9 +17,10 @@ from cmfsim.io.images import read_image_file
 from cmfsim.io.transforms import TransformFile, read_transform_file
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
-from cmfsim.values.anatomy import Finding, ImageData
 from cmfsim.values.case_parts import CaseMotion, CaseSurfaces
-from cmfsim.values.scene import MovedSurface, SurfaceData
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = ["Body", "Evidence", "gather"]
 

@@ -20,7 +20,8 @@ from cmfsim.registration import (
     mirror_agreement,
     swapped_names,
 )
-from cmfsim.values.anatomy import Finding, ImageData
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = [
     "LANDMARK_CODES",

@@ -12,9 +12,9 @@ from cmfsim.doctor.places import place_text
 from cmfsim.doctor.plan_size import FAR, TOO_FAR, check_tiny, check_turn
 from cmfsim.errors import CmfsimError, RegistrationError
 from cmfsim.surfaces.topology import edges_of
-from cmfsim.values.anatomy import Finding
 from cmfsim.values.clinical_motion import clinical_motion
-from cmfsim.values.scene import MovedSurface
+from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import MovedSurface
 
 __all__ = ["check_moved"]
 

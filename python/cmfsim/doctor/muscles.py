@@ -7,7 +7,7 @@ from cmfsim.errors import CmfsimError
 from cmfsim.muscles.template import MuscleTemplate
 from cmfsim.muscles.template.morphing import missing_landmarks
 from cmfsim.registration import match_landmarks
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["check_muscles"]
 

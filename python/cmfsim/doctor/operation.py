@@ -11,9 +11,9 @@ from cmfsim.doctor.places import place_text
 from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
 from cmfsim.errors import CaseError, LandmarkError
 from cmfsim.io.transforms import motion_in_lps
-from cmfsim.values.anatomy import Finding
 from cmfsim.values.case_parts import CaseOsteotomy
 from cmfsim.values.clinical_motion import ClinicalMotion
+from cmfsim.values.finding import Finding
 
 __all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of"]
 

@@ -16,8 +16,8 @@ from cmfsim.doctor.landmarks import (
 from cmfsim.doctor.places import place_text
 from cmfsim.errors import ImageError
 from cmfsim.registration import side_vectors, wrong_sides
-from cmfsim.values.anatomy import Finding
 from cmfsim.values.case_parts import UNITS
+from cmfsim.values.finding import Finding
 
 __all__ = ["check_placement"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmfsim.checks import Floats
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.motion import decompose_motion
 
 __all__ = ["FAR", "TOO_FAR", "SizedMotion", "check_motion_size", "check_tiny", "check_turn"]

@@ -3,7 +3,7 @@
 import textwrap
 from collections.abc import Callable, Iterable
 
-from cmfsim.values.anatomy import SEVERITIES, Finding
+from cmfsim.values.finding import SEVERITIES, Finding
 
 __all__ = ["findings_text"]
 

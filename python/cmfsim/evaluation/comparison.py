@@ -27,8 +27,8 @@ from cmfsim.evaluation.correspondence import Matches, Skin, match_skins
 from cmfsim.evaluation.regions import SKIN_LANDMARKS, skin_regions
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.registration import match_landmarks
-from cmfsim.values.anatomy import Finding
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["MATCHINGS", "SkinComparison", "compare_skins"]
 

@@ -13,7 +13,7 @@ from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.morphology import Mask, Volume, box_of, depth, label, opened, reached, simplex
 from cmfsim.imaging.skin import Skin
 from cmfsim.imaging.working import Working, coarse_of
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["attached_findings"]
 

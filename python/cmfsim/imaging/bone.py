@@ -20,7 +20,7 @@ from cmfsim.imaging.morphology import (
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import Skin
 from cmfsim.imaging.working import Working, coarse_of
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["Bone", "find_bone"]
 

@@ -20,7 +20,9 @@ from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import find_skin
 from cmfsim.imaging.view import view_findings
 from cmfsim.imaging.working import Working, without_noise, working_grid
-from cmfsim.values.anatomy import Anatomy, Finding, ImageData
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["segment_head"]
 

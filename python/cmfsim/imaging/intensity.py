@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.morphology import Volume
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["Calibration", "calibration", "noise_of", "saturation_of", "weak_bone"]
 

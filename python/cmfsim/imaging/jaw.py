@@ -24,7 +24,7 @@ from cmfsim.imaging.morphology import (
     watershed,
 )
 from cmfsim.imaging.working import Working
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["Jaws", "part_jaws"]
 

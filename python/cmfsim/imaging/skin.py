@@ -26,7 +26,7 @@ from cmfsim.imaging.morphology import (
 )
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.working import Working, coarse_of
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["Skin", "find_skin"]
 

@@ -6,7 +6,7 @@ from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.morphology import depth
 from cmfsim.imaging.skin import Skin
 from cmfsim.imaging.working import COARSE, Working
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["view_findings"]
 

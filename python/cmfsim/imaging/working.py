@@ -20,7 +20,8 @@ from cmfsim.imaging.morphology import (
     smoothed,
 )
 from cmfsim.imaging.options import SegmentOptions
-from cmfsim.values.anatomy import Finding, ImageData
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["COARSE", "Working", "coarse_of", "without_noise", "working_grid"]
 

@@ -20,7 +20,8 @@ from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
 from cmfsim.io.dicom_headers import DicomHeader, dicom_header, numbers_of
 from cmfsim.io.image_grids import aligned, of_slices, turn_of, upright
 from cmfsim.io.image_headers import check_shape
-from cmfsim.values.anatomy import Finding, ImageData
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["read_dicom_file", "read_dicom_folder"]
 

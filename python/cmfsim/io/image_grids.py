@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.io.image_headers import MOST_VOXELS
-from cmfsim.values.anatomy import ImageData
+from cmfsim.values.image_data import ImageData
 
 Floats: TypeAlias = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.io.files import check_readable, is_below
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = [
     "KNOWN",

@@ -21,7 +21,8 @@ from cmfsim.io.leftovers import abandoned, temporary_folder
 from cmfsim.io.metaimage import is_meta, meta_header
 from cmfsim.io.nifti import GZIP, is_nifti, read_nifti
 from cmfsim.io.nrrd import nrrd_header
-from cmfsim.values.anatomy import Finding, ImageData
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["ImageFile", "read_image", "read_image_file", "write_image"]
 

@@ -27,7 +27,7 @@ from cmfsim.io.markups import (
     markups_of,
     write_markups,
 )
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, label_key
 
 __all__ = ["LandmarkFile", "read_landmark_file", "read_landmarks", "write_landmarks"]

@@ -25,7 +25,7 @@ from cmfsim.io.image_headers import (
     check_shape,
     unstated,
 )
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["is_nifti", "read_nifti"]
 

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import refuse_constant
-from cmfsim.values.anatomy import SEVERITIES
+from cmfsim.values.finding import SEVERITIES
 
 __all__ = [
     "Check",

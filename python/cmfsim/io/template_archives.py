@@ -11,7 +11,7 @@ from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io.archives import member_of, read_archive, write_archive
 from cmfsim.values.musculature import MuscleSurface
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.template import TemplateData
 
 __all__ = ["TEMPLATE_FORMAT", "mirrored_muscle", "read_template_archive", "write_template_archive"]

@@ -27,10 +27,10 @@ from cmfsim.io.template_archives import (
     read_template_archive,
     write_template_archive,
 )
-from cmfsim.values.anatomy import Finding
 from cmfsim.values.case_parts import FRAMES, UNITS
+from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import MOST_BOXES, MUSCLE_KINDS, MUSCLE_SIDES, MuscleSurface
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.template import TemplateData
 
 __all__ = ["TEMPLATE_FILE", "TemplateSurvey", "read_template", "survey_template", "write_template"]

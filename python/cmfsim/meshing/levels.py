@@ -8,8 +8,10 @@ from cmfsim import _core
 from cmfsim._core import Surface
 from cmfsim.checks import as_positive
 from cmfsim.errors import MeshInputError
-from cmfsim.values.anatomy import Anatomy, Finding, ImageData
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["anatomy_from_surfaces", "signed_level"]
 

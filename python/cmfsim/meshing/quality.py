@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim._core import TetMesh
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["LEAST_DIHEDRAL", "MeshReport", "mesh_findings", "mesh_report", "report_of_part"]
 

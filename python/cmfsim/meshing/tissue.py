@@ -10,7 +10,9 @@ from cmfsim import _core
 from cmfsim.checks import as_number, as_positive, as_rows
 from cmfsim.errors import MeshInputError
 from cmfsim.extras import third_party
-from cmfsim.values.anatomy import Anatomy, Finding, ImageData
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["TissueRegion", "near_skin", "tissue_level"]
 

@@ -18,13 +18,13 @@ from cmfsim import _core
 from cmfsim._core import PRESETS, MuscleFibres, Surface, TetMesh, Tissue
 from cmfsim.checks import Floats, check_instance, frozen
 from cmfsim.errors import MaterialInputError, MeshError, MeshInputError
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import MuscleSurface
-from cmfsim.values.scene import SurfaceData, TissueData
+from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.tissue_data import MIXINGS, TissueData
 
-__all__ = ["INSIDE_TESTS", "MIXINGS", "Mixture", "MuscleVolume", "equivalent_material"]
+__all__ = ["INSIDE_TESTS", "Mixture", "MuscleVolume", "equivalent_material"]
 
-MIXINGS = ("moduli", "stiffness")
 INSIDE_TESTS = ("winding", "normal")
 # Part of a closed muscle that may lie outside the mesh before a finding says so.
 LOST_PART = 0.02

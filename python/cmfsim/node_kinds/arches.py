@@ -9,7 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim._core import Surface
 from cmfsim.checks import Floats, as_rows
 from cmfsim.errors import CaseInputError
-from cmfsim.values.anatomy import Anatomy, BoneSegment, DentalArch, Finding
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.dental_arch import DentalArch
+from cmfsim.values.finding import Finding
 
 __all__ = ["LOWER_ARCH", "UPPER_ARCH", "DentalArches", "dental_arches"]
 

@@ -17,8 +17,11 @@ from cmfsim.errors import CaseInputError
 from cmfsim.node_kinds.arches import DentalArches, dental_arches
 from cmfsim.node_kinds.options import BORDERS, KindOptions
 from cmfsim.node_kinds.sliding import sliding_nodes
-from cmfsim.values.anatomy import NODE_KINDS, Anatomy, BoneSegment, Finding, NodeKinds
-from cmfsim.values.scene import SegmentData, SurfaceData
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
+from cmfsim.values.scene import SegmentData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["ClassifiedNodes", "classify_nodes", "segment_data"]
 

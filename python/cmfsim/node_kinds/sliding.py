@@ -10,8 +10,10 @@ from cmfsim.checks import Floats
 from cmfsim.extras import third_party
 from cmfsim.node_kinds.arches import DentalArches
 from cmfsim.node_kinds.options import KindOptions
-from cmfsim.values.anatomy import SHEET_DEPTH, Anatomy, BoneSegment, DentalArch, Finding
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.dental_arch import SHEET_DEPTH, DentalArch
+from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["sliding_nodes"]
 

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.checks import Floats, as_index_rows, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
-from cmfsim.values.anatomy import NODE_KINDS, BoneSegment, NodeKinds
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
     "add_bone",

@@ -11,7 +11,7 @@ from cmfsim.checks import Floats, as_floats, as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.skin_ends import skin_ends, trimmed
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["DISTANCE_LIMIT", "distance_colour", "picture_distances"]
 

@@ -11,7 +11,7 @@ from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, poly
 from cmfsim.pictures.skin_ends import skin_ends, trimmed
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import Prediction
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["picture_plan", "picture_prediction"]
 

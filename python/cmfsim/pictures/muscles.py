@@ -12,7 +12,7 @@ from cmfsim._core import MuscleFibres, Surface
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import LEGEND_ROW, SIZE, View, bounds, draw, polydata
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 if TYPE_CHECKING:
     from cmfsim.values.musculature import MuscleSurface, Musculature

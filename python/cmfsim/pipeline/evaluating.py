@@ -15,10 +15,11 @@ from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.io.metrics import EVALUATION_FILE
 from cmfsim.pipeline.building import Postoperative, case_key, read_postoperative
 from cmfsim.pipeline.predicting import named_models, predict_models
-from cmfsim.values.anatomy import Anatomy, Finding
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding
 from cmfsim.values.finding_groups import grouped
 from cmfsim.values.prediction import MODELS, Prediction
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["EVALUATION_FILE", "CaseEvaluation", "evaluate", "evaluation_key"]
 

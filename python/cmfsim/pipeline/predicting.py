@@ -9,8 +9,9 @@ from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.pipeline.building import Postoperative, build_model, case_key, input_hashes, plan_key
 from cmfsim.solving.models import predict_patient
-from cmfsim.values.anatomy import Anatomy, Finding
+from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.finding import Finding
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 

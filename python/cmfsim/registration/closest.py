@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim import _core
 from cmfsim._core import IcpFit, Surface
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["icp"]
 

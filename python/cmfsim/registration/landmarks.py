@@ -10,7 +10,7 @@ from cmfsim._core import ThinPlateSpline, rigid_fit
 from cmfsim.checks import Floats, frozen
 from cmfsim.errors import LandmarkInputError, RegistrationError
 from cmfsim.registration.sides import swapped_pairs, wrong_sides
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import label_key
 
 __all__ = ["LandmarkMatch", "match_landmarks"]

@@ -6,8 +6,8 @@ from typing import Any
 from cmfsim.errors import CaseInputError
 from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
 from cmfsim.report.labels import MESH, MUSCLES, labelled
-from cmfsim.values.anatomy import Finding
 from cmfsim.values.clinical_motion import plan_lines
+from cmfsim.values.finding import Finding
 from cmfsim.values.finding_groups import counted, grouped
 
 __all__ = ["case_document", "statistics_table"]

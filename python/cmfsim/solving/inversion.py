@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import MassTensors
 from cmfsim.checks import Floats
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["inversion_finding", "least_volume_ratios"]
 

@@ -20,8 +20,10 @@ from cmfsim._core import (
     Tissue,
     __version__,
 )
-from cmfsim.values.anatomy import Finding
-from cmfsim.values.scene import MovedSurface, Scene, SceneResult, SurfaceData, TissueData
+from cmfsim.values.finding import Finding
+from cmfsim.values.scene import Scene, SceneResult
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.tissue_data import TissueData
 
 __all__ = ["scene_plan", "scene_solver", "solve_scene"]
 

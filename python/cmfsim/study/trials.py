@@ -14,8 +14,8 @@ from cmfsim.io import CaseOrPath, as_case
 from cmfsim.pipeline.building import with_muscles
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.solving.models import predict_patient
-from cmfsim.values.anatomy import Finding
 from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction

@@ -13,7 +13,7 @@ from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.surfaces.crossings import crossing_pairs
 from cmfsim.surfaces.topology import Edges, component_labels, edges_of, orientation_flips
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
     "BorderLoop",

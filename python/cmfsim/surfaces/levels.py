@@ -12,8 +12,9 @@ from cmfsim import _core
 from cmfsim.checks import Floats, Indices, as_number, as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.extras import third_party
-from cmfsim.values.anatomy import BoneSegment, ImageData
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
     "SurfaceOptions",

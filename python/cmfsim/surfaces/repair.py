@@ -17,8 +17,8 @@ from cmfsim.surfaces.checks import (
     thin_triangles,
 )
 from cmfsim.surfaces.topology import component_labels, connected_labels, edges_of, orientation_flips
-from cmfsim.values.anatomy import Finding
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["RepairOptions", "clean_surface", "repair_surface"]
 

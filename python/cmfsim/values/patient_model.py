@@ -15,9 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.checks import Floats, Indices
 from cmfsim.errors import CaseInputError
 from cmfsim.surfaces.levels import surface_of_level
-from cmfsim.values.anatomy import Anatomy, BoneSegment, Finding, NodeKinds
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
-from cmfsim.values.scene import MovedSurface, Scene, SurfaceData, TissueData
+from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.scene import Scene
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.tissue_data import TissueData
 
 if TYPE_CHECKING:
     from cmfsim.values.musculature import Musculature

@@ -20,7 +20,7 @@ from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.cohorts import COHORT_FORMAT
 from cmfsim.io.files import replacing
 from cmfsim.phantom import make_head
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.carried_skin import scanned
 from cmfsim.virtual.equilibrium import EquilibriumOptions
 from cmfsim.virtual.people import PATIENTS, Relocation, VirtualPatient, patient_named

@@ -14,8 +14,10 @@ from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
 from cmfsim.pipeline.building import build_model
 from cmfsim.surfaces.topology import tet_bodies
-from cmfsim.values.anatomy import BoneSegment, ImageData, NodeKinds
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.body import HyperelasticBody
 from cmfsim.virtual.carried_skin import carried
 from cmfsim.virtual.equilibrium import Equilibrium, EquilibriumOptions, find_equilibrium

@@ -10,7 +10,7 @@ import cmfsim.pipeline.predicting
 from cmfsim.cli import main
 from cmfsim.cli.notices import Notices
 from cmfsim.report import case_document, render_page
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.finding_groups import counted, grouped
 from head_case import HeadCase
 

@@ -12,7 +12,7 @@ from cmfsim.muscles.template.built_in import template_path
 from cmfsim.registration import side_vectors, wrong_sides
 from cmfsim.surfaces.checks import check_surface
 from cmfsim.surfaces.repair import clean_surface
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.template import TemplateData

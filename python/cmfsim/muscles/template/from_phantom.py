@@ -12,7 +12,7 @@ from cmfsim.phantom import Muscle, PhantomHead, make_head
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["phantom_muscle", "phantom_template"]
 

@@ -20,9 +20,9 @@ from cmfsim.registration import (
     leave_one_out,
     match_landmarks,
 )
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import MuscleSurface, Musculature
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.template import TemplateData
 
 __all__ = ["MorphedMusculature", "missing_landmarks", "morph_template"]

@@ -11,7 +11,7 @@ from cmfsim.io.templates import read_template, write_template
 from cmfsim.muscles.template.built_in import template_path
 from cmfsim.muscles.template.checking import check_contents
 from cmfsim.muscles.template.morphing import MorphedMusculature, morph_template
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.template import TemplateData
 
 __all__ = ["MuscleTemplate"]

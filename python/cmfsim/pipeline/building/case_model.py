@@ -58,9 +58,12 @@ from cmfsim.pipeline.building.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.skin_part import on_skin
 from cmfsim.pipeline.building.tissue_mesh import end_planes, region_of, tissue_mesh
-from cmfsim.values.anatomy import NODE_KINDS, Anatomy, BoneSegment, Finding, NodeKinds
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.patient_model import PatientModel
-from cmfsim.values.scene import MovedSurface, Scene, SurfaceData
+from cmfsim.values.scene import Scene
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = ["build_case", "build_model"]
 

@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface, TetMesh
 from cmfsim.checks import Floats
-from cmfsim.values.anatomy import BoneSegment, Finding, NodeKinds
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.node_kinds import NodeKinds
 
 __all__ = ["cleft_tets", "without_clefts"]
 

@@ -17,8 +17,11 @@ from cmfsim.bones import (
 from cmfsim.checks import Floats
 from cmfsim.node_kinds import DentalArches, KindOptions
 from cmfsim.surfaces.levels import contact_surface
-from cmfsim.values.anatomy import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["CaseContacts", "arch_sheets", "mean_edge"]
 

@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from cmfsim.checks import Floats
 from cmfsim.meshing import TissueRegion
-from cmfsim.values.anatomy import Anatomy, BoneSegment, Finding, NodeKinds
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.node_kinds import NodeKinds
 
 __all__ = ["end_findings"]
 

@@ -5,7 +5,8 @@ import numpy as np
 from cmfsim._core import TetMesh
 from cmfsim.errors import MeshInputError
 from cmfsim.surfaces.topology import tet_bodies
-from cmfsim.values.anatomy import Finding, NodeKinds
+from cmfsim.values.finding import Finding
+from cmfsim.values.node_kinds import NodeKinds
 
 __all__ = ["held_part"]
 

@@ -27,9 +27,10 @@ from cmfsim.io.models import is_model_file
 from cmfsim.io.transforms import read_transform_file
 from cmfsim.meshing import anatomy_from_surfaces
 from cmfsim.surfaces.repair import repair_surface
-from cmfsim.values.anatomy import Anatomy, Finding
+from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMesh, CaseMotion
-from cmfsim.values.scene import MovedSurface
+from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import MovedSurface
 
 if TYPE_CHECKING:
     from cmfsim.imaging import SegmentOptions

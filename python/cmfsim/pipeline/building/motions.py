@@ -22,8 +22,9 @@ from cmfsim.io import Case, read_surface
 from cmfsim.pipeline.building.inputs import motion_source, read_motion
 from cmfsim.pipeline.building.postoperative import REFERENCES, Postoperative, read_postoperative
 from cmfsim.surfaces.repair import clean_surface
-from cmfsim.values.anatomy import BoneSegment, Finding
-from cmfsim.values.scene import MovedSurface, SurfaceData
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:
     from cmfsim.bones.achieved import AchievedPlan

@@ -15,9 +15,9 @@ from cmfsim.planning.page.segment_points import segment_points
 from cmfsim.planning.page.tooth_rows import tooth_rows
 from cmfsim.planning.replanning import ExpectedError, Motions, PlanningModel, segment_boxes
 from cmfsim.surfaces.levels import simplified_surface
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.prediction import Prediction, carried_share
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["PageContent", "page_content"]
 
