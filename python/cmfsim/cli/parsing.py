@@ -209,7 +209,6 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     )
     evaluate.add_argument("--model", **models, help="as in predict (default all)")
     # For a study's own processes: they end when what started them does.
-    evaluate.add_argument("--end-with-input", action="store_true", help=argparse.SUPPRESS)
     for command in (predict, evaluate):
         command.add_argument("--no-report", action="store_true", help="make no report.html")
     evaluate.set_defaults(run=study_commands.evaluate)

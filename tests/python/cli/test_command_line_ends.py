@@ -167,7 +167,8 @@ def test_missing_packages_are_one_line_before_any_work(command, case, monkeypatc
     missing = {"jinja2", "scipy", "meshio", "pyvista"}
     find = importlib.util.find_spec
     monkeypatch.setattr(
-        "cmfsim.cli.preparation.find_spec", lambda name: None if name in missing else find(name)
+        "cmfsim.pipeline.preparation.find_spec",
+        lambda name: None if name in missing else find(name),
     )
     assert main([command, str(case)]) == 2
     err = capsys.readouterr().err
@@ -307,7 +308,7 @@ def workers_of(output):
             state = (entry.parent / "stat").read_text().rpartition(")")[2].split()[0]
         except OSError:
             continue
-        if str(output).encode() in words and b"evaluate" in words and state != "Z":
+        if str(output).encode() in words and b"cmfsim.study.worker" in words and state != "Z":
             found.append(int(entry.parent.name))
     return found
 

@@ -58,6 +58,7 @@ from cmfsim.pipeline.building.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.skin_part import on_skin
 from cmfsim.pipeline.building.tissue_mesh import end_planes, region_of, tissue_mesh
+from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
@@ -273,6 +274,7 @@ def build_model(
             **({} if bones.achieved is None else {"achieved": bones.achieved.as_dict()}),
             "plan_sources": dict(bones.sources),
         },
+        detailed_skin=partial(detailed_surface, "skin", anatomy.skin),
     )
     if case.muscles is None:
         return patient
