@@ -169,7 +169,7 @@ PYTHON: tuple[frozenset[str], ...] = tuple(
     frozenset(row.split())
     for row in (
         "_core",
-        "errors deferred",
+        "errors deferred progress",
         "checks extras",
         "values",
         "io registration surfaces",

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -15,16 +15,15 @@ from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.io.metrics import EVALUATION_FILE
 from cmfsim.pipeline.building import Postoperative, case_key, read_postoperative
 from cmfsim.pipeline.predicting import named_models, predict_models
+from cmfsim.progress import Progress
 from cmfsim.values.anatomy import Anatomy
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.finding_groups import grouped
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["EVALUATION_FILE", "CaseEvaluation", "evaluate", "evaluation_key"]
 
-Progress = Callable[[str], None]
-OnFindings = Callable[[Iterable[Finding]], None]
 WILCOXON_NOTE = (
     "Wilcoxon's signed-rank test vertex by vertex, as the paper has it: neighbouring vertices are "
     "not independent, so that its p values are far too small; look at the size of the difference."

@@ -43,6 +43,7 @@ from cmfsim.pictures import (
 )
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.planning.page import PAGE_FILE, page_state
+from cmfsim.progress import Progress
 from cmfsim.report import Document, Figure, case_document, write_page
 from cmfsim.values.prediction import MODELS, Prediction
 
@@ -100,7 +101,7 @@ def write_results(
     predictions: Iterable[Prediction],
     n_models: int,
     *,
-    stage: Callable[[str], None],
+    stage: Progress,
     evaluation: Callable[[], CaseEvaluation] | None = None,
     with_report: bool = True,
     pictures: Callable[[str], bool] = lambda _: True,

@@ -1,26 +1,24 @@
 """One case from its files to the predicted face."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from cmfsim.checks import check_one_of
 from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.pipeline.building import Postoperative, build_model, case_key, input_hashes, plan_key
+from cmfsim.progress import Progress
 from cmfsim.solving.models import predict_patient
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMuscles
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 
 __all__ = ["build_patient", "case_for_models", "named_models", "predict", "predict_models"]
 
 _log = logging.getLogger(__name__)
-
-Progress = Callable[[str], None]
-OnFindings = Callable[[Iterable[Finding]], None]
 
 
 def predict(

@@ -1,6 +1,6 @@
 """How much a prediction depends on where the skull landmarks were placed (Kim et al. 2010, 3.3)."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -13,17 +13,16 @@ from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io import CaseOrPath, as_case
 from cmfsim.pipeline.building import with_muscles
 from cmfsim.pipeline.predicting import build_patient
+from cmfsim.progress import Progress
 from cmfsim.solving.models import predict_patient
 from cmfsim.values.case_parts import CaseMuscles
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 
 __all__ = ["LandmarkTrial", "SensitivityReport", "landmark_trials", "sensitivity"]
 
-Progress = Callable[[str], None]
-OnFindings = Callable[[Iterable[Finding]], None]
 # Standard deviation of a landmark's place along each axis that moves the masseter by the 2 mm of
 # the paper's three trials, mm.
 LANDMARK_SD = 2.0

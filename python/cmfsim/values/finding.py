@@ -1,5 +1,6 @@
 """Findings: what a person should know before trusting a case."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from cmfsim.checks import (
@@ -7,7 +8,7 @@ from cmfsim.checks import (
     check_one_of,
 )
 
-__all__ = ["SEVERITIES", "Finding"]
+__all__ = ["SEVERITIES", "Finding", "OnFindings"]
 
 SEVERITIES = ("error", "warning", "note")
 
@@ -43,3 +44,7 @@ class Finding:
         check_one_of("severity", self.severity, SEVERITIES)
         as_text("finding code", self.code)
         as_text("finding", self.what)
+
+
+# What is called with new findings as a stage notices them.
+OnFindings = Callable[[Iterable[Finding]], None]

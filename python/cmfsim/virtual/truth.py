@@ -1,6 +1,6 @@
 """The face that an operation truly makes of a virtual patient: mesh, tissue, equilibrium, skin."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +13,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
 from cmfsim.pipeline.building import build_model
+from cmfsim.progress import Progress, no_progress
 from cmfsim.surfaces.topology import tet_bodies
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.image_data import ImageData
@@ -34,7 +35,6 @@ from cmfsim.virtual.people import VirtualPatient
 
 __all__ = ["PostoperativeTruth", "largest_body", "postoperative_truth"]
 
-Progress = Callable[[str], None]
 
 # Tissue of which the tooth rows together are nearer than the bite's own gap and this, mm, is none.
 BEYOND_BITE = 1.5
@@ -137,7 +137,7 @@ def postoperative_truth(
     CmfsimError
         (also `ValueError` where the input is at fault) What a stage cannot work with.
     """
-    stage = progress or _quiet
+    stage = progress or no_progress
     length = as_positive("edge_length", edge_length)
     region = replace(case.region, upper=float(head.skull_landmarks["nasion"][2]) + ABOVE_NASION)
     mesh = replace(case.mesh, edge_length=length, refine=refine)
@@ -204,10 +204,6 @@ def postoperative_truth(
         volume_ratios=body.volume_ratios(found.displacements),
         last_step=float(np.linalg.norm(found.last_step[on_skin], axis=1).max()),
     )
-
-
-def _quiet(stage: str) -> None:
-    del stage
 
 
 def _motion(case: Case, segment: str) -> Floats:

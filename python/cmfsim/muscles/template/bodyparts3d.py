@@ -6,7 +6,7 @@ this package; `WHERE` says where a user downloads them.
 
 import hashlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from cmfsim.muscles.template.bodyparts3d_parts import (
 )
 from cmfsim.muscles.template.muscle_template import MuscleTemplate
 from cmfsim.muscles.template.skull_reference import joined_surface
+from cmfsim.progress import Progress, no_progress
 from cmfsim.registration import side_vectors
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
 from cmfsim.surfaces.repair import RepairOptions, clean_surface, repair_surface
@@ -85,7 +86,7 @@ def import_bodyparts3d(
     landmarks: Mapping[str, ArrayLike] | str | os.PathLike[str],
     *,
     verify: bool = True,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> MuscleTemplate:
     """The template that the OBJ files of BodyParts3D 3.0 make: 65 muscles, bones and teeth.
 
@@ -129,7 +130,7 @@ def import_bodyparts3d(
     if isinstance(landmarks, str | os.PathLike):
         landmarks = read_landmarks(landmarks)
     points = as_landmarks(landmarks)
-    say = progress or (lambda _: None)
+    say = progress or no_progress
     muscles: list[MuscleSurface] = []
     concepts: dict[str, tuple[str, ...]] = {}
     for pair in PAIRED_MUSCLES:

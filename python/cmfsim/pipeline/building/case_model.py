@@ -3,7 +3,7 @@
 import logging
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -58,9 +58,10 @@ from cmfsim.pipeline.building.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.skin_part import on_skin
 from cmfsim.pipeline.building.tissue_mesh import end_planes, region_of, tissue_mesh
+from cmfsim.progress import Progress, no_progress
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.anatomy import Anatomy, BoneSegment
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.scene import Scene
@@ -69,9 +70,6 @@ from cmfsim.values.surface_data import MovedSurface, SurfaceData
 __all__ = ["build_case", "build_model"]
 
 _log = logging.getLogger(__name__)
-
-Progress = Callable[[str], None]
-OnFindings = Callable[[Iterable[Finding]], None]
 
 
 def build_case(
@@ -119,7 +117,7 @@ def build_case(
     model = build_model(
         case, progress=progress, check=check, findings=findings, on_findings=on_findings
     )
-    stage = progress or _quiet
+    stage = progress or no_progress
     stage("writing the model")
     begun = time.perf_counter()
     names = write_model(case.output, model, partial(_draw, model))
@@ -171,7 +169,7 @@ def build_model(
     case = as_case(case)
     options = _kind_options(case)
     findings = [*findings]
-    stages = _Stages(progress or _quiet, findings, on_findings)
+    stages = _Stages(progress or no_progress, findings, on_findings)
     if check:
         stages.begin("checking the case")
         findings += _checked(case)
@@ -323,10 +321,6 @@ class _Stages:
         self._known.update(new)
         if new and self._on_findings is not None:
             self._on_findings(new)
-
-
-def _quiet(stage: str) -> None:
-    del stage
 
 
 def _checked(case: Case) -> tuple[Finding, ...]:

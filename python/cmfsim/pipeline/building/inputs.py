@@ -26,6 +26,7 @@ from cmfsim.io.images import read_image_file
 from cmfsim.io.models import is_model_file
 from cmfsim.io.transforms import read_transform_file
 from cmfsim.meshing import anatomy_from_surfaces
+from cmfsim.progress import Progress
 from cmfsim.surfaces.repair import repair_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMesh, CaseMotion
@@ -47,7 +48,6 @@ __all__ = [
     "segment_options",
 ]
 
-Progress = Callable[[str], None]
 
 # Voxels of the grid that surfaces are worked on, in edges of the mesh to come, and in mm at least.
 VOXELS_PER_EDGE = 3.0
