@@ -124,7 +124,7 @@ def frontier(
     if "error" in first:
         raise SolverError(
             f"the reference ({_label(reference, base)}) failed, so that nothing can be compared "
-            f"with it: {first['error']}; mend that, or give another reference"
+            f"with it: {first['error']}; fix that, or give another reference"
         )
     for number in range(repeats):
         for choice in choices:

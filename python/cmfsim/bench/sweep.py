@@ -128,7 +128,7 @@ def _varied(base: Choice, name: str, values: Sequence[Any]) -> Iterator[Choice]:
 
 
 def _early(base: Choice, kinematics: Sequence[str]) -> Iterator[Choice]:
-    """Large deformation that stops early: what the last steps mend is a few tets, not the face."""
+    """Large deformation that stops early: what the last steps fix is a few tets, not the face."""
     for name in kinematics:
         if name != "linear":
             for tolerance in EARLY:

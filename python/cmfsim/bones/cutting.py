@@ -265,26 +265,24 @@ def _make_cut(
         moved, kept = _join_crumbs(one, other, bone, limit, int(options.crumb_volume / voxel))
         if moved:
             findings.append(
-                Finding(
-                    "note",
+                Finding.note(
                     "osteotomy-crumbs",
                     f"{len(moved)} pieces of {both[0]!r} that the cut parted from it, "
                     f"{sum(moved) * voxel:.0f} mm³ in all, stay with {both[1]!r}",
-                    procedure.kind,
-                    "they would move with a bone that they do not hang on",
-                    "move the planes, or lower crumb_volume",
+                    where=procedure.kind,
+                    why="they would move with a bone that they do not hang on",
+                    fix="move the planes, or lower crumb_volume",
                 )
             )
         if kept:
             findings.append(
-                Finding(
-                    "warning",
+                Finding.warning(
                     "osteotomy-parts",
                     f"{both[0]!r} has {len(kept) + 1} separate parts; the smaller have "
                     f"{', '.join(f'{n * voxel:.0f}' for n in kept)} mm³",
-                    procedure.kind,
-                    "parts that are not joined move together all the same",
-                    "look at the picture of the segments; move the planes",
+                    where=procedure.kind,
+                    why="parts that are not joined move together all the same",
+                    fix="look at the picture of the segments; move the planes",
                 )
             )
     names_now = list(pieces.items())

@@ -73,7 +73,7 @@ def build(options: argparse.Namespace) -> int:
         )
     summary = dict(built.summary)
     # Those of muscles are noticed after the last stage.
-    notices.add(Finding(**entry) for entry in summary["findings"])
+    notices.add(Finding.from_values(entry) for entry in summary["findings"])
     if not options.no_doctor:
         summary["timings"] = {"checking the case": seconds, **summary["timings"]}
     if options.json:

@@ -288,7 +288,7 @@ def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> No
     check = actions.add_parser(
         "check",
         parents=[named],
-        help="say what is wrong with a template, and how to mend it",
+        help="say what is wrong with a template, and how to fix it",
         epilog="Exit codes: 0 no errors found, 2 errors found or there is no such template.",
     )
     check.set_defaults(run=template_commands.check)

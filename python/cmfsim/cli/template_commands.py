@@ -70,7 +70,7 @@ def check(options: argparse.Namespace) -> int:
 
 
 def import_atlas(options: argparse.Namespace) -> int:
-    """Makes a template of the files of an atlas, and writes it with what was mended."""
+    """Makes a template of the files of an atlas, and writes it with what was repaired."""
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         template = import_bodyparts3d(
             options.folder,

@@ -1,4 +1,4 @@
-"""What will go wrong with a case, said before any work is done: each with why and how to mend it.
+"""What will go wrong with a case, said before any work is done: each with why and how to fix it.
 
 `diagnose` reads the files of a case and looks; it changes and writes nothing. `evidence` is what
 was read, `placement` asks whether it lies where it should, `surfaces` whether it is sound,
@@ -77,7 +77,7 @@ def diagnose(case: CaseOrPath, models: Sequence[str] | None = None) -> tuple[Fin
     --------
     >>> import cmfsim
     >>> for finding in cmfsim.diagnose(cmfsim.Case.load("case.toml")):  # doctest: +SKIP
-    ...     print(finding.severity, finding.what, finding.mend)
+    ...     print(finding.severity, finding.what, finding.fix)
     """
     return examine(case, models).findings
 

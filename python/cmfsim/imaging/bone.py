@@ -105,14 +105,13 @@ def _without_islands(
     findings = []
     if dropped > options.island:
         findings.append(
-            Finding(
-                "note",
+            Finding.note(
                 "bone-islands",
                 f"{count - np.count_nonzero(kept)} pieces of bone below {options.island:g} mm³ "
                 f"each, {dropped / 1000.0:.1f} cm³ together, were dropped",
                 where="bone",
                 why="they are thin bone, calcified vessels or noise, and become soft tissue",
-                mend="lower bone_threshold or island if a wanted piece is missing",
+                fix="lower bone_threshold or island if a wanted piece is missing",
             )
         )
     return kept_mask, findings

@@ -168,25 +168,23 @@ def _side(mandible: Mask, bone: Mask) -> Volume:
 
 
 def _not_parted(reason: str) -> Finding:
-    return Finding(
-        "warning",
+    return Finding.warning(
         "jaws-not-parted",
         f"the mandible was not told from the skull: {reason}",
         where="bone",
         why="mandible and cranium would move as one",
-        mend="give skull landmarks (menton, gonion_L, gonion_R, supradentale, infradentale, …) or "
+        fix="give skull landmarks (menton, gonion_L, gonion_R, supradentale, infradentale, …) or "
         "ready surfaces of both bones",
     )
 
 
 def _guessed() -> Finding:
-    return Finding(
-        "note",
+    return Finding.note(
         "jaws-parted-by-shape",
         "the mandible was told from the skull by shape alone, without landmarks",
         where="bone",
         why="the cut between the tooth rows may be some millimetres off",
-        mend="give skull landmarks",
+        fix="give skull landmarks",
     )
 
 

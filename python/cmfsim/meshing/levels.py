@@ -140,12 +140,12 @@ def _outside(name: str, bone: ImageData, skin: ImageData) -> Finding | None:
         return None
     volume = count * float(np.prod(np.asarray(bone.spacing)))
     place = np.asarray(bone.lowest) + np.argwhere(beyond).mean(axis=0) * np.asarray(bone.spacing)
-    return Finding(
-        "warning",
+    return Finding.warning(
         "bone-outside-skin",
         f"{volume:.0f} mm³ of bone {name!r} lie outside the skin",
-        f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
-        "there is no tissue over it, so the face cannot be predicted there",
-        "check that skin and bone are of one patient, in one frame; a neck cut lower mends a spine "
+        where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
+        why="there is no tissue over it, so the face cannot be predicted there",
+        fix="check that skin and bone are of one patient, in one frame; a neck cut lower mends a "
+        "spine "
         "that sticks out",
     )

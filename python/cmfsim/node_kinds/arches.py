@@ -102,26 +102,24 @@ def dental_arches(
 
 
 def _nothing_slides(missing: Sequence[str]) -> Finding:
-    return Finding(
-        "warning",
+    return Finding.warning(
         "sliding-landmarks",
         f"no sliding region at the teeth: landmarks {', '.join(missing)} are missing, and the "
         "image shows no teeth apart from bone",
-        "landmarks",
-        "lips and cheeks would stick to the teeth",
-        "place them, give regions, or set sliding = false",
+        where="landmarks",
+        why="lips and cheeks would stick to the teeth",
+        fix="place them, give regions, or set sliding = false",
     )
 
 
 def _from_teeth(missing: Sequence[str]) -> Finding:
-    return Finding(
-        "note",
+    return Finding.note(
         "sliding-from-teeth",
         f"landmarks {', '.join(missing)} are missing: the sliding regions were placed from the "
         "teeth that the image shows",
-        "landmarks",
-        "the depth of the vestibule is then right to some 3 mm",
-        "place the landmarks if lips or cheeks matter",
+        where="landmarks",
+        why="the depth of the vestibule is then right to some 3 mm",
+        fix="place the landmarks if lips or cheeks matter",
     )
 
 

@@ -327,14 +327,13 @@ def _noticed(
     points: Floats, kinds: NodeKinds, counts: Mapping[str, int], moved: Collection[str]
 ) -> list[Finding]:
     findings = [
-        Finding(
-            "warning",
+        Finding.warning(
             "segment-without-nodes",
             f"no node is joined to {name!r}, which the plan moves "
             f"({counts[f'sliding on {name}']} slide on it)",
-            name,
-            "its motion pulls no tissue along",
-            "look at the picture; raise bone_distance, or leave it out of the plan",
+            where=name,
+            why="its motion pulls no tissue along",
+            fix="look at the picture; raise bone_distance, or leave it out of the plan",
         )
         for name in kinds.segments
         if name in moved and not counts[f"joined on {name}"]
@@ -343,14 +342,13 @@ def _noticed(
     spread = np.linalg.svd(held - held.mean(axis=0), compute_uv=False) if len(held) else [0.0, 0.0]
     if len(held) < HOLDING_NODES or spread[1] <= 1e-6 * spread[0]:
         findings.append(
-            Finding(
-                "error",
+            Finding.error(
                 "tissue-not-held",
                 f"{len(held)} nodes are fixed or joined: at least {HOLDING_NODES} not on one line "
                 "are needed",
-                "node kinds",
-                "the tissue could drift as a whole, so there is no answer",
-                "give fixed_planes (posterior), or raise bone_distance",
+                where="node kinds",
+                why="the tissue could drift as a whole, so there is no answer",
+                fix="give fixed_planes (posterior), or raise bone_distance",
             )
         )
     return findings

@@ -65,14 +65,13 @@ def sliding_nodes(
 
 
 def _far_sheet(name: str, on_sheet: int, within: int) -> Finding:
-    return Finding(
-        "warning",
+    return Finding.warning(
         "contact-sheet-far",
         f"of {within} nodes on {name!r} at the arch only {on_sheet} lie within {SHEET_DEPTH:g} mm "
         "of its contact sheet; the others are joined",
-        f"segment {name}",
-        "lips and cheeks would stick to the teeth there",
-        "check the arch's landmarks and the bone in anatomy.png, or set contact_surface = "
+        where=f"segment {name}",
+        why="lips and cheeks would stick to the teeth there",
+        fix="check the arch's landmarks and the bone in anatomy.png, or set contact_surface = "
         '"bone" in [node_kinds]',
     )
 

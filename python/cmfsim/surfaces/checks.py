@@ -1,6 +1,6 @@
 """What is wrong with a triangle surface: borders, debris, orientation, crossings, slivers.
 
-Everything here looks and changes nothing; `surface_repair` mends. Costs are a few sorts of the
+Everything here looks and changes nothing; `repair_surface` repairs. Costs are a few sorts of the
 edges, and for crossings a grid over the triangles.
 """
 

@@ -213,4 +213,4 @@ class Prediction(Frozen):
     def findings(self) -> tuple[Finding, ...]:
         """What every stage noticed, the solution included."""
         solved = self.result.summary.get("findings", ())
-        return (*self.patient.findings, *(Finding(**entry) for entry in solved))
+        return (*self.patient.findings, *(Finding.from_values(entry) for entry in solved))

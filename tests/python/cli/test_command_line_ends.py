@@ -225,7 +225,7 @@ def test_numbers_in_mm_that_are_called_metres_are_said_to_be_mm(tmp_path):
     found = [f for f in cmfsim.diagnose(path) if f.code == "surface-units"]
     assert len(found) == 1
     assert "look like mm, and are read as m" in found[0].what
-    assert 'units = "mm"' in found[0].mend
+    assert 'units = "mm"' in found[0].fix
     assert "um" not in found[0].what.split()
 
 

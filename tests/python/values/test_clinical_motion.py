@@ -275,7 +275,7 @@ def test_metres_and_radians_are_noticed_however_the_motion_is_given(how, motion,
     (finding,) = (f for f in examined.findings if f.code == code)
     assert finding.severity == "warning"
     wanted = "0.0051 m would be 5.1 mm" if code == "plan-tiny" else "radians would be 2.0°"
-    assert wanted in finding.mend + finding.why
+    assert wanted in finding.fix + finding.why
 
 
 def test_no_motion_and_ordinary_motions_are_no_tiny_ones(tmp_path):

@@ -110,7 +110,7 @@ class MuscleTemplate(TemplateData):
         write_template(path, self, report)
 
     def check(self) -> tuple[Finding, ...]:
-        """What is wrong with the template, each with its place and mend; see `check_template`."""
+        """What is wrong with the template, each with its place and fix; see `check_template`."""
         return check_contents(self)
 
     def morph(

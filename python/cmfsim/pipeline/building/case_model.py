@@ -329,7 +329,7 @@ def _checked(case: Case) -> tuple[Finding, ...]:
     if errors:
         first = errors[0]
         more = f" ({len(errors) - 1} more: cmfsim doctor shows them)" if len(errors) > 1 else ""
-        raise CaseInputError(f"{first.where}: {first.what}; {first.mend}{more}")
+        raise CaseInputError(f"{first.where}: {first.what}; {first.fix}{more}")
     return findings
 
 
@@ -400,7 +400,7 @@ def _plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> li
             and not (case.achieved and finding.code.startswith("plan-tiny"))
         ]
     if case.surfaces is None and (errors := [f for f in found if f.severity == "error"]):
-        raise CaseInputError(f"{errors[0].where}: {errors[0].what}; {errors[0].mend}")
+        raise CaseInputError(f"{errors[0].where}: {errors[0].what}; {errors[0].fix}")
     return found
 
 
@@ -431,17 +431,16 @@ def _untouched(
             "(segment-touches-no-tissue)"
         )
         where = case.where(f"plan.{name}")
-        mend = "check the cut that makes it, bone_distance in [node_kinds], and the posterior plane"
+        fix = "check the cut that makes it, bone_distance in [node_kinds], and the posterior plane"
         if name in case.plan or name in _cut_segments(case) or beside:
-            raise CaseInputError(f"{where}: {what}: the face would not follow it; {mend}")
+            raise CaseInputError(f"{where}: {what}: the face would not follow it; {fix}")
         findings.append(
-            Finding(
-                "warning",
+            Finding.warning(
                 "segment-touches-no-tissue",
                 f"{what}; it lies beyond the meshed tissue, and the case does not name it",
-                where,
-                "its motion does not reach the face",
-                "if it belongs to the face, widen [region]",
+                where=where,
+                why="its motion does not reach the face",
+                fix="if it belongs to the face, widen [region]",
             )
         )
     return tuple(findings)

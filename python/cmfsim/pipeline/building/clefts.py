@@ -44,15 +44,15 @@ def without_clefts(
     number = np.cumsum(used) - 1
     left = TetMesh(nodes[used], number[kept])
     volume = float(np.asarray(mesh.volumes)[inside].sum())
-    finding = Finding(
-        "note",
+    finding = Finding.note(
         "clefts-left-out",
         f"{int(inside.sum())} tets of {volume:.0f} mm³ in all lie in the clefts between segments "
         f"and were left out: of two segments they are less than {width:g} mm away, taken together",
-        f"segments {', '.join(sorted(moved))}",
-        "between tooth rows there is air, and at a cut tissue is lifted off the bone: stretched "
+        where=f"segments {', '.join(sorted(moved))}",
+        why="between tooth rows there is air, and at a cut tissue is lifted off the bone: "
+        "stretched "
         "across, tets would turn inside out and hold the bones back",
-        "set cleft in [mesh] to another width, or to 0 to keep all tissue",
+        fix="set cleft in [mesh] to another width, or to 0 to keep all tissue",
     )
     return left, NodeKinds(kinds.kind[used], kinds.segment[used], kinds.segments), (finding,)
 

@@ -95,8 +95,8 @@ def read_anatomy(
     for name, path in files.items():
         progress(f"reading surface {name}")
         surface = read_surface(path, units=given_surfaces.units, frame=given_surfaces.frame)
-        surfaces[name], mended = repair_surface(surface, name)
-        findings.extend(mended)
+        surfaces[name], repaired = repair_surface(surface, name)
+        findings.extend(repaired)
     progress("measuring distances from the surfaces")
     spacing = max(case.mesh.edge_length / VOXELS_PER_EDGE, LEAST_VOXEL)
     skin = surfaces.pop("skin")
