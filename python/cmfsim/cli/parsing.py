@@ -338,7 +338,7 @@ def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> No
 
 
 def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
-    bench = commands.add_parser("bench", help="measure: error against run time, other programs")
+    bench = commands.add_parser("bench", help="measure: error against run time")
     actions = bench.add_subparsers(dest="action", metavar="ACTION", required=True)
 
     frontier = actions.add_parser(
@@ -395,16 +395,3 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     )
     frontier.add_argument("--fresh", action="store_true", help="do finished runs again")
     frontier.set_defaults(run=bench_command.frontier)
-
-    for name, (purpose, words, path) in bench_command.SCRIPTS.items():
-        command = actions.add_parser(
-            name,
-            help=f"{purpose}; needs a checkout of the source",
-            epilog=f"Words after -- go to {path}: -- {words}",
-        )
-        command.add_argument(
-            "--checkout", metavar="FOLDER", type=Path, help="(default the working directory's)"
-        )
-        command.add_argument("-q", "--quiet", action="store_true", help="no progress lines")
-        command.add_argument("words", metavar="WORD", nargs="*", help=f"for {path}")
-        command.set_defaults(run=bench_command.script)
