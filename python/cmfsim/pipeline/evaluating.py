@@ -14,7 +14,8 @@ from cmfsim.evaluation import NO_CHANGE, WHOLE, ModelComparison, compare_models
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.io.metrics import EVALUATION_FILE
 from cmfsim.pipeline.building import Postoperative, case_key, read_postoperative
-from cmfsim.pipeline.predicting import named_models, predict_models
+from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline.predicting import named_models, predictions_of
 from cmfsim.progress import Progress
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding, OnFindings
@@ -157,20 +158,16 @@ def evaluate(
         raise CaseInputError(
             f"{case.where('postoperative')}: there is no face to compare with: add skin or image"
         )
-    failed: dict[str, CmfsimError] = {}
-    predictions = tuple(
-        predict_models(
-            case,
-            models,
-            progress=progress,
-            check=check,
-            findings=findings,
-            after=postoperative,
-            failed=failed,
-            anatomy=anatomy,
-            on_findings=on_findings,
-        )
+    options = BuildOptions(
+        progress=progress,
+        check=check,
+        findings=findings,
+        anatomy=anatomy,
+        after=postoperative,
+        on_findings=on_findings,
     )
+    failed: dict[str, CmfsimError] = {}
+    predictions = tuple(predictions_of(case, models, options, failed))
     if not predictions:
         raise next(iter(failed.values()))
     if progress is not None:

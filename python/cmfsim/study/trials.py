@@ -12,6 +12,7 @@ from cmfsim.checks import Floats, as_positive, as_rows
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io import CaseOrPath, as_case
 from cmfsim.pipeline.building import with_muscles
+from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.progress import Progress
 from cmfsim.solving.models import predict_patient
@@ -194,9 +195,10 @@ def sensitivity(
     if (trials if isinstance(trials, int) else len(trials)) < 1:
         raise CaseInputError("no trial is asked for: at least one is needed")
     case = as_case(case)
-    patient = build_patient(
-        case, (model,), progress=progress, check=check, findings=findings, on_findings=on_findings
+    options = BuildOptions(
+        progress=progress, check=check, findings=findings, on_findings=on_findings
     )
+    patient = build_patient(case, (model,), options)
     skull = patient.landmarks.get("skull", {})
     if isinstance(trials, int):
         trials = list(landmark_trials(skull, count=trials, std=std, seed=seed))

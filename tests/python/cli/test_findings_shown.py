@@ -77,15 +77,15 @@ def noticed(tmp_path, monkeypatch):
     """A case with a warning of the doctor, one of building and one of solving."""
     monkeypatch.setattr("cmfsim.pipeline.outputs._pictures_of", lambda _: iter(()))
     build, solve = (
-        cmfsim.pipeline.predicting.build_model,
+        cmfsim.pipeline.predicting.model_of,
         cmfsim.pipeline.predicting.predict_patient,
     )
     solved = Finding.warning("of-solving", "solving is doubtful")
 
-    def build_model(case, *, on_findings, **options):
-        found = build(case, on_findings=on_findings, **options)
-        if on_findings is not None:
-            on_findings(MUSCLES)
+    def model_of(case, options):
+        found = build(case, options)
+        if options.on_findings is not None:
+            options.on_findings(MUSCLES)
         findings = [*found.summary["findings"], *map(dataclasses.asdict, MUSCLES)]
         summary = {**found.summary, "findings": findings}
         return dataclasses.replace(found, findings=(*found.findings, *MUSCLES), summary=summary)
@@ -100,7 +100,7 @@ def noticed(tmp_path, monkeypatch):
             summary={**found.summary, "findings": findings},
         )
 
-    monkeypatch.setattr("cmfsim.pipeline.predicting.build_model", build_model)
+    monkeypatch.setattr("cmfsim.pipeline.predicting.model_of", model_of)
     monkeypatch.setattr("cmfsim.pipeline.predicting.predict_patient", predict_patient)
     doctor = Finding.warning(
         "of-doctor", "the case is doubtful", where="case.toml:3", why="why", fix="fix it"
