@@ -36,7 +36,7 @@ LONG = 60.0
 REFERENCE_PATIENCE = 10.0
 
 
-def frontier(
+def frontier(  # noqa: PLR0913 (options by name)
     case: Case,
     folder: str | os.PathLike[str],
     choices: Iterable[Choice] | None = None,

@@ -151,7 +151,7 @@ def cut_bones(
     grid = next(iter(bones.values()))
     for procedure in placed:
         for cut in procedure.cuts:
-            _make_cut(procedure, cut, grid, pieces, findings, options)
+            _make_cut(procedure, cut, grid, pieces, findings=findings, options=options)
     levels = {name: grid.with_values(values) for name, values in pieces.items()}
     # Marching cubes and smoothing of one piece go on while another is decimated; decimation itself
     # takes one piece at a time.
@@ -228,6 +228,7 @@ def _make_cut(
     cut: Cut,
     grid: ImageData,
     pieces: dict[str, Levels],
+    *,
     findings: list[Finding],
     options: CutOptions,
 ) -> None:

@@ -126,10 +126,10 @@ def register_volumes(
             far.at(size, None),
             near.at(size, places.box),
             chosen,
-            fixed,
-            size,
-            options,
-            places,
+            grid=fixed,
+            size=size,
+            options=options,
+            places=places,
         )
         iterations.append(steps)
         _LOG.info("alignment at %g mm: %d steps, %.4f nats", size, steps, information)

@@ -80,7 +80,7 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     solid &= under > options.least_skin
     solid, findings = _without_islands(solid, work, options)
     cavity = _cranial_cavity(solid, skin, work)
-    mask = _enclosed(hu, solid, cavity, under, work, options)
+    mask = _enclosed(hu, solid, cavity, under, work=work, options=options)
     return Bone(hu, mask, solid, cavity, tuple(findings))
 
 
@@ -153,6 +153,7 @@ def _enclosed(
     solid: Mask,
     cavity: Mask | None,
     under: Volume,
+    *,
     work: Working,
     options: SegmentOptions,
 ) -> Mask:

@@ -237,9 +237,10 @@ def _seeds(
         seeds[bone.cavity[box]] = 2
     _tooth_rows(seeds, landmarks, x, y, z)
     # Landmarks last: they are what a person said.
-    _balls(seeds, domain, work, landmarks, ON_CRANIUM, 2)
+    _balls(seeds, domain, work, landmarks, names=ON_CRANIUM, value=2)
     condyles = _condyles(landmarks)
-    _balls(seeds, domain, work, landmarks | condyles, (*ON_MANDIBLE, *condyles), 1)
+    on_mandible = (*ON_MANDIBLE, *condyles)
+    _balls(seeds, domain, work, landmarks | condyles, names=on_mandible, value=1)
     seeds[~domain] = 0
     return seeds
 
@@ -302,6 +303,7 @@ def _balls(
     domain: Mask,
     work: Working,
     landmarks: Mapping[str, Floats],
+    *,
     names: Iterable[str],
     value: int,
 ) -> None:

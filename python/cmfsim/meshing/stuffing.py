@@ -170,7 +170,9 @@ def mesh_from_level(
     """
     options = options or MeshOptions()
     values = np.asarray(level.values, dtype=np.float32)
-    mesh, making = _stuffed(values, level.spacing, level.origin, options, allowed, needed)
+    mesh, making = _stuffed(
+        values, level.spacing, level.origin, options, allowed=allowed, needed=needed
+    )
     report = mesh_report(mesh, making)
     return TissueMesh(mesh, report, mesh_findings(report))
 
@@ -212,6 +214,7 @@ def _stuffed(
     spacing: ArrayLike,
     origin: ArrayLike,
     options: MeshOptions,
+    *,
     allowed: ArrayLike | None = None,
     needed: ArrayLike | None = None,
 ) -> tuple[TetMesh, dict[str, float]]:

@@ -52,7 +52,7 @@ class ClassifiedNodes:
         object.__setattr__(self, "counts", MappingProxyType(dict(self.counts)))
 
 
-def classify_nodes(
+def classify_nodes(  # noqa: PLR0913 (options by name)
     nodes: ArrayLike,
     boundary_triangles: ArrayLike,
     anatomy: Anatomy,
@@ -135,7 +135,13 @@ def classify_nodes(
         if {segment.name for segment in segments} - {r.segment for r in options.regions}:
             findings += arches.findings
         slides, noticed = sliding_nodes(
-            border.points, nearest, anatomy, segments, arches, contacts or {}, options
+            border.points,
+            nearest,
+            anatomy,
+            segments,
+            arches=arches,
+            contacts=contacts or {},
+            options=options,
         )
         findings += noticed
     moves = np.array([name in moved for name in names])

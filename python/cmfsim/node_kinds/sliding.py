@@ -30,6 +30,7 @@ def sliding_nodes(
     nearest: NDArray[np.intp],
     anatomy: Anatomy,
     segments: Sequence[BoneSegment],
+    *,
     arches: DentalArches,
     contacts: Mapping[str, SurfaceData],
     options: KindOptions,

@@ -103,7 +103,7 @@ def picture_distances(
         View("front", "front   blue: prediction behind, red: in front"),
         View("left", "left"),
     )
-    draw(path, views, corners, size, paint, legend)
+    draw(path, views, corners, size, paint, legend=legend)
 
 
 def distance_colour(distance: float, limit: float = DISTANCE_LIMIT) -> str:

@@ -67,7 +67,7 @@ def predict(
     return next(predict_models(case, model, progress=progress, check=check))
 
 
-def predict_models(
+def predict_models(  # noqa: PLR0913 (options by name)
     case: CaseOrPath,
     models: str | Sequence[str] = MODELS,
     *,

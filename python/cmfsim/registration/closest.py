@@ -11,7 +11,7 @@ from cmfsim.values.surface_data import SurfaceData
 __all__ = ["icp"]
 
 
-def icp(
+def icp(  # noqa: PLR0913 (options by name)
     moving: ArrayLike | Surface | SurfaceData,
     fixed: ArrayLike | Surface | SurfaceData,
     *,

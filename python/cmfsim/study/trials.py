@@ -140,7 +140,7 @@ def landmark_trials(
         yield dict(zip(names, points + drawn, strict=True))
 
 
-def sensitivity(
+def sensitivity(  # noqa: PLR0913 (options by name)
     case: CaseOrPath,
     *,
     trials: int | Sequence[Mapping[str, ArrayLike]] = 3,

@@ -179,6 +179,7 @@ def operate(
     tets: NDArray[Any],
     boundary: NDArray[Any],
     kinds: NodeKinds,
+    *,
     distances: Mapping[str, ImageData],
     centres: Mapping[str, Floats],
     plan: Mapping[str, Floats],

@@ -136,7 +136,7 @@ def _write_cohort(folder: Path) -> None:
         file.write("\n".join([*lines, ""]).encode())
 
 
-def write_virtual_patient(
+def write_virtual_patient(  # noqa: PLR0913 (options by name)
     folder: str | os.PathLike[str],
     number: int,
     *,

@@ -94,7 +94,7 @@ class PostoperativeTruth:
         return max((float(depth.max(initial=0.0)) for depth in depths.values()), default=0.0)
 
 
-def postoperative_truth(
+def postoperative_truth(  # noqa: PLR0913 (options by name)
     patient: VirtualPatient,
     head: PhantomHead,
     case: Case,
@@ -156,7 +156,7 @@ def postoperative_truth(
         model.kinds,
         distances,
         motions,
-        head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE,
+        gap=head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE,
     )
     nodes, tets = opened.nodes, opened.tets
 
@@ -173,10 +173,10 @@ def postoperative_truth(
         tets,
         TetMesh(nodes, tets).boundary_triangles(),
         opened.kinds,
-        distances,
-        {name: np.asarray(s.surface.vertices).mean(axis=0) for name, s in segments.items()},
-        motions,
-        opened.bared,
+        distances=distances,
+        centres={name: np.asarray(s.surface.vertices).mean(axis=0) for name, s in segments.items()},
+        plan=motions,
+        bared=opened.bared,
     )
     found = find_equilibrium(body, operation.held, operation.path, operation.contact, options)
 
@@ -233,6 +233,7 @@ def _opened(
     kinds: NodeKinds,
     distances: Mapping[str, ImageData],
     motions: Mapping[str, Floats],
+    *,
     gap: float,
 ) -> _Opened:
     """The largest body that is left without what lies between tooth rows and parted bones."""

@@ -35,7 +35,7 @@ def without_clefts(
         As for `cleft_tets`.
     """
     nodes, tets = np.asarray(mesh.nodes), np.asarray(mesh.tets)
-    inside = cleft_tets(nodes, tets, kinds, segments, moved, width)
+    inside = cleft_tets(nodes, tets, kinds, segments, moved=moved, width=width)
     if not inside.any():
         return mesh, kinds, ()
     kept = tets[~inside]
@@ -62,6 +62,7 @@ def cleft_tets(
     tets: NDArray[np.uint32],
     kinds: NodeKinds,
     segments: Sequence[BoneSegment],
+    *,
     moved: Collection[str],
     width: float,
 ) -> NDArray[np.bool_]:
