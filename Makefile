@@ -26,7 +26,7 @@ PYTHON_DIRS := python tests/python scripts examples benches fuzz
 CORE_FEATURES := --features mtm-core/metis
 
 .DEFAULT_GOAL := help
-.PHONY: help build test test-rust test-python lint format wheel notices bench peers frontier fuzz demo docs clean
+.PHONY: help build test test-rust test-python lint format wheel notices bench peers stability elements frontier fuzz demo docs clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sort | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 16
@@ -88,6 +88,12 @@ bench: $(BUILD_STAMP) ## run the benches (minutes; close other programs first)
 
 peers: $(BUILD_STAMP) ## compare with the peers that are installed (benches/peers/README.md)
 	"$(PY)" benches/peers/run.py --markdown peers.md --out peers.json
+
+stability: $(BUILD_STAMP) ## measure stiff and extreme cases, and write docs/stability.md
+	"$(PY)" benches/stability.py --markdown docs/stability.md
+
+elements: $(BUILD_STAMP) ## measure elements and kinematics on a shell, and put the table into docs/benchmarks.md
+	"$(PY)" benches/elements.py --level 1 --layers 2 --markdown docs/benchmarks.md
 
 frontier: $(BUILD_STAMP) ## measure error against run time (hours), and put it into docs/frontier.md
 	"$(PY)" -m cmfsim bench frontier -o target/frontier

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import cmfsim
+from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
 from marked import publish
 
@@ -60,7 +61,7 @@ def main(words: Sequence[str] | None = None) -> int:
     options = parser.parse_args(words)
     rows = []
     for path in options.cases:
-        patient = build_patient(path, options.models, check=False)
+        patient = build_patient(path, options.models, BuildOptions(check=False))
         for model in options.models:
             rows.append(row(patient, model, options.plans, options.seed))
             print(rows[-1], file=sys.stderr, flush=True)

@@ -47,7 +47,7 @@ PYTHON: tuple[frozenset[str], ...] = tuple(
     frozenset(row.split())
     for row in (
         "_core",
-        "errors deferred",
+        "errors deferred progress",
         "checks extras",
         "values",
         "io registration surfaces",
@@ -65,8 +65,6 @@ PYTHON: tuple[frozenset[str], ...] = tuple(
 PYTHON_EXCEPTIONS: Mapping[tuple[str, str], str] = {
     ("cli/parsing", "cmfsim"): "the version that --version prints",
     ("cli/view_command", "cmfsim"): "the public mesh that a file of tets is read as",
-    ("pipeline/outputs", "study"): "writes the report of a study",
-    ("values/patient_model", "surfaces"): "the skin of a model is drawn from its level",
 }
 # Outside packages that a module may import at its top: `import cmfsim` needs numpy alone.
 PYTHON_PACKAGES = frozenset({"numpy"})

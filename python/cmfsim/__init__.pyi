@@ -1,421 +1,212 @@
-from cmfsim._core import (
-    ELEMENTS,
-    KINEMATICS,
-    LAWS,
-    METHODS,
-    PRESETS,
-    Boundary,
-    Folds,
-    IcpFit,
-    MassTensors,
-    MeshQuality,
-    MuscleFibres,
-    PlanOperator,
-    RigidFit,
-    Solution,
-    StaticSolver,
-    Surface,
-    SurfaceMotion,
-    TetMesh,
-    ThinPlateSpline,
-    Tissue,
-    __version__,
-    rigid_fit,
-)
-from cmfsim.bench import (
-    Choice,
-    Frontier,
-    FrontierRow,
-    case_choice,
-    frontier,
-    sweep_choices,
-)
-from cmfsim.bones import (
-    ContactSheet,
-    CutBones,
-    CuttingPlane,
-    Procedure,
-    SheetOptions,
-    contact_sheet,
-    cut_bones,
-    free_cut,
-    place_procedure,
-    procedure_options,
-    segments_from_surfaces,
-)
-from cmfsim.bones.achieved import (
-    AchievedMotion,
-    AchievedPlan,
-    MatchOptions,
-    achieved_plan,
-    measure_motion,
-)
-from cmfsim.doctor import Examination, diagnose, examine
-from cmfsim.errors import (
-    BoundaryError,
-    CaseError,
-    CmfsimError,
-    ContactError,
-    ImageError,
-    LandmarkError,
-    MaterialError,
-    MeshError,
-    RegistrationError,
-    SolverError,
-)
-from cmfsim.evaluation import (
-    DistanceStatistics,
-    ErrorTable,
-    Improvement,
-    ModelComparison,
-    PairedTest,
-    SkinComparison,
-    compare_models,
-    compare_skins,
-    distance_statistics,
-    error_table,
-    skin_regions,
-    wilcoxon_test,
-)
-from cmfsim.imaging import (
-    AlignmentOptions,
-    SegmentOptions,
-    VolumeAlignment,
-    register_volumes,
-    segment_head,
-    undeformed_mask,
-)
-from cmfsim.io import (
-    Case,
-    Cohort,
-    read_image,
-    read_landmarks,
-    read_moved_surface,
-    read_plan,
-    read_result,
-    read_scene,
-    read_surface,
-    read_tet_mesh,
-    read_transform,
-    write_image,
-    write_landmarks,
-    write_metrics,
-    write_model,
-    write_plan,
-    write_prediction,
-    write_result,
-    write_scene,
-    write_surface,
-    write_transform,
-)
-from cmfsim.meshing import (
-    MeshOptions,
-    MeshReport,
-    TissueMesh,
-    TissueRegion,
-    anatomy_from_surfaces,
-    mesh_from_labels,
-    mesh_from_level,
-    mesh_report,
-    mesh_with_tetwild,
-    part_mesh,
-    signed_level,
-    tissue_level,
-)
-from cmfsim.muscles.equivalent import Mixture, MuscleVolume, equivalent_material
-from cmfsim.muscles.template import (
-    MorphedMusculature,
-    MuscleTemplate,
-    check_template,
-    import_bodyparts3d,
-    template_names,
-)
-from cmfsim.node_kinds import (
-    ClassifiedNodes,
-    DentalArches,
-    KindOptions,
-    SlidingBox,
-    SlidingSphere,
-    classify_nodes,
-    dental_arches,
-    kind_options,
-    segment_data,
-)
-from cmfsim.phantom import HeadParameters, Muscle, PhantomHead, make_head
-from cmfsim.phantom.case_files import write_phantom_case
-from cmfsim.pipeline.building import build_case, build_model, with_muscles
-from cmfsim.pipeline.evaluating import CaseEvaluation, evaluate
-from cmfsim.pipeline.predicting import predict, predict_models
-from cmfsim.planning.face_measures import (
-    MEASURES,
-    BoneSite,
-    FaceSites,
-    Measure,
-    face_sites,
-    measure_face,
-    measure_sites,
-)
-from cmfsim.planning.face_planning import (
-    FacePlan,
-    FaceSearch,
-    MeasureTarget,
-    PointTarget,
-    SurfaceTarget,
-    plan_for_face,
-)
-from cmfsim.planning.page import PageContent, page_content, page_text, write_planning_page
-from cmfsim.planning.replanning import (
-    ExpectedError,
-    PlanningModel,
-    PlanTrial,
-    expected_error,
-    planning_model,
-)
-from cmfsim.planning.server import serve_planning
-from cmfsim.registration import (
-    FoldReport,
-    LandmarkAgreement,
-    LandmarkMatch,
-    fold_report,
-    icp,
-    leave_one_out,
-    match_landmarks,
-)
-from cmfsim.solving.models import model_scene, predict_patient
-from cmfsim.solving.simulation import scene_plan, scene_solver, solve_scene
-from cmfsim.study import SensitivityReport, StudyReport, landmark_trials, run_study, sensitivity
-from cmfsim.surfaces.checks import SurfaceReport, check_surface
-from cmfsim.surfaces.levels import contact_surface
-from cmfsim.surfaces.repair import RepairOptions, repair_surface
-from cmfsim.values.anatomy import Anatomy, BoneSegment, DentalArch, Finding, ImageData, NodeKinds
-from cmfsim.values.case_parts import CaseMuscles
-from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion, planned_motion
-from cmfsim.values.landmark_sites import SKULL_LANDMARKS
-from cmfsim.values.motion import RigidMotion, decompose_motion, rigid_matrix, rigid_motion
-from cmfsim.values.musculature import MuscleSurface, Musculature
-from cmfsim.values.patient_model import PatientModel
-from cmfsim.values.prediction import MODELS, Prediction
-from cmfsim.values.scene import (
-    MovedSurface,
-    Scene,
-    SceneResult,
-    SegmentData,
-    SolverOptions,
-    SurfaceData,
-    TissueData,
-)
-from cmfsim.virtual import virtual_patients, write_virtual_patient
-
-__all__ = [
-    "ELEMENTS",
-    "KINEMATICS",
-    "LAWS",
-    "MEASURES",
-    "METHODS",
-    "MODELS",
-    "PRESETS",
-    "SKULL_LANDMARKS",
-    "AchievedMotion",
-    "AchievedPlan",
-    "AlignmentOptions",
-    "Anatomy",
-    "BoneSegment",
-    "BoneSite",
-    "Boundary",
-    "BoundaryError",
-    "Case",
-    "CaseError",
-    "CaseEvaluation",
-    "CaseMuscles",
-    "Choice",
-    "ClassifiedNodes",
-    "ClinicalMotion",
-    "CmfsimError",
-    "Cohort",
-    "ContactError",
-    "ContactSheet",
-    "CutBones",
-    "CuttingPlane",
-    "DentalArch",
-    "DentalArches",
-    "DistanceStatistics",
-    "ErrorTable",
-    "Examination",
-    "ExpectedError",
-    "FacePlan",
-    "FaceSearch",
-    "FaceSites",
-    "Finding",
-    "FoldReport",
-    "Folds",
-    "Frontier",
-    "FrontierRow",
-    "HeadParameters",
-    "IcpFit",
-    "ImageData",
-    "ImageError",
-    "Improvement",
-    "KindOptions",
-    "LandmarkAgreement",
-    "LandmarkError",
-    "LandmarkMatch",
-    "MassTensors",
-    "MatchOptions",
-    "MaterialError",
-    "Measure",
-    "MeasureTarget",
-    "MeshError",
-    "MeshOptions",
-    "MeshQuality",
-    "MeshReport",
-    "Mixture",
-    "ModelComparison",
-    "MorphedMusculature",
-    "MovedSurface",
-    "Muscle",
-    "MuscleFibres",
-    "MuscleSurface",
-    "MuscleTemplate",
-    "MuscleVolume",
-    "Musculature",
-    "NodeKinds",
-    "PageContent",
-    "PairedTest",
-    "PatientModel",
-    "PhantomHead",
-    "PlanOperator",
-    "PlanTrial",
-    "PlanningModel",
-    "PointTarget",
-    "Prediction",
-    "Procedure",
-    "RegistrationError",
-    "RepairOptions",
-    "RigidFit",
-    "RigidMotion",
-    "Scene",
-    "SceneResult",
-    "SegmentData",
-    "SegmentOptions",
-    "SensitivityReport",
-    "SheetOptions",
-    "SkinComparison",
-    "SlidingBox",
-    "SlidingSphere",
-    "Solution",
-    "SolverError",
-    "SolverOptions",
-    "StaticSolver",
-    "StudyReport",
-    "Surface",
-    "SurfaceData",
-    "SurfaceMotion",
-    "SurfaceReport",
-    "SurfaceTarget",
-    "TetMesh",
-    "ThinPlateSpline",
-    "Tissue",
-    "TissueData",
-    "TissueMesh",
-    "TissueRegion",
-    "VolumeAlignment",
-    "__version__",
-    "achieved_plan",
-    "anatomy_from_surfaces",
-    "build_case",
-    "build_model",
-    "case_choice",
-    "check_surface",
-    "check_template",
-    "classify_nodes",
-    "clinical_motion",
-    "compare_models",
-    "compare_skins",
-    "contact_sheet",
-    "contact_surface",
-    "cut_bones",
-    "decompose_motion",
-    "dental_arches",
-    "diagnose",
-    "distance_statistics",
-    "equivalent_material",
-    "error_table",
-    "evaluate",
-    "examine",
-    "expected_error",
-    "face_sites",
-    "fold_report",
-    "free_cut",
-    "frontier",
-    "icp",
-    "import_bodyparts3d",
-    "kind_options",
-    "landmark_trials",
-    "leave_one_out",
-    "make_head",
-    "match_landmarks",
-    "measure_face",
-    "measure_motion",
-    "measure_sites",
-    "mesh_from_labels",
-    "mesh_from_level",
-    "mesh_report",
-    "mesh_with_tetwild",
-    "model_scene",
-    "page_content",
-    "page_text",
-    "part_mesh",
-    "place_procedure",
-    "plan_for_face",
-    "planned_motion",
-    "planning_model",
-    "predict",
-    "predict_models",
-    "predict_patient",
-    "procedure_options",
-    "read_image",
-    "read_landmarks",
-    "read_moved_surface",
-    "read_plan",
-    "read_result",
-    "read_scene",
-    "read_surface",
-    "read_tet_mesh",
-    "read_transform",
-    "register_volumes",
-    "repair_surface",
-    "rigid_fit",
-    "rigid_matrix",
-    "rigid_motion",
-    "run_study",
-    "scene_plan",
-    "scene_solver",
-    "segment_data",
-    "segment_head",
-    "segments_from_surfaces",
-    "sensitivity",
-    "serve_planning",
-    "signed_level",
-    "skin_regions",
-    "solve_scene",
-    "sweep_choices",
-    "template_names",
-    "tissue_level",
-    "undeformed_mask",
-    "virtual_patients",
-    "wilcoxon_test",
-    "with_muscles",
-    "write_image",
-    "write_landmarks",
-    "write_metrics",
-    "write_model",
-    "write_phantom_case",
-    "write_plan",
-    "write_planning_page",
-    "write_prediction",
-    "write_result",
-    "write_scene",
-    "write_surface",
-    "write_transform",
-    "write_virtual_patient",
-]
+# The public names, a line each: what type checkers read, and what `deferred` loads names from.
+from cmfsim._core import ELEMENTS as ELEMENTS
+from cmfsim._core import KINEMATICS as KINEMATICS
+from cmfsim._core import LAWS as LAWS
+from cmfsim._core import METHODS as METHODS
+from cmfsim._core import PRESETS as PRESETS
+from cmfsim._core import Boundary as Boundary
+from cmfsim._core import Folds as Folds
+from cmfsim._core import IcpFit as IcpFit
+from cmfsim._core import MassTensors as MassTensors
+from cmfsim._core import MeshQuality as MeshQuality
+from cmfsim._core import MuscleFibres as MuscleFibres
+from cmfsim._core import PlanOperator as PlanOperator
+from cmfsim._core import RigidFit as RigidFit
+from cmfsim._core import Solution as Solution
+from cmfsim._core import StaticSolver as StaticSolver
+from cmfsim._core import Surface as Surface
+from cmfsim._core import SurfaceMotion as SurfaceMotion
+from cmfsim._core import TetMesh as TetMesh
+from cmfsim._core import ThinPlateSpline as ThinPlateSpline
+from cmfsim._core import Tissue as Tissue
+from cmfsim._core import __version__ as __version__
+from cmfsim._core import rigid_fit as rigid_fit
+from cmfsim.bench import Choice as Choice
+from cmfsim.bench import Frontier as Frontier
+from cmfsim.bench import FrontierRow as FrontierRow
+from cmfsim.bench import case_choice as case_choice
+from cmfsim.bench import frontier as frontier
+from cmfsim.bench import sweep_choices as sweep_choices
+from cmfsim.bones import ContactSheet as ContactSheet
+from cmfsim.bones import CutBones as CutBones
+from cmfsim.bones import CuttingPlane as CuttingPlane
+from cmfsim.bones import Procedure as Procedure
+from cmfsim.bones import SheetOptions as SheetOptions
+from cmfsim.bones import contact_sheet as contact_sheet
+from cmfsim.bones import cut_bones as cut_bones
+from cmfsim.bones import free_cut as free_cut
+from cmfsim.bones import place_procedure as place_procedure
+from cmfsim.bones import procedure_options as procedure_options
+from cmfsim.bones import segments_from_surfaces as segments_from_surfaces
+from cmfsim.bones.achieved import AchievedMotion as AchievedMotion
+from cmfsim.bones.achieved import AchievedPlan as AchievedPlan
+from cmfsim.bones.achieved import MatchOptions as MatchOptions
+from cmfsim.bones.achieved import achieved_plan as achieved_plan
+from cmfsim.bones.achieved import measure_motion as measure_motion
+from cmfsim.doctor import Examination as Examination
+from cmfsim.doctor import diagnose as diagnose
+from cmfsim.doctor import examine as examine
+from cmfsim.errors import BoundaryError as BoundaryError
+from cmfsim.errors import CaseError as CaseError
+from cmfsim.errors import CmfsimError as CmfsimError
+from cmfsim.errors import ContactError as ContactError
+from cmfsim.errors import ImageError as ImageError
+from cmfsim.errors import LandmarkError as LandmarkError
+from cmfsim.errors import MaterialError as MaterialError
+from cmfsim.errors import MeshError as MeshError
+from cmfsim.errors import RegistrationError as RegistrationError
+from cmfsim.errors import SolverError as SolverError
+from cmfsim.evaluation import DistanceStatistics as DistanceStatistics
+from cmfsim.evaluation import ErrorTable as ErrorTable
+from cmfsim.evaluation import Improvement as Improvement
+from cmfsim.evaluation import ModelComparison as ModelComparison
+from cmfsim.evaluation import PairedTest as PairedTest
+from cmfsim.evaluation import SkinComparison as SkinComparison
+from cmfsim.evaluation import compare_models as compare_models
+from cmfsim.evaluation import compare_skins as compare_skins
+from cmfsim.evaluation import distance_statistics as distance_statistics
+from cmfsim.evaluation import error_table as error_table
+from cmfsim.evaluation import skin_regions as skin_regions
+from cmfsim.evaluation import wilcoxon_test as wilcoxon_test
+from cmfsim.imaging import AlignmentOptions as AlignmentOptions
+from cmfsim.imaging import SegmentOptions as SegmentOptions
+from cmfsim.imaging import VolumeAlignment as VolumeAlignment
+from cmfsim.imaging import register_volumes as register_volumes
+from cmfsim.imaging import segment_head as segment_head
+from cmfsim.imaging import undeformed_mask as undeformed_mask
+from cmfsim.io import Case as Case
+from cmfsim.io import Cohort as Cohort
+from cmfsim.io import read_image as read_image
+from cmfsim.io import read_landmarks as read_landmarks
+from cmfsim.io import read_moved_surface as read_moved_surface
+from cmfsim.io import read_plan as read_plan
+from cmfsim.io import read_result as read_result
+from cmfsim.io import read_scene as read_scene
+from cmfsim.io import read_surface as read_surface
+from cmfsim.io import read_tet_mesh as read_tet_mesh
+from cmfsim.io import read_transform as read_transform
+from cmfsim.io import write_image as write_image
+from cmfsim.io import write_landmarks as write_landmarks
+from cmfsim.io import write_metrics as write_metrics
+from cmfsim.io import write_model as write_model
+from cmfsim.io import write_plan as write_plan
+from cmfsim.io import write_prediction as write_prediction
+from cmfsim.io import write_result as write_result
+from cmfsim.io import write_scene as write_scene
+from cmfsim.io import write_surface as write_surface
+from cmfsim.io import write_transform as write_transform
+from cmfsim.meshing import MeshOptions as MeshOptions
+from cmfsim.meshing import MeshReport as MeshReport
+from cmfsim.meshing import TissueMesh as TissueMesh
+from cmfsim.meshing import TissueRegion as TissueRegion
+from cmfsim.meshing import anatomy_from_surfaces as anatomy_from_surfaces
+from cmfsim.meshing import mesh_from_labels as mesh_from_labels
+from cmfsim.meshing import mesh_from_level as mesh_from_level
+from cmfsim.meshing import mesh_report as mesh_report
+from cmfsim.meshing import mesh_with_tetwild as mesh_with_tetwild
+from cmfsim.meshing import part_mesh as part_mesh
+from cmfsim.meshing import signed_level as signed_level
+from cmfsim.meshing import tissue_level as tissue_level
+from cmfsim.muscles.equivalent import Mixture as Mixture
+from cmfsim.muscles.equivalent import MuscleVolume as MuscleVolume
+from cmfsim.muscles.equivalent import equivalent_material as equivalent_material
+from cmfsim.muscles.template import MorphedMusculature as MorphedMusculature
+from cmfsim.muscles.template import MuscleTemplate as MuscleTemplate
+from cmfsim.muscles.template import check_template as check_template
+from cmfsim.muscles.template import import_bodyparts3d as import_bodyparts3d
+from cmfsim.muscles.template import template_names as template_names
+from cmfsim.node_kinds import ClassifiedNodes as ClassifiedNodes
+from cmfsim.node_kinds import DentalArches as DentalArches
+from cmfsim.node_kinds import KindOptions as KindOptions
+from cmfsim.node_kinds import SlidingBox as SlidingBox
+from cmfsim.node_kinds import SlidingSphere as SlidingSphere
+from cmfsim.node_kinds import classify_nodes as classify_nodes
+from cmfsim.node_kinds import dental_arches as dental_arches
+from cmfsim.node_kinds import kind_options as kind_options
+from cmfsim.node_kinds import segment_data as segment_data
+from cmfsim.phantom import HeadParameters as HeadParameters
+from cmfsim.phantom import Muscle as Muscle
+from cmfsim.phantom import PhantomHead as PhantomHead
+from cmfsim.phantom import make_head as make_head
+from cmfsim.phantom.case_files import write_phantom_case as write_phantom_case
+from cmfsim.pipeline.building import build_case as build_case
+from cmfsim.pipeline.building import build_model as build_model
+from cmfsim.pipeline.building import with_muscles as with_muscles
+from cmfsim.pipeline.evaluating import CaseEvaluation as CaseEvaluation
+from cmfsim.pipeline.evaluating import evaluate as evaluate
+from cmfsim.pipeline.predicting import predict as predict
+from cmfsim.pipeline.predicting import predict_models as predict_models
+from cmfsim.planning.face_measures import MEASURES as MEASURES
+from cmfsim.planning.face_measures import BoneSite as BoneSite
+from cmfsim.planning.face_measures import FaceSites as FaceSites
+from cmfsim.planning.face_measures import Measure as Measure
+from cmfsim.planning.face_measures import face_sites as face_sites
+from cmfsim.planning.face_measures import measure_face as measure_face
+from cmfsim.planning.face_measures import measure_sites as measure_sites
+from cmfsim.planning.face_planning import FacePlan as FacePlan
+from cmfsim.planning.face_planning import FaceSearch as FaceSearch
+from cmfsim.planning.face_planning import MeasureTarget as MeasureTarget
+from cmfsim.planning.face_planning import PointTarget as PointTarget
+from cmfsim.planning.face_planning import SurfaceTarget as SurfaceTarget
+from cmfsim.planning.face_planning import plan_for_face as plan_for_face
+from cmfsim.planning.page import PageContent as PageContent
+from cmfsim.planning.page import page_content as page_content
+from cmfsim.planning.page import page_text as page_text
+from cmfsim.planning.page import write_planning_page as write_planning_page
+from cmfsim.planning.replanning import ExpectedError as ExpectedError
+from cmfsim.planning.replanning import PlanningModel as PlanningModel
+from cmfsim.planning.replanning import PlanTrial as PlanTrial
+from cmfsim.planning.replanning import expected_error as expected_error
+from cmfsim.planning.replanning import planning_model as planning_model
+from cmfsim.planning.server import serve_planning as serve_planning
+from cmfsim.registration import FoldReport as FoldReport
+from cmfsim.registration import LandmarkAgreement as LandmarkAgreement
+from cmfsim.registration import LandmarkMatch as LandmarkMatch
+from cmfsim.registration import fold_report as fold_report
+from cmfsim.registration import icp as icp
+from cmfsim.registration import leave_one_out as leave_one_out
+from cmfsim.registration import match_landmarks as match_landmarks
+from cmfsim.solving.models import model_scene as model_scene
+from cmfsim.solving.models import predict_patient as predict_patient
+from cmfsim.solving.simulation import scene_plan as scene_plan
+from cmfsim.solving.simulation import scene_solver as scene_solver
+from cmfsim.solving.simulation import solve_scene as solve_scene
+from cmfsim.study import SensitivityReport as SensitivityReport
+from cmfsim.study import StudyReport as StudyReport
+from cmfsim.study import landmark_trials as landmark_trials
+from cmfsim.study import run_study as run_study
+from cmfsim.study import sensitivity as sensitivity
+from cmfsim.surfaces.checks import SurfaceReport as SurfaceReport
+from cmfsim.surfaces.checks import check_surface as check_surface
+from cmfsim.surfaces.levels import contact_surface as contact_surface
+from cmfsim.surfaces.repair import RepairOptions as RepairOptions
+from cmfsim.surfaces.repair import repair_surface as repair_surface
+from cmfsim.values.anatomy import Anatomy as Anatomy
+from cmfsim.values.anatomy import BoneSegment as BoneSegment
+from cmfsim.values.case_parts import CaseMuscles as CaseMuscles
+from cmfsim.values.clinical_motion import ClinicalMotion as ClinicalMotion
+from cmfsim.values.clinical_motion import clinical_motion as clinical_motion
+from cmfsim.values.clinical_motion import planned_motion as planned_motion
+from cmfsim.values.dental_arch import DentalArch as DentalArch
+from cmfsim.values.finding import Finding as Finding
+from cmfsim.values.image_data import ImageData as ImageData
+from cmfsim.values.landmark_sites import SKULL_LANDMARKS as SKULL_LANDMARKS
+from cmfsim.values.motion import RigidMotion as RigidMotion
+from cmfsim.values.motion import decompose_motion as decompose_motion
+from cmfsim.values.motion import rigid_matrix as rigid_matrix
+from cmfsim.values.motion import rigid_motion as rigid_motion
+from cmfsim.values.musculature import MuscleSurface as MuscleSurface
+from cmfsim.values.musculature import Musculature as Musculature
+from cmfsim.values.node_kinds import NodeKinds as NodeKinds
+from cmfsim.values.patient_model import PatientModel as PatientModel
+from cmfsim.values.prediction import MODELS as MODELS
+from cmfsim.values.prediction import Prediction as Prediction
+from cmfsim.values.scene import Scene as Scene
+from cmfsim.values.scene import SceneResult as SceneResult
+from cmfsim.values.scene import SegmentData as SegmentData
+from cmfsim.values.solver_options import SolverOptions as SolverOptions
+from cmfsim.values.surface_data import MovedSurface as MovedSurface
+from cmfsim.values.surface_data import SurfaceData as SurfaceData
+from cmfsim.values.tissue_data import TissueData as TissueData
+from cmfsim.virtual import virtual_patients as virtual_patients
+from cmfsim.virtual import write_virtual_patient as write_virtual_patient

@@ -1,33 +1,39 @@
 """Names that a package loads when they are first asked for: a scene pays for what it has."""
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 __all__ = ["deferred"]
 
+# A line of a stub that makes a name of another module public.
+PUBLIC = re.compile(r"^from (\S+) import (\w+) as \2$", re.MULTILINE)
+
 
 def deferred(
-    package: str, homes: Mapping[str, tuple[str, ...]]
+    package: str, file: str
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """The `__getattr__`, `__dir__` and `__all__` of a package (Python reference, 3.3.2.1).
 
+    The stub next to its `__init__.py` has the one list of its public names, a line each:
+    `from module import name as name`. Modules and folders of the package too are attributes.
+
     Parameters
     ----------
-    package : str
-        Its `__name__`.
-    homes : mapping of str to tuple of str
-        The public names by the module of the package that defines them, `folder.module` where
-        it lies in a folder. Modules and folders too are attributes. `__init__.pyi` has the same
-        list for type checkers.
+    package, file : str
+        Its `__name__` and `__file__`.
     """
-    home_of = {name: home for home, names in homes.items() for name in names}
+    stub = Path(file).with_suffix(".pyi").read_text(encoding="utf-8")
+    home_of = {name: home for home, name in PUBLIC.findall(stub)}
     names = sorted(home_of)
-    beside = {home.split(".")[0] for home in homes}
+    inside = [home for home in home_of.values() if home.startswith(f"{package}.")]
+    beside = {home.removeprefix(f"{package}.").split(".")[0] for home in inside}
 
     def get(name: str) -> Any:
         if name in home_of:
-            value = getattr(import_module(f"{package}.{home_of[name]}"), name)
+            value = getattr(import_module(home_of[name]), name)
         elif name in beside:
             value = import_module(f"{package}.{name}")
         else:

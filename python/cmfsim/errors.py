@@ -64,3 +64,10 @@ class ImageInputError(ImageError, ValueError):
 
 class RegistrationInputError(RegistrationError, ValueError):
     """Points, surfaces or volumes that cannot be brought together as they are."""
+
+
+def error_text(error: BaseException) -> str:
+    """The text of an error; a file of the system's errors comes first, as in the package's own."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return str(error) or type(error).__name__

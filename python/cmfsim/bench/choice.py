@@ -11,7 +11,8 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.prediction import MODELS
-from cmfsim.values.scene import MIXINGS, SolverOptions
+from cmfsim.values.solver_options import SolverOptions
+from cmfsim.values.tissue_data import MIXINGS
 
 __all__ = ["Choice", "case_choice"]
 

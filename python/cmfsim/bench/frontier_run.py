@@ -5,7 +5,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -24,19 +24,19 @@ from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.io import Case
 from cmfsim.io.archives import member_of, read_archive
 from cmfsim.pipeline.building import input_hashes
+from cmfsim.progress import Progress, no_progress
 
 __all__ = ["content_key", "frontier"]
 
 _log = logging.getLogger(__name__)
 
-Progress = Callable[[str], None]
 # A solve that takes longer than this is timed once, s: repeats tell short ones apart.
 LONG = 60.0
 # Time that the reference may take, in that of any other choice.
 REFERENCE_PATIENCE = 10.0
 
 
-def frontier(
+def frontier(  # noqa: PLR0913 (options by name)
     case: Case,
     folder: str | os.PathLike[str],
     choices: Iterable[Choice] | None = None,
@@ -114,7 +114,7 @@ def frontier(
         threads=threads,
         time_limit=as_positive("time_limit", time_limit),
         fresh=fresh,
-        say=progress or _quiet,
+        say=progress or no_progress,
     )
     everyone = [reference, *choices]
     jobs.time_limit *= REFERENCE_PATIENCE
@@ -124,7 +124,7 @@ def frontier(
     if "error" in first:
         raise SolverError(
             f"the reference ({_label(reference, base)}) failed, so that nothing can be compared "
-            f"with it: {first['error']}; mend that, or give another reference"
+            f"with it: {first['error']}; fix that, or give another reference"
         )
     for number in range(repeats):
         for choice in choices:
@@ -332,7 +332,3 @@ def _sampling(choice: Choice) -> str:
     if not choice.model.startswith("M"):
         return ", no muscles"
     return f", {choice.samples} samples, {choice.mixing}"
-
-
-def _quiet(stage: str) -> None:
-    del stage

@@ -5,10 +5,12 @@ from dataclasses import fields, replace
 from types import MappingProxyType
 from typing import Any
 
+from cmfsim._core import ELEMENTS, KINEMATICS, METHODS
 from cmfsim.bench.choice import Choice
 from cmfsim.errors import CaseInputError
 from cmfsim.values.prediction import MODELS
-from cmfsim.values.scene import CONTACTS, ELEMENTS, KINEMATICS, METHODS, MIXINGS
+from cmfsim.values.solver_options import CONTACTS
+from cmfsim.values.tissue_data import MIXINGS
 
 __all__ = ["EDGES", "FACTORS", "reference_choice", "sweep_choices"]
 
@@ -126,7 +128,7 @@ def _varied(base: Choice, name: str, values: Sequence[Any]) -> Iterator[Choice]:
 
 
 def _early(base: Choice, kinematics: Sequence[str]) -> Iterator[Choice]:
-    """Large deformation that stops early: what the last steps mend is a few tets, not the face."""
+    """Large deformation that stops early: what the last steps fix is a few tets, not the face."""
     for name in kinematics:
         if name != "linear":
             for tolerance in EARLY:

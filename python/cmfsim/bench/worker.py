@@ -24,7 +24,7 @@ from cmfsim.pipeline.building import build_model
 from cmfsim.solving.models import model_scene
 from cmfsim.solving.simulation import solve_scene
 from cmfsim.values.prediction import carried_points
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["MOVED_FORMAT", "main"]
 

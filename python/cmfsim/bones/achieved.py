@@ -32,7 +32,7 @@ from cmfsim.registration import icp
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import RigidMotion, decompose_motion, rigid_matrix
-from cmfsim.values.scene import MovedSurface, SurfaceData
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = [
     "AchievedMotion",

@@ -15,8 +15,10 @@ from cmfsim.checks import as_number, check_instance
 from cmfsim.errors import CaseInputError
 from cmfsim.extras import third_party
 from cmfsim.surfaces.levels import SurfaceOptions, block_of, surface_of_level
-from cmfsim.values.anatomy import BoneSegment, Finding, ImageData
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["CutBones", "CutOptions", "cut_bones", "segments_from_surfaces"]
 
@@ -149,7 +151,7 @@ def cut_bones(
     grid = next(iter(bones.values()))
     for procedure in placed:
         for cut in procedure.cuts:
-            _make_cut(procedure, cut, grid, pieces, findings, options)
+            _make_cut(procedure, cut, grid, pieces, findings=findings, options=options)
     levels = {name: grid.with_values(values) for name, values in pieces.items()}
     # Marching cubes and smoothing of one piece go on while another is decimated; decimation itself
     # takes one piece at a time.
@@ -226,6 +228,7 @@ def _make_cut(
     cut: Cut,
     grid: ImageData,
     pieces: dict[str, Levels],
+    *,
     findings: list[Finding],
     options: CutOptions,
 ) -> None:
@@ -263,26 +266,24 @@ def _make_cut(
         moved, kept = _join_crumbs(one, other, bone, limit, int(options.crumb_volume / voxel))
         if moved:
             findings.append(
-                Finding(
-                    "note",
+                Finding.note(
                     "osteotomy-crumbs",
                     f"{len(moved)} pieces of {both[0]!r} that the cut parted from it, "
                     f"{sum(moved) * voxel:.0f} mm³ in all, stay with {both[1]!r}",
-                    procedure.kind,
-                    "they would move with a bone that they do not hang on",
-                    "move the planes, or lower crumb_volume",
+                    where=procedure.kind,
+                    why="they would move with a bone that they do not hang on",
+                    fix="move the planes, or lower crumb_volume",
                 )
             )
         if kept:
             findings.append(
-                Finding(
-                    "warning",
+                Finding.warning(
                     "osteotomy-parts",
                     f"{both[0]!r} has {len(kept) + 1} separate parts; the smaller have "
                     f"{', '.join(f'{n * voxel:.0f}' for n in kept)} mm³",
-                    procedure.kind,
-                    "parts that are not joined move together all the same",
-                    "look at the picture of the segments; move the planes",
+                    where=procedure.kind,
+                    why="parts that are not joined move together all the same",
+                    fix="look at the picture of the segments; move the planes",
                 )
             )
     names_now = list(pieces.items())

@@ -20,7 +20,7 @@ from cmfsim.errors import BoundaryInputError, RegistrationError
 from cmfsim.extras import third_party
 from cmfsim.surfaces.checks import duplicate_triangles, has_three_corners, thin_triangles
 from cmfsim.surfaces.topology import connected_labels, edges_of
-from cmfsim.values.scene import MovedSurface, SurfaceData
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = [
     "RemovedBone",

@@ -11,8 +11,9 @@ from cmfsim.bones.cutting import SURFACES_AT_ONCE
 from cmfsim.bones.segment_checks import check_segments
 from cmfsim.errors import CaseInputError
 from cmfsim.surfaces.levels import surface_of_level
-from cmfsim.values.anatomy import BoneSegment, ImageData
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["part_segment"]
 

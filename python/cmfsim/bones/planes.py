@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from cmfsim.checks import Floats, as_rows, as_text, check_instance
 from cmfsim.errors import CaseInputError
-from cmfsim.values.anatomy import Finding, ImageData
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["Cut", "CuttingPlane", "Procedure", "free_cut"]
 

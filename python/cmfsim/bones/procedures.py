@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from cmfsim.bones.planes import Cut, CuttingPlane, Procedure
 from cmfsim.checks import Floats, as_number, check_one_of
 from cmfsim.errors import CaseInputError, LandmarkInputError
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["PROCEDURES", "place_procedure", "procedure_options"]
 
@@ -244,9 +244,14 @@ def _unit(kind: str, what: str, vector: Floats) -> Floats:
 
 
 def _frame(
-    kind: str, points: Mapping[str, Floats], pairs: Sequence[str], tip: Floats, back: Floats,
+    kind: str,
+    points: Mapping[str, Floats],
+    pairs: Sequence[str],
+    *,
+    tip: Floats,
+    back: Floats,
     above: Floats,
-) -> _Frame:  # fmt: skip
+) -> _Frame:
     """Left from the pairs, front from `back` to `tip`, up towards `above`; each at right angles."""
     sides = sum((points[f"{n}_L"] - points[f"{n}_R"] for n in pairs), np.zeros(3))
     left = _unit(kind, f"left and right {pairs[0]}", sides)
@@ -262,9 +267,9 @@ def _upper_frame(kind: str, points: Mapping[str, Floats]) -> _Frame:
         kind,
         points,
         ("supra_m2",),
-        points["supradentale"],
-        _middle(points, "supra_m2"),
-        points["nasion"] - points["supradentale"],
+        tip=points["supradentale"],
+        back=_middle(points, "supra_m2"),
+        above=points["nasion"] - points["supradentale"],
     )
 
 
@@ -272,9 +277,9 @@ def _lower_frame(kind: str, points: Mapping[str, Floats]) -> _Frame:
     """Along the bite: from the rami at its height to the edges of the lower incisors."""
     back, above = _middle(points, "occlusal_line"), points["infradentale"] - points["menton"]
     names = ("occlusal_line", "sub_m2")
-    first = _frame(kind, points, names, points["infradentale"], back, above)
+    first = _frame(kind, points, names, tip=points["infradentale"], back=back, above=above)
     tip = points["infradentale"] + LOWER_INCISOR_CROWN * first.up
-    return _frame(kind, points, names, tip, back, above)
+    return _frame(kind, points, names, tip=tip, back=back, above=above)
 
 
 def _turned(vector: Floats, towards: Floats, degrees: float) -> Floats:
@@ -380,14 +385,13 @@ def _genioplasty(
     findings: tuple[Finding, ...] = ()
     if clearance < wanted:
         findings = (
-            Finding(
-                "warning",
+            Finding.warning(
                 "chin-short",
                 f"the chin is {symphysis:.1f} mm high, so the cut passes {clearance:.1f} mm below "
                 f"the estimated roots instead of {wanted:.1f} mm",
-                "genioplasty",
-                "the piece is low, and the cut near the roots",
-                "look at the cut in the picture; set clearance, or give the plane",
+                where="genioplasty",
+                why="the piece is low, and the cut near the roots",
+                fix="look at the cut in the picture; set clearance, or give the plane",
             ),
         )
     front = tip - (LOWER_CANINE_REACH + clearance) * frame.up

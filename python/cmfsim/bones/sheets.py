@@ -16,8 +16,9 @@ from cmfsim.checks import Floats, as_positive, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.extras import third_party
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
-from cmfsim.values.anatomy import SHEET_DEPTH, DentalArch, ImageData
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.dental_arch import SHEET_DEPTH, DentalArch
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["ContactSheet", "SheetOptions", "contact_sheet", "sheet_departure"]
 

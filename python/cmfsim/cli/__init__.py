@@ -19,8 +19,8 @@ from cmfsim.cli.case_commands import print_findings
 from cmfsim.cli.exit_codes import BAD_INPUT, CLOSED, DONE, FAILED
 from cmfsim.cli.notices import FindingsError
 from cmfsim.cli.parsing import make_parser
-from cmfsim.cli.terminal import ProgressHandler, error_text, print_error
-from cmfsim.errors import CmfsimError
+from cmfsim.cli.terminal import ProgressHandler, print_error
+from cmfsim.errors import CmfsimError, error_text
 
 __all__ = ["BAD_INPUT", "CLOSED", "DONE", "FAILED", "main"]
 

@@ -1,8 +1,7 @@
-"""`cmfsim bench`: what accuracy costs, here and elsewhere, and where methods end."""
+"""`cmfsim bench`: what accuracy costs."""
 
 import argparse
 import json
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -21,32 +20,13 @@ from cmfsim.bench.files import write_frontier
 from cmfsim.bench.table import GRID, base_verdict
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.terminal import StageProgress, escaped
-from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.phantom import make_head
 from cmfsim.phantom.case_files import write_phantom_case
 
-__all__ = ["FRONTIER_FOLDER", "SCRIPTS", "frontier", "script"]
+__all__ = ["FRONTIER_FOLDER", "frontier"]
 
 FRONTIER_FOLDER = Path("cmfsim-frontier")
-# Benches of a source checkout by name: what they tell, words to try, and where they are.
-SCRIPTS = {
-    "peers": (
-        "compare with other finite-element programs",
-        "--tets 20000 --peers ngsolve",
-        Path("benches/peers/run.py"),
-    ),
-    "stability": (
-        "stiff and extreme cases: residual, error, verdict",
-        "--markdown table.md",
-        Path("benches/stability.py"),
-    ),
-    "elements": (
-        "elements and kinematics on a shell: error against time",
-        "--level 1 --layers 2",
-        Path("benches/elements.py"),
-    ),
-}
 # Of the made head's CT, mm.
 PHANTOM_SPACING = 1.0
 
@@ -132,31 +112,3 @@ def _text(found: Frontier) -> str:
         )
     lines.append(f"  base {base_verdict(base)}")
     return "\n".join(lines)
-
-
-def script(options: argparse.Namespace) -> int:
-    """Runs a bench of a source checkout; its exit code is its own."""
-    path = SCRIPTS[options.action][-1]
-    command = [sys.executable, str(_checkout(options.checkout, path) / path)]
-    if options.quiet:
-        command.append("--quiet")
-    command += options.words
-    return subprocess.run(command, check=False).returncode  # noqa: S603 (the checkout's own script)
-
-
-def _checkout(given: Path | None, path: Path) -> Path:
-    """The checkout that has `path`: as given, or the first at or above the working directory."""
-    if given is not None:
-        if not (given / path).is_file():
-            raise CaseInputError(
-                f"{given}: has no {path}: give the folder of a checkout of cmfsim's source"
-            )
-        return given
-    here = Path.cwd()
-    for folder in (here, *here.parents):
-        if (folder / path).is_file():
-            return folder
-    raise CaseInputError(
-        f"{here}: neither it nor a folder above it has {path}, which is part of cmfsim's source: "
-        "work in a checkout, or name it by --checkout"
-    )

@@ -16,15 +16,15 @@ from cmfsim.checks import as_positive
 from cmfsim.cli.build_report import WIDTH, build_text
 from cmfsim.cli.exit_codes import BAD_INPUT, DONE
 from cmfsim.cli.notices import FindingsError, Notices
-from cmfsim.cli.preparation import prepare
 from cmfsim.cli.terminal import StageProgress, columns, escaped, in_colour
 from cmfsim.doctor import Examination, examine, findings_text
 from cmfsim.io import Case
 from cmfsim.io.models import is_model_file
 from cmfsim.pipeline.building import plan_key
 from cmfsim.pipeline.predicting import case_for_models
-from cmfsim.values.anatomy import SEVERITIES, Finding
+from cmfsim.pipeline.preparation import prepare
 from cmfsim.values.clinical_motion import plan_lines
+from cmfsim.values.finding import SEVERITIES, Finding
 
 _log = logging.getLogger(__name__)
 # What the planning page states of the case that a plan was made for.
@@ -73,7 +73,7 @@ def build(options: argparse.Namespace) -> int:
         )
     summary = dict(built.summary)
     # Those of muscles are noticed after the last stage.
-    notices.add(Finding(**entry) for entry in summary["findings"])
+    notices.add(Finding.from_values(entry) for entry in summary["findings"])
     if not options.no_doctor:
         summary["timings"] = {"checking the case": seconds, **summary["timings"]}
     if options.json:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from typing import Any
 
 from cmfsim.cli.terminal import CLEAR_LINE, escaped, in_colour
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.finding_groups import FindingGroup, counted, grouped
 
 __all__ = ["FindingsError", "Notices"]
@@ -64,8 +64,8 @@ class Notices:
         _print(f"cmfsim: {counted(self._found)}; in full: {escaped(where)}")
         for group in groups:
             _print(f"  {_head(group)}: {escaped(group.line)}")
-            if group.worst.mend:
-                _print(f"    fix: {escaped(group.worst.mend)}")
+            if group.worst.fix:
+                _print(f"    fix: {escaped(group.worst.fix)}")
 
     def as_dicts(self) -> list[dict[str, Any]]:
         """Plain values, ready for JSON."""

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim import __version__
+from cmfsim._core import ELEMENTS, KINEMATICS, METHODS
 from cmfsim.bench import EDGES, FACTORS
 from cmfsim.cli import (
     bench_command,
@@ -21,7 +22,7 @@ from cmfsim.cli import (
 from cmfsim.io import result_suffixes
 from cmfsim.muscles.template import WHERE
 from cmfsim.values.prediction import MODELS
-from cmfsim.values.scene import CONTACTS, ELEMENTS, KINEMATICS, METHODS
+from cmfsim.values.solver_options import CONTACTS
 from cmfsim.virtual import PATIENTS
 
 __all__ = ["make_parser"]
@@ -208,7 +209,6 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     )
     evaluate.add_argument("--model", **models, help="as in predict (default all)")
     # For a study's own processes: they end when what started them does.
-    evaluate.add_argument("--end-with-input", action="store_true", help=argparse.SUPPRESS)
     for command in (predict, evaluate):
         command.add_argument("--no-report", action="store_true", help="make no report.html")
     evaluate.set_defaults(run=study_commands.evaluate)
@@ -288,7 +288,7 @@ def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> No
     check = actions.add_parser(
         "check",
         parents=[named],
-        help="say what is wrong with a template, and how to mend it",
+        help="say what is wrong with a template, and how to fix it",
         epilog="Exit codes: 0 no errors found, 2 errors found or there is no such template.",
     )
     check.set_defaults(run=template_commands.check)
@@ -338,7 +338,7 @@ def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> No
 
 
 def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
-    bench = commands.add_parser("bench", help="measure: error against run time, other programs")
+    bench = commands.add_parser("bench", help="measure: error against run time")
     actions = bench.add_subparsers(dest="action", metavar="ACTION", required=True)
 
     frontier = actions.add_parser(
@@ -395,16 +395,3 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     )
     frontier.add_argument("--fresh", action="store_true", help="do finished runs again")
     frontier.set_defaults(run=bench_command.frontier)
-
-    for name, (purpose, words, path) in bench_command.SCRIPTS.items():
-        command = actions.add_parser(
-            name,
-            help=f"{purpose}; needs a checkout of the source",
-            epilog=f"Words after -- go to {path}: -- {words}",
-        )
-        command.add_argument(
-            "--checkout", metavar="FOLDER", type=Path, help="(default the working directory's)"
-        )
-        command.add_argument("-q", "--quiet", action="store_true", help="no progress lines")
-        command.add_argument("words", metavar="WORD", nargs="*", help=f"for {path}")
-        command.set_defaults(run=bench_command.script)

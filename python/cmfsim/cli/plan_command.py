@@ -15,13 +15,14 @@ import numpy as np
 from cmfsim.cli.case_commands import case_of, checked
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.notices import Notices
-from cmfsim.cli.preparation import prepare
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.cli.wished_faces import TARGET_STD, read_targets
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_plan
 from cmfsim.pictures import has_screen
+from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
+from cmfsim.pipeline.preparation import prepare
 from cmfsim.planning.face_planning import FacePlan, FaceSearch, plan_for_face
 from cmfsim.planning.page import PAGE_FILE, PageContent, page_content, write_planning_page
 from cmfsim.planning.replanning import ExpectedError, PlanningModel, expected_error, planning_model
@@ -94,14 +95,10 @@ def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
     models = (options.model,)
     findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
-        patient = build_patient(
-            case,
-            models,
-            progress=progress.stage,
-            check=False,
-            findings=findings,
-            on_findings=notices.add,
+        asked = BuildOptions(
+            progress=progress.stage, check=False, findings=findings, on_findings=notices.add
         )
+        patient = build_patient(case, models, asked)
         progress.stage("computing the plan operator")
         planning = planning_model(patient, options.model)
         progress.stage("solving the case's plan")

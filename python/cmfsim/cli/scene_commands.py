@@ -16,7 +16,7 @@ from cmfsim.cli.terminal import escaped
 from cmfsim.errors import CaseInputError
 from cmfsim.io import read_plan, read_scene, result_suffixes, write_result
 from cmfsim.solving.simulation import solve_scene
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.scene import Scene
 
 __all__ = ["info", "solve"]
@@ -32,7 +32,7 @@ def solve(options: argparse.Namespace) -> int:
     write_result(options.output, result)
     logging.getLogger("cmfsim").info("wrote %s", options.output)
     summary = dict(result.summary)
-    Notices(quiet=options.quiet).add(Finding(**entry) for entry in summary["findings"])
+    Notices(quiet=options.quiet).add(Finding.from_values(entry) for entry in summary["findings"])
     size = np.linalg.norm(result.displacements, axis=1)
     if options.json:
         extra = {"output": str(options.output), "seconds": seconds, "largest": float(size.max())}

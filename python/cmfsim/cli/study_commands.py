@@ -10,8 +10,7 @@ from typing import Any
 from cmfsim.cli.case_commands import case_of, checked
 from cmfsim.cli.exit_codes import DONE, FAILED
 from cmfsim.cli.notices import Notices
-from cmfsim.cli.preparation import prepare
-from cmfsim.cli.terminal import StageProgress, end_with_input, escaped
+from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.errors import CmfsimError
 from cmfsim.io import Cohort, read_landmark_file, replacing
 from cmfsim.pipeline.evaluating import evaluate as evaluate_case
@@ -20,11 +19,12 @@ from cmfsim.pipeline.outputs import (
     WrittenResults,
     write_case_report,
     write_results,
-    write_study_report,
 )
 from cmfsim.pipeline.predicting import predict_models
+from cmfsim.pipeline.preparation import prepare
 from cmfsim.study import CaseOutcome, StudyReport, run_study
 from cmfsim.study import sensitivity as landmark_sensitivity
+from cmfsim.study.outputs import write_study_report
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import MODELS, Prediction
 
@@ -95,8 +95,6 @@ def _at_least_one(
 
 def evaluate(options: argparse.Namespace) -> int:
     """Predicts a case and compares it with the face after the operation."""
-    if options.end_with_input:
-        end_with_input()
     case = case_of(options)
     models = models_of(options.model, MODELS)
     prepare(case, report=not options.no_report, evaluation=True)

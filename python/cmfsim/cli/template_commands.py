@@ -22,7 +22,7 @@ from cmfsim.muscles.template import (
     template_names,
 )
 from cmfsim.pictures import picture_muscles
-from cmfsim.values.anatomy import SEVERITIES, Finding
+from cmfsim.values.finding import SEVERITIES, Finding
 from cmfsim.values.musculature import Musculature
 
 __all__ = ["check", "import_atlas", "list_templates", "morph", "show"]
@@ -70,7 +70,7 @@ def check(options: argparse.Namespace) -> int:
 
 
 def import_atlas(options: argparse.Namespace) -> int:
-    """Makes a template of the files of an atlas, and writes it with what was mended."""
+    """Makes a template of the files of an atlas, and writes it with what was repaired."""
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         template = import_bodyparts3d(
             options.folder,

@@ -1,6 +1,5 @@
 """What the command line prints for a person: errors, log lines, the stage of the work."""
 
-import contextlib
 import logging
 import os
 import shutil
@@ -10,15 +9,13 @@ import time
 from types import TracebackType
 from typing import TextIO
 
-from cmfsim.cli.exit_codes import FAILED
+from cmfsim.errors import error_text
 
 __all__ = [
     "CLEAR_LINE",
     "ProgressHandler",
     "StageProgress",
     "columns",
-    "end_with_input",
-    "error_text",
     "escaped",
     "in_colour",
     "print_error",
@@ -108,27 +105,6 @@ class StageProgress:
 def print_error(error: BaseException) -> None:
     """Prints an error as one line on standard error."""
     print(f"cmfsim: error: {escaped(error_text(error))}", file=sys.stderr)
-
-
-def error_text(error: BaseException) -> str:
-    """The text of an error; a file of the system's errors comes first, as in the package's own."""
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror}"
-    return str(error) or type(error).__name__
-
-
-def end_with_input() -> None:
-    """Has the process end at once when standard input does: with the process that started it."""
-
-    def wait() -> None:
-        # Not through `sys.stdin`, whose lock the end of the interpreter would wait for.
-        with contextlib.suppress(OSError):
-            while os.read(0, 1024):
-                pass
-        # Results are whole whenever a process ends.
-        os._exit(FAILED)
-
-    threading.Thread(target=wait, daemon=True).start()
 
 
 def escaped(text: str) -> str:

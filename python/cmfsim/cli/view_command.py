@@ -15,7 +15,7 @@ from cmfsim.io import Case, read_parts, read_result, read_scene, read_surface
 from cmfsim.io.predictions import predictions_of
 from cmfsim.muscles.template import joined_surface
 from cmfsim.pictures import KIND_COLOURS, SKIN_COLOUR, ViewPart, segment_colours, view_parts
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["parts_of", "view"]
 

@@ -1,4 +1,4 @@
-"""What will go wrong with a case, said before any work is done: each with why and how to mend it.
+"""What will go wrong with a case, said before any work is done: each with why and how to fix it.
 
 `diagnose` reads the files of a case and looks; it changes and writes nothing. `evidence` is what
 was read, `placement` asks whether it lies where it should, `surfaces` whether it is sound,
@@ -23,8 +23,8 @@ from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
 from cmfsim.doctor.report import findings_text
 from cmfsim.doctor.surfaces import check_image, check_mesh_size, check_surfaces
 from cmfsim.io import CaseOrPath, as_case
-from cmfsim.values.anatomy import SEVERITIES, Finding
 from cmfsim.values.clinical_motion import ClinicalMotion
+from cmfsim.values.finding import SEVERITIES, Finding
 
 __all__ = [
     "Examination",
@@ -77,7 +77,7 @@ def diagnose(case: CaseOrPath, models: Sequence[str] | None = None) -> tuple[Fin
     --------
     >>> import cmfsim
     >>> for finding in cmfsim.diagnose(cmfsim.Case.load("case.toml")):  # doctest: +SKIP
-    ...     print(finding.severity, finding.what, finding.mend)
+    ...     print(finding.severity, finding.what, finding.fix)
     """
     return examine(case, models).findings
 

@@ -9,7 +9,7 @@ from cmfsim.doctor.evidence import Evidence
 from cmfsim.doctor.placement import LANDMARK_WARNING
 from cmfsim.errors import CmfsimError
 from cmfsim.io import read_landmark_file, read_surface
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["check_after"]
 
@@ -29,26 +29,25 @@ def check_after(evidence: Evidence) -> Iterator[Finding]:
         places = read_landmark_file(given.landmarks, frame=case.landmarks.frame).points
         closest, _, _ = Surface(skin.vertices, skin.triangles).closest([*places.values()])
     except CmfsimError as error:
-        yield Finding(
-            "error",
+        yield Finding.error(
             "postoperative-unreadable",
             str(error),
-            where,
-            "the prediction cannot be compared with the face after the operation",
-            "mend or replace the file",
+            where=where,
+            why="the prediction cannot be compared with the face after the operation",
+            fix="repair or replace the file",
         )
         return
     away = np.linalg.norm(closest - np.array([*places.values()]), axis=1)
     far = [n for n, d in zip(places, away, strict=True) if d > LANDMARK_WARNING]
     if far:
         more = ", …" if len(far) > 4 else ""
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "postoperative-landmarks-off",
             f"{len(far)} of {len(away)} landmarks lie more than {LANDMARK_WARNING:g} mm from the "
             f"skin after the operation, {away.max():.1f} mm at most: {', '.join(far[:4])}{more}",
-            where,
-            "partners are looked for where these landmarks carry the prediction: errors would be "
+            where=where,
+            why="partners are looked for where these landmarks carry the prediction: errors would "
+            "be "
             "those of the landmarks",
-            "place them on the skin after the operation, not on the one before",
+            fix="place them on the skin after the operation, not on the one before",
         )

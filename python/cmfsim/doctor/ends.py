@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from cmfsim.doctor.evidence import Evidence
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["check_ends"]
 
@@ -38,15 +38,14 @@ def check_ends(evidence: Evidence) -> Iterator[Finding]:
     # A jaw that lies beyond the end altogether is another finding's.
     if room >= NEAR_END or top < end:
         return
-    yield Finding(
-        "warning",
+    yield Finding.warning(
         "segment-near-end",
         f"{', '.join(sorted(moving))} moves, and the tissue ends, fixed, {max(room, 0.0):.1f} mm "
         f"below {where} (z = {place:.1f} mm, end at {end:.1f} mm; at least {NEAR_END:g} mm is "
         "needed)",
-        key,
-        "tissue below the chin cannot follow: the face there moves too little, or not at all",
-        f"use data where {how}, or leave chin and throat out of the evaluation",
+        where=key,
+        why="tissue below the chin cannot follow: the face there moves too little, or not at all",
+        fix=f"use data where {how}, or leave chin and throat out of the evaluation",
     )
 
 

@@ -17,9 +17,10 @@ from cmfsim.io.images import read_image_file
 from cmfsim.io.transforms import TransformFile, read_transform_file
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
-from cmfsim.values.anatomy import Finding, ImageData
 from cmfsim.values.case_parts import CaseMotion, CaseSurfaces
-from cmfsim.values.scene import MovedSurface, SurfaceData
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = ["Body", "Evidence", "gather"]
 
@@ -31,7 +32,7 @@ FAR_TOO_LONG = 4200.0
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A surface of the case, as read and as it would be mended.
+    """A surface of the case, as read and as it would be repaired.
 
     Attributes
     ----------
@@ -51,19 +52,19 @@ class Body:
         return check_surface(self.surface)
 
     @cached_property
-    def mended(self) -> SurfaceData:
+    def repaired(self) -> SurfaceData:
         """The surface closed and outward, as `build` would make it."""
         return repair_surface(self.surface, self.name, RepairOptions())[0]
 
     @cached_property
     def index(self) -> Surface:
-        """Closest points and winding numbers of the mended surface."""
-        return Surface(self.mended.vertices, self.mended.triangles)
+        """Closest points and winding numbers of the repaired surface."""
+        return Surface(self.repaired.vertices, self.repaired.triangles)
 
     @cached_property
     def samples(self) -> Floats:
         """Vertices, evenly taken from the list where there are many."""
-        vertices = np.asarray(self.mended.vertices)
+        vertices = np.asarray(self.repaired.vertices)
         step = -(-len(vertices) // MAX_SAMPLES)
         return vertices[::step]
 
@@ -121,7 +122,7 @@ class Evidence:
         """
         if self.skin is None:
             return np.ones(len(points), dtype=bool)
-        depths = np.asarray(self.skin.mended.vertices)[:, 1]
+        depths = np.asarray(self.skin.repaired.vertices)[:, 1]
         region = self.case.region
         try:
             plane = region.plane(self.skull_landmarks, float(depths.min()), float(depths.max()))
@@ -188,24 +189,22 @@ def gather(case: Case) -> Evidence:
         case.region.plane(skull, 0.0, 0.0)
     except CaseError as error:
         findings.append(
-            Finding(
-                "error",
+            Finding.error(
                 "region-unplaced",
                 str(error),
-                case.where("region.posterior_depth"),
-                "the face cannot be parted from the rest of the head",
-                "place these landmarks, or give posterior_plane",
+                where=case.where("region.posterior_depth"),
+                why="the face cannot be parted from the rest of the head",
+                fix="place these landmarks, or give posterior_plane",
             )
         )
     if case.tissue.kind == "preset" and case.tissue.preset not in PRESETS:
         findings.append(
-            Finding(
-                "error",
+            Finding.error(
                 "tissue-preset",
                 f"preset is {case.tissue.preset!r}",
-                case.where("tissue.preset"),
-                "no tissue can be made from it",
-                f"use one of: {', '.join(PRESETS)}",
+                where=case.where("tissue.preset"),
+                why="no tissue can be made from it",
+                fix=f"use one of: {', '.join(PRESETS)}",
             )
         )
     _check_output(case, findings)
@@ -229,19 +228,18 @@ def _body(
     try:
         surface = read_surface(path, units=given.units, frame=given.frame)
         body = Body(key.removeprefix("bones."), where, surface)
-        # Triangles that are all without area pass the reader and fail when the surface is mended.
+        # Triangles that are all without area pass the reader and fail when the surface is repaired.
         # Coordinates in a wrong unit may fail too; the check of sizes reports the unit.
         if not (is_sized and np.ptp(surface.vertices, axis=0).max() > FAR_TOO_LONG):
             _ = body.index
     except CmfsimError as error:
         findings.append(
-            Finding(
-                "error",
+            Finding.error(
                 "surface-unreadable",
                 str(error),
-                where,
-                "nothing can be built from it",
-                "export it again from the program that made it, as STL, PLY, OBJ or VTP",
+                where=where,
+                why="nothing can be built from it",
+                fix="export it again from the program that made it, as STL, PLY, OBJ or VTP",
             )
         )
         return None
@@ -258,13 +256,12 @@ def _image(case: Case, findings: list[Finding]) -> ImageData | None:
         found = read_image_file(path, series=case.image.series)
     except (CmfsimError, MemoryError) as error:
         findings.append(
-            Finding(
-                "error",
+            Finding.error(
                 "image-unreadable",
                 str(error),
-                f"{case.where('image.file')} ({path.name})",
-                "nothing can be built from it",
-                "export the CT series again, as DICOM, NRRD or NIfTI",
+                where=f"{case.where('image.file')} ({path.name})",
+                why="nothing can be built from it",
+                fix="export the CT series again, as DICOM, NRRD or NIfTI",
             )
         )
         return None
@@ -282,13 +279,12 @@ def _transform(
         return read_transform_file(motion.transform, direction=motion.direction, frame=motion.frame)
     except CmfsimError as error:
         findings.append(
-            Finding(
-                "error",
+            Finding.error(
                 "transform-unreadable",
                 str(error),
-                case.where(f"plan.{name}.transform"),
-                f"nobody knows how {name} moves",
-                "save it again as one rigid ITK transform (.tfm or .h5), or write a matrix",
+                where=case.where(f"plan.{name}.transform"),
+                why=f"nobody knows how {name} moves",
+                fix="save it again as one rigid ITK transform (.tfm or .h5), or write a matrix",
             )
         )
         return None
@@ -303,13 +299,12 @@ def _landmarks(
         found = read_landmark_file(path, frame=case.landmarks.frame)
     except CmfsimError as error:
         findings.append(
-            Finding(
-                "error",
+            Finding.error(
                 "landmarks-unreadable",
                 str(error),
-                case.where(key),
-                "cuts and muscles are placed from landmarks",
-                "correct the file, or save it again from 3D Slicer",
+                where=case.where(key),
+                why="cuts and muscles are placed from landmarks",
+                fix="correct the file, or save it again from 3D Slicer",
             )
         )
         return {}
@@ -340,13 +335,12 @@ def _check_file(
     if not what:
         return True
     findings.append(
-        Finding(
-            "error",
+        Finding.error(
             "file-missing",
             what,
-            case.where(key),
-            "the case cannot be built without it",
-            f"correct the path; it is relative to {case.file.parent.resolve()}",
+            where=case.where(key),
+            why="the case cannot be built without it",
+            fix=f"correct the path; it is relative to {case.file.parent.resolve()}",
         )
     )
     return False
@@ -360,12 +354,11 @@ def _check_output(case: Case, findings: list[Finding]) -> None:
         return
     what = "may not be written to" if folder.is_dir() else "is a file, not a folder"
     findings.append(
-        Finding(
-            "error",
+        Finding.error(
             "output-not-writable",
             f"{folder} {what}",
-            case.where("output.folder"),
-            "results could not be written after the work is done",
-            "name another folder, or change its permissions",
+            where=case.where("output.folder"),
+            why="results could not be written after the work is done",
+            fix="name another folder, or change its permissions",
         )
     )

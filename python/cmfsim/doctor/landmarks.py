@@ -20,7 +20,8 @@ from cmfsim.registration import (
     mirror_agreement,
     swapped_names,
 )
-from cmfsim.values.anatomy import Finding, ImageData
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = [
     "LANDMARK_CODES",
@@ -187,26 +188,30 @@ def _off_surface(
         and shift.after <= SHIFT_LEAVES * shift.before
     ):
         yield Finding(
-            "error" if shift.size > SHIFT_ERROR else "warning",
-            "landmarks-shifted",
-            f"all {n} landmarks of the {key} lie {shift_text(shift.offset)}: moved back, they lie "
+            severity="error" if shift.size > SHIFT_ERROR else "warning",
+            code="landmarks-shifted",
+            what=f"all {n} landmarks of the {key} lie {shift_text(shift.offset)}: moved back, "
+            "they lie "
             f"{shift.after:.1f} mm from the {surface} on average, now {shift.before:.1f} mm",
-            where,
-            "a set that is off as a whole was placed in another image or frame; every cut, muscle "
+            where=where,
+            why="a set that is off as a whole was placed in another image or frame; every cut, "
+            "muscle "
             "or measured point is off by as much",
-            "check that the landmarks were placed in this image (same series, same frame, not "
+            fix="check that the landmarks were placed in this image (same series, same frame, not "
             "resampled or aligned since), and export them again",
         )
     elif far.mean() >= MANY and far.sum() > 1:
         yield Finding(
-            "error" if median > ANOTHER else "warning",
-            "landmarks-off",
-            f"{int(far.sum())} of {n} landmarks of the {key} lie more than {FAR:g} mm from the "
+            severity="error" if median > ANOTHER else "warning",
+            code="landmarks-off",
+            what=f"{int(far.sum())} of {n} landmarks of the {key} lie more than {FAR:g} mm from "
+            "the "
             f"{surface}, half of them more than {median:.1f} mm",
-            where,
-            "so many are no placing errors: they belong to another patient, scan or frame, or the "
+            where=where,
+            why="so many are no placing errors: they belong to another patient, scan or frame, or "
+            "the "
             f"{surface} is not that of this patient",
-            "check that both files are of one patient and one scan",
+            fix="check that both files are of one patient and one scan",
         )
     for (name, point), offset, distance in zip(landmarks.items(), offsets, found, strict=True):
         if distance <= FAR:
@@ -217,26 +222,25 @@ def _off_surface(
         else:
             lies = f"lies more than {REACH:g} mm from any {surface}"
         yield Finding(
-            "error" if distance > TOO_FAR else "warning",
-            "landmark-far",
-            f"{name} {lies}, at {place_text(point)}",
-            where,
-            f"{PLACED_FROM[key]}; more than {FAR:g} mm is no placing error",
-            AGAIN,
+            severity="error" if distance > TOO_FAR else "warning",
+            code="landmark-far",
+            what=f"{name} {lies}, at {place_text(point)}",
+            where=where,
+            why=f"{PLACED_FROM[key]}; more than {FAR:g} mm is no placing error",
+            fix=AGAIN,
         )
 
 
 def _swapped(landmarks: Mapping[str, Floats], pair: tuple[str, str], where: str) -> Finding:
     one, other = pair
     apart = float(np.linalg.norm(landmarks[one] - landmarks[other]))
-    return Finding(
-        "error",
+    return Finding.error(
         "landmarks-swapped",
         f"{one} at {place_text(landmarks[one])} and {other} at {place_text(landmarks[other])} seem "
         f"to have each other's name: exchanged they fit all others ({apart:.0f} mm apart)",
-        where,
-        "each draws the muscles and cuts near it to the other's place",
-        "exchange the two labels, or place both again",
+        where=where,
+        why="each draws the muscles and cuts near it to the other's place",
+        fix="exchange the two labels, or place both again",
     )
 
 
@@ -268,14 +272,15 @@ def _asymmetric(
             else f"{base}_L and {base}_R are no mirror images of each other by {distance:.1f} mm, "
             "as the other landmarks show left and right"
         )
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "landmark-asymmetric",
             what,
-            where,
-            f"{PLACED_FROM[key]}; an uneven face as a whole is allowed for, so that one of them is "
+            where=where,
+            why=f"{PLACED_FROM[key]}; an uneven face as a whole is allowed for, so that one of "
+            "them is "
             "misplaced or the bone is deformed there",
-            "look at both sides in 3D Slicer; place it again, or leave it if the bone is like that",
+            fix="look at both sides in 3D Slicer; place it again, or leave it if the bone is like "
+            "that",
         )
 
 
@@ -294,12 +299,11 @@ def _disagreeing(key: str, landmarks: Mapping[str, Floats], where: str) -> Itera
         if distances[name] < CLEARLY * distances[agreement.misplaced[0]]:
             continue
         offset = landmarks[name] - agreement.predicted[agreement.names.index(name)]
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "landmark-disagrees",
             f"{name} lies {distances[name]:.1f} mm {direction_text(offset)} where the other "
             "landmarks put it in an average head",
-            where,
-            f"{PLACED_FROM[key]}; heads differ by up to 10 mm there",
-            AGAIN,
+            where=where,
+            why=f"{PLACED_FROM[key]}; heads differ by up to 10 mm there",
+            fix=AGAIN,
         )

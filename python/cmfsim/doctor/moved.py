@@ -12,9 +12,9 @@ from cmfsim.doctor.places import place_text
 from cmfsim.doctor.plan_size import FAR, TOO_FAR, check_tiny, check_turn
 from cmfsim.errors import CmfsimError, RegistrationError
 from cmfsim.surfaces.topology import edges_of
-from cmfsim.values.anatomy import Finding
 from cmfsim.values.clinical_motion import clinical_motion
-from cmfsim.values.scene import MovedSurface
+from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import MovedSurface
 
 __all__ = ["check_moved"]
 
@@ -59,13 +59,12 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
     for name, moved in evidence.moved.items():
         where = case.where(f"plan.{name}")
         if isinstance(moved, CmfsimError):
-            yield Finding(
-                "error",
+            yield Finding.error(
                 "moved-not-paired",
                 str(moved),
-                where,
-                f"nobody knows where each vertex of {name} went",
-                "export the bone before, and the same mesh after the motion",
+                where=where,
+                why=f"nobody knows where each vertex of {name} went",
+                fix="export the bone before, and the same mesh after the motion",
             )
             continue
         here, there = np.asarray(moved.surface.vertices), np.asarray(moved.moved_vertices)
@@ -79,14 +78,13 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
             yield from check_against_skin(evidence, name, here, there)
     others = set(evidence.bones) - set(case.plan) if case.surfaces is not None else {""}
     if least and not others and not case.osteotomies and min(least.values()) > STAYS:
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "moved-all",
             f"every bone moves: {', '.join(least)}, by {min(least.values()):.1f} mm at least",
-            case.where("plan"),
-            "the skull above the jaws stays in surgery of the jaws; if the scans lie in two "
+            where=case.where("plan"),
+            why="the skull above the jaws stays in surgery of the jaws; if the scans lie in two "
             "frames, the whole face is moved by the difference",
-            "lay the scan after on the one before by the skull (register_volumes, icp)",
+            fix="lay the scan after on the one before by the skull (register_volumes, icp)",
         )
 
 
@@ -94,24 +92,22 @@ def _check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding
     """Whether both are one bone: of one size, with vertices that belong together, not mirrored."""
     here, there = np.asarray(moved.surface.vertices), np.asarray(moved.moved_vertices)
     if _is_mirrored(here, there):
-        yield Finding(
-            "error",
+        yield Finding.error(
             "moved-mirrored",
             f"{name} is mirrored after against before",
-            where,
-            "no motion of bone does that: one file has left and right, or an axis, swapped",
-            "export both in one frame (LPS or RAS)",
+            where=where,
+            why="no motion of bone does that: one file has left and right, or an axis, swapped",
+            fix="export both in one frame (LPS or RAS)",
         )
         return
     scale, along = _edges(moved)
     if along < ALONG:
-        yield Finding(
-            "error",
+        yield Finding.error(
             "moved-scrambled",
             f"the edges of {name} point elsewhere after (cosine {along:.2f} on average, not 1)",
-            where,
-            "both files have as many vertices, but these do not belong together in their order",
-            "export the moved mesh without remeshing or sorting its vertices, or name it in "
+            where=where,
+            why="both files have as many vertices, but these do not belong together in their order",
+            fix="export the moved mesh without remeshing or sorting its vertices, or name it in "
             '[postoperative.bones] and write plan = "achieved"',
         )
     elif abs(scale - 1.0) > SCALED:
@@ -131,23 +127,22 @@ def _scaled(name: str, where: str, scale: float) -> Finding:
     what = f"{name} is {scale:.3g} times as large after as before (median of its edges)"
     if unit is not None or scale < LEAST_SCALE:
         between = f": that is {unit[0]} read as {unit[1]}" if unit is not None else ""
-        return Finding(
-            "error",
+        return Finding.error(
             "moved-scaled",
             f"{what}{between}",
-            where,
-            "bone does not grow in an operation: the files are in two units, or scaled",
-            "export both in the unit that [surfaces] states",
+            where=where,
+            why="bone does not grow in an operation: the files are in two units, or scaled",
+            fix="export both in the unit that [surfaces] states",
         )
-    return Finding(
-        "warning",
+    return Finding.warning(
         "moved-scaled",
         f"{what}: near no ratio of two units (2.54, 10, 25.4, 100, 1000)",
-        where,
-        "bone does not grow in an operation, so that the scans are calibrated or segmented "
+        where=where,
+        why="bone does not grow in an operation, so that the scans are calibrated or segmented "
         f"differently by {abs(scale - 1.0):.1%}; each vertex is followed all the same, and the "
         "difference counts as motion",
-        "check the voxel sizes of both scans and the thresholds of both segmentations, or align "
+        fix="check the voxel sizes of both scans and the thresholds of both segmentations, or "
+        "align "
         'the bone by shape: [postoperative.bones] and plan = "achieved"',
     )
 
@@ -189,24 +184,23 @@ def _check_distance(name: str, where: str, motion: MovedSurface) -> Iterator[Fin
     moved = np.linalg.norm(there - here, axis=1)
     worst = int(np.argmax(moved))
     if moved[worst] < STILL:
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "moved-still",
             f"{name} moves by {moved[worst]:.2g} mm at most",
-            where,
-            "the plan moves nothing there",
-            "check that the file is the bone after the operation; else leave it out",
+            where=where,
+            why="the plan moves nothing there",
+            fix="check that the file is the bone after the operation; else leave it out",
         )
         return
     if moved[worst] > FAR:
         turned = np.linalg.norm(here * [-1.0, -1.0, 1.0] - there, axis=1).max() < moved[worst]
         yield Finding(
-            "error" if moved[worst] > TOO_FAR else "warning",
-            "plan-far",
-            f"{name} moves by up to {moved[worst]:.1f} mm, at {place_text(here[worst])}",
-            where,
-            f"bone moves by {FAR:g} mm at most in ordinary surgery; tissue would be torn",
-            "one file is in LPS, the other in RAS: export both in one frame"
+            severity="error" if moved[worst] > TOO_FAR else "warning",
+            code="plan-far",
+            what=f"{name} moves by up to {moved[worst]:.1f} mm, at {place_text(here[worst])}",
+            where=where,
+            why=f"bone moves by {FAR:g} mm at most in ordinary surgery; tissue would be torn",
+            fix="one file is in LPS, the other in RAS: export both in one frame"
             if turned
             else "lay the scan after on the one before by the skull, and check that both files "
             "number their vertices alike",

@@ -7,7 +7,7 @@ from cmfsim.errors import CmfsimError
 from cmfsim.muscles.template import MuscleTemplate
 from cmfsim.muscles.template.morphing import missing_landmarks
 from cmfsim.registration import match_landmarks
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["check_muscles"]
 
@@ -21,35 +21,32 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
     try:
         template = MuscleTemplate.load(given.template)
     except (CmfsimError, OSError) as error:
-        yield Finding(
-            "error",
+        yield Finding.error(
             "template-unreadable",
             str(error),
-            evidence.case.where("muscles.template"),
-            "there is nothing to take muscles from",
-            'name a folder that "cmfsim template check" passes, or "default"',
+            where=evidence.case.where("muscles.template"),
+            why="there is nothing to take muscles from",
+            fix='name a folder that "cmfsim template check" passes, or "default"',
         )
         return
     if not evidence.skull_landmarks:
-        yield Finding(
-            "error",
+        yield Finding.error(
             "muscles-without-landmarks",
             "muscles are asked for, and no skull landmarks could be read",
-            where,
-            "they carry the template to the patient",
-            "add [landmarks] skull, or leave out [muscles]",
+            where=where,
+            why="they carry the template to the patient",
+            fix="add [landmarks] skull, or leave out [muscles]",
         )
         return
     try:
         matched = match_landmarks(template.landmarks, evidence.skull_landmarks, required=())
     except CmfsimError as error:
-        yield Finding(
-            "error",
+        yield Finding.error(
             "muscles-landmarks",
             str(error),
-            where,
-            "the template cannot be carried to the patient by these landmarks",
-            'correct the landmarks; "cmfsim template morph" shows each one\'s error',
+            where=where,
+            why="the template cannot be carried to the patient by these landmarks",
+            fix='correct the landmarks; "cmfsim template morph" shows each one\'s error',
         )
         return
     yield from (finding for finding in matched.findings if finding.code != "landmark-extra")

@@ -11,9 +11,9 @@ from cmfsim.doctor.places import place_text
 from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
 from cmfsim.errors import CaseError, LandmarkError
 from cmfsim.io.transforms import motion_in_lps
-from cmfsim.values.anatomy import Finding
 from cmfsim.values.case_parts import CaseOsteotomy
 from cmfsim.values.clinical_motion import ClinicalMotion
+from cmfsim.values.finding import Finding
 
 __all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of"]
 
@@ -32,25 +32,24 @@ def check_cuts(evidence: Evidence) -> Iterator[Finding]:
     for number, cut in enumerate(case.osteotomies):
         where = case.where(f"osteotomies.{number}")
         if cut.bone is not None and cut.bone not in available:
-            yield Finding(
-                "error",
+            yield Finding.error(
                 "cut-unknown-bone",
                 f"the cut is through bone {cut.bone!r}",
-                where,
-                "there is no such bone or segment at this point of the list",
-                f"use one of: {', '.join(sorted(available))}",
+                where=where,
+                why="there is no such bone or segment at this point of the list",
+                fix=f"use one of: {', '.join(sorted(available))}",
             )
         available |= set(cut.segments)
         yield from _check_procedure(evidence, cut, where)
     for name in case.plan:
         if name not in available:
-            yield Finding(
-                "error",
+            yield Finding.error(
                 "plan-unknown-segment",
                 f"the plan moves {name!r}",
-                case.where(f"plan.{name}"),
-                "no bone and no osteotomy of the case has this name",
-                f"use one of: {', '.join(sorted(available))}, or add the osteotomy that makes it",
+                where=case.where(f"plan.{name}"),
+                why="no bone and no osteotomy of the case has this name",
+                fix=f"use one of: {', '.join(sorted(available))}, or add the osteotomy that makes "
+                "it",
             )
 
 
@@ -61,22 +60,20 @@ def _check_procedure(evidence: Evidence, cut: CaseOsteotomy, where: str) -> Iter
     try:
         yield from place_procedure(cut.procedure, evidence.skull_landmarks, cut.options).findings
     except LandmarkError as error:
-        yield Finding(
-            "error",
+        yield Finding.error(
             "landmark-missing",
             str(error),
-            where,
-            "standard procedures are placed from skull landmarks",
-            "add it to the file under [landmarks] skull, or cut by planes",
+            where=where,
+            why="standard procedures are placed from skull landmarks",
+            fix="add it to the file under [landmarks] skull, or cut by planes",
         )
     except CaseError as error:
-        yield Finding(
-            "error",
+        yield Finding.error(
             "cut-options",
             str(error),
-            where,
-            "the cut cannot be placed",
-            "correct the option, or leave it out",
+            where=where,
+            why="the cut cannot be placed",
+            fix="correct the option, or leave it out",
         )
 
 
@@ -175,14 +172,14 @@ def _check_frame(evidence: Evidence, name: str, matrix: Floats) -> Iterator[Find
         return
     if np.allclose(motion_in_lps(matrix, case.surfaces.frame), matrix, rtol=0.0, atol=1e-9):
         return
-    yield Finding(
-        "warning",
+    yield Finding.warning(
         "plan-frame",
         f"the motion of {name} states no frame and is taken as LPS; the surfaces are in "
         f"{case.surfaces.frame}",
-        case.where(f"plan.{name}"),
-        "in the other frame forwards is backwards, and left is right",
-        f'write frame = "LPS" or frame = "{case.surfaces.frame}" beside the numbers of the motion',
+        where=case.where(f"plan.{name}"),
+        why="in the other frame forwards is backwards, and left is right",
+        fix=f'write frame = "LPS" or frame = "{case.surfaces.frame}" beside the numbers of the '
+        "motion",
     )
 
 
@@ -212,14 +209,13 @@ def _check_through_skin(
     if depth.max() <= THROUGH_SKIN:
         return
     worst = int(np.argmax(depth))
-    yield Finding(
-        "warning",
+    yield Finding.warning(
         "plan-through-skin",
         f"{name} is moved through the skin at rest, by {depth[worst]:.1f} mm at "
         f"{place_text(moved[through[worst]])}",
-        evidence.case.where(f"plan.{name}"),
-        "the tissue over it would be pressed flat or turned inside out",
-        "check the plan; a large true advancement is better solved in steps",
+        where=evidence.case.where(f"plan.{name}"),
+        why="the tissue over it would be pressed flat or turned inside out",
+        fix="check the plan; a large true advancement is better solved in steps",
     )
 
 
@@ -237,13 +233,12 @@ def _check_tissue(evidence: Evidence, name: str, piece: Floats) -> Iterator[Find
             tissue[beside_tissue[inside]] = False
     if tissue.any():
         return
-    yield Finding(
-        "error",
+    yield Finding.error(
         "segment-no-tissue",
         f"{name} touches no soft tissue in the meshed region",
-        evidence.case.where(f"plan.{name}"),
-        "moving it moves nothing",
-        "check region (posterior plane, lower, upper), and that the skin encloses it",
+        where=evidence.case.where(f"plan.{name}"),
+        why="moving it moves nothing",
+        fix="check region (posterior plane, lower, upper), and that the skin encloses it",
     )
 
 

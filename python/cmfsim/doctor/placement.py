@@ -16,8 +16,8 @@ from cmfsim.doctor.landmarks import (
 from cmfsim.doctor.places import place_text
 from cmfsim.errors import ImageError
 from cmfsim.registration import side_vectors, wrong_sides
-from cmfsim.values.anatomy import Finding
 from cmfsim.values.case_parts import UNITS
+from cmfsim.values.finding import Finding
 
 __all__ = ["check_placement"]
 
@@ -104,7 +104,7 @@ def _extent(points: Floats) -> float:
 def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
     if evidence.skin is None:
         return
-    extent = _extent(np.asarray(evidence.skin.mended.vertices))
+    extent = _extent(np.asarray(evidence.skin.repaired.vertices))
     low, high = SKIN_EXTENT
     if low <= extent <= high:
         return
@@ -112,60 +112,57 @@ def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
     # As the file has it: where other units are stated, its numbers may simply be mm.
     numbers = extent / UNITS[stated]
     if low <= numbers <= high:
-        yield Finding(
-            "error",
+        yield Finding.error(
             "surface-units",
             f"the skin is {numbers:.4g} long in the file's own numbers: these look like mm, and "
             f"are read as {stated} ({extent:.4g} mm)",
-            evidence.skin.where,
-            "every length of the case is mm; a head is 110 to 420 mm long",
-            'write units = "mm" under [surfaces], or leave units out',
+            where=evidence.skin.where,
+            why="every length of the case is mm; a head is 110 to 420 mm long",
+            fix='write units = "mm" under [surfaces], or leave units out',
         )
         return
     for name, least, most, factor in OTHER_UNITS:
         if least <= extent <= most:
-            mend = (
+            fix = (
                 f'write units = "{name}" under [surfaces]'
                 if factor and stated == "mm"
                 else "export the surfaces in mm, or correct units under [surfaces]"
             )
-            yield Finding(
-                "error",
+            yield Finding.error(
                 "surface-units",
                 f"the skin is {extent:.4g} mm long: this looks like {name}, read as {stated}",
-                evidence.skin.where,
-                "every length of the case is mm; a head is 110 to 420 mm long",
-                mend,
+                where=evidence.skin.where,
+                why="every length of the case is mm; a head is 110 to 420 mm long",
+                fix=fix,
             )
             return
     yield Finding(
-        "error" if not 0.5 * low <= extent <= 2.0 * high else "warning",
-        "surface-size",
-        f"the skin is {extent:.4g} mm long",
-        evidence.skin.where,
-        f"a head or face is {low:g} to {high:g} mm long",
-        "check the units, and that the file holds the skin alone",
+        severity="error" if not 0.5 * low <= extent <= 2.0 * high else "warning",
+        code="surface-size",
+        what=f"the skin is {extent:.4g} mm long",
+        where=evidence.skin.where,
+        why=f"a head or face is {low:g} to {high:g} mm long",
+        fix="check the units, and that the file holds the skin alone",
     )
 
 
 def _check_bone_sizes(evidence: Evidence) -> Iterator[Finding]:
     if evidence.skin is None:
         return
-    skin = _extent(np.asarray(evidence.skin.mended.vertices))
+    skin = _extent(np.asarray(evidence.skin.repaired.vertices))
     low, high = SKIN_EXTENT
     if not low <= skin <= high:
         return
     for name, body in evidence.bones.items():
-        extent = _extent(np.asarray(body.mended.vertices))
+        extent = _extent(np.asarray(body.repaired.vertices))
         if BONE_SHARE[0] * skin <= extent <= BONE_SHARE[1] * skin:
             continue
-        yield Finding(
-            "error",
+        yield Finding.error(
             "surface-units",
             f"bone {name} is {extent:.4g} mm long, the skin {skin:.4g} mm",
-            body.where,
-            "all surfaces of a case have the same units and lie in one frame",
-            "export it in the units of the skin",
+            where=body.where,
+            why="all surfaces of a case have the same units and lie in one frame",
+            fix="export it in the units of the skin",
         )
 
 
@@ -214,25 +211,24 @@ def _check_landmark_fit(
         fitted = float(np.median(_nearest(bodies, points * factors)))
         if fitted <= LANDMARK_WARNING:
             is_frame = name == "frame"
-            yield Finding(
-                "error",
+            yield Finding.error(
                 "landmark-frame" if is_frame else "landmark-units",
                 f"{what}; {done}, {fitted:.1f} mm",
-                where,
-                why,
-                "correct coordinateSystem in the file (LPS or RAS), or frame under [surfaces] if "
+                where=where,
+                why=why,
+                fix="correct coordinateSystem in the file (LPS or RAS), or frame under [surfaces] "
+                "if "
                 "the surfaces are the ones that are turned"
                 if is_frame
                 else "correct coordinateUnits in the file, or save it again in mm",
             )
             return
-    yield Finding(
-        "error",
+    yield Finding.error(
         "landmark-frame",
         what,
-        where,
-        why,
-        "check that landmarks and surfaces belong to one patient and one frame",
+        where=where,
+        why=why,
+        fix="check that landmarks and surfaces belong to one patient and one frame",
     )
 
 
@@ -259,14 +255,14 @@ def _check_within_image(
     names = [name for name, is_wrong in zip(landmarks, wrong, strict=True) if is_wrong]
     more = ", …" if len(names) > 4 else ""
     yield Finding(
-        "error" if is_frame or wrong.mean() > ELSEWHERE_SHARE else "warning",
-        "landmark-frame" if is_frame else "landmark-outside-image",
-        f"{len(names)} of {len(landmarks)} landmarks lie beyond the image"
+        severity="error" if is_frame or wrong.mean() > ELSEWHERE_SHARE else "warning",
+        code="landmark-frame" if is_frame else "landmark-outside-image",
+        what=f"{len(names)} of {len(landmarks)} landmarks lie beyond the image"
         + (f", turned from RAS to LPS {int(turned.sum())}" if is_frame else "")
         + f": {', '.join(names[:4])}{more}",
-        evidence.case.where(f"landmarks.{key}"),
-        "cuts, muscles and the region are placed from landmarks",
-        "correct coordinateSystem in the file (LPS or RAS)"
+        where=evidence.case.where(f"landmarks.{key}"),
+        why="cuts, muscles and the region are placed from landmarks",
+        fix="correct coordinateSystem in the file (LPS or RAS)"
         if is_frame
         else "check that landmarks and image belong to one patient, and that the scan is whole",
     )
@@ -315,45 +311,42 @@ def _check_directions(
     where = evidence.case.where(f"landmarks.{key}")
     why = "left and right, front and back would be taken for one another"
     if signs[0] < 0 and signs[1] < 0:
-        yield Finding(
-            "error",
+        yield Finding.error(
             "frame-turned",
             "the face looks towards +P and its left side lies towards R: these are RAS coordinates "
             "read as LPS",
-            where,
-            why,
-            'state the frame: "coordinateSystem": "RAS" in the file, and frame = "RAS" under '
+            where=where,
+            why=why,
+            fix='state the frame: "coordinateSystem": "RAS" in the file, and frame = "RAS" under '
             "[surfaces] if the surfaces are in it as well",
         )
     elif signs[0] < 0:
-        yield Finding(
-            "error",
+        yield Finding.error(
             "left-right-swapped",
             f"of {len(pairs)} pairs of landmarks the left ones lie on the right (R) side",
-            where,
-            "either the labels are swapped or the data are mirrored; a plan would move the "
+            where=where,
+            why="either the labels are swapped or the data are mirrored; a plan would move the "
             "wrong side",
-            "swap the labels _L and _R; if the labels are right, the images or surfaces are "
+            fix="swap the labels _L and _R; if the labels are right, the images or surfaces are "
             "mirrored: export them again",
         )
     elif signs[1] < 0 or signs[2] < 0:
         what = "the face looks backwards" if signs[1] < 0 else "the head stands on its crown"
-        yield Finding(
-            "error",
+        yield Finding.error(
             "frame-turned",
             f"by its landmarks, {what}",
-            where,
-            why,
-            "check the axes of the program that made the files: LPS is left, posterior, superior",
+            where=where,
+            why=why,
+            fix="check the axes of the program that made the files: LPS is left, posterior, "
+            "superior",
         )
     elif any(v is not None and s == 0 for v, s in zip((left, back, up), signs, strict=True)):
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "frame-tilted",
             "by its landmarks, the head is turned by more than 60° from the axes",
-            where,
-            "default planes are placed along the axes",
-            "turn the data upright, or give posterior_plane and the planes of cuts",
+            where=where,
+            why="default planes are placed along the axes",
+            fix="turn the data upright, or give posterior_plane and the planes of cuts",
         )
 
 
@@ -363,13 +356,12 @@ def _check_sides(
     wrong = wrong_sides(landmarks)
     if wrong:
         names = ", ".join(wrong)
-        yield Finding(
-            "error",
+        yield Finding.error(
             "landmark-pair-swapped",
             f"left and right are swapped in: {names}",
-            evidence.case.where(f"landmarks.{key}"),
-            "cuts and muscles would be placed on the wrong side",
-            "swap the labels _L and _R of these points",
+            where=evidence.case.where(f"landmarks.{key}"),
+            why="cuts and muscles would be placed on the wrong side",
+            fix="swap the labels _L and _R of these points",
         )
 
 
@@ -418,13 +410,13 @@ def _check_bone_directions(evidence: Evidence) -> Iterator[Finding]:
     margin = 0.05 * (highest - lowest)
     if away[1] > margin[1] or away[2] > margin[2]:
         direction = "behind" if away[1] > margin[1] else "above"
-        yield Finding(
-            "error",
+        yield Finding.error(
             "surface-frame",
             f"the mandible lies {direction} the middle of the cranium",
-            mandible.where,
-            "in LPS the face looks along −P and the crown along +S",
-            'write frame = "RAS" under [surfaces] if the files are in RAS; else check their axes',
+            where=mandible.where,
+            why="in LPS the face looks along −P and the crown along +S",
+            fix='write frame = "RAS" under [surfaces] if the files are in RAS; else check their '
+            "axes",
         )
 
 
@@ -445,27 +437,25 @@ def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Fi
     if share > ELSEWHERE_SHARE:
         turned = float((skin.index.winding_number(points * HALF_TURN) < 0.5).mean())
         is_frame = turned <= FITTING_SHARE
-        yield Finding(
-            "error",
+        yield Finding.error(
             "surface-frame" if is_frame else "bone-elsewhere",
             f"{share:.0%} of bone {name} lies outside the skin"
             + (f", turned from RAS to LPS {turned:.0%}" if is_frame else ""),
-            body.where,
-            "skin and bones of a case lie in one frame",
-            "export skin and bones in the same frame",
+            where=body.where,
+            why="skin and bones of a case lie in one frame",
+            fix="export skin and bones in the same frame",
         )
         return
     if depth.max() <= THROUGH_SKIN:
         return
     worst = int(np.argmax(depth))
-    yield Finding(
-        "warning",
+    yield Finding.warning(
         "bone-through-skin",
         f"bone {name} stands out of the skin by {depth[worst]:.1f} mm at "
         f"{place_text(points[worst])}, with {share:.1%} of its points",
-        body.where,
-        "there is no tissue over it, so that the skin there is bone",
-        "correct the surface there; build cuts the bone off at the skin",
+        where=body.where,
+        why="there is no tissue over it, so that the skin there is bone",
+        fix="correct the surface there; build cuts the bone off at the skin",
     )
 
 
@@ -486,12 +476,13 @@ def _check_bone_overlap(evidence: Evidence) -> Iterator[Finding]:
                 continue
             share = float((other.index.winding_number(inner) > 0.5).mean())
             if share > OVERLAP_SHARE:
-                yield Finding(
-                    "warning",
+                yield Finding.warning(
                     "bone-overlap",
                     f"{share:.0%} of bone {name} lies within bone {other_name}",
-                    body.where,
-                    "the same bone stands in the case twice; where one part moves and the other "
+                    where=body.where,
+                    why="the same bone stands in the case twice; where one part moves and the "
+                    "other "
                     "stays, tissue is held by both",
-                    f"cut {name} out of {other_name}, or drop the file and cut by [[osteotomies]]",
+                    fix=f"cut {name} out of {other_name}, or drop the file and cut by "
+                    "[[osteotomies]]",
                 )

@@ -7,7 +7,7 @@ from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.errors import CmfsimError
 from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion
-from cmfsim.values.scene import MovedSurface
+from cmfsim.values.surface_data import MovedSurface
 
 __all__ = ["state_plan"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmfsim.checks import Floats
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.motion import decompose_motion
 
 __all__ = ["FAR", "TOO_FAR", "SizedMotion", "check_motion_size", "check_tiny", "check_turn"]
@@ -80,12 +80,12 @@ def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
 
 def _too_far(motion: SizedMotion, far: float, remedy: str) -> Finding:
     return Finding(
-        "error" if far > TOO_FAR else "warning",
-        "plan-far",
-        f"{motion.name} moves by up to {far:.1f} mm",
-        motion.where,
-        f"bone moves by {FAR:g} mm at most in ordinary surgery; tissue would be torn",
-        remedy,
+        severity="error" if far > TOO_FAR else "warning",
+        code="plan-far",
+        what=f"{motion.name} moves by up to {far:.1f} mm",
+        where=motion.where,
+        why=f"bone moves by {FAR:g} mm at most in ordinary surgery; tissue would be torn",
+        fix=remedy,
     )
 
 
@@ -93,36 +93,35 @@ def check_turn(name: str, where: str, angle: float) -> Iterator[Finding]:
     """A finding about a turn, in degrees, of more than bone is turned."""
     if angle > TURNED:
         yield Finding(
-            "error" if angle > TOO_TURNED else "warning",
-            "plan-turned",
-            f"{name} turns by {angle:.1f}°",
-            where,
-            f"bone turns by {TURNED:g}° at most in ordinary surgery; linear strain invents volume",
-            "check angle (degrees, not radians) and axis",
+            severity="error" if angle > TOO_TURNED else "warning",
+            code="plan-turned",
+            what=f"{name} turns by {angle:.1f}°",
+            where=where,
+            why=f"bone turns by {TURNED:g}° at most in ordinary surgery; linear strain invents "
+            "volume",
+            fix="check angle (degrees, not radians) and axis",
         )
 
 
 def check_tiny(name: str, where: str, far: float, angle: float) -> Iterator[Finding]:
     """Findings about a motion of `far` mm at most and a turn, in degrees, that nobody plans."""
     if NOTHING < far < TINY:
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "plan-tiny",
             f"{name} moves by {far:.2g} mm at most",
-            where,
-            "no face shows that: the prediction is the face before the operation",
-            f"check the unit: translations and matrices are in mm ({far:.2g} m would be "
+            where=where,
+            why="no face shows that: the prediction is the face before the operation",
+            fix=f"check the unit: translations and matrices are in mm ({far:.2g} m would be "
             f"{1000.0 * far:.2g} mm); if the segment stays, leave it out of the plan",
         )
     least, most = TINY_TURN
     if least <= angle < most:
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "plan-tiny-angle",
             f"{name} turns by {angle:.2g}°",
-            where,
-            f"no operation is planned to that; {angle:.2g} radians would be "
+            where=where,
+            why=f"no operation is planned to that; {angle:.2g} radians would be "
             f"{math.degrees(angle):.1f}°",
-            "check the unit: angles are in degrees; nothing to do if the turn is meant, or was "
+            fix="check the unit: angles are in degrees; nothing to do if the turn is meant, or was "
             "measured",
         )

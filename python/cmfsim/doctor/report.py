@@ -3,7 +3,7 @@
 import textwrap
 from collections.abc import Callable, Iterable
 
-from cmfsim.values.anatomy import SEVERITIES, Finding
+from cmfsim.values.finding import SEVERITIES, Finding
 
 __all__ = ["findings_text"]
 
@@ -43,7 +43,7 @@ def findings_text(
         if colour:
             head = f"\x1b[{COLOURS[finding.severity]}m{head}\x1b[0m"
         lines.append(f"{head}: {escape(finding.where or 'case')}: [{finding.code}]")
-        for label, text in (("", finding.what), ("why: ", finding.why), ("mend: ", finding.mend)):
+        for label, text in (("", finding.what), ("why: ", finding.why), ("fix: ", finding.fix)):
             if text:
                 lines += _wrapped(label, escape(text), width)
     counts = [

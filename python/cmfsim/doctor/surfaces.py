@@ -7,7 +7,7 @@ import numpy as np
 from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Body, Evidence
 from cmfsim.doctor.places import place_text
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["check_image", "check_mesh_size", "check_surfaces"]
 
@@ -32,13 +32,12 @@ def check_image(evidence: Evidence) -> Iterator[Finding]:
     largest = float(np.max(np.asarray(image.spacing)))
     if largest > COARSE_SPACING:
         size = " × ".join(f"{s:.2f}" for s in np.asarray(image.spacing))
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "ct-spacing-coarse",
             f"voxels are {size} mm",
-            evidence.case.where("image.file"),
-            f"beyond {COARSE_SPACING:g} mm thin bone, lids and lips are lost between voxels",
-            "use the thin series of the scan (1 mm or below) where there is one",
+            where=evidence.case.where("image.file"),
+            why=f"beyond {COARSE_SPACING:g} mm thin bone, lids and lips are lost between voxels",
+            fix="use the thin series of the scan (1 mm or below) where there is one",
         )
 
 
@@ -59,64 +58,60 @@ def _check_body(body: Body) -> Iterator[Finding]:
         extent = float((report.highest - report.lowest).max())
         wide = longest.length > WIDE_BORDER * extent
         yield Finding(
-            "warning" if wide or body.name != "skin" else "note",
-            "surface-open",
-            f"{len(report.borders)} open borders of {lengths}{more} mm, the longest round "
+            severity="warning" if wide or body.name != "skin" else "note",
+            code="surface-open",
+            what=f"{len(report.borders)} open borders of {lengths}{more} mm, the longest round "
             f"{place_text(longest.centre)}",
-            where,
-            "inside and outside are only known for a closed surface: caps are put on"
+            where=where,
+            why="inside and outside are only known for a closed surface: caps are put on"
             + (", and one this wide makes up a part of the head" if wide else ""),
-            "look at the caps after build; if they are wrong, close the surface yourself",
+            fix="look at the caps after build; if they are wrong, close the surface yourself",
         )
     if report.inconsistent or not report.orientable:
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "surface-inconsistent",
             f"{report.inconsistent} edges have triangles that face opposite ways"
             + ("" if report.orientable else "; a part has only one side (Möbius)"),
-            where,
-            "inside and outside swap from place to place; the smaller part is turned round",
-            "recompute normals in the program that made it",
+            where=where,
+            why="inside and outside swap from place to place; the smaller part is turned round",
+            fix="recompute normals in the program that made it",
         )
     elif report.volume < 0.0:
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "surface-inward",
             f"normals point inwards (volume {report.volume:.0f} mm³)",
-            where,
-            "inside and outside are swapped; build turns it round",
-            "flip normals in the program that made it",
+            where=where,
+            why="inside and outside are swapped; build turns it round",
+            fix="flip normals in the program that made it",
         )
     if len(report.non_manifold):
         vertex = np.asarray(body.surface.vertices)[report.non_manifold[0, 0]]
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "surface-non-manifold",
             f"{len(report.non_manifold)} edges have more than two triangles, first at "
             f"{place_text(vertex)}",
-            where,
-            "the surface forks there, so that inside and outside are not known close to it",
-            "remove inner walls and repeated parts, or remesh it",
+            where=where,
+            why="the surface forks there, so that inside and outside are not known close to it",
+            fix="remove inner walls and repeated parts, or remesh it",
         )
     if report.crossings is None:
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "surface-crossings-unknown",
             "triangles lie so close together that crossings were not looked for",
-            where,
-            "crossing triangles make inside and outside doubtful",
-            "remesh it with triangles of about equal size",
+            where=where,
+            why="crossing triangles make inside and outside doubtful",
+            fix="remesh it with triangles of about equal size",
         )
     elif len(report.crossings) and report.crossing_points is not None:
         share = len(np.unique(report.crossings)) / max(report.n_triangles, 1)
         yield Finding(
-            "warning" if share > CROSSING_SHARE or body.name == "skin" else "note",
-            "surface-crossing",
-            f"{len(report.crossings)} pairs of triangles cut through each other, first at "
+            severity="warning" if share > CROSSING_SHARE or body.name == "skin" else "note",
+            code="surface-crossing",
+            what=f"{len(report.crossings)} pairs of triangles cut through each other, first at "
             f"{place_text(report.crossing_points[0])}",
-            where,
-            "what is enclosed twice counts once, and what lies between may count as outside",
-            "smooth or remesh it there",
+            where=where,
+            why="what is enclosed twice counts once, and what lies between may count as outside",
+            fix="smooth or remesh it there",
         )
     yield from _check_pieces(body)
     yield from _check_triangles(body)
@@ -132,37 +127,38 @@ def _check_pieces(body: Body) -> Iterator[Finding]:
         return
     share = sum(piece.area for piece in solid) / largest.area
     yield Finding(
-        "warning" if body.name == "skin" else "note",
-        "surface-islands",
-        f"{len(solid)} pieces beside the largest, with {share:.1%} of its area; the next is of "
+        severity="warning" if body.name == "skin" else "note",
+        code="surface-islands",
+        what=f"{len(solid)} pieces beside the largest, with {share:.1%} of its area; the next is "
+        "of "
         f"{solid[0].n_triangles} triangles at {place_text(solid[0].centre)}",
-        body.where,
-        "debris becomes islands of bone or skin; pieces below 1 % of the largest are dropped",
-        "delete what does not belong, or give each bone a file of its own",
+        where=body.where,
+        why="debris becomes islands of bone or skin; pieces below 1 % of the largest are dropped",
+        fix="delete what does not belong, or give each bone a file of its own",
     )
 
 
 def _check_triangles(body: Body) -> Iterator[Finding]:
     report = body.report
     if len(report.degenerate) or len(report.duplicate):
-        yield Finding(
-            "note",
+        yield Finding.note(
             "surface-degenerate",
             f"{len(report.degenerate)} triangles without area and {len(report.duplicate)} repeated",
-            body.where,
-            "they have no normal, or count their space twice; they are dropped",
-            "nothing to do",
+            where=body.where,
+            why="they have no normal, or count their space twice; they are dropped",
+            fix="nothing to do",
         )
     share = len(report.slivers) / max(report.n_triangles, 1)
     if share > SOME_SLIVERS:
         yield Finding(
-            "warning" if share > SLIVER_SHARE else "note",
-            "surface-slivers",
-            f"{len(report.slivers)} of {report.n_triangles} triangles are slivers, over a hundred "
+            severity="warning" if share > SLIVER_SHARE else "note",
+            code="surface-slivers",
+            what=f"{len(report.slivers)} of {report.n_triangles} triangles are slivers, over a "
+            "hundred "
             "times longer than high",
-            body.where,
-            "their normals point anywhere, which contact surfaces feel",
-            "remesh it if sliding on it matters" if share <= SLIVER_SHARE else "remesh it",
+            where=body.where,
+            why="their normals point anywhere, which contact surfaces feel",
+            fix="remesh it if sliding on it matters" if share <= SLIVER_SHARE else "remesh it",
         )
 
 
@@ -182,13 +178,16 @@ def check_mesh_size(evidence: Evidence) -> Iterator[Finding]:
     place = points[int(np.argmin(thickness))]
     refined = case.mesh.refine
     yield Finding(
-        "note" if refined else "warning",
-        "edge-length-coarse",
-        f"{thin.mean():.0%} of the skin of the region lies closer to bone than "
+        severity="note" if refined else "warning",
+        code="edge-length-coarse",
+        what=f"{thin.mean():.0%} of the skin of the region lies closer to bone than "
         f"an edge of {edge:g} mm, {thickness.min():.1f} mm at {place_text(place)}",
-        case.where("mesh.edge_length"),
-        "sheets thinner than an edge are lost or stiff" + (" unless refined" if refined else ""),
-        "nothing to do" if refined else f"set edge_length to {0.5 * edge:g} or below, or refine",
+        where=case.where("mesh.edge_length"),
+        why="sheets thinner than an edge are lost or stiff"
+        + (" unless refined" if refined else ""),
+        fix="nothing to do"
+        if refined
+        else f"set edge_length to {0.5 * edge:g} or below, or refine",
     )
 
 

@@ -27,8 +27,8 @@ from cmfsim.evaluation.correspondence import Matches, Skin, match_skins
 from cmfsim.evaluation.regions import SKIN_LANDMARKS, skin_regions
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.registration import match_landmarks
-from cmfsim.values.anatomy import Finding
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["MATCHINGS", "SkinComparison", "compare_skins"]
 
@@ -436,24 +436,22 @@ def _findings(
     found = []
     if matches.n_border > MANY_AT_BORDER * n_chosen:
         found.append(
-            Finding(
-                "note",
+            Finding.note(
                 "many-border-matches",
                 f"{matches.n_border} of {n_chosen} vertices are matched to the border of the "
                 "post-operative skin and left out",
                 why="the scan ends there, or the landmarks carry the skin past it",
-                mend="evaluate the face alone with mask='face', or a mask of what was simulated",
+                fix="evaluate the face alone with mask='face', or a mask of what was simulated",
             )
         )
     folds = warp.folds(places) if warp is not None else None
     if folds is not None and folds.count:
         found.append(
-            Finding(
-                "warning",
+            Finding.warning(
                 "correspondence-folds",
                 f"the map between the landmarks folds at {folds.count} of {n_chosen} vertices",
                 why="partners there are not where the anatomy is the same",
-                mend="check the landmarks: one stands in another's place, or on another point of "
+                fix="check the landmarks: one stands in another's place, or on another point of "
                 "the face",
             )
         )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from cmfsim._core import Surface, ThinPlateSpline
 from cmfsim.checks import Floats
 from cmfsim.surfaces.topology import edges_of
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["Matches", "Skin", "match_skins"]
 

@@ -20,7 +20,7 @@ from cmfsim.evaluation.comparison import (
 from cmfsim.evaluation.regions import SKIN_LANDMARKS, skin_regions
 from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["NO_CHANGE", "WHOLE", "Improvement", "ModelComparison", "compare_models"]
 

@@ -13,7 +13,7 @@ from cmfsim.errors import BoundaryError, RegistrationError, RegistrationInputErr
 from cmfsim.imaging.alignment_options import AlignmentOptions
 from cmfsim.imaging.descent import Clipped, Places, align, inverse, matrix_of
 from cmfsim.imaging.morphology import Mask
-from cmfsim.values.anatomy import ImageData
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["VolumeAlignment", "register_volumes"]
 
@@ -126,10 +126,10 @@ def register_volumes(
             far.at(size, None),
             near.at(size, places.box),
             chosen,
-            fixed,
-            size,
-            options,
-            places,
+            grid=fixed,
+            size=size,
+            options=options,
+            places=places,
         )
         iterations.append(steps)
         _LOG.info("alignment at %g mm: %d steps, %.4f nats", size, steps, information)

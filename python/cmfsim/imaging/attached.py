@@ -13,7 +13,7 @@ from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.morphology import Mask, Volume, box_of, depth, label, opened, reached, simplex
 from cmfsim.imaging.skin import Skin
 from cmfsim.imaging.working import Working, coarse_of
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["attached_findings"]
 
@@ -72,14 +72,13 @@ def _finding(
     middle: NDArray[np.float64], size: NDArray[np.float64], volume: float, dense: float
 ) -> Finding:
     kind = "as dense as plastic" if dense > 0.5 else "without its like on the other side"
-    return Finding(
-        "warning",
+    return Finding.warning(
         "skin-attachment",
         f"something stands out from the face {kind}: {size[0]:.0f} × {size[1]:.0f} × "
         f"{size[2]:.0f} mm, {volume / 1000.0:.1f} cm³",
         where=f"skin at ({middle[0]:.0f}, {middle[1]:.0f}, {middle[2]:.0f}) mm",
         why="a tube, a holder or tape on the face becomes skin, and moves and is compared as such",
-        mend="look at it in the image; erase it there (air, −1000 HU), or leave that part of the "
+        fix="look at it in the image; erase it there (air, −1000 HU), or leave that part of the "
         "face out of the evaluation",
     )
 

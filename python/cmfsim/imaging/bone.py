@@ -20,7 +20,7 @@ from cmfsim.imaging.morphology import (
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import Skin
 from cmfsim.imaging.working import Working, coarse_of
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["Bone", "find_bone"]
 
@@ -80,7 +80,7 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     solid &= under > options.least_skin
     solid, findings = _without_islands(solid, work, options)
     cavity = _cranial_cavity(solid, skin, work)
-    mask = _enclosed(hu, solid, cavity, under, work, options)
+    mask = _enclosed(hu, solid, cavity, under, work=work, options=options)
     return Bone(hu, mask, solid, cavity, tuple(findings))
 
 
@@ -105,14 +105,13 @@ def _without_islands(
     findings = []
     if dropped > options.island:
         findings.append(
-            Finding(
-                "note",
+            Finding.note(
                 "bone-islands",
                 f"{count - np.count_nonzero(kept)} pieces of bone below {options.island:g} mm³ "
                 f"each, {dropped / 1000.0:.1f} cm³ together, were dropped",
                 where="bone",
                 why="they are thin bone, calcified vessels or noise, and become soft tissue",
-                mend="lower bone_threshold or island if a wanted piece is missing",
+                fix="lower bone_threshold or island if a wanted piece is missing",
             )
         )
     return kept_mask, findings
@@ -154,6 +153,7 @@ def _enclosed(
     solid: Mask,
     cavity: Mask | None,
     under: Volume,
+    *,
     work: Working,
     options: SegmentOptions,
 ) -> Mask:

@@ -12,7 +12,7 @@ from cmfsim.checks import Floats
 from cmfsim.errors import RegistrationError, RegistrationInputError
 from cmfsim.imaging.alignment_options import AlignmentOptions
 from cmfsim.imaging.morphology import Mask, as_itk, box_of, resampled_to, simpleitk, smoothed
-from cmfsim.values.anatomy import ImageData
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["Clipped", "Places", "align", "inverse", "matrix_of"]
 
@@ -90,6 +90,7 @@ def align(
     moving: Any,
     fixed: Any,
     chosen: Mask,
+    *,
     grid: ImageData,
     size: float,
     options: AlignmentOptions,
@@ -108,30 +109,30 @@ def align(
         )
     with _one_thread():
         return _descend(
-            itk.ImageRegistrationMethod(),
             transform,
             moving,
             fixed,
             mask,
-            size,
-            options,
-            options.samples / count,
-            places,
+            size=size,
+            options=options,
+            share=options.samples / count,
+            places=places,
         )
 
 
 def _descend(
-    method: Any,
     transform: Any,
     moving: Any,
     fixed: Any,
     mask: Any,
+    *,
     size: float,
     options: AlignmentOptions,
     share: float,
     places: Places,
 ) -> tuple[int, float]:
     """Goes down the metric until the step is too small to matter."""
+    method = simpleitk().ImageRegistrationMethod()
     method.SetMetricAsMattesMutualInformation(options.bins)
     method.SetMetricFixedMask(mask)
     method.SetMetricSamplingStrategy(method.RANDOM)

@@ -1,7 +1,7 @@
 """The way from a CT to an anatomy, stage by stage."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +20,10 @@ from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import find_skin
 from cmfsim.imaging.view import view_findings
 from cmfsim.imaging.working import Working, without_noise, working_grid
-from cmfsim.values.anatomy import Anatomy, Finding, ImageData
+from cmfsim.progress import Progress
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["segment_head"]
 
@@ -35,7 +38,7 @@ def segment_head(
     options: SegmentOptions | None = None,
     *,
     landmarks: Mapping[str, ArrayLike] | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Anatomy:
     """Skin, bones, air and teeth of a head CT, as level images on one grid, with findings.
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.morphology import Volume
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["Calibration", "calibration", "noise_of", "saturation_of", "weak_bone"]
 
@@ -161,14 +161,13 @@ def _peaks(sample: NDArray[np.float64], low: float, high: float) -> tuple[float,
 
 
 def _not_hu(air: float, soft: float, slope: float, offset: float) -> Finding:
-    return Finding(
-        "warning",
+    return Finding.warning(
         "ct-not-hu",
         f"the image is not in HU: air is at {air:.4g}, soft tissue at {soft:.4g}; taken as HU = "
         f"{slope:.4g}·value {'+' if offset >= 0.0 else '−'} {abs(offset):.4g}",
         where="image",
         why="thresholds of skin and bone are in HU; a guessed scale moves the bone's surface",
-        mend="state the scale in the case file (rescale = [slope, intercept] in [image]), or "
+        fix="state the scale in the case file (rescale = [slope, intercept] in [image]), or "
         "export the CT with it; check skin and bone by eye",
     )
 
@@ -209,12 +208,11 @@ def weak_bone(hu: Volume, threshold: float) -> tuple[Finding, ...]:
     if half >= 0.9 * threshold:
         return ()
     return (
-        Finding(
-            "warning",
+        Finding.warning(
             "bone-weak",
             f"compact bone reaches {compact:.0f} HU only, so that {threshold:g} HU misses much",
             where="image",
             why="thin bone is lost and the skull gets holes",
-            mend=f"try bone_threshold = {round(half, -1):.0f}",
+            fix=f"try bone_threshold = {round(half, -1):.0f}",
         ),
     )

@@ -24,7 +24,7 @@ from cmfsim.imaging.morphology import (
     watershed,
 )
 from cmfsim.imaging.working import Working
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["Jaws", "part_jaws"]
 
@@ -168,25 +168,23 @@ def _side(mandible: Mask, bone: Mask) -> Volume:
 
 
 def _not_parted(reason: str) -> Finding:
-    return Finding(
-        "warning",
+    return Finding.warning(
         "jaws-not-parted",
         f"the mandible was not told from the skull: {reason}",
         where="bone",
         why="mandible and cranium would move as one",
-        mend="give skull landmarks (menton, gonion_L, gonion_R, supradentale, infradentale, …) or "
+        fix="give skull landmarks (menton, gonion_L, gonion_R, supradentale, infradentale, …) or "
         "ready surfaces of both bones",
     )
 
 
 def _guessed() -> Finding:
-    return Finding(
-        "note",
+    return Finding.note(
         "jaws-parted-by-shape",
         "the mandible was told from the skull by shape alone, without landmarks",
         where="bone",
         why="the cut between the tooth rows may be some millimetres off",
-        mend="give skull landmarks",
+        fix="give skull landmarks",
     )
 
 
@@ -239,9 +237,10 @@ def _seeds(
         seeds[bone.cavity[box]] = 2
     _tooth_rows(seeds, landmarks, x, y, z)
     # Landmarks last: they are what a person said.
-    _balls(seeds, domain, work, landmarks, ON_CRANIUM, 2)
+    _balls(seeds, domain, work, landmarks, names=ON_CRANIUM, value=2)
     condyles = _condyles(landmarks)
-    _balls(seeds, domain, work, landmarks | condyles, (*ON_MANDIBLE, *condyles), 1)
+    on_mandible = (*ON_MANDIBLE, *condyles)
+    _balls(seeds, domain, work, landmarks | condyles, names=on_mandible, value=1)
     seeds[~domain] = 0
     return seeds
 
@@ -304,6 +303,7 @@ def _balls(
     domain: Mask,
     work: Working,
     landmarks: Mapping[str, Floats],
+    *,
     names: Iterable[str],
     value: int,
 ) -> None:

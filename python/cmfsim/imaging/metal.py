@@ -20,7 +20,7 @@ from cmfsim.imaging.morphology import (
 )
 from cmfsim.imaging.options import METAL, SegmentOptions
 from cmfsim.imaging.working import Working
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["Metal", "find_metal", "metal_within", "without_streaks"]
 
@@ -97,15 +97,14 @@ def find_metal(work: Working, options: SegmentOptions) -> Metal:
     part = hu[:, :, zone]
     hu[:, :, zone] = np.where(mask[:, :, zone], part, _median(part, work.spacing))
     low, high = (work.origin[2] + work.spacing[2] * layers[i] for i in (0, -1))
-    finding = Finding(
-        "warning",
+    finding = Finding.warning(
         "metal",
         f"{int(np.count_nonzero(large))} pieces of metal, "
         f"{np.count_nonzero(mask) * volume / 1000.0:.1f} cm³ above {threshold:.0f} HU, between "
         f"z = {low:.0f} and {high:.0f} mm",
         where="image",
         why="streaks hide skin and bone at that height; they were smoothed and spikes removed",
-        mend="check lips, cheeks and tooth rows by eye",
+        fix="check lips, cheeks and tooth rows by eye",
     )
     return Metal(mask, zone, hu, (*noticed, finding))
 
@@ -119,14 +118,14 @@ def _threshold(work: Working, options: SegmentOptions) -> tuple[float, tuple[Fin
         return METAL, ()
     sees = cut >= LEAST_SATURATION
     finding = Finding(
-        "warning" if cut >= LEAST_WINDOW else "note",
-        "ct-saturated",
-        f"the image is cut off at {work.saturation:.0f} HU, and metal is told by {METAL:g} HU"
+        severity="warning" if cut >= LEAST_WINDOW else "note",
+        code="ct-saturated",
+        what=f"the image is cut off at {work.saturation:.0f} HU, and metal is told by {METAL:g} HU"
         + (f"; what reaches {cut:.0f} HU was taken for metal" if sees else ": none was looked for"),
         where="image",
         why="metal, enamel and dense bone have one value there"
         + ("" if sees else ", so that streaks of metal may stay in skin and bone"),
-        mend="export the CT with its whole range of values, or set metal_threshold in [image]",
+        fix="export the CT with its whole range of values, or set metal_threshold in [image]",
     )
     return (cut if sees else np.inf), (finding,)
 

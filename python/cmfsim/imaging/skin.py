@@ -26,7 +26,7 @@ from cmfsim.imaging.morphology import (
 )
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.working import Working, coarse_of
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["Skin", "find_skin"]
 
@@ -150,13 +150,12 @@ def _box(
 
 
 def _rest_removed(volume: float) -> Finding:
-    return Finding(
-        "note",
+    return Finding.note(
         "rest-removed",
         f"{volume / 1000.0:.0f} cm³ of couch, pillow or head-rest was taken away",
         where="behind or beside the head",
         why="where it touched, the skin is drawn from the head's shape, not from the image",
-        mend="check the back of the head by eye if it matters",
+        fix="check the back of the head by eye if it matters",
     )
 
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from cmfsim.checks import as_floats, as_number, as_positive, as_rows, check_instance
 from cmfsim.errors import LandmarkInputError, RegistrationInputError
 from cmfsim.imaging.morphology import distance
-from cmfsim.values.anatomy import ImageData
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["undeformed_mask"]
 

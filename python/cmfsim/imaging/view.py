@@ -6,7 +6,7 @@ from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.morphology import depth
 from cmfsim.imaging.skin import Skin
 from cmfsim.imaging.working import COARSE, Working
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["view_findings"]
 
@@ -50,14 +50,13 @@ def _direction(work: Working, bone: Bone) -> tuple[Finding, ...]:
 
 
 def _turned(code: str, what: str) -> Finding:
-    return Finding(
-        "error",
+    return Finding.error(
         f"ct-{code}",
         f"{what}: the image is flipped, or its header lies",
         where="image",
         why="front and back, or up and down, would be taken for one another; left and right may "
         "be swapped as well, which no image shows",
-        mend="export the image again with its orientation, and check left and right",
+        fix="export the image again with its orientation, and check left and right",
     )
 
 
@@ -93,8 +92,7 @@ def _top(bone: Bone, area: float) -> Finding:
     what = f"bone of the skull meets the border over {area:.0f} mm²"
     if per_layer[-1] > 0.75 * per_layer.max():
         return _missing("top", "forehead", what)
-    return Finding(
-        "note",
+    return Finding.note(
         "ct-cut-vertex",
         f"the vertex is cut off: {what}",
         where="top border of the image",
@@ -110,11 +108,10 @@ def _chin_area(work: Working, bone: Bone, skin: Skin) -> float:
 
 
 def _missing(side: str, part: str, what: str) -> Finding:
-    return Finding(
-        "warning",
+    return Finding.warning(
         f"ct-cut-{side}",
         f"{part} cut off: {what}",
         where=f"{side} border of the image",
         why="the surface is closed flat there, and the prediction near it means nothing",
-        mend="use an image that holds the whole face, or leave that region out of the evaluation",
+        fix="use an image that holds the whole face, or leave that region out of the evaluation",
     )

@@ -20,7 +20,8 @@ from cmfsim.imaging.morphology import (
     smoothed,
 )
 from cmfsim.imaging.options import SegmentOptions
-from cmfsim.values.anatomy import Finding, ImageData
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["COARSE", "Working", "coarse_of", "without_noise", "working_grid"]
 
@@ -171,14 +172,13 @@ def _spacing_findings(spacing: NDArray[np.float64]) -> list[Finding]:
     if spacing.max() <= COARSE_SLICES:
         return []
     return [
-        Finding(
-            "warning",
+        Finding.warning(
             "ct-spacing-coarse",
             f"voxels are {' × '.join(f'{s:g}' for s in spacing)} mm",
             where="image",
             why="thin bone, lips and lids vanish between slices further apart than "
             f"{COARSE_SLICES:g} mm; surfaces are a millimetre worse",
-            mend="use the thin-slice reconstruction of the same scan",
+            fix="use the thin-slice reconstruction of the same scan",
         )
     ]
 
@@ -204,13 +204,12 @@ def _target(
 
 
 def _coarsened(target: NDArray[np.float64], options: SegmentOptions) -> Finding:
-    return Finding(
-        "note",
+    return Finding.note(
         "ct-coarsened",
         f"the head was sampled at {' × '.join(f'{t:.2f}' for t in target)} mm",
         where="image",
         why=f"more than most_voxels = {options.most_voxels} would have been needed",
-        mend="crop the image to the face, or raise most_voxels",
+        fix="crop the image to the face, or raise most_voxels",
     )
 
 

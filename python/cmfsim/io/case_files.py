@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
+from cmfsim._core import ELEMENTS, KINEMATICS, METHODS, PRESETS
 from cmfsim.checks import as_text
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import FORMAT_VERSION, is_there
@@ -32,16 +33,8 @@ from cmfsim.values.case_parts import (
     Region,
 )
 from cmfsim.values.motion import rigid_matrix, rigid_motion
-from cmfsim.values.scene import (
-    CONTACTS,
-    ELEMENTS,
-    KINEMATICS,
-    METHODS,
-    MIXINGS,
-    PRESETS,
-    SolverOptions,
-    TissueData,
-)
+from cmfsim.values.solver_options import CONTACTS, SolverOptions
+from cmfsim.values.tissue_data import MIXINGS, TissueData
 
 __all__ = ["CASE_FORMAT", "Case", "CaseOrPath", "as_case"]
 

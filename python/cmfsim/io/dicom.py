@@ -20,7 +20,8 @@ from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
 from cmfsim.io.dicom_headers import DicomHeader, dicom_header, numbers_of
 from cmfsim.io.image_grids import aligned, of_slices, turn_of, upright
 from cmfsim.io.image_headers import check_shape
-from cmfsim.values.anatomy import Finding, ImageData
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["read_dicom_file", "read_dicom_folder"]
 
@@ -206,8 +207,7 @@ def _headers(folder: Path) -> tuple[list[DicomHeader], list[Finding]]:
     findings = []
     if others:
         findings.append(
-            Finding(
-                "note",
+            Finding.note(
                 "dicom-other-files",
                 f"skipped {_count(len(others), 'file')} not in DICOM: {_listed(others)}",
                 where=folder.name,
@@ -260,14 +260,13 @@ def _chosen(folder: Path, found: list[Series], wanted: str | None) -> tuple[Seri
         raise ImageInputError(f"{folder.name}: {several}; {how}: {listed}")
     if len(found) == 1:
         return first, []
-    finding = Finding(
-        "warning",
+    finding = Finding.warning(
         "dicom-series",
         f"{len(found)} series in the folder; the largest CT, {first.described()}, was taken of: "
         f"{listed}",
         where=folder.name,
         why="another series may be the one that was meant",
-        mend=how,
+        fix=how,
     )
     return first, [finding]
 
@@ -363,13 +362,14 @@ def _without_scouts(name: str, slices: list[Slice]) -> tuple[list[Slice], list[F
     if not left:
         return groups[0], []
     finding = Finding(
-        "note" if not others else "warning",
-        "dicom-scouts",
-        f"skipped {_count(len(left), 'scout')} (localisers, or slices of another orientation): "
+        severity="note" if not others else "warning",
+        code="dicom-scouts",
+        what=f"skipped {_count(len(left), 'scout')} (localisers, or slices of another "
+        "orientation): "
         f"{_listed(left)}",
         where=name,
         why="they show the head from elsewhere",
-        mend="" if not others else "see whether these are no slices of the volume",
+        fix="" if not others else "see whether these are no slices of the volume",
     )
     return groups[0], [finding]
 
@@ -504,8 +504,7 @@ def _without_copies(
         copies.append(other.name)
     if not copies:
         return kept, []
-    finding = Finding(
-        "note",
+    finding = Finding.note(
         "dicom-copies",
         f"skipped {_count(len(copies), 'copy')} of slices with the same place and pixels: "
         f"{_listed(copies)}",
@@ -641,27 +640,25 @@ def _tilt_findings(
                 f"slices shifted against one another by up to {np.ptp(along, axis=0).max():.1f} mm"
             )
         findings.append(
-            Finding(
-                "warning",
+            Finding.warning(
                 "dicom-tilted",
                 f"{what}, resampled by each slice's own position "
                 f"({np.linalg.norm(along[-1]):.1f} mm from first to last slice)",
                 where=name,
                 why="stacked at right angles the head would be sheared; outside the slices there "
                 "is air, so that the neck may end on an oblique plane, where nothing is fixed",
-                mend=f"check the skin by eye; {_whole_heights(stack)}",
+                fix=f"check the skin by eye; {_whole_heights(stack)}",
             )
         )
     if abs(abs(tilt) - angle) > TILTS_AGREE:
         findings.append(
-            Finding(
-                "warning",
+            Finding.warning(
                 "dicom-tilt-unclear",
                 f"the header states a gantry tilt of {tilt:g}°, the positions of the slices one of "
                 f"{angle:.1f}°; the positions were used",
                 where=name,
                 why="if another program wrote the positions without the tilt, the head is sheared",
-                mend="export the series from the scanner or archive as it was made, and check the "
+                fix="export the series from the scanner or archive as it was made, and check the "
                 "head's shape by eye",
             )
         )
@@ -685,20 +682,18 @@ def _whole_heights(stack: _Stack) -> str:
 
 def _uneven(name: str, stack: _Stack, uneven: list[int]) -> Finding:
     steps = np.diff(stack.heights)
-    return Finding(
-        "warning",
+    return Finding.warning(
         "dicom-uneven",
         f"slices are {np.median(steps):.3g} mm apart, from {steps.min():.3g} to "
         f"{steps.max():.3g} mm: {_steps(stack, uneven)}; resampled by their positions",
         where=name,
         why="between slices farther apart than the others, shapes are less certain",
-        mend="use a reconstruction with even slices if there is one",
+        fix="use a reconstruction with even slices if there is one",
     )
 
 
 def _oblique(name: str, angle: float) -> Finding:
-    return Finding(
-        "note",
+    return Finding.note(
         "image-oblique",
         f"the image's axes are turned by {angle:.1f}° from the patient's; it was resampled",
         where=name,
@@ -707,14 +702,13 @@ def _oblique(name: str, angle: float) -> Finding:
 
 
 def _coarse(name: str, gap: float) -> Finding:
-    return Finding(
-        "warning",
+    return Finding.warning(
         "ct-spacing-coarse",
         f"slices are {gap:.3g} mm apart",
         where=name,
         why="thin bone, lips and lids vanish between slices further apart than "
         f"{COARSE_SLICES:g} mm; surfaces are a millimetre worse",
-        mend="use the thin-slice reconstruction of the same scan",
+        fix="use the thin-slice reconstruction of the same scan",
     )
 
 
@@ -723,13 +717,12 @@ def _rescale_findings(name: str, stack: _Stack) -> list[Finding]:
     if not kinds:
         return []
     return [
-        Finding(
-            "warning",
+        Finding.warning(
             "dicom-not-hu",
             f"the header states that values are {', '.join(sorted(kinds))!r}, not HU",
             where=name,
             why="thresholds of skin and bone are in HU",
-            mend="check skin and bone by eye, or set skin_threshold and bone_threshold",
+            fix="check skin and bone by eye, or set skin_threshold and bone_threshold",
         )
     ]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.io.image_headers import MOST_VOXELS
-from cmfsim.values.anatomy import ImageData
+from cmfsim.values.image_data import ImageData
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -203,7 +203,7 @@ def of_slices(
         four = np.logical_and.reduce([*inside, below > 0, below < len(heights) - 2])
         weights = [np.where(four, c, w) for c, w in zip(weights, _linear(part), strict=True)]
         if by_rows:
-            layer = _from_rows(values, slices, v, weights, inside, outside)
+            layer = _from_rows(values, slices, v, weights, inside, outside=outside)
         else:
             found = [
                 np.where(i, _in_slice(values, k, a, b), outside)
@@ -268,6 +268,7 @@ def _from_rows(
     v: Sequence[Floats],
     weights: Sequence[Floats],
     inside: Sequence[NDArray[np.bool_]],
+    *,
     outside: float,
 ) -> Floats:
     """Whole rows, each of four rows (at v) of four slices; the value outside beyond a border."""

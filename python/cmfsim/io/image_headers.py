@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.io.files import check_readable, is_below
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = [
     "KNOWN",
@@ -229,14 +229,13 @@ def data_file(path: Path, name: str) -> Path:
 
 def unstated(path: Path, stated: str, how: str) -> Finding:
     """A finding on a file that does not state its frame, and how it would."""
-    return Finding(
-        "warning",
+    return Finding.warning(
         "image-frame-unstated",
         f"{stated}: its axes were taken as left, posterior and superior",
         where=path.name,
         why="left and right of the face would be swapped, or front and back, if that is wrong; no "
         "image shows left and right",
-        mend=f"export the image again with its orientation ({how}), and check left and right",
+        fix=f"export the image again with its orientation ({how}), and check left and right",
     )
 
 

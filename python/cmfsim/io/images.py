@@ -21,7 +21,8 @@ from cmfsim.io.leftovers import abandoned, temporary_folder
 from cmfsim.io.metaimage import is_meta, meta_header
 from cmfsim.io.nifti import GZIP, is_nifti, read_nifti
 from cmfsim.io.nrrd import nrrd_header
-from cmfsim.values.anatomy import Finding, ImageData
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["ImageFile", "read_image", "read_image_file", "write_image"]
 
@@ -234,22 +235,20 @@ def _affine_of(place: Any) -> NDArray[np.float64]:
 def _resampled(path: Path, affine: NDArray[np.float64]) -> Finding:
     shear = shear_of(affine)
     if shear <= SHEARED:
-        return Finding(
-            "note",
+        return Finding.note(
             "image-oblique",
             f"the image's axes are turned by {turn_of(affine):.1f}° from the patient's; it was "
             "resampled",
             where=path.name,
             why="everything works on a grid along the patient's axes",
         )
-    return Finding(
-        "warning",
+    return Finding.warning(
         "image-sheared",
         f"the image's axes are {shear:.1f}° from right angles, as those of a CT with a tilted "
         "gantry; it was resampled by its own map",
         where=path.name,
         why="programs that take such axes for perpendicular shear the head",
-        mend="check the skin by eye against the scan",
+        fix="check the skin by eye against the scan",
     )
 
 

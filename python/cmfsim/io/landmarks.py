@@ -27,7 +27,7 @@ from cmfsim.io.markups import (
     markups_of,
     write_markups,
 )
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, label_key
 
 __all__ = ["LandmarkFile", "read_landmark_file", "read_landmarks", "write_landmarks"]
@@ -140,13 +140,12 @@ def _known_labels(
     if not renamed:
         return points, []
     more = f" and {len(renamed) - 4} more" if len(renamed) > 4 else ""
-    finding = Finding(
-        "note",
+    finding = Finding.note(
         "landmark-spelling",
         f"{len(renamed)} labels are spelled differently: {', '.join(renamed[:4])}{more}",
-        where,
-        "they are used under the second name",
-        "nothing has to be done; spelled alike they are easier to find",
+        where=where,
+        why="they are used under the second name",
+        fix="nothing has to be done; spelled alike they are easier to find",
     )
     return MappingProxyType({labels[label]: point for label, point in points.items()}), [finding]
 
@@ -273,25 +272,25 @@ def _landmark_file(
         origin = "as the case says" if given else "the rule of this format"
         findings.append(
             Finding(
-                "note" if given else "warning",
-                "landmark-frame-unstated",
-                f"the file does not state its frame: read as {chosen}, {origin}",
-                path.name,
-                "RAS read as LPS turns the head by half a turn about its long axis",
-                'state it: "coordinateSystem": "LPS" (.mrk.json), # CoordinateSystem = LPS (.fcsv),'
+                severity="note" if given else "warning",
+                code="landmark-frame-unstated",
+                what=f"the file does not state its frame: read as {chosen}, {origin}",
+                where=path.name,
+                why="RAS read as LPS turns the head by half a turn about its long axis",
+                fix='state it: "coordinateSystem": "LPS" (.mrk.json), # CoordinateSystem = LPS '
+                "(.fcsv),"
                 ' or frame = "LPS" under [landmarks]',
             )
         )
     if unset:
         names = ", ".join(unset[:5]) + (", …" if len(unset) > 5 else "")
         findings.append(
-            Finding(
-                "note",
+            Finding.note(
                 "landmark-unset",
                 f"{len(unset)} points were never placed and are left out: {names}",
-                path.name,
-                "what is placed from them falls back to its default or is refused",
-                "place them in 3D Slicer, or delete them",
+                where=path.name,
+                why="what is placed from them falls back to its default or is refused",
+                fix="place them in 3D Slicer, or delete them",
             )
         )
     return LandmarkFile(MappingProxyType(_by_label(points)), chosen, stated, tuple(findings))

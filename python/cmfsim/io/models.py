@@ -15,7 +15,7 @@ from cmfsim.io.folders import replacing_files
 from cmfsim.io.scenes import write_scene
 from cmfsim.io.surfaces import write_surface
 from cmfsim.io.vtk import write_tets
-from cmfsim.values.anatomy import NodeKinds
+from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.patient_model import PatientModel
 
 __all__ = ["is_model_file", "write_model"]

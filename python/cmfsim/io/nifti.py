@@ -25,7 +25,7 @@ from cmfsim.io.image_headers import (
     check_shape,
     unstated,
 )
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["is_nifti", "read_nifti"]
 
@@ -225,13 +225,12 @@ def _voxels(path: Path, stream: Any, header: _Header, *, packed: bool) -> NDArra
 
 def _no_unit(path: Path, spacing: NDArray[np.float64]) -> Finding:
     text = " × ".join(f"{s:.4g}" for s in spacing)
-    return Finding(
-        "note",
+    return Finding.note(
         "image-unit-unstated",
         f"it states no unit of length: voxels were taken as {text} mm",
         where=path.name,
         why="every length of the head follows from it",
-        mend="compare a distance with one on the patient, or export with units of mm",
+        fix="compare a distance with one on the patient, or export with units of mm",
     )
 
 
@@ -268,12 +267,12 @@ def _affine(path: Path, header: _Header) -> tuple[NDArray[np.float64], list[Find
 
 def _template(path: Path, code: int, severity: str, used: str) -> Finding:
     return Finding(
-        severity,
-        "image-template-space",
-        f"its sform (code {code}) leads to the space of a template{used}",
+        severity=severity,
+        code="image-template-space",
+        what=f"its sform (code {code}) leads to the space of a template{used}",
         where=path.name,
         why="lengths in a template's space are not the patient's",
-        mend="" if used else "use the image in the scanner's space",
+        fix="" if used else "use the image in the scanner's space",
     )
 
 

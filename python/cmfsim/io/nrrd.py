@@ -22,7 +22,7 @@ from cmfsim.io.image_headers import (
     unstated,
     whole,
 )
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["nrrd_header"]
 

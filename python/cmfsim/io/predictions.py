@@ -41,7 +41,7 @@ from cmfsim.io.summaries import (
 from cmfsim.io.surfaces import write_surface
 from cmfsim.io.vtk import write_tets, write_triangles
 from cmfsim.values.prediction import MODELS, Prediction
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
     "fill_prediction",

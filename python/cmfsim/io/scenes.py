@@ -22,17 +22,12 @@ from cmfsim.io.files import (
 )
 from cmfsim.io.meshes import read_mesh, read_tets
 from cmfsim.io.surfaces import read_moved_surface, read_surface
-from cmfsim.values.anatomy import NODE_KINDS
 from cmfsim.values.motion import rigid_motion
-from cmfsim.values.scene import (
-    TISSUE_ARRAYS,
-    MovedSurface,
-    Scene,
-    SegmentData,
-    SolverOptions,
-    SurfaceData,
-    TissueData,
-)
+from cmfsim.values.node_kinds import NODE_KINDS
+from cmfsim.values.scene import Scene, SegmentData
+from cmfsim.values.solver_options import SolverOptions
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.tissue_data import TISSUE_ARRAYS, TissueData
 
 __all__ = ["read_plan", "read_scene", "write_scene"]
 

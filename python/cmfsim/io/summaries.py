@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import refuse_constant
-from cmfsim.values.anatomy import SEVERITIES
+from cmfsim.values.finding import SEVERITIES
 
 __all__ = [
     "Check",
@@ -297,9 +297,12 @@ def table(
 def finding(where: str, value: object) -> None:
     """The values of a `Finding`."""
     known = {"severity": one_of(*SEVERITIES), "code": text, "what": text}
-    table({**known, "where": text, "why": text, "mend": text})(where, value)
+    # Files of earlier builds have `mend` for `fix`.
+    table({**known, "where": text, "why": text}, {"fix": text, "mend": text})(where, value)
     if isinstance(value, dict) and not (value["code"] and value["what"]):
         raise CaseInputError(f"{where} states nothing")
+    if isinstance(value, dict) and not {"fix", "mend"} & set(value):
+        raise CaseInputError(f"{where} lacks 'fix'")
 
 
 def _refuse(where: str, value: object, needed: str) -> NoReturn:

@@ -20,7 +20,7 @@ from cmfsim.io.polygons import triangles_of
 from cmfsim.io.stl import write_stl
 from cmfsim.io.vtk import data_array, write_vtk
 from cmfsim.values.case_parts import FRAMES, UNITS
-from cmfsim.values.scene import MovedSurface, SurfaceData
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = [
     "read_moved_surface",

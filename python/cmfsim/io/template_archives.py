@@ -11,7 +11,7 @@ from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io.archives import member_of, read_archive, write_archive
 from cmfsim.values.musculature import MuscleSurface
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.template import TemplateData
 
 __all__ = ["TEMPLATE_FORMAT", "mirrored_muscle", "read_template_archive", "write_template_archive"]
@@ -104,34 +104,71 @@ def mirrored_muscle(muscle: MuscleSurface, name: str, side: str) -> MuscleSurfac
 def read_template_archive(path: Path) -> TemplateData:
     """The template of an archive; needs numpy alone."""
     header, members = read_archive(path, TEMPLATE_FORMAT, "template")
-    vertices, course = (_rows(members, name) for name in ("vertices", "course"))
-    steps = member_of(members, "triangle_steps")
-    if steps.ndim != 1 or steps.dtype.kind != "i" or len(steps) % 3:
-        raise CaseInputError(f"triangle_steps has {steps.dtype} of shape {steps.shape}: (3 t,)")
-    triangles = np.cumsum(steps, dtype=np.int64).reshape(-1, 3)
+    rows = _Rows(members)
     entries = header.get("muscles")
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise CaseInputError("'muscles' is not a list of tables")
     skull = header.get("skull")
     if not isinstance(skull, dict):
         raise CaseInputError("'skull' is not a table")
-    taken = {"vertices": 0, "triangles": 0, "course": 0}
+    muscles, concepts = _muscles_of(entries, rows)
+    names = header.get("landmarks")
+    points = member_of(members, "landmarks")
+    if not isinstance(names, list) or len(set(map(str, names))) != len(points):
+        raise LandmarkInputError(f"has {len(points)} landmarks and other names than that")
+    definitions = header.get("definitions", {})
+    if not isinstance(definitions, dict):
+        raise CaseInputError("'definitions' is not a table")
+    texts = [str(header.get(key, "")) for key in ("name", "licence", "attribution", "source")]
+    return TemplateData(
+        name=texts[0],
+        muscles=muscles,
+        skull=rows.surface(skull),
+        landmarks=dict(zip(map(str, names), points, strict=True)),
+        licence=texts[1],
+        attribution=texts[2],
+        source=texts[3],
+        definitions={str(key): str(text) for key, text in definitions.items()},
+        concepts=concepts,
+    )
 
-    def take(kind: str, count: object, rows: NDArray[Any]) -> NDArray[Any]:
-        start = taken[kind]
+
+class _Rows:
+    """The rows of an archive's arrays, handed out in order: muscle by muscle, the skull last."""
+
+    def __init__(self, members: Mapping[str, NDArray[Any]]) -> None:
+        steps = member_of(members, "triangle_steps")
+        if steps.ndim != 1 or steps.dtype.kind != "i" or len(steps) % 3:
+            raise CaseInputError(f"triangle_steps has {steps.dtype} of shape {steps.shape}: (3 t,)")
+        self._rows: dict[str, NDArray[Any]] = {
+            "vertices": _rows(members, "vertices"),
+            "triangles": np.cumsum(steps, dtype=np.int64).reshape(-1, 3),
+            "course": _rows(members, "course"),
+        }
+        self._taken = dict.fromkeys(self._rows, 0)
+
+    def take(self, kind: str, count: object) -> NDArray[Any]:
+        """The next rows of a kind."""
+        start, rows = self._taken[kind], self._rows[kind]
         if isinstance(count, bool) or not isinstance(count, int) or not count >= 0:
             raise CaseInputError(f"number of {kind} is {count!r}: a whole number is needed")
         if start + count > len(rows):
             raise CaseInputError(f"has {len(rows)} {kind}, {start + count} are needed")
-        taken[kind] = start + count
+        self._taken[kind] = start + count
         return rows[start : start + count]
 
-    def surface(entry: Mapping[str, Any]) -> SurfaceData:
+    def surface(self, entry: Mapping[str, Any]) -> SurfaceData:
+        """The next surface, of as many vertices and triangles as its entry states."""
         return SurfaceData(
-            take("vertices", entry.get("vertices"), vertices),
-            take("triangles", entry.get("triangles"), triangles),
+            self.take("vertices", entry.get("vertices")),
+            self.take("triangles", entry.get("triangles")),
         )
 
+
+def _muscles_of(
+    entries: list[dict[str, Any]], rows: _Rows
+) -> tuple[tuple[MuscleSurface, ...], dict[str, tuple[str, ...]]]:
+    """The muscles of an archive, and the concepts of those that have some."""
     muscles: dict[str, MuscleSurface] = {}
     concepts: dict[str, tuple[str, ...]] = {}
     for number, entry in enumerate(entries):
@@ -153,29 +190,12 @@ def read_template_archive(path: Path) -> TemplateData:
         counts = entry.get("course", [])
         if not isinstance(counts, list):
             raise CaseInputError(f"course of {name} is no list of numbers of points")
-        lines = tuple(take("course", count, course) for count in counts)
-        muscles[name] = MuscleSurface(name, str(side), surface(entry), str(kind), boxes, lines)
+        lines = tuple(rows.take("course", count) for count in counts)
+        surface = rows.surface(entry)
+        muscles[name] = MuscleSurface(name, str(side), surface, str(kind), boxes, lines)
     if len(muscles) != len(entries):
         raise CaseInputError("two muscles have the same name")
-    names = header.get("landmarks")
-    points = member_of(members, "landmarks")
-    if not isinstance(names, list) or len(set(map(str, names))) != len(points):
-        raise LandmarkInputError(f"has {len(points)} landmarks and other names than that")
-    definitions = header.get("definitions", {})
-    if not isinstance(definitions, dict):
-        raise CaseInputError("'definitions' is not a table")
-    texts = [str(header.get(key, "")) for key in ("name", "licence", "attribution", "source")]
-    return TemplateData(
-        name=texts[0],
-        muscles=tuple(muscles.values()),
-        skull=surface(skull),
-        landmarks=dict(zip(map(str, names), points, strict=True)),
-        licence=texts[1],
-        attribution=texts[2],
-        source=texts[3],
-        definitions={str(key): str(text) for key, text in definitions.items()},
-        concepts=concepts,
-    )
+    return tuple(muscles.values()), concepts
 
 
 def _rows(members: Mapping[str, NDArray[Any]], name: str) -> Floats:

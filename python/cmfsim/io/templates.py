@@ -27,10 +27,10 @@ from cmfsim.io.template_archives import (
     read_template_archive,
     write_template_archive,
 )
-from cmfsim.values.anatomy import Finding
 from cmfsim.values.case_parts import FRAMES, UNITS
+from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import MOST_BOXES, MUSCLE_KINDS, MUSCLE_SIDES, MuscleSurface
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.template import TemplateData
 
 __all__ = ["TEMPLATE_FILE", "TemplateSurvey", "read_template", "survey_template", "write_template"]
@@ -149,16 +149,16 @@ class _Gathered:
     def has_error(self) -> bool:
         return any(finding.severity == "error" for finding in self.findings)
 
-    def at(self, code: str, mend: str) -> "_Attempt":
+    def at(self, code: str, fix: str) -> "_Attempt":
         """A context that turns an error into a finding with its place, and goes on."""
-        return _Attempt(self, code, mend)
+        return _Attempt(self, code, fix)
 
 
 class _Attempt:
     """The context of `_Gathered.at`."""
 
-    def __init__(self, gathered: _Gathered, code: str, mend: str) -> None:
-        self._gathered, self._code, self._mend = gathered, code, mend
+    def __init__(self, gathered: _Gathered, code: str, fix: str) -> None:
+        self._gathered, self._code, self._fix = gathered, code, fix
 
     def __enter__(self) -> None:
         pass
@@ -173,11 +173,11 @@ class _Attempt:
             return False
         found = PLACE.fullmatch(str(error))
         where, what = (found[1], found[2]) if found else (self._gathered.where, str(error))
-        code, mend = self._code, self._mend
+        code, fix = self._code, self._fix
         if isinstance(error, FileNotFoundError):
-            code, mend = MISSING, "put the file there, or correct its name"
+            code, fix = MISSING, "put the file there, or correct its name"
         why = "the template cannot be used"
-        self._gathered.findings.append(Finding("error", code, what, where, why, mend))
+        self._gathered.findings.append(Finding.error(code, what, where=where, why=why, fix=fix))
         return True
 
 
@@ -206,9 +206,9 @@ def _survey_folder(folder: Path, gathered: _Gathered) -> TemplateData | None:
     with gathered.at("template-text", "correct the line"):
         units = table.text("units", units, tuple(UNITS))
         frame = table.text("frame", frame, FRAMES)
-    with gathered.at("template-surface", "mend the skull reference"):
+    with gathered.at("template-surface", "repair the skull reference"):
         given["skull"] = _surface(table, "skull", folder, units, frame)
-    with gathered.at("template-landmarks", "mend the landmarks"):
+    with gathered.at("template-landmarks", "correct the landmarks"):
         landmarks = table.table("landmarks").only("file", "definitions")
         definitions = landmarks.table("definitions")
         given["definitions"] = {name: definitions.text(name) for name in definitions}

@@ -8,8 +8,10 @@ from cmfsim import _core
 from cmfsim._core import Surface
 from cmfsim.checks import as_positive
 from cmfsim.errors import MeshInputError
-from cmfsim.values.anatomy import Anatomy, Finding, ImageData
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["anatomy_from_surfaces", "signed_level"]
 
@@ -138,12 +140,12 @@ def _outside(name: str, bone: ImageData, skin: ImageData) -> Finding | None:
         return None
     volume = count * float(np.prod(np.asarray(bone.spacing)))
     place = np.asarray(bone.lowest) + np.argwhere(beyond).mean(axis=0) * np.asarray(bone.spacing)
-    return Finding(
-        "warning",
+    return Finding.warning(
         "bone-outside-skin",
         f"{volume:.0f} mm³ of bone {name!r} lie outside the skin",
-        f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
-        "there is no tissue over it, so the face cannot be predicted there",
-        "check that skin and bone are of one patient, in one frame; a neck cut lower mends a spine "
+        where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
+        why="there is no tissue over it, so the face cannot be predicted there",
+        fix="check that skin and bone are of one patient, in one frame; a neck cut lower mends a "
+        "spine "
         "that sticks out",
     )

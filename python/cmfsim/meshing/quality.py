@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim._core import TetMesh
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["LEAST_DIHEDRAL", "MeshReport", "mesh_findings", "mesh_report", "report_of_part"]
 
@@ -178,25 +178,23 @@ def mesh_findings(report: MeshReport) -> tuple[Finding, ...]:
         worst = report.worst[0]
         x, y, z = worst["centroid"]
         findings.append(
-            Finding(
-                "warning",
+            Finding.warning(
                 "mesh-poor-tet",
                 f"tet {worst['tet']} has a dihedral angle of {report.min_dihedral:.1f}°",
-                f"mesh, at ({x:.1f}, {y:.1f}, {z:.1f}) mm",
-                "its deformation is inaccurate and the system worse conditioned",
-                "change edge_length a little, or set refinements = 0",
+                where=f"mesh, at ({x:.1f}, {y:.1f}, {z:.1f}) mm",
+                why="its deformation is inaccurate and the system worse conditioned",
+                fix="change edge_length a little, or set refinements = 0",
             )
         )
     if report.dropped_parts:
         findings.append(
-            Finding(
-                "note",
+            Finding.note(
                 "mesh-specks-dropped",
                 f"{report.dropped_parts} specks of tissue with {report.dropped_volume:.1f} mm³ "
                 "in all were left out",
-                "mesh",
-                "they hang on nothing",
-                "none is needed; check the thresholds if a part of the face is missing",
+                where="mesh",
+                why="they hang on nothing",
+                fix="none is needed; check the thresholds if a part of the face is missing",
             )
         )
     return tuple(findings)

@@ -10,8 +10,9 @@ from cmfsim._core import Surface, TetMesh
 from cmfsim.checks import as_number, as_positive, as_rows
 from cmfsim.errors import MeshInputError
 from cmfsim.meshing.quality import MeshReport, mesh_findings, mesh_report
-from cmfsim.values.anatomy import Finding, ImageData
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["MeshOptions", "TissueMesh", "mesh_from_labels", "mesh_from_level", "part_mesh"]
 
@@ -169,7 +170,9 @@ def mesh_from_level(
     """
     options = options or MeshOptions()
     values = np.asarray(level.values, dtype=np.float32)
-    mesh, making = _stuffed(values, level.spacing, level.origin, options, allowed, needed)
+    mesh, making = _stuffed(
+        values, level.spacing, level.origin, options, allowed=allowed, needed=needed
+    )
     report = mesh_report(mesh, making)
     return TissueMesh(mesh, report, mesh_findings(report))
 
@@ -211,6 +214,7 @@ def _stuffed(
     spacing: ArrayLike,
     origin: ArrayLike,
     options: MeshOptions,
+    *,
     allowed: ArrayLike | None = None,
     needed: ArrayLike | None = None,
 ) -> tuple[TetMesh, dict[str, float]]:

@@ -12,7 +12,7 @@ import numpy as np
 from cmfsim._core import TetMesh
 from cmfsim.checks import as_positive
 from cmfsim.errors import MeshInputError
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["mesh_with_tetwild"]
 

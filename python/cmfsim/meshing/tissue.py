@@ -10,7 +10,9 @@ from cmfsim import _core
 from cmfsim.checks import as_number, as_positive, as_rows
 from cmfsim.errors import MeshInputError
 from cmfsim.extras import third_party
-from cmfsim.values.anatomy import Anatomy, Finding, ImageData
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["TissueRegion", "near_skin", "tissue_level"]
 
@@ -165,11 +167,10 @@ def _without_hollows(
     if volume < NOTEWORTHY_HOLLOW:
         return
     place = np.asarray(grid.lowest) + np.argwhere(hollow).mean(axis=0) * np.asarray(grid.spacing)
-    yield Finding(
-        "note",
+    yield Finding.note(
         "hollow-left-out",
         f"{volume / 1000.0:.1f} cm³ behind bone were left out of the tissue",
-        f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
-        "the cranial cavity and closed sinuses do not deform with the face",
-        "none is needed; lower foramen_radius if tissue of the face is missing",
+        where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
+        why="the cranial cavity and closed sinuses do not deform with the face",
+        fix="none is needed; lower foramen_radius if tissue of the face is missing",
     )

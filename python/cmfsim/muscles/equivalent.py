@@ -18,13 +18,13 @@ from cmfsim import _core
 from cmfsim._core import PRESETS, MuscleFibres, Surface, TetMesh, Tissue
 from cmfsim.checks import Floats, check_instance, frozen
 from cmfsim.errors import MaterialInputError, MeshError, MeshInputError
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import MuscleSurface
-from cmfsim.values.scene import SurfaceData, TissueData
+from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.tissue_data import MIXINGS, TissueData
 
-__all__ = ["INSIDE_TESTS", "MIXINGS", "Mixture", "MuscleVolume", "equivalent_material"]
+__all__ = ["INSIDE_TESTS", "Mixture", "MuscleVolume", "equivalent_material"]
 
-MIXINGS = ("moduli", "stiffness")
 INSIDE_TESTS = ("winding", "normal")
 # Part of a closed muscle that may lie outside the mesh before a finding says so.
 LOST_PART = 0.02
@@ -317,8 +317,7 @@ def _findings(
     ready: Sequence[tuple[Surface, MuscleFibres]],
 ) -> Iterator[Finding]:
     if not volumes:
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "muscles-none",
             "no muscle was given: every tet is fat",
             why="The tissue is homogeneous and isotropic.",
@@ -327,44 +326,39 @@ def _findings(
         volumes.items(), turned, ready, strict=True
     ):
         if was_turned:
-            yield Finding(
-                "note",
+            yield Finding.note(
                 "muscle-inside-out",
                 f"the surface of {name} is inside out; it was turned",
                 where=name,
             )
         if volume.enclosed is None:
-            yield Finding(
-                "note",
+            yield Finding.note(
                 "muscle-open",
                 f"the surface of {name} is not closed: {surface.n_border_edges} border edges",
                 where=name,
                 why="Inside is where the winding number exceeds one half; holes are bridged.",
             )
         if volume.inside == 0.0:
-            yield Finding(
-                "warning",
+            yield Finding.warning(
                 "muscle-missed",
                 f"{name} holds no sample of any tet",
                 where=name,
                 why="It has no part in the tissue: it lies outside the mesh, or encloses nothing.",
-                mend="Check its frame and that its surface is closed; or take more samples.",
+                fix="Check its frame and that its surface is closed; or take more samples.",
             )
         elif volume.enclosed is not None:
             lost = 1.0 - volume.inside / volume.enclosed
             if lost > LOST_PART and lost * volume.enclosed > 3.0 * volume.error:
-                yield Finding(
-                    "note",
+                yield Finding.note(
                     "muscle-cut-off",
                     f"{lost:.1%} of {name} lies outside the mesh or in its own overlaps",
                     where=name,
                 )
         if fibres.is_sheet:
-            yield Finding(
-                "note",
+            yield Finding.note(
                 "muscle-sheet",
                 f"{name} is a sheet: second extent {fibres.sheet_ratio:.2f} of the first",
                 where=name,
                 why="Its outline hardly tells the direction of its fibres.",
-                mend="Give the course of its fibres.",
+                fix="Give the course of its fibres.",
             )

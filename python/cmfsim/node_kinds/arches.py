@@ -9,7 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim._core import Surface
 from cmfsim.checks import Floats, as_rows
 from cmfsim.errors import CaseInputError
-from cmfsim.values.anatomy import Anatomy, BoneSegment, DentalArch, Finding
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.dental_arch import DentalArch
+from cmfsim.values.finding import Finding
 
 __all__ = ["LOWER_ARCH", "UPPER_ARCH", "DentalArches", "dental_arches"]
 
@@ -100,26 +102,24 @@ def dental_arches(
 
 
 def _nothing_slides(missing: Sequence[str]) -> Finding:
-    return Finding(
-        "warning",
+    return Finding.warning(
         "sliding-landmarks",
         f"no sliding region at the teeth: landmarks {', '.join(missing)} are missing, and the "
         "image shows no teeth apart from bone",
-        "landmarks",
-        "lips and cheeks would stick to the teeth",
-        "place them, give regions, or set sliding = false",
+        where="landmarks",
+        why="lips and cheeks would stick to the teeth",
+        fix="place them, give regions, or set sliding = false",
     )
 
 
 def _from_teeth(missing: Sequence[str]) -> Finding:
-    return Finding(
-        "note",
+    return Finding.note(
         "sliding-from-teeth",
         f"landmarks {', '.join(missing)} are missing: the sliding regions were placed from the "
         "teeth that the image shows",
-        "landmarks",
-        "the depth of the vestibule is then right to some 3 mm",
-        "place the landmarks if lips or cheeks matter",
+        where="landmarks",
+        why="the depth of the vestibule is then right to some 3 mm",
+        fix="place the landmarks if lips or cheeks matter",
     )
 
 

@@ -17,8 +17,11 @@ from cmfsim.errors import CaseInputError
 from cmfsim.node_kinds.arches import DentalArches, dental_arches
 from cmfsim.node_kinds.options import BORDERS, KindOptions
 from cmfsim.node_kinds.sliding import sliding_nodes
-from cmfsim.values.anatomy import NODE_KINDS, Anatomy, BoneSegment, Finding, NodeKinds
-from cmfsim.values.scene import SegmentData, SurfaceData
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
+from cmfsim.values.scene import SegmentData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["ClassifiedNodes", "classify_nodes", "segment_data"]
 
@@ -49,7 +52,7 @@ class ClassifiedNodes:
         object.__setattr__(self, "counts", MappingProxyType(dict(self.counts)))
 
 
-def classify_nodes(
+def classify_nodes(  # noqa: PLR0913 (options by name)
     nodes: ArrayLike,
     boundary_triangles: ArrayLike,
     anatomy: Anatomy,
@@ -132,7 +135,13 @@ def classify_nodes(
         if {segment.name for segment in segments} - {r.segment for r in options.regions}:
             findings += arches.findings
         slides, noticed = sliding_nodes(
-            border.points, nearest, anatomy, segments, arches, contacts or {}, options
+            border.points,
+            nearest,
+            anatomy,
+            segments,
+            arches=arches,
+            contacts=contacts or {},
+            options=options,
         )
         findings += noticed
     moves = np.array([name in moved for name in names])
@@ -324,14 +333,13 @@ def _noticed(
     points: Floats, kinds: NodeKinds, counts: Mapping[str, int], moved: Collection[str]
 ) -> list[Finding]:
     findings = [
-        Finding(
-            "warning",
+        Finding.warning(
             "segment-without-nodes",
             f"no node is joined to {name!r}, which the plan moves "
             f"({counts[f'sliding on {name}']} slide on it)",
-            name,
-            "its motion pulls no tissue along",
-            "look at the picture; raise bone_distance, or leave it out of the plan",
+            where=name,
+            why="its motion pulls no tissue along",
+            fix="look at the picture; raise bone_distance, or leave it out of the plan",
         )
         for name in kinds.segments
         if name in moved and not counts[f"joined on {name}"]
@@ -340,14 +348,13 @@ def _noticed(
     spread = np.linalg.svd(held - held.mean(axis=0), compute_uv=False) if len(held) else [0.0, 0.0]
     if len(held) < HOLDING_NODES or spread[1] <= 1e-6 * spread[0]:
         findings.append(
-            Finding(
-                "error",
+            Finding.error(
                 "tissue-not-held",
                 f"{len(held)} nodes are fixed or joined: at least {HOLDING_NODES} not on one line "
                 "are needed",
-                "node kinds",
-                "the tissue could drift as a whole, so there is no answer",
-                "give fixed_planes (posterior), or raise bone_distance",
+                where="node kinds",
+                why="the tissue could drift as a whole, so there is no answer",
+                fix="give fixed_planes (posterior), or raise bone_distance",
             )
         )
     return findings

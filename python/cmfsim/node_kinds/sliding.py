@@ -10,8 +10,10 @@ from cmfsim.checks import Floats
 from cmfsim.extras import third_party
 from cmfsim.node_kinds.arches import DentalArches
 from cmfsim.node_kinds.options import KindOptions
-from cmfsim.values.anatomy import SHEET_DEPTH, Anatomy, BoneSegment, DentalArch, Finding
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.dental_arch import SHEET_DEPTH, DentalArch
+from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["sliding_nodes"]
 
@@ -28,6 +30,7 @@ def sliding_nodes(
     nearest: NDArray[np.intp],
     anatomy: Anatomy,
     segments: Sequence[BoneSegment],
+    *,
     arches: DentalArches,
     contacts: Mapping[str, SurfaceData],
     options: KindOptions,
@@ -63,14 +66,13 @@ def sliding_nodes(
 
 
 def _far_sheet(name: str, on_sheet: int, within: int) -> Finding:
-    return Finding(
-        "warning",
+    return Finding.warning(
         "contact-sheet-far",
         f"of {within} nodes on {name!r} at the arch only {on_sheet} lie within {SHEET_DEPTH:g} mm "
         "of its contact sheet; the others are joined",
-        f"segment {name}",
-        "lips and cheeks would stick to the teeth there",
-        "check the arch's landmarks and the bone in anatomy.png, or set contact_surface = "
+        where=f"segment {name}",
+        why="lips and cheeks would stick to the teeth there",
+        fix="check the arch's landmarks and the bone in anatomy.png, or set contact_surface = "
         '"bone" in [node_kinds]',
     )
 

@@ -25,7 +25,14 @@ class Course(NamedTuple):
 
 
 def _ring(
-    x: float, z: float, half_x: float, half_z: float, place: float, thick: float, wide: float
+    x: float,
+    z: float,
+    half_x: float,
+    half_z: float,
+    *,
+    place: float,
+    thick: float,
+    wide: float,
 ) -> tuple[Row, ...]:
     """Rows about an eye, from the inner corner over the upper lid."""
     turns = (
@@ -159,9 +166,9 @@ COURSES = MappingProxyType(
         "orbicularis_oculi": Course(
             "ring",
             (
-                _ring(32, 18, 14.5, 8.5, 2.0, 0.8, 3.0),
-                _ring(32.5, 18, 19, 14, 2.4, 0.9, 3.2),
-                _ring(33, 18, 23, 19.5, 2.6, 0.9, 3.4),
+                _ring(32, 18, 14.5, 8.5, place=2.0, thick=0.8, wide=3.0),
+                _ring(32.5, 18, 19, 14, place=2.4, thick=0.9, wide=3.2),
+                _ring(33, 18, 23, 19.5, place=2.6, thick=0.9, wide=3.4),
             ),
             closed=True,
         ),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom.curves import Level
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["Field", "gradient_at", "level_grid", "level_surface", "to_surface"]
 

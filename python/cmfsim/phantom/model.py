@@ -27,8 +27,9 @@ from cmfsim.phantom.skull import (
     teeth_shape,
 )
 from cmfsim.phantom.warp import FaceWarp, JawWarp, JawWarped
-from cmfsim.values.anatomy import Anatomy, ImageData
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["BONES", "LABELS", "PARTS", "PhantomHead", "make_head"]
 

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.checks import Floats, as_index_rows, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
-from cmfsim.values.anatomy import NODE_KINDS, BoneSegment, NodeKinds
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
     "add_bone",
@@ -80,7 +81,7 @@ def picture_segments(
             add_bone(plotter, segment, colours[segment.name])
 
     views = tuple(View(name, name) for name in ("front", "left front", "left"))
-    draw(path, views, corners, size, paint, list(colours.items()))
+    draw(path, views, corners, size, paint, legend=list(colours.items()))
 
 
 def picture_anatomy(
@@ -121,7 +122,7 @@ def picture_anatomy(
         plotter.add_mesh(shape, color=SKIN_COLOUR, opacity=0.35, smooth_shading=True)
 
     views = tuple(View(name, name) for name in ("right", "front", "left"))
-    draw(path, views, corners, size, paint, [("skin", SKIN_COLOUR), *colours.items()])
+    draw(path, views, corners, size, paint, legend=[("skin", SKIN_COLOUR), *colours.items()])
 
 
 def picture_node_kinds(
@@ -197,7 +198,7 @@ def picture_node_kinds(
         View("front", "front, without the free part", bare=True),
         View("behind", "from behind, without the free part", bare=True),
     )
-    draw(path, views, corners, size, paint, entries)
+    draw(path, views, corners, size, paint, legend=entries)
 
 
 def _corners_of_kind(

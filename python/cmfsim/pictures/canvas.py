@@ -90,7 +90,8 @@ def draw(
     corners: Floats,
     size: tuple[int, int],
     paint: Callable[[Any, View], None],
-    legend: Sequence[tuple[str, str]],
+    *,
+    legend: Sequence[tuple[str, str]] = (),
     columns: int | None = None,
     words: Sequence[str] = (),
 ) -> None:

@@ -11,7 +11,7 @@ from cmfsim.checks import Floats, as_floats, as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.skin_ends import skin_ends, trimmed
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["DISTANCE_LIMIT", "distance_colour", "picture_distances"]
 
@@ -103,7 +103,7 @@ def picture_distances(
         View("front", "front   blue: prediction behind, red: in front"),
         View("left", "left"),
     )
-    draw(path, views, corners, size, paint, legend)
+    draw(path, views, corners, size, paint, legend=legend)
 
 
 def distance_colour(distance: float, limit: float = DISTANCE_LIMIT) -> str:

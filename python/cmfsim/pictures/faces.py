@@ -11,7 +11,7 @@ from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, poly
 from cmfsim.pictures.skin_ends import skin_ends, trimmed
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import Prediction
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["picture_plan", "picture_prediction"]
 
@@ -84,7 +84,7 @@ def picture_prediction(
     views = tuple(View(d, f"{name}, {d}") for d in ("front", "left") for name in names)
     corners = bounds([before.vertices, after.vertices])
     corners = ends.within(corners)
-    draw(path, views, corners, size, paint, [], columns=len(names))
+    draw(path, views, corners, size, paint, columns=len(names))
 
 
 def picture_plan(
@@ -138,4 +138,4 @@ def picture_plan(
     views = tuple(View(name, name) for name in ("right", "front", "left"))
     legend = [*colours.items(), ("before", GHOST_COLOUR)]
     plan = {name: m["clinical"] for name, m in prediction.summary.get("plan", {}).items()}
-    draw(path, views, corners, size, paint, legend, words=plan_lines(plan))
+    draw(path, views, corners, size, paint, legend=legend, words=plan_lines(plan))

@@ -12,7 +12,7 @@ from cmfsim._core import MuscleFibres, Surface
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import LEGEND_ROW, SIZE, View, bounds, draw, polydata
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 if TYPE_CHECKING:
     from cmfsim.values.musculature import MuscleSurface, Musculature
@@ -97,7 +97,7 @@ def picture_muscles(
             ("box of a sheet", SHEET_COLOUR),
         ]
         views = tuple(View(name, name) for name in ("front", "left front", "left"))
-        draw(path, views, corners, size, paint_fibres, legend)
+        draw(path, views, corners, size, paint_fibres, legend=legend)
         return
 
     names = list(dict.fromkeys(_without_side(muscle.name) for muscle in musculature))
@@ -113,7 +113,7 @@ def picture_muscles(
     # The legend stands beside the heads, not on them.
     views = (View("front", ""), View("front", "front"), View("left", "left"))
     rows = int(size[1]) // LEGEND_ROW - 1
-    draw(path, views, corners, size, paint_names, list(colours.items())[:rows])
+    draw(path, views, corners, size, paint_names, legend=list(colours.items())[:rows])
 
 
 def add_muscle(plotter: Any, muscle: MuscleSurface, colour: str) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.checks import Floats
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["SkinEnds", "skin_ends", "trimmed"]
 

@@ -22,7 +22,7 @@ from cmfsim.pictures.canvas import (
     silent_vtk,
     write_picture,
 )
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["ViewPart", "has_screen", "view_parts"]
 

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -14,16 +14,17 @@ from cmfsim.evaluation import NO_CHANGE, WHOLE, ModelComparison, compare_models
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.io.metrics import EVALUATION_FILE
 from cmfsim.pipeline.building import Postoperative, case_key, read_postoperative
-from cmfsim.pipeline.predicting import named_models, predict_models
-from cmfsim.values.anatomy import Anatomy, Finding
+from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline.predicting import named_models, predictions_of
+from cmfsim.progress import Progress
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.finding_groups import grouped
 from cmfsim.values.prediction import MODELS, Prediction
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["EVALUATION_FILE", "CaseEvaluation", "evaluate", "evaluation_key"]
 
-Progress = Callable[[str], None]
-OnFindings = Callable[[Iterable[Finding]], None]
 WILCOXON_NOTE = (
     "Wilcoxon's signed-rank test vertex by vertex, as the paper has it: neighbouring vertices are "
     "not independent, so that its p values are far too small; look at the size of the difference."
@@ -157,20 +158,16 @@ def evaluate(
         raise CaseInputError(
             f"{case.where('postoperative')}: there is no face to compare with: add skin or image"
         )
-    failed: dict[str, CmfsimError] = {}
-    predictions = tuple(
-        predict_models(
-            case,
-            models,
-            progress=progress,
-            check=check,
-            findings=findings,
-            after=postoperative,
-            failed=failed,
-            anatomy=anatomy,
-            on_findings=on_findings,
-        )
+    options = BuildOptions(
+        progress=progress,
+        check=check,
+        findings=findings,
+        anatomy=anatomy,
+        after=postoperative,
+        on_findings=on_findings,
     )
+    failed: dict[str, CmfsimError] = {}
+    predictions = tuple(predictions_of(case, models, options, failed))
     if not predictions:
         raise next(iter(failed.values()))
     if progress is not None:

@@ -5,7 +5,6 @@ results of one run. What belongs to another plan, or to other inputs or another 
 """
 
 import contextlib
-import json
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -44,16 +43,16 @@ from cmfsim.pictures import (
 )
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.planning.page import PAGE_FILE, page_state
-from cmfsim.report import Figure, case_document, study_document, write_page
-from cmfsim.study import StudyReport
+from cmfsim.progress import Progress
+from cmfsim.report import Document, Figure, case_document, write_page
 from cmfsim.values.prediction import MODELS, Prediction
 
 __all__ = [
     "WrittenPrediction",
     "WrittenResults",
     "write_case_report",
+    "write_report_page",
     "write_results",
-    "write_study_report",
 ]
 
 _log = logging.getLogger(__name__)
@@ -102,7 +101,7 @@ def write_results(
     predictions: Iterable[Prediction],
     n_models: int,
     *,
-    stage: Callable[[str], None],
+    stage: Progress,
     evaluation: Callable[[], CaseEvaluation] | None = None,
     with_report: bool = True,
     pictures: Callable[[str], bool] = lambda _: True,
@@ -274,7 +273,7 @@ def _report_of(
     found = {fresh / entry.place: read_prediction(fresh / entry.place) for entry in entries}
     links = _links(output, found)
     if evaluation is None:
-        return _write_report(fresh, replace(_document(found, None, {}), links=links))
+        return write_report_page(fresh, replace(_document(found, None, {}), links=links))
     new = "sha256" not in evaluation
     figures = {
         name: (fresh / name).read_bytes()
@@ -283,7 +282,7 @@ def _report_of(
         for name in evaluation["files"]
         if name.endswith(".png")
     }
-    return _write_report(fresh, replace(_document(found, evaluation, figures), links=links))
+    return write_report_page(fresh, replace(_document(found, evaluation, figures), links=links))
 
 
 def _links(folder: Path, found: Mapping[Path, Mapping[str, Any]]) -> dict[str, str]:
@@ -318,7 +317,7 @@ def write_case_report(folder: Path) -> str | None:
         names = [name for name in evaluation["files"] if name.endswith(".png")]
         figures = {name: read_evaluation_picture(folder, evaluation, name) for name in names}
     document = _document(found, evaluation, figures, left_out)
-    return _write_report(folder, replace(document, links=_links(folder, found)))
+    return write_report_page(folder, replace(document, links=_links(folder, found)))
 
 
 def _document(
@@ -326,7 +325,7 @@ def _document(
     evaluation: Mapping[str, Any] | None,
     figures: Mapping[str, bytes],
     left_out: str = "",
-) -> Any:
+) -> Document:
     """The report of predictions in their places, with the pictures of the last that has some."""
     pictures: dict[str, bytes] = {}
     shown = ""
@@ -361,22 +360,8 @@ def _error_caption(model: str) -> str:
     )
 
 
-def write_study_report(report: StudyReport) -> list[str]:
-    """The names of the files of a study: its table as JSON and its report."""
-    folder, names = report.cohort.output, ["study.json"]
-    text = json.dumps(report.as_dict(), indent=1, allow_nan=False)
-
-    def fill(fresh: Path) -> list[str]:
-        (fresh / "study.json").write_text(text + "\n", encoding="utf-8")
-        if _write_report(fresh, study_document(report.as_dict())) is not None:
-            return [*names, REPORT_FILE]
-        return names
-
-    ours = {"study.json", REPORT_FILE}
-    return replacing_files(folder, None, ours.__contains__, fill, lambda: [*ours])
-
-
-def _write_report(folder: Path, document: Any) -> str | None:
+def write_report_page(folder: Path, document: Document) -> str | None:
+    """The name of the page that a report was written to; none, with a warning, without Jinja2."""
     try:
         write_page(folder / REPORT_FILE, document)
     except CmfsimError as error:

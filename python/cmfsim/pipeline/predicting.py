@@ -1,25 +1,33 @@
 """One case from its files to the predicted face."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from cmfsim.checks import check_one_of
 from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
 from cmfsim.io import Case, CaseOrPath, as_case
-from cmfsim.pipeline.building import Postoperative, build_model, case_key, input_hashes, plan_key
+from cmfsim.pipeline.building import Postoperative, case_key, input_hashes, plan_key
+from cmfsim.pipeline.building.case_model import model_of
+from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.progress import Progress
 from cmfsim.solving.models import predict_patient
-from cmfsim.values.anatomy import Anatomy, Finding
+from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 
-__all__ = ["build_patient", "case_for_models", "named_models", "predict", "predict_models"]
+__all__ = [
+    "build_patient",
+    "case_for_models",
+    "named_models",
+    "predict",
+    "predict_models",
+    "predictions_of",
+]
 
 _log = logging.getLogger(__name__)
-
-Progress = Callable[[str], None]
-OnFindings = Callable[[Iterable[Finding]], None]
 
 
 def predict(
@@ -59,7 +67,7 @@ def predict(
     return next(predict_models(case, model, progress=progress, check=check))
 
 
-def predict_models(
+def predict_models(  # noqa: PLR0913 (options by name)
     case: CaseOrPath,
     models: str | Sequence[str] = MODELS,
     *,
@@ -108,10 +116,7 @@ def predict_models(
     >>> for prediction in cmfsim.predict_models(case, ["H", "M+S"]):  # doctest: +SKIP
     ...     print(prediction.model, prediction.result.summary["residual"])
     """
-    models = named_models(models)
-    patient = build_patient(
-        case,
-        models,
+    options = BuildOptions(
         progress=progress,
         check=check,
         findings=findings,
@@ -119,10 +124,21 @@ def predict_models(
         after=after,
         on_findings=on_findings,
     )
+    yield from predictions_of(as_case(case), named_models(models), options, failed)
+
+
+def predictions_of(
+    case: Case,
+    models: Sequence[str],
+    options: BuildOptions,
+    failed: dict[str, CmfsimError] | None = None,
+) -> Iterator[Prediction]:
+    """The predictions of several models for one case, as `predict_models` makes them."""
+    patient = build_patient(case, models, options)
     known = set(patient.findings)
     for model in models:
-        if progress is not None:
-            progress(f"solving {model}")
+        if options.progress is not None:
+            options.progress(f"solving {model}")
         try:
             prediction = predict_patient(patient, model)
         except (ContactError, SolverError) as error:
@@ -132,8 +148,8 @@ def predict_models(
             failed[model] = error
         else:
             new = [finding for finding in prediction.findings if finding not in known]
-            if new and on_findings is not None:
-                on_findings(new)
+            if new and options.on_findings is not None:
+                options.on_findings(new)
             known.update(new)
             yield prediction
 
@@ -165,15 +181,7 @@ def case_for_models(case: Case, models: Sequence[str]) -> Case:
 
 
 def build_patient(
-    case: CaseOrPath,
-    models: Sequence[str],
-    *,
-    progress: Progress | None = None,
-    check: bool = True,
-    findings: Iterable[Finding] = (),
-    anatomy: Anatomy | None = None,
-    after: Postoperative | None = None,
-    on_findings: OnFindings | None = None,
+    case: CaseOrPath, models: Sequence[str], options: BuildOptions | None = None
 ) -> PatientModel:
     """The patient as models need it: muscles are placed if one of them has muscles.
 
@@ -182,21 +190,13 @@ def build_patient(
     CaseError
         (also `ValueError`) A file of the case changed while the work went on.
     """
-    case = as_case(case)
+    case, options = as_case(case), options or BuildOptions()
     # Before the files are read: the key must be that of what is built.
     hashes = input_hashes(case)
     key, about = case_key(case, hashes), plan_key(case)
-    patient = build_model(
-        case_for_models(case, models),
-        progress=progress,
-        check=check,
-        findings=findings,
-        anatomy=anatomy,
-        after=after,
-        on_findings=on_findings,
-    )
-    if on_findings is not None:
-        on_findings(patient.findings)
+    patient = model_of(case_for_models(case, models), options)
+    if options.on_findings is not None:
+        options.on_findings(patient.findings)
     for name, found in patient.summary["inputs"].items():
         if hashes.get(name, found) != found:
             raise CaseInputError(

@@ -6,12 +6,12 @@ from numpy.typing import ArrayLike
 
 from cmfsim import _core
 from cmfsim._core import IcpFit, Surface
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["icp"]
 
 
-def icp(
+def icp(  # noqa: PLR0913 (options by name)
     moving: ArrayLike | Surface | SurfaceData,
     fixed: ArrayLike | Surface | SurfaceData,
     *,

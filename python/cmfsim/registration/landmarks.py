@@ -10,7 +10,7 @@ from cmfsim._core import ThinPlateSpline, rigid_fit
 from cmfsim.checks import Floats, frozen
 from cmfsim.errors import LandmarkInputError, RegistrationError
 from cmfsim.registration.sides import swapped_pairs, wrong_sides
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import label_key
 
 __all__ = ["LandmarkMatch", "match_landmarks"]
@@ -165,13 +165,12 @@ def _spelling(keys: Mapping[str, Mapping[str, str]], shared: Iterable[str]) -> l
     if not different:
         return []
     return [
-        Finding(
-            "note",
+        Finding.note(
             "landmark-spelling",
             f"{len(different)} labels are spelled differently: {_listed(different)}",
-            "landmarks",
-            "they are taken as the same landmarks",
-            "spell them alike in both files",
+            where="landmarks",
+            why="they are taken as the same landmarks",
+            fix="spell them alike in both files",
         )
     ]
 
@@ -186,13 +185,12 @@ def _extra(keys: Mapping[str, Mapping[str, str]], *, strict: bool) -> list[Findi
         if strict:
             raise LandmarkInputError(f"{what}; add them to the {other} or remove them")
         findings.append(
-            Finding(
-                "note",
+            Finding.note(
                 "landmark-extra",
                 what,
-                f"landmarks of the {name}",
-                "they are not used",
-                f"place them in the {other} as well, if they should be",
+                where=f"landmarks of the {name}",
+                why="they are not used",
+                fix=f"place them in the {other} as well, if they should be",
             )
         )
     return findings
@@ -228,7 +226,7 @@ def _check_sides(names: tuple[str, ...], source: Floats, target: Floats) -> None
             name: set(wrong_sides(dict(zip(names, points, strict=True))))
             for name, points in (("source", source), ("target", target))
         }
-        # In LPS one set has its left on the left: the other is the one to mend.
+        # In LPS one set has its left on the left: the other is the one to correct.
         guilty = [name for name, pairs in wrong.items() if set(swapped) <= pairs]
         where = f"in the {guilty[0]}" if len(guilty) == 1 else "in one of the two sets"
         n_pairs = sum(name.endswith("_L") for name in names)

@@ -6,8 +6,8 @@ from typing import Any
 from cmfsim.errors import CaseInputError
 from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
 from cmfsim.report.labels import MESH, MUSCLES, labelled
-from cmfsim.values.anatomy import Finding
 from cmfsim.values.clinical_motion import plan_lines
+from cmfsim.values.finding import Finding
 from cmfsim.values.finding_groups import counted, grouped
 
 __all__ = ["case_document", "statistics_table"]
@@ -152,12 +152,7 @@ def _findings(predictions: Sequence[Values], evaluation: Values | None) -> list[
     """What the stages noticed, the solution of any model and the comparison; each once."""
     entries = [finding for prediction in predictions for finding in prediction["findings"]]
     entries += [] if evaluation is None else evaluation.get("findings", [])
-    known = ("severity", "code", "what", "where", "why", "mend")
-    return [
-        *dict.fromkeys(
-            Finding(**{name: entry.get(name, "") for name in known}) for entry in entries
-        )
-    ]
+    return [*dict.fromkeys(Finding.from_values(entry) for entry in entries)]
 
 
 def _alerts(findings: Sequence[Finding], left_out: str) -> list[Alert]:
@@ -408,7 +403,7 @@ def _sentence(finding: Finding, *, with_what: bool = True) -> str:
     """What a finding states, where, why it matters and what to do, as far as it does."""
     place = f" ({finding.where})" if finding.where else ""
     what = f"{finding.what}{place}" if with_what else ""
-    fix = f"Fix: {finding.mend}" if finding.mend else ""
+    fix = f"Fix: {finding.fix}" if finding.fix else ""
     parts = [text.rstrip(". ") for text in (what, finding.why, fix) if text]
     return "".join(f"{text}. " for text in parts).strip()
 

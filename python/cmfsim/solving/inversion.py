@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import MassTensors
 from cmfsim.checks import Floats
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 
 __all__ = ["inversion_finding", "least_volume_ratios"]
 
@@ -106,13 +106,13 @@ def inversion_finding(tensors: MassTensors, displacements: ArrayLike) -> tuple[i
         return 0, None
     worst = int(np.argmin(ratios))
     x, y, z = np.asarray(tensors.mesh.nodes)[np.asarray(tensors.mesh.tets)[worst]].mean(axis=0)
-    return count, Finding(
-        "warning",
+    return count, Finding.warning(
         "inverted-tets",
         f"{count} of {len(ratios)} tets rest inverted; worst is tet {worst}, at "
         f"{ratios[worst]:.2g} of its volume",
-        f"({x:.1f}, {y:.1f}, {z:.1f}) mm before the operation",
-        "tissue cannot turn inside out: forces and displacements about these tets are wrong",
-        "a smaller motion, or larger tets where bones squeeze a thin layer; where kinematics is "
+        where=f"({x:.1f}, {y:.1f}, {z:.1f}) mm before the operation",
+        why="tissue cannot turn inside out: forces and displacements about these tets are wrong",
+        fix="a smaller motion, or larger tets where bones squeeze a thin layer; where kinematics "
+        "is "
         '"corotational" also "hyperelastic", which resists longer',
     )

@@ -17,7 +17,8 @@ from cmfsim.values.clinical_motion import clinical_motion
 from cmfsim.values.motion import decompose_motion
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
-from cmfsim.values.scene import MovedSurface, Scene, SegmentData
+from cmfsim.values.scene import Scene, SegmentData
+from cmfsim.values.surface_data import MovedSurface
 
 __all__ = ["model_scene", "predict_patient"]
 

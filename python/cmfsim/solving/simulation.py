@@ -20,8 +20,10 @@ from cmfsim._core import (
     Tissue,
     __version__,
 )
-from cmfsim.values.anatomy import Finding
-from cmfsim.values.scene import MovedSurface, Scene, SceneResult, SurfaceData, TissueData
+from cmfsim.values.finding import Finding
+from cmfsim.values.scene import Scene, SceneResult
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.tissue_data import TissueData
 
 __all__ = ["scene_plan", "scene_solver", "solve_scene"]
 
@@ -207,22 +209,21 @@ def _contact_findings(solution: Solution) -> list[dict[str, str]]:
     """That contact stopped above its tolerance, with figures that no face would show."""
     if solution.contact_converged:
         return []
-    found = Finding(
-        "warning",
+    found = Finding.warning(
         "contact-stopped",
         f"contact stopped after {solution.contact_iterations} steps with gaps of "
         f"{solution.contact_gap:.1e} mm and nodes {solution.contact_unbalanced:.1e} mm out of "
         "balance",
-        "contact",
-        "the tolerance asks for less, though no face would show it",
-        "allow more contact_iterations or a larger contact_tolerance, or smooth the surface",
+        where="contact",
+        why="the tolerance asks for less, though no face would show it",
+        fix="allow more contact_iterations or a larger contact_tolerance, or smooth the surface",
     )
     return [_told(found)]
 
 
 def _told(found: Finding) -> dict[str, str]:
     """The finding as results hold it, after a warning: the command line prints findings itself."""
-    words = (found.code, found.what, found.where, found.why, found.mend)
+    words = (found.code, found.what, found.where, found.why, found.fix)
     _log.warning("%s: %s, %s: %s; %s", *words, extra={"is_finding": True})
     return asdict(found)
 

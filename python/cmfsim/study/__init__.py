@@ -2,19 +2,5 @@
 
 from cmfsim.deferred import deferred
 
-__getattr__, __dir__, __all__ = deferred(
-    __name__,
-    {
-        "cohort": (
-            "CaseOutcome",
-            "StudyReport",
-            "run_study",
-        ),
-        "trials": (
-            "LandmarkTrial",
-            "SensitivityReport",
-            "landmark_trials",
-            "sensitivity",
-        ),
-    },
-)
+# A public name is a line of __init__.pyi.
+__getattr__, __dir__, __all__ = deferred(__name__, __file__)

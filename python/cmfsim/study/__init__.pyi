@@ -1,12 +1,7 @@
-from cmfsim.study.cohort import CaseOutcome, StudyReport, run_study
-from cmfsim.study.trials import LandmarkTrial, SensitivityReport, landmark_trials, sensitivity
-
-__all__ = [
-    "CaseOutcome",
-    "LandmarkTrial",
-    "SensitivityReport",
-    "StudyReport",
-    "landmark_trials",
-    "run_study",
-    "sensitivity",
-]
+from cmfsim.study.cohort import CaseOutcome as CaseOutcome
+from cmfsim.study.cohort import StudyReport as StudyReport
+from cmfsim.study.cohort import run_study as run_study
+from cmfsim.study.trials import LandmarkTrial as LandmarkTrial
+from cmfsim.study.trials import SensitivityReport as SensitivityReport
+from cmfsim.study.trials import landmark_trials as landmark_trials
+from cmfsim.study.trials import sensitivity as sensitivity

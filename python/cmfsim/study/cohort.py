@@ -18,7 +18,7 @@ from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.extras import third_party
 from cmfsim.io import Case, Cohort, finish_writing
 from cmfsim.io.folders import check_below, check_writable
-from cmfsim.io.metrics import EVALUATION_FILE, read_evaluation
+from cmfsim.io.metrics import read_evaluation
 from cmfsim.pipeline.evaluating import evaluation_key
 
 __all__ = ["CaseJob", "CaseOutcome", "StudyReport", "run_study"]
@@ -288,37 +288,22 @@ def run_job(job: CaseJob, processes: _Workers | None = None) -> CaseOutcome:
     """The outcome of one case, worked on by another process."""
     output = Path(job.output)
     begun = time.perf_counter()
-    command = [sys.executable, "-m", "cmfsim.cli", "evaluate", job.file, "-o", job.output, "-q"]
-    command.append("--end-with-input")
-    for model in job.models:
-        command += ["--model", model]
+    command = [sys.executable, "-m", "cmfsim.study.worker", job.file, job.output, *job.models]
     environment = {**os.environ, "RAYON_NUM_THREADS": str(job.threads)}
     try:
         output.mkdir(parents=True, exist_ok=True)
-        before = _stamp(output / EVALUATION_FILE)
         # Made again, so that a link of that name leads nowhere.
         (output / LOG_FILE).unlink(missing_ok=True)
         with (output / LOG_FILE).open("xb") as log:
             code = (processes or _Workers()).run(command, environment, log)
         seconds = time.perf_counter() - begun
-        # A case of which a model failed, or none, has written its figures all the same.
-        written = _stamp(output / EVALUATION_FILE) not in {before, None}
-        if code < 0 or not written:
+        if code != 0:
             return CaseOutcome(job.name, "failed", seconds, _reason(code, output))
         evaluation = read_evaluation(output)
     except (OSError, ValueError) as error:
         seconds = time.perf_counter() - begun
         return CaseOutcome(job.name, "failed", seconds, f"{type(error).__name__}: {error}")
     return _outcome(job.name, "done", seconds, evaluation)
-
-
-def _stamp(path: Path) -> tuple[int, int] | None:
-    """What tells one writing of a file from another; none where there is no file."""
-    try:
-        found = path.stat()
-    except FileNotFoundError:
-        return None
-    return found.st_ino, found.st_mtime_ns
 
 
 def _reason(code: int, output: Path) -> str:

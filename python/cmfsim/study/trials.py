@@ -1,6 +1,6 @@
 """How much a prediction depends on where the skull landmarks were placed (Kim et al. 2010, 3.3)."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -12,18 +12,18 @@ from cmfsim.checks import Floats, as_positive, as_rows
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io import CaseOrPath, as_case
 from cmfsim.pipeline.building import with_muscles
+from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
+from cmfsim.progress import Progress
 from cmfsim.solving.models import predict_patient
-from cmfsim.values.anatomy import Finding
 from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 
 __all__ = ["LandmarkTrial", "SensitivityReport", "landmark_trials", "sensitivity"]
 
-Progress = Callable[[str], None]
-OnFindings = Callable[[Iterable[Finding]], None]
 # Standard deviation of a landmark's place along each axis that moves the masseter by the 2 mm of
 # the paper's three trials, mm.
 LANDMARK_SD = 2.0
@@ -140,7 +140,7 @@ def landmark_trials(
         yield dict(zip(names, points + drawn, strict=True))
 
 
-def sensitivity(
+def sensitivity(  # noqa: PLR0913 (options by name)
     case: CaseOrPath,
     *,
     trials: int | Sequence[Mapping[str, ArrayLike]] = 3,
@@ -195,9 +195,10 @@ def sensitivity(
     if (trials if isinstance(trials, int) else len(trials)) < 1:
         raise CaseInputError("no trial is asked for: at least one is needed")
     case = as_case(case)
-    patient = build_patient(
-        case, (model,), progress=progress, check=check, findings=findings, on_findings=on_findings
+    options = BuildOptions(
+        progress=progress, check=check, findings=findings, on_findings=on_findings
     )
+    patient = build_patient(case, (model,), options)
     skull = patient.landmarks.get("skull", {})
     if isinstance(trials, int):
         trials = list(landmark_trials(skull, count=trials, std=std, seed=seed))

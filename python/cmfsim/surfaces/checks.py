@@ -1,6 +1,6 @@
 """What is wrong with a triangle surface: borders, debris, orientation, crossings, slivers.
 
-Everything here looks and changes nothing; `surface_repair` mends. Costs are a few sorts of the
+Everything here looks and changes nothing; `repair_surface` repairs. Costs are a few sorts of the
 edges, and for crossings a grid over the triangles.
 """
 
@@ -13,7 +13,7 @@ from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.surfaces.crossings import crossing_pairs
 from cmfsim.surfaces.topology import Edges, component_labels, edges_of, orientation_flips
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
     "BorderLoop",

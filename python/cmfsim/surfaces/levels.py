@@ -1,8 +1,10 @@
 """Closed, lightly smoothed surfaces of levels, of a size that contact can be searched on."""
 
+import logging
 import os
 import threading
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import cast
 
 import numpy as np
@@ -12,16 +14,20 @@ from cmfsim import _core
 from cmfsim.checks import Floats, Indices, as_number, as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.extras import third_party
-from cmfsim.values.anatomy import BoneSegment, ImageData
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
     "SurfaceOptions",
     "block_of",
     "contact_surface",
+    "detailed_surface",
     "simplified_surface",
     "surface_of_level",
 ]
+
+_log = logging.getLogger(__name__)
 
 # Taubin (1995): a shrinking step and a slightly larger growing one, which keep the volume.
 SHRINK, GROW = 0.5, -0.53
@@ -125,6 +131,14 @@ def surface_of_level(
     if len(corners) > options.max_triangles:
         points, corners = _decimated(name, points, corners, options.max_triangles)
     return SurfaceData(points, _outward(points, corners))
+
+
+def detailed_surface(name: str, level: ImageData) -> SurfaceData | None:
+    """The surface of a level as `surface_of_level` has it; None where scikit-image is missing."""
+    if find_spec("skimage") is None:
+        _log.info("no detailed %s: scikit-image is not installed", name)
+        return None
+    return surface_of_level(name, level)
 
 
 def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> SurfaceData:

@@ -1,4 +1,4 @@
-"""A mended triangle surface: welded, cleaned, oriented outwards, closed; each mend is a finding."""
+"""Triangle surfaces repaired: welded, cleaned, oriented, closed; each repair is a finding."""
 
 from dataclasses import dataclass
 
@@ -17,8 +17,8 @@ from cmfsim.surfaces.checks import (
     thin_triangles,
 )
 from cmfsim.surfaces.topology import component_labels, connected_labels, edges_of, orientation_flips
-from cmfsim.values.anatomy import Finding
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["RepairOptions", "clean_surface", "repair_surface"]
 
@@ -27,7 +27,7 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class RepairOptions:
-    """Which mends are made.
+    """Which repairs are made.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ def clean_surface(surface: SurfaceData) -> SurfaceData:
 def repair_surface(
     surface: SurfaceData, name: str, options: RepairOptions | None = None
 ) -> tuple[SurfaceData, tuple[Finding, ...]]:
-    """A closed, outward surface made from one that is nearly so, with a finding for each mend.
+    """A closed, outward surface made from one that is nearly so, with a finding for each repair.
 
     Vertices in the same place become one; triangles without area and repeated ones are dropped, and
     so are small pieces; triangles are turned round until neighbours agree and the largest piece
@@ -111,7 +111,9 @@ def repair_surface(
     findings: list[Finding] = []
 
     def note(code: str, what: str, why: str) -> None:
-        findings.append(Finding("note", code, what, name, why, "look at the result; nothing to do"))
+        findings.append(
+            Finding.note(code, what, where=name, why=why, fix="look at the result; nothing to do")
+        )
 
     vertices = np.asarray(surface.vertices)
     triangles = np.asarray(surface.triangles).astype(np.int64)
@@ -159,13 +161,14 @@ def _cap_finding(name: str, length: float, centre: Floats, bulge: float) -> Find
     flat = bulge <= FLAT_SHARE * length
     place = ", ".join(f"{x:.1f}" for x in centre)
     return Finding(
-        "note" if flat else "warning",
-        "surface-closed",
-        f"a border of {length:.1f} mm (at most {bulge:.1f} mm from a plane) is closed by a cap",
-        f"{name} at ({place})",
-        "inside and outside are only known for a closed surface"
+        severity="note" if flat else "warning",
+        code="surface-closed",
+        what=f"a border of {length:.1f} mm (at most {bulge:.1f} mm from a plane) is closed by a "
+        "cap",
+        where=f"{name} at ({place})",
+        why="inside and outside are only known for a closed surface"
         + ("" if flat else "; this cap is far from flat, so its shape is made up"),
-        "look at the cap; if it is wrong, close the surface yourself",
+        fix="look at the cap; if it is wrong, close the surface yourself",
     )
 
 

@@ -22,7 +22,7 @@ from cmfsim._core import rigid_fit
 from cmfsim.checks import Floats
 from cmfsim.errors import BoundaryInputError, RegistrationError
 from cmfsim.values.motion import decompose_motion, rigid_motion
-from cmfsim.values.scene import MovedSurface
+from cmfsim.values.surface_data import MovedSurface
 
 __all__ = ["ClinicalMotion", "clinical_motion", "plan_lines", "planned_motion"]
 

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from cmfsim.values.anatomy import SEVERITIES, Finding
+from cmfsim.values.finding import SEVERITIES, Finding
 
 __all__ = ["FindingGroup", "counted", "grouped"]
 

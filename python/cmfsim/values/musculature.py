@@ -13,9 +13,9 @@ import numpy as np
 from cmfsim._core import MOST_BOXES
 from cmfsim.checks import Floats, as_rows, as_text, check_instance, check_one_of
 from cmfsim.errors import CaseInputError
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["MOST_BOXES", "MUSCLE_KINDS", "MUSCLE_SIDES", "MuscleSurface", "Musculature"]
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,17 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import Floats, Indices
 from cmfsim.errors import CaseInputError
-from cmfsim.surfaces.levels import surface_of_level
-from cmfsim.values.anatomy import Anatomy, BoneSegment, Finding, NodeKinds
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
-from cmfsim.values.scene import MovedSurface, Scene, SurfaceData, TissueData
+from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.scene import Scene
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.tissue_data import TissueData
 
 if TYPE_CHECKING:
     from cmfsim.values.musculature import Musculature
 
 __all__ = ["PatientModel"]
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +57,8 @@ class PatientModel(Frozen):
         What every stage noticed.
     summary : mapping
         Counts, quality, timings, versions, hashes of the inputs: plain values, ready for JSON.
+    detailed_skin : callable or None
+        Makes the skin of `face` where no surface of it was given.
     """
 
     name: str
@@ -74,6 +75,7 @@ class PatientModel(Frozen):
     landmarks: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
+    detailed_skin: Callable[[], SurfaceData | None] | None = None
 
     @property
     def skin_nodes(self) -> NDArray[np.uint32]:
@@ -122,12 +124,9 @@ class PatientModel(Frozen):
         """The skin of the whole head in full detail, as it was given or as the image shows it.
 
         Tets are larger than what one sees of lips and lids. None where scikit-image is missing.
-        Made when it is first asked for: solving does not need it.
+        What an image shows is made when it is first asked for: solving does not need it.
         """
         given = self.anatomy.surfaces.get("skin")
-        if given is not None:
+        if given is not None or self.detailed_skin is None:
             return given
-        if find_spec("skimage") is None:
-            _log.info("no detailed face: scikit-image is not installed")
-            return None
-        return surface_of_level("skin", self.anatomy.skin)
+        return self.detailed_skin()

@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim._core import Surface, SurfaceMotion
 from cmfsim.checks import Floats, as_rows, check_one_of
 from cmfsim.errors import CaseInputError
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.patient_model import PatientModel
-from cmfsim.values.scene import MovedSurface, Scene, SceneResult, SurfaceData
+from cmfsim.values.scene import Scene, SceneResult
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:
     from cmfsim.values.musculature import Musculature
@@ -212,4 +213,4 @@ class Prediction(Frozen):
     def findings(self) -> tuple[Finding, ...]:
         """What every stage noticed, the solution included."""
         solved = self.result.summary.get("findings", ())
-        return (*self.patient.findings, *(Finding(**entry) for entry in solved))
+        return (*self.patient.findings, *(Finding.from_values(entry) for entry in solved))

@@ -1,4 +1,4 @@
-"""The plain values that stages hand to each other: frozen, checked where they are made, no files.
+"""Scenes and their results.
 
 A `Scene` is everything that one solve needs. Checks here are of shape, range and name, with the
 index and value at fault; what geometry and physics forbid (inverted tets, indefinite materials,
@@ -21,8 +21,6 @@ from cmfsim.checks import (
     as_floats,
     as_index_rows,
     as_indices,
-    as_number,
-    as_positive,
     as_rows,
     as_text,
     check_instance,
@@ -32,183 +30,17 @@ from cmfsim.checks import (
 from cmfsim.errors import CaseInputError
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import rigid_matrix
+from cmfsim.values.solver_options import SolverOptions
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.tissue_data import TissueData
 
 __all__ = [
-    "MovedSurface",
     "Scene",
     "SceneResult",
     "SegmentData",
-    "SolverOptions",
-    "SurfaceData",
-    "TissueData",
 ]
 
-
-# Arrays that each kind of tissue needs, with the number of axes after the first.
-TISSUE_ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = MappingProxyType(
-    {
-        "isotropic": {"young": (), "poisson": ()},
-        "transversely_isotropic": {
-            "young_along": (),
-            "young_across": (),
-            "poisson": (),
-            "fibre": (3,),
-        },
-        "stiffness": {"stiffness": (6, 6)},
-        "preset": {"fraction": (), "fibre": (3,)},
-    }
-)
-# Arrays of the above that may be left out.
-TISSUE_OPTIONAL = frozenset({("preset", "fibre")})
-
-METHODS = ("auto", "cholesky", "pcg", "relaxation")
-ELEMENTS = ("p1", "anp", "p2")
-KINEMATICS = ("linear", "corotational", "hyperelastic")
-CONTACTS = ("bilateral", "unilateral")
 CONFLICTS = ("error", "resolve")
-PRESETS = ("kim2010", "kim2010-swapped")
-MIXINGS = ("moduli", "stiffness")
-
-
-@dataclass(frozen=True, eq=False)
-class TissueData(Frozen):
-    """What the tets are made of, as the arrays that `cmfsim.Tissue` takes.
-
-    Every array holds one value per tet, or a single one for all tets.
-
-    Attributes
-    ----------
-    kind : str
-        "isotropic" (`young`, `poisson`), "transversely_isotropic" (`young_along`, `young_across`,
-        `poisson`, `fibre`, `law`), "stiffness" (`stiffness`) or "preset" (`preset`, `fraction`,
-        `fibre`, `mixing`).
-    young, young_along, young_across : (m,) or (1,) float64, MPa
-    poisson, fraction : (m,) or (1,) float64
-    fibre : (m, 3) or (1, 3) float64
-        Unit vectors.
-    stiffness : (m, 6, 6) or (1, 6, 6) float64, MPa
-        Voigt order xx, yy, zz, yz, xz, xy with engineering shears, global axes.
-    law, preset, mixing : str
-        Names that `cmfsim.Tissue` knows.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Unknown kind, an array missing, not wanted, misshapen or not finite.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> fat = cmfsim.TissueData("isotropic", young=0.003, poisson=0.46)
-    >>> fat.young.shape
-    (1,)
-    """
-
-    kind: str
-    young: ArrayLike | None = None
-    poisson: ArrayLike | None = None
-    young_along: ArrayLike | None = None
-    young_across: ArrayLike | None = None
-    fibre: ArrayLike | None = None
-    stiffness: ArrayLike | None = None
-    fraction: ArrayLike | None = None
-    law: str = "spencer"
-    preset: str = "kim2010"
-    mixing: str = "moduli"
-
-    def __post_init__(self) -> None:
-        check_one_of("tissue kind", self.kind, tuple(TISSUE_ARRAYS))
-        wanted = TISSUE_ARRAYS[self.kind]
-        for name in sorted({n for arrays in TISSUE_ARRAYS.values() for n in arrays}):
-            value = getattr(self, name)
-            if name not in wanted:
-                if value is not None:
-                    raise CaseInputError(f"tissue of kind {self.kind!r} takes no {name!r}")
-            elif value is not None:
-                array = as_floats(f"tissue {name}", value)
-                tail = wanted[name]
-                if array.shape == tail:
-                    array = array[np.newaxis]
-                if array.shape[1:] != tail or array.ndim != 1 + len(tail):
-                    shape = ", ".join(str(n) for n in ("m", *tail))
-                    raise CaseInputError(
-                        f"tissue {name} has shape {array.shape}: ({shape}) is needed"
-                    )
-                object.__setattr__(self, name, frozen(array))
-            elif (self.kind, name) not in TISSUE_OPTIONAL:
-                raise CaseInputError(f"tissue of kind {self.kind!r} lacks {name!r}")
-        for name in ("law", "preset", "mixing"):
-            as_text(f"tissue {name}", getattr(self, name))
-
-    def arrays(self) -> dict[str, Floats]:
-        """The arrays of this kind of tissue, by name."""
-        return {
-            name: np.asarray(getattr(self, name), dtype=np.float64)
-            for name in TISSUE_ARRAYS[self.kind]
-            if getattr(self, name) is not None
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class SurfaceData(Frozen):
-    """A triangle surface.
-
-    Attributes
-    ----------
-    vertices : (v, 3) float64, mm
-    triangles : (t, 3) uint32
-        Outward normals by the right-hand rule.
-    crease_angle : float, degrees
-        Edges sharper than this keep the normals of their triangles apart.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).vertices.shape
-    (3, 3)
-    """
-
-    vertices: ArrayLike
-    triangles: ArrayLike
-    crease_angle: float = 60.0
-
-    def __post_init__(self) -> None:
-        vertices = as_rows("surface vertices", self.vertices, 3)
-        triangles = as_index_rows("surface triangles", self.triangles, 3, len(vertices), "vertices")
-        object.__setattr__(self, "vertices", vertices)
-        object.__setattr__(self, "triangles", triangles)
-        object.__setattr__(self, "crease_angle", as_number("crease_angle", self.crease_angle))
-
-
-@dataclass(frozen=True, eq=False)
-class MovedSurface(Frozen):
-    """A motion of a segment given by a surface before and after.
-
-    Attributes
-    ----------
-    surface : SurfaceData
-    moved_vertices : (v, 3) float64, mm
-        Where each vertex of `surface` goes.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> bone = cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    >>> cmfsim.MovedSurface(bone, bone.vertices + [0, 0, 2.0]).moved_vertices[0].tolist()
-    [0.0, 0.0, 2.0]
-    """
-
-    surface: SurfaceData
-    moved_vertices: ArrayLike
-
-    def __post_init__(self) -> None:
-        moved = as_rows("moved_vertices", self.moved_vertices, 3)
-        count = len(np.asarray(self.surface.vertices))
-        if len(moved) != count:
-            raise CaseInputError(
-                f"moved_vertices has {len(moved)} rows, but the surface has {count} vertices"
-            )
-        object.__setattr__(self, "moved_vertices", moved)
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,76 +87,6 @@ class SegmentData(Frozen):
                 f"gap has shape {gap.shape}: one number or {len(sliding)} (one per sliding node)"
             )
         object.__setattr__(self, "gap", frozen(gap))
-
-
-@dataclass(frozen=True)
-class SolverOptions:
-    """How a scene is solved; the defaults are those of `MassTensors` and `StaticSolver`.
-
-    Attributes
-    ----------
-    method : str
-        "auto", "cholesky", "pcg" or "relaxation".
-    contact : str
-        "bilateral" or "unilateral".
-    tolerance : float
-        Estimated error of the iterative methods, over the length of the motion.
-    max_iterations : int or None
-    contact_tolerance : float, mm
-        Largest distance of a held node from its contact surface; a tenth of it is the way that the
-        force along the surface may still move any node by itself.
-    contact_iterations : int
-        Newton steps of the contact solver.
-    memory_limit : float or None, MB
-    element : str
-        "p1", "anp" or "p2", as `cmfsim.MassTensors` takes it.
-    kinematics : str
-        "linear", "corotational" or "hyperelastic".
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> cmfsim.SolverOptions(method="cholesky").contact
-    'bilateral'
-    """
-
-    method: str = "auto"
-    contact: str = "bilateral"
-    tolerance: float = 1e-8
-    max_iterations: int | None = None
-    contact_tolerance: float = 1e-4
-    contact_iterations: int = 50
-    memory_limit: float | None = None
-    element: str = "p1"
-    kinematics: str = "linear"
-
-    def __post_init__(self) -> None:
-        check_one_of("method", self.method, METHODS)
-        check_one_of("element", self.element, ELEMENTS)
-        check_one_of("kinematics", self.kinematics, KINEMATICS)
-        check_one_of("contact", self.contact, CONTACTS)
-        for name in ("tolerance", "contact_tolerance"):
-            as_positive(name, getattr(self, name))
-        if self.memory_limit is not None:
-            as_positive("memory_limit", self.memory_limit)
-        for name in ("max_iterations", "contact_iterations"):
-            value = getattr(self, name)
-            if value is None and name == "max_iterations":
-                continue
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise CaseInputError(f"{name} is {value!r}: a whole number from 1 on is needed")
-
-    def as_dict(self) -> dict[str, Any]:
-        """The options by name, as `MassTensors` (`element`) and `StaticSolver` take them."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
-
-    def header(self) -> dict[str, Any]:
-        """The options as a scene file holds them: element and kinematics where unusual.
-
-        So a scene that asks for neither has the content, and the hash, that it has always had.
-        """
-        usual = {"element": "p1", "kinematics": "linear"}
-        return {k: v for k, v in self.as_dict().items() if usual.get(k) != v}
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 
 from cmfsim.checks import Floats, as_rows, as_text, check_instance
 from cmfsim.errors import CaseInputError, LandmarkInputError
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.musculature import MuscleSurface, Musculature
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["TemplateData", "as_landmarks", "is_template_name"]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.extras import third_party
-from cmfsim.values.anatomy import ImageData
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["BoneContact", "SmoothDistance"]
 

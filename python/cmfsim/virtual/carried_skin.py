@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.checks import Floats, as_index_rows, as_number, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.extras import third_party
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["carried", "scanned"]
 

@@ -12,8 +12,10 @@ from cmfsim._core import Surface, signed_distance_image
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.extras import third_party
-from cmfsim.values.anatomy import BoneSegment, ImageData, NodeKinds
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import decompose_motion, rigid_motion
+from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.virtual.bone_contact import BoneContact, SmoothDistance
 
 __all__ = ["Operation", "bone_distances", "operate", "screw", "without_bite", "without_gaps"]
@@ -177,6 +179,7 @@ def operate(
     tets: NDArray[Any],
     boundary: NDArray[Any],
     kinds: NodeKinds,
+    *,
     distances: Mapping[str, ImageData],
     centres: Mapping[str, Floats],
     plan: Mapping[str, Floats],

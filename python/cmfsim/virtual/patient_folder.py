@@ -6,7 +6,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,8 @@ from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.cohorts import COHORT_FORMAT
 from cmfsim.io.files import replacing
 from cmfsim.phantom import make_head
-from cmfsim.values.scene import SurfaceData
+from cmfsim.progress import Progress, no_progress
+from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.carried_skin import scanned
 from cmfsim.virtual.equilibrium import EquilibriumOptions
 from cmfsim.virtual.people import PATIENTS, Relocation, VirtualPatient, patient_named
@@ -30,7 +31,6 @@ __all__ = ["case_text", "virtual_patients", "write_virtual_patient"]
 
 _log = logging.getLogger(__name__)
 
-Progress = Callable[[str], None]
 
 # Standard deviations, mm: of a landmark's place along each axis, on the skull as one operator
 # repeats it, on the skin as the mean of several is; of the noise of a surface scanner at a point,
@@ -136,7 +136,7 @@ def _write_cohort(folder: Path) -> None:
         file.write("\n".join([*lines, ""]).encode())
 
 
-def write_virtual_patient(
+def write_virtual_patient(  # noqa: PLR0913 (options by name)
     folder: str | os.PathLike[str],
     number: int,
     *,
@@ -202,7 +202,7 @@ def write_virtual_patient(
         raise CaseInputError(f"seed is {seed!r}: a whole number from 0 is needed")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    stage = progress or _quiet
+    stage = progress or no_progress
     begun = time.perf_counter()
     head = make_head(patient.parameters)
     stage("imaging the head")
@@ -257,10 +257,6 @@ def write_virtual_patient(
     shutil.rmtree(folder / TRUTH, ignore_errors=True)
     fresh.rename(folder / TRUTH)
     return folder / "case.toml"
-
-
-def _quiet(stage: str) -> None:
-    del stage
 
 
 def _draw(seed: int, patient: VirtualPatient, draw: int) -> int:

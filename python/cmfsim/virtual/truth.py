@@ -1,6 +1,6 @@
 """The face that an operation truly makes of a virtual patient: mesh, tissue, equilibrium, skin."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,9 +13,12 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
 from cmfsim.pipeline.building import build_model
+from cmfsim.progress import Progress, no_progress
 from cmfsim.surfaces.topology import tet_bodies
-from cmfsim.values.anatomy import BoneSegment, ImageData, NodeKinds
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.body import HyperelasticBody
 from cmfsim.virtual.carried_skin import carried
 from cmfsim.virtual.equilibrium import Equilibrium, EquilibriumOptions, find_equilibrium
@@ -32,7 +35,6 @@ from cmfsim.virtual.people import VirtualPatient
 
 __all__ = ["PostoperativeTruth", "largest_body", "postoperative_truth"]
 
-Progress = Callable[[str], None]
 
 # Tissue of which the tooth rows together are nearer than the bite's own gap and this, mm, is none.
 BEYOND_BITE = 1.5
@@ -92,7 +94,7 @@ class PostoperativeTruth:
         return max((float(depth.max(initial=0.0)) for depth in depths.values()), default=0.0)
 
 
-def postoperative_truth(
+def postoperative_truth(  # noqa: PLR0913 (options by name)
     patient: VirtualPatient,
     head: PhantomHead,
     case: Case,
@@ -135,7 +137,7 @@ def postoperative_truth(
     CmfsimError
         (also `ValueError` where the input is at fault) What a stage cannot work with.
     """
-    stage = progress or _quiet
+    stage = progress or no_progress
     length = as_positive("edge_length", edge_length)
     region = replace(case.region, upper=float(head.skull_landmarks["nasion"][2]) + ABOVE_NASION)
     mesh = replace(case.mesh, edge_length=length, refine=refine)
@@ -154,7 +156,7 @@ def postoperative_truth(
         model.kinds,
         distances,
         motions,
-        head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE,
+        gap=head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE,
     )
     nodes, tets = opened.nodes, opened.tets
 
@@ -171,10 +173,10 @@ def postoperative_truth(
         tets,
         TetMesh(nodes, tets).boundary_triangles(),
         opened.kinds,
-        distances,
-        {name: np.asarray(s.surface.vertices).mean(axis=0) for name, s in segments.items()},
-        motions,
-        opened.bared,
+        distances=distances,
+        centres={name: np.asarray(s.surface.vertices).mean(axis=0) for name, s in segments.items()},
+        plan=motions,
+        bared=opened.bared,
     )
     found = find_equilibrium(body, operation.held, operation.path, operation.contact, options)
 
@@ -204,10 +206,6 @@ def postoperative_truth(
     )
 
 
-def _quiet(stage: str) -> None:
-    del stage
-
-
 def _motion(case: Case, segment: str) -> Floats:
     motion = case.plan.get(segment)
     if motion is None:
@@ -235,6 +233,7 @@ def _opened(
     kinds: NodeKinds,
     distances: Mapping[str, ImageData],
     motions: Mapping[str, Floats],
+    *,
     gap: float,
 ) -> _Opened:
     """The largest body that is left without what lies between tooth rows and parted bones."""

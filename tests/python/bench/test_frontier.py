@@ -4,7 +4,6 @@ import csv
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,7 +28,6 @@ from cmfsim.bench.measure import run_job
 from cmfsim.bench.rows import FrontierRow, with_front
 from cmfsim.bench.sweep import EARLY
 from cmfsim.cli import main
-from cmfsim.cli.bench_command import SCRIPTS
 from cmfsim.errors import CaseInputError
 from cmfsim.values.prediction import carried_points
 from head_case import HeadCase
@@ -308,18 +306,3 @@ def test_the_command_writes_table_page_picture_and_figures(case, swept, capsys):
     assert [line["role"] for line in lines] == ["base", "", "", "", "reference"]
     first = written["rows"][0]["error"][WHOLE]
     assert float(lines[0]["mean_mm"]) == first["mean_mm"]
-
-
-@pytest.mark.parametrize("name", SCRIPTS)
-def test_benches_of_a_checkout_run_with_their_words(name, tmp_path, monkeypatch, capfd):
-    assert (Path(__file__).parents[3] / SCRIPTS[name][-1]).is_file()
-    monkeypatch.chdir(tmp_path)
-    assert main(["bench", name]) == 2
-    assert "--checkout" in capfd.readouterr().err
-    script = tmp_path / SCRIPTS[name][-1]
-    script.parent.mkdir(parents=True)
-    script.write_text("import sys\nprint(sys.argv[1:])\nsys.exit(3)\n", encoding="utf-8")
-    assert main(["bench", name, "--", "--tets", "20000"]) == 3
-    assert "['--tets', '20000']" in capfd.readouterr().out
-    assert main(["bench", name, "-q", "--", "--tets", "20000"]) == 3
-    assert "['--quiet', '--tets', '20000']" in capfd.readouterr().out

@@ -186,10 +186,10 @@ def test_the_doctor_tells_what_is_wrong_with_a_moved_bone(code, change, words, t
     findings = cmfsim.diagnose(cmfsim.Case.load(head.write(tmp_path)))
     found = {f.code: f for f in findings if f.code.startswith(("moved", "plan"))}
     assert set(found) in ({code}, {code, "plan-far"})
-    text = " ".join([found[code].what, found[code].why, found[code].mend])
+    text = " ".join([found[code].what, found[code].why, found[code].fix])
     assert words in text
     assert found[code].where.startswith("case.toml:")
-    assert found[code].mend
+    assert found[code].fix
 
 
 def test_the_doctor_says_nothing_of_a_sound_motion_and_warns_where_all_moves(tmp_path):

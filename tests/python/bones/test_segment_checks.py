@@ -14,7 +14,7 @@ import cmfsim
 import phantom_case
 from cmfsim.bones import CutOptions, check_segments
 from cmfsim.io import Case
-from cmfsim.pipeline.building import build_model, case_model
+from cmfsim.pipeline.building import build_model, case_checks
 from cmfsim.pipeline.building.motions import PlannedBones
 from cmfsim.surfaces import levels as surfaces
 from head_case import HeadCase
@@ -210,7 +210,7 @@ def moved_without_nodes(segments, motions, *, plan):
         np.zeros(4, np.uint8), np.full(4, -1, np.int16), tuple(s.name for s in segments)
     )
     case = types.SimpleNamespace(where=lambda key: key, plan=plan, osteotomies=())
-    return case_model._untouched(case, mesh, none, PlannedBones(tuple(segments), motions))
+    return case_checks.untouched(case, mesh, none, PlannedBones(tuple(segments), motions))
 
 
 def test_a_piece_beyond_the_mesh_that_nobody_named_is_a_warning(cut):
@@ -232,13 +232,13 @@ def test_a_build_compares_landmarks_with_the_bones_that_it_made(head, truth, cut
     """Correct ones give no word; all 5 mm up are found on bones and skin, and end no build."""
     case = types.SimpleNamespace(where=lambda key: key)
     marks = {"skull": head.skull_landmarks, "skin": head.skin_landmarks}
-    assert case_model._misplaced(case, marks, truth, cut) == []
+    assert case_checks.misplaced(case, marks, truth, cut) == []
     for shift, words in ((5.0, "5.0 mm too high"), (12.0, "12.0 mm too high")):
         moved = {
             key: {name: place + [0, 0, shift] for name, place in places.items()}
             for key, places in marks.items()
         }
-        told = case_model._misplaced(case, moved, truth, cut)
+        told = case_checks.misplaced(case, moved, truth, cut)
         assert {f.severity for f in told} == {"warning"}
         assert any(words in f.what for f in told if f.where == "landmarks.skull")
         assert any(f.where == "landmarks.skin" for f in told)

@@ -167,7 +167,8 @@ def test_missing_packages_are_one_line_before_any_work(command, case, monkeypatc
     missing = {"jinja2", "scipy", "meshio", "pyvista"}
     find = importlib.util.find_spec
     monkeypatch.setattr(
-        "cmfsim.cli.preparation.find_spec", lambda name: None if name in missing else find(name)
+        "cmfsim.pipeline.preparation.find_spec",
+        lambda name: None if name in missing else find(name),
     )
     assert main([command, str(case)]) == 2
     err = capsys.readouterr().err
@@ -224,7 +225,7 @@ def test_numbers_in_mm_that_are_called_metres_are_said_to_be_mm(tmp_path):
     found = [f for f in cmfsim.diagnose(path) if f.code == "surface-units"]
     assert len(found) == 1
     assert "look like mm, and are read as m" in found[0].what
-    assert 'units = "mm"' in found[0].mend
+    assert 'units = "mm"' in found[0].fix
     assert "um" not in found[0].what.split()
 
 
@@ -307,7 +308,7 @@ def workers_of(output):
             state = (entry.parent / "stat").read_text().rpartition(")")[2].split()[0]
         except OSError:
             continue
-        if str(output).encode() in words and b"evaluate" in words and state != "Z":
+        if str(output).encode() in words and b"cmfsim.study.worker" in words and state != "Z":
             found.append(int(entry.parent.name))
     return found
 

@@ -275,7 +275,7 @@ def _kill_worker_of(output: Path, killed: list[int]) -> None:
                 words = entry.read_bytes().split(b"\0")
             except OSError:
                 continue
-            if str(output).encode() in words and b"cmfsim.cli" in words:
+            if str(output).encode() in words and b"cmfsim.study.worker" in words:
                 os.kill(int(entry.parent.name), signal.SIGKILL)
                 killed.append(int(entry.parent.name))
                 return

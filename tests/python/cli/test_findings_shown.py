@@ -10,7 +10,7 @@ import cmfsim.pipeline.predicting
 from cmfsim.cli import main
 from cmfsim.cli.notices import Notices
 from cmfsim.report import case_document, render_page
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.finding_groups import counted, grouped
 from head_case import HeadCase
 
@@ -19,8 +19,8 @@ pytest.importorskip("jinja2")
 
 
 def cut_off(name, share):
-    return Finding(
-        "warning", "muscle-cut-off", f"{share}% of {name} lies outside the mesh", where=name
+    return Finding.warning(
+        "muscle-cut-off", f"{share}% of {name} lies outside the mesh", where=name
     )
 
 
@@ -28,7 +28,7 @@ MUSCLES = [cut_off(f"muscle_{i}", share) for i, share in enumerate((3.1, 12.0, 9
 
 
 def test_findings_of_one_kind_are_one_line_with_count_and_worst():
-    findings = [*MUSCLES, cut_off("platysma", 40.2), Finding("note", "x", "a note")]
+    findings = [*MUSCLES, cut_off("platysma", 40.2), Finding.note("x", "a note")]
     groups = grouped([*findings, *findings])
     assert [len(group.findings) for group in groups] == [5, 1]
     assert groups[0].line == "5 muscles partly outside the tissue (largest: platysma 40.2 %)"
@@ -38,10 +38,10 @@ def test_findings_of_one_kind_are_one_line_with_count_and_worst():
 
 def test_errors_come_first_and_unknown_kinds_are_counted_too():
     findings = [
-        Finding("note", "a", "n"),
-        Finding("warning", "b", "thing lies 2.5 mm off", "here"),
-        Finding("warning", "b", "thing lies 12.5 mm off", "there"),
-        Finding("error", "c", "e"),
+        Finding.note("a", "n"),
+        Finding.warning("b", "thing lies 2.5 mm off", where="here"),
+        Finding.warning("b", "thing lies 12.5 mm off", where="there"),
+        Finding.error("c", "e"),
     ]
     lines = [group.line for group in grouped(findings)]
     assert lines == ["e", "thing lies 12.5 mm off (there); and 1 more of this kind [b]", "n"]
@@ -50,12 +50,12 @@ def test_errors_come_first_and_unknown_kinds_are_counted_too():
 def test_warnings_are_printed_once_as_they_come_and_once_at_the_end(capsys):
     notices = Notices(quiet=True)
     notices.add(MUSCLES)
-    notices.add([*MUSCLES, Finding("note", "x", "a note")])
+    notices.add([*MUSCLES, Finding.note("x", "a note")])
     first = capsys.readouterr()
     assert first.out == ""
     assert first.err.count("warning") == 1
     assert "a note" not in first.err
-    notices.add([Finding("warning", "y", "evil \x1b[2Jname", mend="rename it")])
+    notices.add([Finding.warning("y", "evil \x1b[2Jname", fix="rename it")])
     notices.summarise("out/report.html")
     err = capsys.readouterr().err
     assert err.count("4 muscles partly outside the tissue") == 1
@@ -67,7 +67,7 @@ def test_warnings_are_printed_once_as_they_come_and_once_at_the_end(capsys):
 def test_nothing_doubtful_prints_nothing(capsys):
     Notices().summarise("out")
     quiet = Notices(quiet=True)
-    quiet.add([Finding("note", "x", "a note")])
+    quiet.add([Finding.note("x", "a note")])
     quiet.summarise("out")
     assert capsys.readouterr() == ("", "")
 
@@ -77,15 +77,15 @@ def noticed(tmp_path, monkeypatch):
     """A case with a warning of the doctor, one of building and one of solving."""
     monkeypatch.setattr("cmfsim.pipeline.outputs._pictures_of", lambda _: iter(()))
     build, solve = (
-        cmfsim.pipeline.predicting.build_model,
+        cmfsim.pipeline.predicting.model_of,
         cmfsim.pipeline.predicting.predict_patient,
     )
-    solved = Finding("warning", "of-solving", "solving is doubtful")
+    solved = Finding.warning("of-solving", "solving is doubtful")
 
-    def build_model(case, *, on_findings, **options):
-        found = build(case, on_findings=on_findings, **options)
-        if on_findings is not None:
-            on_findings(MUSCLES)
+    def model_of(case, options):
+        found = build(case, options)
+        if options.on_findings is not None:
+            options.on_findings(MUSCLES)
         findings = [*found.summary["findings"], *map(dataclasses.asdict, MUSCLES)]
         summary = {**found.summary, "findings": findings}
         return dataclasses.replace(found, findings=(*found.findings, *MUSCLES), summary=summary)
@@ -100,9 +100,11 @@ def noticed(tmp_path, monkeypatch):
             summary={**found.summary, "findings": findings},
         )
 
-    monkeypatch.setattr("cmfsim.pipeline.predicting.build_model", build_model)
+    monkeypatch.setattr("cmfsim.pipeline.predicting.model_of", model_of)
     monkeypatch.setattr("cmfsim.pipeline.predicting.predict_patient", predict_patient)
-    doctor = Finding("warning", "of-doctor", "the case is doubtful", "case.toml:3", "why", "fix it")
+    doctor = Finding.warning(
+        "of-doctor", "the case is doubtful", where="case.toml:3", why="why", fix="fix it"
+    )
     found = cmfsim.doctor.Examination((doctor,), {})
     monkeypatch.setattr("cmfsim.cli.case_commands.examine", lambda *_, **__: found)
     head = HeadCase(rounds=2)

@@ -308,7 +308,7 @@ DEFECTS = {
 
 @pytest.mark.parametrize("name", DEFECTS)
 def test_a_defect_is_said_and_said_alone(name, tmp_path):
-    """One defect in a clean case gives one serious finding, with its reason and its mend."""
+    """One defect in a clean case gives one serious finding, with its reason and its fix."""
     spoil, severity, code = DEFECTS[name]
     head = HeadCase()
     spoil(head)
@@ -317,7 +317,7 @@ def test_a_defect_is_said_and_said_alone(name, tmp_path):
     (finding,) = findings
     assert finding.what
     assert finding.why
-    assert finding.mend
+    assert finding.fix
     assert "case.toml" in finding.where
 
 
@@ -583,7 +583,7 @@ def test_the_command_exits_with_2_on_an_error_and_speaks_json(tmp_path, capsys):
     assert err == ""
     assert report["errors"] == 1
     assert report["findings"][0]["code"] == "surface-units"
-    assert set(report["findings"][0]) == {"severity", "code", "what", "where", "why", "mend"}
+    assert set(report["findings"][0]) == {"severity", "code", "what", "where", "why", "fix"}
     assert main(["doctor", str(path), "-q"]) == 2
     assert "surface-units" in capsys.readouterr().out
 

@@ -55,7 +55,7 @@ def test_tissue_that_ends_loose_on_a_border_is_reported():
     (finding,) = block(loose=("x",))
     assert finding.code == "tissue-ends-loose"
     assert "left border" in finding.what
-    assert 'fixed_borders = ["left"]' in finding.mend
+    assert 'fixed_borders = ["left"]' in finding.fix
     assert not block()
 
 

@@ -248,7 +248,7 @@ def test_an_image_cut_off_too_low_to_tell_metal_is_reported(head):
     assert "metal" not in codes(found)
     (finding,) = [f for f in found.findings if f.code == "ct-saturated"]
     assert finding.severity == "warning"
-    assert "metal_threshold" in finding.mend
+    assert "metal_threshold" in finding.fix
     lower = segment_head(with_fillings(head, 1500.0), SegmentOptions(metal_threshold=1400.0))
     assert "metal" in codes(lower)
 

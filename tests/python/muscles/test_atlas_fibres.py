@@ -18,7 +18,7 @@ SAGITTAL = (0.0, 1.0, 1.0)
 
 
 def muscle(name, side):
-    """A muscle of the atlas: its mended surface, and its fibres as the importer gives them."""
+    """A muscle of the atlas: its repaired surface, and its fibres as the importer gives them."""
     pair = next(pair for pair in PAIRED_MUSCLES if pair.name == name)
     part = pair.left if side == "L" else pair.right
     path = real_heads.data_folder() / "bodyparts3d" / "v3_obj99" / f"{part}.obj"

@@ -214,7 +214,7 @@ def edited(folder, old, new):
 def the_finding(folder, code):
     """The one finding of a code."""
     (found,) = [f for f in cmfsim.check_template(folder) if f.code == code]
-    assert found.mend
+    assert found.fix
     return found
 
 

@@ -63,7 +63,9 @@ def bite():
 
 def inside(bite, width, moved=("maxilla",)):
     mesh, kinds, segments = bite
-    return cleft_tets(np.asarray(mesh.nodes), np.asarray(mesh.tets), kinds, segments, moved, width)
+    return cleft_tets(
+        np.asarray(mesh.nodes), np.asarray(mesh.tets), kinds, segments, moved=moved, width=width
+    )
 
 
 def test_tissue_between_rows_goes_and_tissue_beside_stays(bite):
@@ -100,8 +102,8 @@ def test_a_tet_that_holds_nodes_of_both_goes_whatever_its_size():
     kinds = cmfsim.NodeKinds([2, 0, 1, 0], [0, -1, 1, -1], ("maxilla", "cranium"))
     far = [plate((90, 90, 90), (91, 91, 91), name) for name in ("maxilla", "cranium")]
     both = (np.asarray(mesh.nodes), np.asarray(mesh.tets), kinds, far)
-    assert cleft_tets(*both, ("maxilla",), 1.0).all()
-    assert not cleft_tets(*both, (), 1.0).any()
+    assert cleft_tets(*both, moved=("maxilla",), width=1.0).all()
+    assert not cleft_tets(*both, moved=(), width=1.0).any()
 
 
 def test_what_is_left_keeps_its_kinds_and_what_went_is_said(bite):

@@ -207,14 +207,14 @@ def test_the_key_is_that_of_files_plan_and_options_and_not_of_the_folder(case, t
 
 def test_a_file_that_changes_during_the_work_is_an_error(tmp_path, monkeypatch):
     path = write_head(tmp_path)
-    build = cmfsim.pipeline.predicting.build_model
+    build = cmfsim.pipeline.predicting.model_of
 
-    def slow_build(case, **options):
+    def slow_build(case, options):
         with path.open("a", encoding="utf-8") as file:
             file.write("\n# another line\n")
-        return build(case, **options)
+        return build(case, options)
 
-    monkeypatch.setattr("cmfsim.pipeline.predicting.build_model", slow_build)
+    monkeypatch.setattr("cmfsim.pipeline.predicting.model_of", slow_build)
     with pytest.raises(cmfsim.CaseError, match=r"case.toml: changed while"):
         cmfsim.predict(path, model="H", check=False)
 

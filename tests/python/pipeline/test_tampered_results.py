@@ -36,7 +36,9 @@ def originals(prediction, evaluation, tmp_path_factory):  # noqa: F811
                 f"cmfsim.pipeline.outputs.{name}", lambda path, *_, **__: path.write_bytes(PNG)
             )
         folder = tmp_path_factory.mktemp("results")
-        noticed = dataclasses.asdict(cmfsim.Finding("warning", "x", "a thing", "here", "so", "do"))
+        noticed = dataclasses.asdict(
+            cmfsim.Finding.warning("x", "a thing", where="here", why="so", fix="do")
+        )
         summary = {**prediction.summary, "findings": [noticed], "note": "a note"}
         write(folder, dataclasses.replace(prediction, summary=summary), evaluation=evaluation)
     return folder

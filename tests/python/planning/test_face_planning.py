@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 import cmfsim
+from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.planning.face_planning.search import bounded_least_squares
 from head_case import HeadCase
@@ -36,7 +37,7 @@ def planning(tmp_path_factory):
     case.replace("\n[tissue]\n", CUT)
     case.replace("edge_length = 4.0", "edge_length = 9.0")
     path = case.write(tmp_path_factory.mktemp("face"))
-    return cmfsim.planning_model(build_patient(path, ("H",), check=False), "H")
+    return cmfsim.planning_model(build_patient(path, ("H",), BuildOptions(check=False)), "H")
 
 
 def stated(planning, plan):

@@ -44,13 +44,13 @@ def test_a_bar_pushed_to_half_its_length_says_which_tets_inverted(caplog):
     count, worst = int((ratios <= 0.0).sum()), int(ratios.argmin())
     assert count > 0
     assert result.summary["inverted_tets"] == count
-    (said,) = (cmfsim.Finding(**entry) for entry in result.summary["findings"])
+    (said,) = (cmfsim.Finding.from_values(entry) for entry in result.summary["findings"])
     assert (said.severity, said.code) == ("warning", "inverted-tets")
     assert said.what.startswith(f"{count} of {len(rest)} tets rest inverted; worst is tet {worst},")
     assert f"at {ratios[worst]:.2g} of its volume" in said.what
     middle = result.nodes[result.tets[worst]].mean(axis=0)
     assert said.where.startswith("({:.1f}, {:.1f}, {:.1f}) mm".format(*middle))
-    assert "hyperelastic" in said.mend
+    assert "hyperelastic" in said.fix
     (record,) = caplog.records
     assert record.getMessage().startswith(f"inverted-tets: {count} of ")
 

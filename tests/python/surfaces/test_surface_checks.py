@@ -1,4 +1,4 @@
-"""Surfaces are read, written, checked and mended; each defect is counted, placed and undone."""
+"""Surfaces are read, written, checked and repaired; each defect is counted, placed and undone."""
 
 import os
 import time
@@ -30,8 +30,8 @@ def check(vertices, triangles):
 
 def repair(vertices, triangles, **options):
     surface = cmfsim.SurfaceData(vertices, triangles)
-    mended, findings = cmfsim.repair_surface(surface, "it", cmfsim.RepairOptions(**options))
-    return mended, [f.code for f in findings]
+    repaired, findings = cmfsim.repair_surface(surface, "it", cmfsim.RepairOptions(**options))
+    return repaired, [f.code for f in findings]
 
 
 # Reading and writing.
@@ -297,10 +297,10 @@ def test_labels_are_those_of_the_connected_pieces():
 def test_a_sound_surface_is_left_as_it_is():
     """Same numbers, no findings."""
     vertices, triangles = sphere()
-    mended, codes = repair(vertices, triangles)
+    repaired, codes = repair(vertices, triangles)
     assert codes == []
-    assert np.array_equal(mended.vertices, vertices)
-    assert np.array_equal(mended.triangles, triangles)
+    assert np.array_equal(repaired.vertices, vertices)
+    assert np.array_equal(repaired.triangles, triangles)
 
 
 def test_nearly_equal_vertices_are_welded():
@@ -308,10 +308,10 @@ def test_nearly_equal_vertices_are_welded():
     vertices, triangles = sphere()
     rng = np.random.default_rng(3)
     loose = vertices[triangles].reshape(-1, 3) + rng.uniform(-1e-6, 1e-6, (3 * len(triangles), 3))
-    mended, codes = repair(loose, np.arange(len(loose)).reshape(-1, 3), weld_distance=1e-6)
+    repaired, codes = repair(loose, np.arange(len(loose)).reshape(-1, 3), weld_distance=1e-6)
     assert codes == ["surface-welded"]
-    assert len(mended.vertices) == len(vertices)
-    assert cmfsim.check_surface(mended).is_closed
+    assert len(repaired.vertices) == len(vertices)
+    assert cmfsim.check_surface(repaired).is_closed
 
 
 @pytest.mark.parametrize("turned", [slice(None), slice(0, 300), slice(0, None, 2)])
@@ -320,8 +320,8 @@ def test_a_surface_is_turned_outward(turned):
     vertices, triangles = sphere()
     volume = check(vertices, triangles).volume
     triangles[turned] = triangles[turned][:, ::-1]
-    mended, codes = repair(vertices, triangles)
-    report = cmfsim.check_surface(mended)
+    repaired, codes = repair(vertices, triangles)
+    report = cmfsim.check_surface(repaired)
     assert codes == ["surface-turned"]
     assert report.inconsistent == 0
     assert report.volume == pytest.approx(volume, rel=1e-12)
@@ -334,13 +334,13 @@ def test_hollows_stay_hollow_and_neighbours_are_turned():
     both = np.concatenate([triangles, hollow + len(outer)])
     size = check(outer, triangles).volume
     for shift, volume, expected in ((0.0, 0.875, []), (100.0, 1.125, ["surface-turned"])):
-        mended, codes = repair(np.concatenate([outer, 0.5 * outer + [shift, 0, 0]]), both)
+        repaired, codes = repair(np.concatenate([outer, 0.5 * outer + [shift, 0, 0]]), both)
         assert codes == expected
-        assert cmfsim.check_surface(mended).volume == pytest.approx(volume * size, rel=1e-9)
+        assert cmfsim.check_surface(repaired).volume == pytest.approx(volume * size, rel=1e-9)
     # Inside out as a whole, the hollow stays a hollow.
-    mended, codes = repair(np.concatenate([outer, 0.5 * outer]), both[:, ::-1])
+    repaired, codes = repair(np.concatenate([outer, 0.5 * outer]), both[:, ::-1])
     assert codes == ["surface-turned"]
-    assert cmfsim.check_surface(mended).volume == pytest.approx(0.875 * size, rel=1e-9)
+    assert cmfsim.check_surface(repaired).volume == pytest.approx(0.875 * size, rel=1e-9)
 
 
 def test_debris_is_dropped_by_its_share():
@@ -348,9 +348,9 @@ def test_debris_is_dropped_by_its_share():
     vertices, triangles = sphere()
     both = np.concatenate([vertices, vertices * 0.05 + [200, 0, 0]])
     pieces = np.concatenate([triangles, triangles + len(vertices)])
-    mended, codes = repair(both, pieces)
+    repaired, codes = repair(both, pieces)
     assert codes == ["surface-debris"]
-    assert len(mended.triangles) == len(triangles)
+    assert len(repaired.triangles) == len(triangles)
     assert len(repair(both, pieces, keep_share=0.0)[0].triangles) == len(pieces)
 
 
@@ -359,8 +359,8 @@ def test_an_open_sphere_is_closed_by_a_cap(height):
     """Closed and consistent, with the volume of the cut sphere."""
     vertices, triangles = sphere(5, centre=(0, 0, 0))
     upper = triangles[(vertices[triangles][:, :, 2] > height * RADIUS).all(axis=1)]
-    mended, codes = repair(vertices, upper)
-    report = cmfsim.check_surface(mended)
+    repaired, codes = repair(vertices, upper)
+    report = cmfsim.check_surface(repaired)
     assert codes == ["surface-closed"]
     assert report.is_closed
     assert report.inconsistent == 0
@@ -403,12 +403,12 @@ def test_a_flat_triangle_is_removed_without_a_slit():
     edge[a] = 0.4 * edge[b] + 0.6 * edge[c]
     for spoilt in (point, edge):
         assert len(check(spoilt, triangles).degenerate) > 0
-        mended, codes = repair(spoilt, triangles, weld_distance=0.0)
-        report = cmfsim.check_surface(mended)
+        repaired, codes = repair(spoilt, triangles, weld_distance=0.0)
+        report = cmfsim.check_surface(repaired)
         assert codes == ["surface-cleaned"]
         assert report.is_closed
         assert len(report.degenerate) == 0
-        assert cmfsim.Surface(mended.vertices, mended.triangles).is_closed
+        assert cmfsim.Surface(repaired.vertices, repaired.triangles).is_closed
 
 
 def test_nothing_left_is_an_error():
@@ -427,8 +427,8 @@ def test_real_open_parts_are_mended():
     """Parts of BodyParts3D that are open, forked, doubled or with debris become closed."""
     folder = DATA / "bodyparts3d/v3_obj99"
     for part in ("FMA46763", "FMA46782", "FMA46826", "FMA49012", "FMA52748", "FMA53649"):
-        mended, _ = cmfsim.repair_surface(cmfsim.read_surface(folder / f"{part}.obj"), part)
-        report = cmfsim.check_surface(mended)
+        repaired, _ = cmfsim.repair_surface(cmfsim.read_surface(folder / f"{part}.obj"), part)
+        report = cmfsim.check_surface(repaired)
         assert report.is_closed, part
         assert report.volume > 0.0, part
         assert report.inconsistent == 0, part
@@ -438,9 +438,11 @@ def test_real_open_parts_are_mended():
 def test_the_open_skin_closes_to_the_closed_one():
     """Same volume as the skin with its flat neck cap."""
     folder = DATA / "atlas_head"
-    mended, findings = cmfsim.repair_surface(cmfsim.read_surface(folder / "skin_open.ply"), "skin")
+    repaired, findings = cmfsim.repair_surface(
+        cmfsim.read_surface(folder / "skin_open.ply"), "skin"
+    )
     closed = cmfsim.check_surface(cmfsim.read_surface(folder / "skin.ply"))
-    report = cmfsim.check_surface(mended)
+    report = cmfsim.check_surface(repaired)
     assert [f.code for f in findings] == ["surface-closed"]
     assert report.is_closed
     assert report.volume == pytest.approx(closed.volume, rel=1e-6)

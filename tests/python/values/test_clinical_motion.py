@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import cmfsim
 from cmfsim.cli import main
-from cmfsim.pipeline.building.case_model import _plan_sizes
+from cmfsim.pipeline.building.case_checks import plan_sizes
 from cmfsim.pipeline.building.motions import PlannedBones
 from head_case import HeadCase
 
@@ -275,7 +275,7 @@ def test_metres_and_radians_are_noticed_however_the_motion_is_given(how, motion,
     (finding,) = (f for f in examined.findings if f.code == code)
     assert finding.severity == "warning"
     wanted = "0.0051 m would be 5.1 mm" if code == "plan-tiny" else "radians would be 2.0°"
-    assert wanted in finding.mend + finding.why
+    assert wanted in finding.fix + finding.why
 
 
 def test_no_motion_and_ordinary_motions_are_no_tiny_ones(tmp_path):
@@ -402,6 +402,6 @@ def test_a_plan_that_turns_bone_still_to_be_segmented_is_measured_when_it_is_bui
     with pytest.raises(
         cmfsim.CaseError, match=r"mandible moves by up to 7\d\.\d mm; give the centre"
     ):
-        _plan_sizes(case, planned, [])
+        plan_sizes(case, planned, [])
     small = PlannedBones(segments, {"mandible": TINY})
-    assert [f.code for f in _plan_sizes(case, small, [])] == ["plan-tiny"]
+    assert [f.code for f in plan_sizes(case, small, [])] == ["plan-tiny"]

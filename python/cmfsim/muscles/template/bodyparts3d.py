@@ -6,7 +6,7 @@ this package; `WHERE` says where a user downloads them.
 
 import hashlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,13 +28,14 @@ from cmfsim.muscles.template.bodyparts3d_parts import (
 )
 from cmfsim.muscles.template.muscle_template import MuscleTemplate
 from cmfsim.muscles.template.skull_reference import joined_surface
+from cmfsim.progress import Progress, no_progress
 from cmfsim.registration import side_vectors
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
 from cmfsim.surfaces.repair import RepairOptions, clean_surface, repair_surface
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.template import as_landmarks
 
 __all__ = ["WHERE", "import_bodyparts3d"]
@@ -52,20 +53,19 @@ MIRROR_VOLUME_SHARE = 0.05
 
 # Measured on these files: 49002 runs forward on its way down, behind and 2.4 mm inside 49005, as
 # the deep part does. Names follow the ids all the same, so that they can be looked up.
-_EXCHANGED_NAMES = Finding(
-    "note",
+_EXCHANGED_NAMES = Finding.note(
     "bodyparts3d-names",
     "the parts called superficial lie behind and inside those called deep: the atlas seems to have "
     "exchanged them",
-    "masseter_superficial, masseter_deep (FMA49001 to FMA49005)",
-    "only the names are affected: each keeps its own place and direction",
-    "mind it where a name is read as anatomy",
+    where="masseter_superficial, masseter_deep (FMA49001 to FMA49005)",
+    why="only the names are affected: each keeps its own place and direction",
+    fix="mind it where a name is read as anatomy",
 )
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A file as it was and as it was mended."""
+    """A file as it was and as it was repaired."""
 
     concept: str
     raw: SurfaceReport
@@ -85,7 +85,7 @@ def import_bodyparts3d(
     landmarks: Mapping[str, ArrayLike] | str | os.PathLike[str],
     *,
     verify: bool = True,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> MuscleTemplate:
     """The template that the OBJ files of BodyParts3D 3.0 make: 65 muscles, bones and teeth.
 
@@ -129,7 +129,7 @@ def import_bodyparts3d(
     if isinstance(landmarks, str | os.PathLike):
         landmarks = read_landmarks(landmarks)
     points = as_landmarks(landmarks)
-    say = progress or (lambda _: None)
+    say = progress or no_progress
     muscles: list[MuscleSurface] = []
     concepts: dict[str, tuple[str, ...]] = {}
     for pair in PAIRED_MUSCLES:
@@ -162,7 +162,7 @@ def import_bodyparts3d(
         definitions={n: where for n, where in SKULL_LANDMARKS.items() if n in points},
         licence=LICENCE,
         attribution=ATTRIBUTION,
-        source=f"BodyParts3D release 3.0, 99 % reduced; files from {WHERE}; mended by cmfsim",
+        source=f"BodyParts3D release 3.0, 99 % reduced; files from {WHERE}; repaired by cmfsim",
         concepts=concepts,
         findings=tuple(findings),
     )
@@ -187,33 +187,34 @@ def _verified(folder: Path, *, must_be_known: bool) -> list[Finding]:
         return []
     named = ", ".join(f"{name}.obj" for name in other[:3]) + (", …" if len(other) > 3 else "")
     what = f"{len(other)} of {len(HASHES)} files have other SHA-256 hashes than known: {named}"
-    mend = f"get them anew from {WHERE}"
+    fix = f"get them anew from {WHERE}"
     if must_be_known:
-        raise CaseInputError(f"{folder.name}: {what}; {mend}, or import with verification off")
+        raise CaseInputError(f"{folder.name}: {what}; {fix}, or import with verification off")
     why = "another release has other coordinates, and files may have been damaged"
-    return [Finding("warning", "bodyparts3d-other-file", what, folder.name, why, mend)]
+    return [Finding.warning("bodyparts3d-other-file", what, where=folder.name, why=why, fix=fix)]
 
 
 def _part(folder: Path, concept: str) -> _Part:
-    """A muscle's file, mended."""
+    """A muscle's file, repaired."""
     read = read_surface(folder / f"{concept}.obj")
     raw = check_surface(read, crossings=False)
     surface, findings = repair_surface(read, concept, RepairOptions())
-    mended = check_surface(surface, crossings=False)
-    is_sound = mended.is_closed and not len(mended.non_manifold) and not mended.inconsistent
+    repaired = check_surface(surface, crossings=False)
+    is_sound = repaired.is_closed and not len(repaired.non_manifold) and not repaired.inconsistent
     if not is_sound:
         findings = (
             *findings,
-            Finding(
-                "warning",
+            Finding.warning(
                 "bodyparts3d-broken",
-                f"{len(mended.borders)} borders and {len(mended.non_manifold)} forked edges remain",
-                concept,
-                "generalised winding numbers bridge small gaps; the edge of the muscle is blurred",
-                "look at the muscle; mend it by hand if it matters",
+                f"{len(repaired.borders)} borders and {len(repaired.non_manifold)} forked edges "
+                "remain",
+                where=concept,
+                why="generalised winding numbers bridge small gaps; the edge of the muscle is "
+                "blurred",
+                fix="look at the muscle; repair it by hand if it matters",
             ),
         )
-    return _Part(concept, raw, surface, mended.volume, is_sound, findings)
+    return _Part(concept, raw, surface, repaired.volume, is_sound, findings)
 
 
 def _both_sides(
@@ -231,14 +232,13 @@ def _both_sides(
     good, bad = (left, right) if left_is_better else (right, left)
     sides = ("left", "right") if left_is_better else ("right", "left")
     mirrored = _mirrored(good.surface, landmarks)
-    finding = Finding(
-        "note",
+    finding = Finding.note(
         "bodyparts3d-mirrored",
         f"the {sides[1]} one ({bad.concept}: {bad.volume:.0f} mm³, {bad.damage[2]} pieces) is "
         f"mirrored from the {sides[0]} one ({good.concept}: {good.volume:.0f} mm³)",
-        f"{pair.name}_{'R' if left_is_better else 'L'}",
-        "its file has lost a part of it",
-        "look at the muscle; nothing to do",
+        where=f"{pair.name}_{'R' if left_is_better else 'L'}",
+        why="its file has lost a part of it",
+        fix="look at the muscle; nothing to do",
     )
     surfaces = (good.surface, mirrored) if left_is_better else (mirrored, good.surface)
     return surfaces, [finding]
@@ -264,5 +264,13 @@ def _mirrored(surface: SurfaceData, landmarks: Mapping[str, Floats]) -> SurfaceD
 def _renamed(findings: tuple[Finding, ...], name: str) -> list[Finding]:
     """Findings about a file as findings about a muscle."""
     return [
-        Finding(f.severity, f.code, f.what, f"{name} ({f.where})", f.why, f.mend) for f in findings
+        Finding(
+            severity=f.severity,
+            code=f.code,
+            what=f.what,
+            where=f"{name} ({f.where})",
+            why=f.why,
+            fix=f.fix,
+        )
+        for f in findings
     ]

@@ -9,7 +9,7 @@ import numpy as np
 
 from cmfsim.checks import Floats
 from cmfsim.muscles.template.fibre_lines import fan_lines, lane_lines
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["atlas_course"]
 

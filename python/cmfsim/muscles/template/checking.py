@@ -1,4 +1,4 @@
-"""What is wrong with a muscle template: files, surfaces, sides, landmarks, each with its mend."""
+"""What is wrong with a muscle template: files, surfaces, sides, landmarks, each with its fix."""
 
 import os
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from cmfsim.muscles.template.built_in import template_path
 from cmfsim.registration import side_vectors, wrong_sides
 from cmfsim.surfaces.checks import check_surface
 from cmfsim.surfaces.repair import clean_surface
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.template import TemplateData
@@ -38,7 +38,7 @@ MOST_NAMES = 6
 
 
 def check_template(template: TemplateData | str | os.PathLike[str]) -> tuple[Finding, ...]:
-    """Everything that is wrong with a template, each with its place, reason and mend.
+    """Everything that is wrong with a template, each with its place, reason and fix.
 
     Parameters
     ----------
@@ -108,13 +108,12 @@ def _check_terms(template: TemplateData) -> Iterator[Finding]:
         ("source", "nobody can tell where it comes from"),
     ):
         if not getattr(template, key):
-            yield Finding(
-                "warning",
+            yield Finding.warning(
                 f"template-{key}",
                 f"{key} is not stated",
-                template.name,
-                why,
-                f'write {key} = "…" in template.toml',
+                where=template.name,
+                why=why,
+                fix=f'write {key} = "…" in template.toml',
             )
 
 
@@ -124,47 +123,44 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
     missing = [name for name in SKULL_LANDMARKS if name not in template.landmarks]
     extra = [name for name in names if name not in SKULL_LANDMARKS]
     if missing:
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "template-landmarks-missing",
             f"{len(missing)} of the {len(SKULL_LANDMARKS)} usual landmarks are missing: "
             f"{_listed(missing)}",
-            template.name,
-            "near them the muscles follow landmarks that lie further away",
-            "place them on the skull reference",
+            where=template.name,
+            why="near them the muscles follow landmarks that lie further away",
+            fix="place them on the skull reference",
         )
     undefined = [name for name in extra if name not in template.definitions]
     if extra:
         yield Finding(
-            "warning" if undefined else "note",
-            "template-landmarks-extra",
-            f"{len(extra)} landmarks have names of this template's own: {_listed(extra)}"
+            severity="warning" if undefined else "note",
+            code="template-landmarks-extra",
+            what=f"{len(extra)} landmarks have names of this template's own: {_listed(extra)}"
             + (f"; without a definition: {_listed(undefined)}" if undefined else ""),
-            template.name,
-            "only patients with landmarks of the same names can use them",
-            "say where they lie under [landmarks.definitions], or take the usual names",
+            where=template.name,
+            why="only patients with landmarks of the same names can use them",
+            fix="say where they lie under [landmarks.definitions], or take the usual names",
         )
     points = np.array(list(template.landmarks.values()))
     pairs = _coincident(points)
     for one, other in pairs:
-        yield Finding(
-            "error",
+        yield Finding.error(
             "template-landmarks-coincide",
             f"{names[one]} and {names[other]} lie in the same place",
-            template.name,
-            "no map takes one place to two",
-            "place one of them anew",
+            where=template.name,
+            why="no map takes one place to two",
+            fix="place one of them anew",
         )
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if len(points) < 4 or spread[-1] <= PLANE_SHARE * spread[0]:
         found = f"there are {len(points)}" if len(points) < 4 else "all lie in one plane"
-        yield Finding(
-            "error",
+        yield Finding.error(
             "template-landmarks-flat",
             f"four landmarks that do not lie in a plane are needed: {found}",
-            template.name,
-            "the map to a patient has no third direction",
-            "place more landmarks",
+            where=template.name,
+            why="the map to a patient has no third direction",
+            fix="place more landmarks",
         )
 
 
@@ -180,15 +176,14 @@ def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Ite
     swapped = wrong_sides(template.landmarks)
     if swapped:
         everything = len(swapped) == len(pairs)
-        yield Finding(
-            "error",
+        yield Finding.error(
             "template-landmarks-swapped",
             "left and right are exchanged in "
             + ("every pair" if everything else f"{len(swapped)} pairs")
             + f": {_listed(swapped)}",
-            template.name,
-            "muscles would be turned inside out on the way to a patient",
-            "the set is mirrored, or in another frame than LPS"
+            where=template.name,
+            why="muscles would be turned inside out on the way to a patient",
+            fix="the set is mirrored, or in another frame than LPS"
             if everything
             else "exchange their labels: _L is the patient's left, at greater x in LPS",
         )
@@ -197,14 +192,13 @@ def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Ite
     points = np.array(list(template.landmarks.values()))
     for name, distance in zip(template.landmarks, _distances(skull, points), strict=True):
         if distance > LANDMARK_DISTANCE:
-            yield Finding(
-                "warning",
+            yield Finding.warning(
                 "template-landmark-off-skull",
                 f"{name} lies {distance:.1f} mm from the skull reference (at most "
                 f"{LANDMARK_DISTANCE:g})",
-                template.name,
-                "muscles follow it to where no bone is",
-                "place it on the bone, in the frame and units of the skull reference",
+                where=template.name,
+                why="muscles follow it to where no bone is",
+                fix="place it on the bone, in the frame and units of the skull reference",
             )
 
 
@@ -213,13 +207,12 @@ def _check_skull(template: TemplateData) -> Iterator[Finding]:
     extent = float(np.ptp(vertices, axis=0).max()) if len(vertices) else 0.0
     low, high = SKULL_EXTENT
     if not low <= extent <= high:
-        yield Finding(
-            "error",
+        yield Finding.error(
             "template-skull-size",
             f"the skull reference is {extent:.3g} mm long (a head has {low:g} to {high:g})",
-            template.name,
-            "it is in another unit than mm, or no skull",
-            'state the unit of the files: units = "cm"',
+            where=template.name,
+            why="it is in another unit than mm, or no skull",
+            fix='state the unit of the files: units = "cm"',
         )
 
 
@@ -229,87 +222,79 @@ def _check_partners(template: TemplateData) -> Iterator[Finding]:
     for muscle in template.muscles:
         ending = muscle.name[-2:] if muscle.name[-2:] in {"_L", "_R"} else ""
         if ending != ("" if muscle.side == "both" else f"_{muscle.side}"):
-            yield Finding(
-                "error",
+            yield Finding.error(
                 "template-side-name",
                 f"the side is {muscle.side!r}, the name ends in {ending or 'no side'!r}",
-                muscle.name,
-                "muscles are addressed by names that say their side",
-                "end the name in _L or _R, or in neither for side both",
+                where=muscle.name,
+                why="muscles are addressed by names that say their side",
+                fix="end the name in _L or _R, or in neither for side both",
             )
         elif ending:
             partner = muscle.name[:-1] + ("R" if muscle.side == "L" else "L")
             if partner not in kinds:
-                yield Finding(
-                    "warning",
+                yield Finding.warning(
                     "template-partner-missing",
                     f"there is no {partner}",
-                    muscle.name,
-                    "a face with a muscle on one side alone is drawn to that side",
-                    "add it, mirrored if need be",
+                    where=muscle.name,
+                    why="a face with a muscle on one side alone is drawn to that side",
+                    fix="add it, mirrored if need be",
                 )
             elif muscle.side == "L" and kinds[partner] != muscle.kind:
-                yield Finding(
-                    "warning",
+                yield Finding.warning(
                     "template-partner-kind",
                     f"it is a {muscle.kind}, {partner} a {kinds[partner]}",
-                    muscle.name,
-                    "fibres would differ between the sides",
-                    "give both the same kind",
+                    where=muscle.name,
+                    why="fibres would differ between the sides",
+                    fix="give both the same kind",
                 )
 
 
 def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Finding]:
     report = check_surface(muscle.surface)
     if report.volume < 0.0:
-        yield Finding(
-            "error",
+        yield Finding.error(
             "template-inside-out",
             f"it encloses {report.volume:.0f} mm³: normals point inwards",
-            muscle.name,
-            "inside and outside are exchanged",
-            "turn its triangles round (cmfsim.repair_surface)",
+            where=muscle.name,
+            why="inside and outside are exchanged",
+            fix="turn its triangles round (cmfsim.repair_surface)",
         )
     if not report.is_closed:
         length = sum(loop.length for loop in report.borders)
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "template-open",
             f"{len(report.borders)} borders, {length:.1f} mm long",
-            muscle.name,
-            "near a gap the winding number fades from 1 to 0 instead of falling",
-            "close it (cmfsim.repair_surface)",
+            where=muscle.name,
+            why="near a gap the winding number fades from 1 to 0 instead of falling",
+            fix="close it (cmfsim.repair_surface)",
         )
     if len(report.non_manifold) or report.inconsistent:
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "template-not-manifold",
             f"{len(report.non_manifold)} edges of more than two triangles, {report.inconsistent} "
             "between triangles that face opposite ways",
-            muscle.name,
-            "which side is inside is not certain there",
-            "mend it (cmfsim.repair_surface)",
+            where=muscle.name,
+            why="which side is inside is not certain there",
+            fix="repair it (cmfsim.repair_surface)",
         )
     if report.crossings is not None and len(report.crossings):
-        yield Finding(
-            "note",
+        yield Finding.note(
             "template-crosses-itself",
             f"{len(report.crossings)} pairs of triangles cut through each other",
-            muscle.name,
-            "winding numbers above ½ count as inside, so that only folds of the surface suffer",
-            "nothing, if the muscle looks right",
+            where=muscle.name,
+            why="winding numbers above ½ count as inside, so that only folds of the surface suffer",
+            fix="nothing, if the muscle looks right",
         )
     if skull is None or not len(np.asarray(muscle.surface.vertices)):
         return
     nearest = float(_distances(skull, np.asarray(muscle.surface.vertices)).min())
     if nearest > MUSCLE_DISTANCE:
-        yield Finding(
-            "warning",
+        yield Finding.warning(
             "template-far-from-skull",
             f"it comes no nearer to the skull than {nearest:.0f} mm (at most {MUSCLE_DISTANCE:g})",
-            muscle.name,
-            "it lies in another frame or unit than the skull, or is no muscle of the face",
-            "bring both into one frame",
+            where=muscle.name,
+            why="it lies in another frame or unit than the skull, or is no muscle of the face",
+            fix="bring both into one frame",
         )
     body = _searchable(muscle.surface)
     if body is None:
@@ -318,13 +303,12 @@ def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Find
         outside = body.winding_number(line) < 0.5
         away = float(_distances(body, line)[outside].max(initial=0.0))
         if away > COURSE_DISTANCE:
-            yield Finding(
-                "warning",
+            yield Finding.warning(
                 "template-course-outside",
                 f"fibre line {number} leaves it by {away:.1f} mm (at most {COURSE_DISTANCE:g})",
-                muscle.name,
-                "the line may belong to another muscle",
-                "correct the line",
+                where=muscle.name,
+                why="the line may belong to another muscle",
+                fix="correct the line",
             )
 
 
@@ -337,11 +321,10 @@ def _check_sides(template: TemplateData) -> Iterator[Finding]:
             continue
         across = middles[muscle.name] - middles[partner]
         if across < 0.0:
-            yield Finding(
-                "error",
+            yield Finding.error(
                 "template-muscles-swapped",
                 f"it lies {-across:.0f} mm to the right of {partner}",
-                muscle.name,
-                "left and right are exchanged",
-                "exchange the names, or correct the frame: x grows to the patient's left",
+                where=muscle.name,
+                why="left and right are exchanged",
+                fix="exchange the names, or correct the frame: x grows to the patient's left",
             )

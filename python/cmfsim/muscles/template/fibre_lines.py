@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import Floats
 from cmfsim.errors import MeshInputError
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["fan_lines", "lane_lines"]
 

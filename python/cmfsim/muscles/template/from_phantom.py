@@ -1,7 +1,5 @@
 """A template made from a phantom head: muscles whose fibres are known, on a skull made by code."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from cmfsim.checks import Floats
@@ -9,10 +7,11 @@ from cmfsim.io.template_archives import mirrored_muscle
 from cmfsim.muscles.template.muscle_template import MuscleTemplate
 from cmfsim.muscles.template.skull_reference import joined_surface
 from cmfsim.phantom import Muscle, PhantomHead, make_head
+from cmfsim.progress import Progress, no_progress
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["phantom_muscle", "phantom_template"]
 
@@ -29,7 +28,7 @@ def phantom_template(
     head: PhantomHead | None = None,
     *,
     name: str = "phantom",
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> MuscleTemplate:
     """The muscles, skull and landmarks of a phantom head as a template, with known fibre lines.
 
@@ -59,7 +58,7 @@ def phantom_template(
     >>> template = phantom_template()  # doctest: +SKIP
     """
     head = make_head() if head is None else head
-    say = progress or (lambda _: None)
+    say = progress or no_progress
     symmetric = head.parameters.asymmetry == 0.0
     made: dict[str, MuscleSurface] = {}
     for muscle in head.muscles.values():

@@ -20,9 +20,9 @@ from cmfsim.registration import (
     leave_one_out,
     match_landmarks,
 )
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import MuscleSurface, Musculature
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.template import TemplateData
 
 __all__ = ["MorphedMusculature", "missing_landmarks", "morph_template"]
@@ -204,17 +204,16 @@ def missing_landmarks(
     listed += f" and {len(missing) - MOST_NAMES} more" if len(missing) > MOST_NAMES else ""
     few = len(used) < FEW_LANDMARKS
     return (
-        Finding(
-            "warning",
+        Finding.warning(
             "template-landmarks-missing",
             f"{len(missing)} of the template's {len(template.landmarks)} landmarks are missing: "
             f"{listed}; muscles are placed by the other {len(used)}",
-            where,
-            f"fewer than {FEW_LANDMARKS} scale and turn the muscles, but do not shape them"
+            where=where,
+            why=f"fewer than {FEW_LANDMARKS} scale and turn the muscles, but do not shape them"
             if few
             else "muscles near them follow their neighbours; with six landmarks in all, well "
             "spread, the predicted skin changes by about 0.3 mm",
-            "place them, or take a homogeneous model",
+            fix="place them, or take a homogeneous model",
         ),
     )
 
@@ -226,20 +225,21 @@ def _agreement(matched: LandmarkMatch) -> tuple[LandmarkAgreement | None, list[F
     except LandmarkError as error:
         what = f"no landmark can be judged by the others: {error}"
         why = "a misplaced landmark would not be noticed"
-        finding = Finding("note", "template-landmarks-few", what, "landmarks", why, "place more")
+        finding = Finding.note(
+            "template-landmarks-few", what, where="landmarks", why=why, fix="place more"
+        )
         return None, [finding]
     if not left_out.misplaced:
         return left_out, []
     distances = dict(zip(left_out.names, left_out.distances, strict=True))
     away = [f"{name} {distances[name]:.1f} mm" for name in left_out.misplaced]
     listed = ", ".join(away[:MOST_NAMES]) + (", …" if len(away) > MOST_NAMES else "")
-    finding = Finding(
-        "warning",
+    finding = Finding.warning(
         "template-landmarks-disagree",
         f"{len(away)} landmarks lie out of line from where the others put them: {listed}",
-        "landmarks",
-        "each draws the muscles near it along, and its neighbours out of line",
-        "look at the first in both heads; place it anew, or leave it out, and morph again",
+        where="landmarks",
+        why="each draws the muscles near it along, and its neighbours out of line",
+        fix="look at the first in both heads; place it anew, or leave it out, and morph again",
     )
     return left_out, [finding]
 
@@ -273,12 +273,11 @@ def _folds(
 def _fold_finding(folds: Mapping[str, int], worst: tuple[float, str, Floats]) -> Finding:
     smallest, name, place = worst
     where = ", ".join(f"{x:.1f}" for x in place)
-    return Finding(
-        "warning",
+    return Finding.warning(
         "template-folds",
         f"the map turns {sum(folds.values())} vertices of {len(folds)} muscles inside out, worst "
         f"in {name} (Jacobian {smallest:.2g})",
-        f"template, at ({where}) mm",
-        "muscles overlap themselves there, and their fibres run astray",
-        "look at the landmarks near there, or smooth the map",
+        where=f"template, at ({where}) mm",
+        why="muscles overlap themselves there, and their fibres run astray",
+        fix="look at the landmarks near there, or smooth the map",
     )

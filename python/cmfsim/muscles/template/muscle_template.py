@@ -11,7 +11,7 @@ from cmfsim.io.templates import read_template, write_template
 from cmfsim.muscles.template.built_in import template_path
 from cmfsim.muscles.template.checking import check_contents
 from cmfsim.muscles.template.morphing import MorphedMusculature, morph_template
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.template import TemplateData
 
 __all__ = ["MuscleTemplate"]
@@ -110,7 +110,7 @@ class MuscleTemplate(TemplateData):
         write_template(path, self, report)
 
     def check(self) -> tuple[Finding, ...]:
-        """What is wrong with the template, each with its place and mend; see `check_template`."""
+        """What is wrong with the template, each with its place and fix; see `check_template`."""
         return check_contents(self)
 
     def morph(

@@ -17,7 +17,7 @@ import numpy as np
 
 from cmfsim.checks import Floats, as_index_rows, as_rows
 from cmfsim.errors import CaseInputError
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["TRUTH_FILE", "DemoTruth", "read_demo_truth"]
 

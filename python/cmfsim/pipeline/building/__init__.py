@@ -2,23 +2,5 @@
 
 from cmfsim.deferred import deferred
 
-__getattr__, __dir__, __all__ = deferred(
-    __name__,
-    {
-        "case_model": (
-            "build_case",
-            "build_model",
-        ),
-        "inputs": (
-            "case_key",
-            "check_output",
-            "input_hashes",
-            "plan_key",
-        ),
-        "muscles": ("with_muscles",),
-        "postoperative": (
-            "Postoperative",
-            "read_postoperative",
-        ),
-    },
-)
+# A public name is a line of __init__.pyi.
+__getattr__, __dir__, __all__ = deferred(__name__, __file__)

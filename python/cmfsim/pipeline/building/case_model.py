@@ -3,15 +3,15 @@
 import logging
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cmfsim._core import Surface, TetMesh, __version__
+from cmfsim._core import TetMesh, __version__
 from cmfsim.bones import (
     CuttingPlane,
     Procedure,
@@ -21,17 +21,15 @@ from cmfsim.bones import (
     place_procedure,
 )
 from cmfsim.checks import Floats
-from cmfsim.doctor import SizedMotion, check_motion_size, diagnose
+from cmfsim.doctor import diagnose
 from cmfsim.doctor.landmarks import (
     LANDMARK_CODES,
-    check_landmarks,
-    nearest_of_level,
-    nearest_of_surfaces,
 )
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Case, CaseOrPath, as_case, write_model
 from cmfsim.meshing import (
     MeshReport,
+    TissueRegion,
     report_of_part,
     tissue_level,
 )
@@ -43,6 +41,7 @@ from cmfsim.node_kinds import (
     segment_data,
 )
 from cmfsim.pictures import picture_anatomy, picture_node_kinds
+from cmfsim.pipeline.building.case_checks import cut_segments, misplaced, plan_sizes, untouched
 from cmfsim.pipeline.building.clefts import without_clefts
 from cmfsim.pipeline.building.contacts import CaseContacts, arch_sheets, mean_edge
 from cmfsim.pipeline.building.ends import end_findings
@@ -57,17 +56,21 @@ from cmfsim.pipeline.building.inputs import (
 from cmfsim.pipeline.building.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.skin_part import on_skin
+from cmfsim.pipeline.building.stages import BuildOptions, Stages
 from cmfsim.pipeline.building.tissue_mesh import end_planes, region_of, tissue_mesh
-from cmfsim.values.anatomy import NODE_KINDS, Anatomy, BoneSegment, Finding, NodeKinds
+from cmfsim.progress import Progress, no_progress
+from cmfsim.surfaces.levels import detailed_surface
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding, OnFindings
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.patient_model import PatientModel
-from cmfsim.values.scene import MovedSurface, Scene, SurfaceData
+from cmfsim.values.scene import Scene
+from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["build_case", "build_model"]
+__all__ = ["build_case", "build_model", "model_of"]
 
 _log = logging.getLogger(__name__)
-
-Progress = Callable[[str], None]
-OnFindings = Callable[[Iterable[Finding]], None]
 
 
 def build_case(
@@ -115,7 +118,7 @@ def build_case(
     model = build_model(
         case, progress=progress, check=check, findings=findings, on_findings=on_findings
     )
-    stage = progress or _quiet
+    stage = progress or no_progress
     stage("writing the model")
     begun = time.perf_counter()
     names = write_model(case.output, model, partial(_draw, model))
@@ -164,53 +167,125 @@ def build_model(
     >>> import cmfsim
     >>> model = cmfsim.build_model(cmfsim.Case.load("case.toml"))  # doctest: +SKIP
     """
-    case = as_case(case)
-    options = _kind_options(case)
-    findings = [*findings]
-    stages = _Stages(progress or _quiet, findings, on_findings)
-    if check:
-        stages.begin("checking the case")
-        findings += _checked(case)
-    landmarks, noticed = read_case_landmarks(case)
-    findings += noticed
-    skull = landmarks.get("skull", {})
-    if anatomy is None:
-        anatomy, noticed = read_anatomy(case, skull, stages.begin)
-        findings += noticed
+    options = BuildOptions(
+        progress=progress,
+        check=check,
+        findings=findings,
+        anatomy=anatomy,
+        after=after,
+        on_findings=on_findings,
+    )
+    return model_of(as_case(case), options)
 
+
+def model_of(case: Case, options: BuildOptions) -> PatientModel:
+    """The model of a case, as `build_model` makes it."""
+    kinds = _kind_options(case)
+    stages = Stages(options)
+    if options.check:
+        stages.begin("checking the case")
+        stages.add(_checked(case))
+    landmarks, noticed = read_case_landmarks(case)
+    stages.add(noticed)
+    anatomy = options.anatomy
+    if anatomy is None:
+        anatomy, noticed = read_anatomy(case, landmarks.get("skull", {}), stages.begin)
+        stages.add(noticed)
+    head = _Head(case, landmarks, anatomy)
+    bones, procedures = _bones(head, stages, options.after)
+    tissue = _tissue(head, stages)
+    nodes = _nodes(head, stages, bones, tissue, kinds)
+    patient = _assembled(head, stages, bones, nodes, procedures)
+    if case.muscles is None:
+        return patient
+    stages.begin("placing and sampling the muscles")
+    # A case without muscles loads nothing of them.
+    from cmfsim.pipeline.building.muscles import with_muscles  # noqa: PLC0415
+
+    return with_muscles(patient, case.muscles, mesh=nodes.mesh)
+
+
+@dataclass(frozen=True, eq=False)
+class _Head:
+    """A case with what was read of it."""
+
+    case: Case
+    landmarks: Mapping[str, Mapping[str, Floats]]
+    anatomy: Anatomy
+
+    @property
+    def skull(self) -> Mapping[str, Floats]:
+        return self.landmarks.get("skull", {})
+
+
+@dataclass(frozen=True, eq=False)
+class _Tissue:
+    """The soft tissue of a head, and the tets that fill it."""
+
+    region: TissueRegion
+    level: ImageData
+    mesh: TetMesh
+    report: MeshReport
+
+
+@dataclass(frozen=True, eq=False)
+class _Nodes:
+    """The mesh that is solved on, and what its nodes do."""
+
+    mesh: TetMesh
+    report: MeshReport
+    kinds: NodeKinds
+    contacts: CaseContacts
+    level: ImageData
+
+
+def _bones(
+    head: _Head, stages: Stages, after: Postoperative | None
+) -> tuple[PlannedBones, tuple[Procedure, ...]]:
+    """The segments of the bones with their motions, and the procedures that cut them."""
+    case = head.case
     stages.begin("cutting the bones")
-    cut = cut_bones(anatomy.bones, _procedures(case, skull))
-    findings += cut.findings
+    cut = cut_bones(head.anatomy.bones, _procedures(case, head.skull))
+    stages.add(cut.findings)
     if case.achieved:
         stages.begin("reading the achieved plan")
     bones = planned_bones(case, cut.segments, after)
-    findings += bones.findings
-    findings += _plan_sizes(case, bones, findings)
+    stages.add(bones.findings)
+    stages.add(plan_sizes(case, bones, stages.findings))
     if case.image is not None:
         # What was compared with the voxels of the CT is compared with the bones made of them.
-        findings[:] = [f for f in findings if f.code not in LANDMARK_CODES]
-        findings += _misplaced(case, landmarks, anatomy, cut.segments)
+        stages.drop(LANDMARK_CODES)
+        stages.add(misplaced(case, head.landmarks, head.anatomy, cut.segments))
     # Again for all of them together: pieces of two bones never met before.
     check_segments(bones.segments)
-    moved = [*dict.fromkeys([*_cut_segments(case), *bones.motions])]
+    return bones, cut.procedures
 
+
+def _tissue(head: _Head, stages: Stages) -> _Tissue:
     stages.begin("finding the soft tissue")
-    region = region_of(case, anatomy, skull)
-    level, noticed = tissue_level(anatomy, region)
-    findings += noticed
+    region = region_of(head.case, head.anatomy, head.skull)
+    level, noticed = tissue_level(head.anatomy, region)
+    stages.add(noticed)
 
     stages.begin("filling the tissue with tets")
-    mesh, report, noticed = tissue_mesh(case, level, anatomy)
-    findings += noticed
+    mesh, report, noticed = tissue_mesh(head.case, level, head.anatomy)
+    stages.add(noticed)
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
+    return _Tissue(region, level, mesh, report)
 
-    arches = dental_arches(anatomy, bones.segments, skull) if options.sliding else None
+
+def _nodes(
+    head: _Head, stages: Stages, bones: PlannedBones, tissue: _Tissue, options: KindOptions
+) -> _Nodes:
+    case, anatomy, mesh, report = head.case, head.anatomy, tissue.mesh, tissue.report
+    moved = [*dict.fromkeys([*cut_segments(case), *bones.motions])]
+    arches = dental_arches(anatomy, bones.segments, head.skull) if options.sliding else None
     contacts = CaseContacts()
     if arches is not None:
         stages.begin("making the contact sheets")
         edge = case.mesh.edge_length if case.mesh.file is None else mean_edge(mesh)
         contacts = arch_sheets(anatomy, bones.segments, arches, options, edge)
-        findings += contacts.findings
+        stages.add(contacts.findings)
 
     stages.begin("classifying nodes")
     classified = classify_nodes(
@@ -219,41 +294,53 @@ def build_model(
         anatomy,
         bones.segments,
         moved=moved,
-        landmarks=skull,
-        fixed_planes=end_planes(region),
+        landmarks=head.skull,
+        fixed_planes=end_planes(tissue.region),
         options=options,
         arches=arches,
         contacts=contacts.surfaces,
     )
-    findings += classified.findings
+    stages.add(classified.findings)
     kinds, whole = classified.kinds, mesh.n_tets
     if case.mesh.file is None:
         mesh, kinds, noticed = without_clefts(mesh, kinds, bones.segments, moved, case.mesh.cleft)
-        findings += noticed
+        stages.add(noticed)
     mesh, kinds, noticed = held_part(mesh, kinds)
-    findings += noticed
+    stages.add(noticed)
     if mesh.n_tets < whole:
         report = report_of_part(mesh, report)
-    findings += end_findings(
+    found = end_findings(
         np.asarray(mesh.nodes),
         np.asarray(mesh.boundary_triangles()),
         kinds,
         anatomy,
-        region,
+        tissue.region,
         segments=bones.segments,
         moved=moved,
     )
-    findings += _untouched(case, mesh, kinds, bones)
-    findings[:] = [*dict.fromkeys(findings)]
+    stages.add(found)
+    stages.add(untouched(case, mesh, kinds, bones))
+    stages.drop_repeated()
+    return _Nodes(mesh, report, kinds, contacts, tissue.level)
 
+
+def _assembled(
+    head: _Head,
+    stages: Stages,
+    bones: PlannedBones,
+    nodes: _Nodes,
+    procedures: Sequence[Procedure],
+) -> PatientModel:
+    """The patient without muscles."""
+    case, anatomy, kinds = head.case, head.anatomy, nodes.kinds
     stages.begin("assembling the scene")
-    slid = contacts.of_scene(bones.segments, kinds)
-    scene = _scene(case, mesh, kinds, bones, slid)
-    departures = contacts.summary(bones.segments, kinds, np.asarray(mesh.nodes), slid)
-    boundary = np.asarray(mesh.boundary_triangles())
-    skin = boundary[on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)]
+    places, boundary = np.asarray(nodes.mesh.nodes), np.asarray(nodes.mesh.boundary_triangles())
+    slid = nodes.contacts.of_scene(bones.segments, kinds)
+    scene = _scene(case, nodes.mesh, kinds, bones, slid)
+    departures = nodes.contacts.summary(bones.segments, kinds, places, slid)
+    skin = boundary[on_skin(places, boundary, anatomy, nodes.level)]
     stages.end()
-    patient = PatientModel(
+    return PatientModel(
         name=case.name,
         scene=scene,
         kinds=kinds,
@@ -262,22 +349,16 @@ def build_model(
         segments=bones.segments,
         anatomy=anatomy,
         fat=case.tissue,
-        landmarks=landmarks,
-        findings=tuple(findings),
+        landmarks=head.landmarks,
+        findings=tuple(stages.findings),
         summary={
-            **_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
+            **_summary(head, nodes, stages, procedures),
             "contact": departures,
             **({} if bones.achieved is None else {"achieved": bones.achieved.as_dict()}),
             "plan_sources": dict(bones.sources),
         },
+        detailed_skin=partial(detailed_surface, "skin", anatomy.skin),
     )
-    if case.muscles is None:
-        return patient
-    stages.begin("placing and sampling the muscles")
-    # A case without muscles loads nothing of them.
-    from cmfsim.pipeline.building.muscles import with_muscles  # noqa: PLC0415
-
-    return with_muscles(patient, case.muscles, mesh=mesh)
 
 
 def _draw(model: PatientModel, folder: Path) -> list[str]:
@@ -291,70 +372,14 @@ def _draw(model: PatientModel, folder: Path) -> list[str]:
     return [path.name for path in (anatomy, kinds) if path.exists()]
 
 
-class _Stages:
-    """The stages as they pass, with the seconds that each took."""
-
-    def __init__(
-        self, progress: Progress, findings: list[Finding], on_findings: OnFindings | None
-    ) -> None:
-        self._progress = progress
-        # The list that the stages add to, and what of it is known.
-        self._findings, self._known, self._on_findings = findings, set(findings), on_findings
-        self._name: str | None = None
-        self._begun = 0.0
-        self.seconds: dict[str, float] = {}
-
-    def begin(self, name: str) -> None:
-        self.end()
-        self._name, self._begun = name, time.perf_counter()
-        self._progress(name)
-
-    def end(self) -> None:
-        if self._name is not None:
-            took = time.perf_counter() - self._begun
-            self.seconds[self._name] = self.seconds.get(self._name, 0.0) + took
-            self._name = None
-        new = [finding for finding in self._findings if finding not in self._known]
-        self._known.update(new)
-        if new and self._on_findings is not None:
-            self._on_findings(new)
-
-
-def _quiet(stage: str) -> None:
-    del stage
-
-
 def _checked(case: Case) -> tuple[Finding, ...]:
     findings = diagnose(case)
     errors = [f for f in findings if f.severity == "error"]
     if errors:
         first = errors[0]
         more = f" ({len(errors) - 1} more: cmfsim doctor shows them)" if len(errors) > 1 else ""
-        raise CaseInputError(f"{first.where}: {first.what}; {first.mend}{more}")
+        raise CaseInputError(f"{first.where}: {first.what}; {first.fix}{more}")
     return findings
-
-
-def _misplaced(
-    case: Case,
-    landmarks: Mapping[str, Mapping[str, Floats]],
-    anatomy: Anatomy,
-    segments: tuple[BoneSegment, ...],
-) -> list[Finding]:
-    """Findings about landmarks that do not lie on the bones and the skin that were segmented."""
-    surfaces = [Surface(s.surface.vertices, s.surface.triangles) for s in segments]
-    findings: list[Finding] = []
-    for key, places in landmarks.items():
-        where = case.where(f"landmarks.{key}")
-        on_bone = key == "skull"
-        nearest = (
-            nearest_of_surfaces(surfaces)
-            if on_bone
-            else nearest_of_level(anatomy.skin, 0.0, places)
-        )
-        findings += check_landmarks(key, places, where, nearest)
-    # What is too far from the bone of the CT has ended the work before; what only lies far from the
-    # bone that was segmented may lie on bone that was lost.
-    return [replace(f, severity="warning") if f.severity == "error" else f for f in findings]
 
 
 def _procedures(case: Case, landmarks: Mapping[str, Floats]) -> list[Procedure]:
@@ -366,86 +391,6 @@ def _procedures(case: Case, landmarks: Mapping[str, Floats]) -> list[Procedure]:
             plane = CuttingPlane(osteotomy.plane.point, osteotomy.plane.normal)
             placed.append(free_cut(str(osteotomy.bone), str(osteotomy.name), (plane,)))
     return placed
-
-
-def _cut_segments(case: Case) -> list[str]:
-    return [name for osteotomy in case.osteotomies for name in osteotomy.segments]
-
-
-def _plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> list[Finding]:
-    """What is to be found about the sizes of the motions now that every segment has its surface.
-
-    The doctor has no surface of bone that is still to be segmented. Raises what it would have
-    raised: a bone that is torn away.
-    """
-    seen = {(finding.code, finding.where) for finding in known}
-    surfaces = {segment.name: segment.surface for segment in bones.segments}
-    found: list[Finding] = []
-    for name, motion in bones.motions.items():
-        if isinstance(motion, MovedSurface):
-            continue
-        given = case.plan.get(name)
-        sized = SizedMotion(
-            name,
-            motion,
-            case.where("plan" if case.achieved else f"plan.{name}"),
-            points=np.asarray(surfaces[name].vertices),
-            typed=given is not None and given.typed,
-            has_centre=given is not None and given.centre is not None,
-        )
-        # A measured motion may be as small as it likes.
-        found += [
-            finding
-            for finding in check_motion_size(sized)
-            if (finding.code, finding.where) not in seen
-            and not (case.achieved and finding.code.startswith("plan-tiny"))
-        ]
-    if case.surfaces is None and (errors := [f for f in found if f.severity == "error"]):
-        raise CaseInputError(f"{errors[0].where}: {errors[0].what}; {errors[0].mend}")
-    return found
-
-
-def _untouched(
-    case: Case, mesh: TetMesh, kinds: NodeKinds, bones: PlannedBones
-) -> tuple[Finding, ...]:
-    """A finding for each moved segment that lies beyond the mesh and holds none of its nodes.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A moved segment that holds no node and is named in the case, or lies at
-        the mesh: the face would not follow it.
-    """
-    findings = []
-    segments = {segment.name: segment for segment in bones.segments}
-    nodes = np.asarray(mesh.nodes)
-    low, high = nodes.min(axis=0), nodes.max(axis=0)
-    for name, motion in bones.motions.items():
-        if len(kinds.nodes("joined", name)) or len(kinds.nodes("sliding", name)):
-            continue
-        if not isinstance(motion, MovedSurface) and np.array_equal(motion, np.eye(4)):
-            continue
-        vertices = np.asarray(segments[name].surface.vertices)
-        beside = ((vertices > low) & (vertices < high)).all(axis=1).any()
-        what = (
-            f"segment {name!r} moves, but no node of the tissue is joined to it or slides on it "
-            "(segment-touches-no-tissue)"
-        )
-        where = case.where(f"plan.{name}")
-        mend = "check the cut that makes it, bone_distance in [node_kinds], and the posterior plane"
-        if name in case.plan or name in _cut_segments(case) or beside:
-            raise CaseInputError(f"{where}: {what}: the face would not follow it; {mend}")
-        findings.append(
-            Finding(
-                "warning",
-                "segment-touches-no-tissue",
-                f"{what}; it lies beyond the meshed tissue, and the case does not name it",
-                where,
-                "its motion does not reach the face",
-                "if it belongs to the face, widen [region]",
-            )
-        )
-    return tuple(findings)
 
 
 def _kind_options(case: Case) -> KindOptions:
@@ -477,15 +422,10 @@ def _scene(
 
 
 def _summary(
-    case: Case,
-    kinds: NodeKinds,
-    report: MeshReport,
-    anatomy: Anatomy,
-    findings: list[Finding],
-    seconds: Mapping[str, float],
-    procedures: tuple[Procedure, ...],
+    head: _Head, nodes: _Nodes, stages: Stages, procedures: Sequence[Procedure]
 ) -> dict[str, Any]:
-    grid, inputs = anatomy.skin, input_hashes(case)
+    case, kinds, grid = head.case, nodes.kinds, head.anatomy.skin
+    inputs = input_hashes(case)
     return {
         "case": case.name,
         "note": case.note,
@@ -494,18 +434,18 @@ def _summary(
             name: {kind: len(kinds.nodes(kind, name)) for kind in ("joined", "sliding")}
             for name in kinds.segments
         },
-        "mesh": report.as_dict(),
+        "mesh": nodes.report.as_dict(),
         "grid": {
             "shape": list(grid.values.shape),
             "spacing": np.asarray(grid.spacing).tolist(),
             "origin": grid.lowest.tolist(),
         },
-        "bones": list(anatomy.bones),
+        "bones": list(head.anatomy.bones),
         "osteotomies": [
             {"procedure": placed.kind, "options": dict(placed.options)} for placed in procedures
         ],
-        "findings": [asdict(finding) for finding in findings],
-        "timings": dict(seconds),
+        "findings": [asdict(finding) for finding in stages.findings],
+        "timings": dict(stages.seconds),
         "inputs": inputs,
         "inputs_key": case_key(case, inputs),
         "versions": {

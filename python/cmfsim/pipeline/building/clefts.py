@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface, TetMesh
 from cmfsim.checks import Floats
-from cmfsim.values.anatomy import BoneSegment, Finding, NodeKinds
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.node_kinds import NodeKinds
 
 __all__ = ["cleft_tets", "without_clefts"]
 
@@ -33,7 +35,7 @@ def without_clefts(
         As for `cleft_tets`.
     """
     nodes, tets = np.asarray(mesh.nodes), np.asarray(mesh.tets)
-    inside = cleft_tets(nodes, tets, kinds, segments, moved, width)
+    inside = cleft_tets(nodes, tets, kinds, segments, moved=moved, width=width)
     if not inside.any():
         return mesh, kinds, ()
     kept = tets[~inside]
@@ -42,15 +44,15 @@ def without_clefts(
     number = np.cumsum(used) - 1
     left = TetMesh(nodes[used], number[kept])
     volume = float(np.asarray(mesh.volumes)[inside].sum())
-    finding = Finding(
-        "note",
+    finding = Finding.note(
         "clefts-left-out",
         f"{int(inside.sum())} tets of {volume:.0f} mm³ in all lie in the clefts between segments "
         f"and were left out: of two segments they are less than {width:g} mm away, taken together",
-        f"segments {', '.join(sorted(moved))}",
-        "between tooth rows there is air, and at a cut tissue is lifted off the bone: stretched "
+        where=f"segments {', '.join(sorted(moved))}",
+        why="between tooth rows there is air, and at a cut tissue is lifted off the bone: "
+        "stretched "
         "across, tets would turn inside out and hold the bones back",
-        "set cleft in [mesh] to another width, or to 0 to keep all tissue",
+        fix="set cleft in [mesh] to another width, or to 0 to keep all tissue",
     )
     return left, NodeKinds(kinds.kind[used], kinds.segment[used], kinds.segments), (finding,)
 
@@ -60,6 +62,7 @@ def cleft_tets(
     tets: NDArray[np.uint32],
     kinds: NodeKinds,
     segments: Sequence[BoneSegment],
+    *,
     moved: Collection[str],
     width: float,
 ) -> NDArray[np.bool_]:

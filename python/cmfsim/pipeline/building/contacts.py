@@ -17,8 +17,11 @@ from cmfsim.bones import (
 from cmfsim.checks import Floats
 from cmfsim.node_kinds import DentalArches, KindOptions
 from cmfsim.surfaces.levels import contact_surface
-from cmfsim.values.anatomy import Anatomy, BoneSegment, Finding, ImageData, NodeKinds
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["CaseContacts", "arch_sheets", "mean_edge"]
 
@@ -174,27 +177,25 @@ def _mostly(inside: NDArray[np.bool_], bone: NDArray[Any]) -> bool:
 
 
 def _bears_both(name: str) -> Finding:
-    return Finding(
-        "note",
+    return Finding.note(
         "contact-sheet-both-arches",
         f"{name!r} bears the upper and the lower teeth: tissue slides on the blurred bone, for one "
         "sheet cannot go on past the edges of both",
-        f"segment {name}",
-        "lips and cheeks move with both jaws, which move as one",
-        "part the jaws in the image or surfaces if one of them moves alone",
+        where=f"segment {name}",
+        why="lips and cheeks move with both jaws, which move as one",
+        fix="part the jaws in the image or surfaces if one of them moves alone",
     )
 
 
 def _sharp(jaw: str, name: str, sheet: ContactSheet, edge_length: float) -> Finding:
-    return Finding(
-        "warning",
+    return Finding.warning(
         "contact-sheet-sharp",
         f"the contact sheet of the {jaw} arch has a radius of curvature of {sheet.radius:.1f} mm "
         f"where tissue slides; {RADIUS_IN_EDGES * edge_length:g} mm, half an edge of the tets, are "
         "needed for them to follow it",
-        f"segment {name}",
-        "sliding may need many iterations there, or not converge",
-        "look at the bone at this arch; take a smaller edge_length in [mesh]",
+        where=f"segment {name}",
+        why="sliding may need many iterations there, or not converge",
+        fix="look at the bone at this arch; take a smaller edge_length in [mesh]",
     )
 
 

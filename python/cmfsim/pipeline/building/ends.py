@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from cmfsim.checks import Floats
 from cmfsim.meshing import TissueRegion
-from cmfsim.values.anatomy import Anatomy, BoneSegment, Finding, NodeKinds
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.node_kinds import NodeKinds
 
 __all__ = ["end_findings"]
 
@@ -69,8 +71,7 @@ def _near_ends(
             # The plane lies some voxels inside the image where the head was cut off there.
             cut = abs(end - border) < NEAR_END
             how = "use a scan that goes further" if cut else f"move {key} in [region] further away"
-            yield Finding(
-                "warning",
+            yield Finding.warning(
                 "segment-near-end",
                 f"{segment.name}, which moves, "
                 + (
@@ -82,7 +83,7 @@ def _near_ends(
                 where=f"{segment.name} at z = {place:.1f} mm",
                 why=f"tissue {side} it cannot follow: the face there moves too little, or not at "
                 "all" + (", for the image ends there" if cut else ""),
-                mend=f"{how}, or leave that part of the face out of the evaluation",
+                fix=f"{how}, or leave that part of the face out of the evaluation",
             )
 
 
@@ -104,15 +105,14 @@ def _loose_ends(
             area = 0.5 * float(twice[chosen].sum())
             if area <= CUT_AREA:
                 continue
-            yield Finding(
-                "warning",
+            yield Finding.warning(
                 "tissue-ends-loose",
                 f"the tissue ends on the {name} border of the image over {area:.0f} mm², and "
                 "nothing is fixed there",
                 where=f"{name} border, {'xyz'[axis]} = {end[axis]:.1f} mm",
                 why="what lies beyond would hold the tissue back: near that border the face moves "
                 "too far",
-                mend="use an image that holds the whole face"
+                fix="use an image that holds the whole face"
                 + (
                     ", or bring the posterior plane inside it (posterior_depth in [region])"
                     if name == "back"

@@ -5,7 +5,8 @@ import numpy as np
 from cmfsim._core import TetMesh
 from cmfsim.errors import MeshInputError
 from cmfsim.surfaces.topology import tet_bodies
-from cmfsim.values.anatomy import Finding, NodeKinds
+from cmfsim.values.finding import Finding
+from cmfsim.values.node_kinds import NodeKinds
 
 __all__ = ["held_part"]
 
@@ -50,13 +51,14 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
     place = np.asarray(mesh.nodes)[tets[dropped]].reshape(-1, 3).mean(axis=0)
     speck = volume < SPECKS
     finding = Finding(
-        "note" if speck else "warning",
-        "tissue-not-held",
-        f"{int(loose.sum())} bodies of tissue of {volume:.3g} mm³ in all touch no bone and were "
+        severity="note" if speck else "warning",
+        code="tissue-not-held",
+        what=f"{int(loose.sum())} bodies of tissue of {volume:.3g} mm³ in all touch no bone and "
+        "were "
         "left out",
-        f"mesh, about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
-        "nothing says where they would go",
-        "nothing: they are specks beside the face"
+        where=f"mesh, about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
+        why="nothing says where they would go",
+        fix="nothing: they are specks beside the face"
         if speck
         else "check skin and bone near there; a larger bone threshold or closing may have parted "
         "them",

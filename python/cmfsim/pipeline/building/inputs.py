@@ -26,10 +26,12 @@ from cmfsim.io.images import read_image_file
 from cmfsim.io.models import is_model_file
 from cmfsim.io.transforms import read_transform_file
 from cmfsim.meshing import anatomy_from_surfaces
+from cmfsim.progress import Progress
 from cmfsim.surfaces.repair import repair_surface
-from cmfsim.values.anatomy import Anatomy, Finding
+from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMesh, CaseMotion
-from cmfsim.values.scene import MovedSurface
+from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import MovedSurface
 
 if TYPE_CHECKING:
     from cmfsim.imaging import SegmentOptions
@@ -46,7 +48,6 @@ __all__ = [
     "segment_options",
 ]
 
-Progress = Callable[[str], None]
 
 # Voxels of the grid that surfaces are worked on, in edges of the mesh to come, and in mm at least.
 VOXELS_PER_EDGE = 3.0
@@ -94,8 +95,8 @@ def read_anatomy(
     for name, path in files.items():
         progress(f"reading surface {name}")
         surface = read_surface(path, units=given_surfaces.units, frame=given_surfaces.frame)
-        surfaces[name], mended = repair_surface(surface, name)
-        findings.extend(mended)
+        surfaces[name], repaired = repair_surface(surface, name)
+        findings.extend(repaired)
     progress("measuring distances from the surfaces")
     spacing = max(case.mesh.edge_length / VOXELS_PER_EDGE, LEAST_VOXEL)
     skin = surfaces.pop("skin")

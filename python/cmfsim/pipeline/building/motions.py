@@ -22,8 +22,9 @@ from cmfsim.io import Case, read_surface
 from cmfsim.pipeline.building.inputs import motion_source, read_motion
 from cmfsim.pipeline.building.postoperative import REFERENCES, Postoperative, read_postoperative
 from cmfsim.surfaces.repair import clean_surface
-from cmfsim.values.anatomy import BoneSegment, Finding
-from cmfsim.values.scene import MovedSurface, SurfaceData
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:
     from cmfsim.bones.achieved import AchievedPlan
@@ -210,14 +211,14 @@ def _parted(
     named = {_numbered(segment.name, n): piece for n, piece in enumerate(pieces)}
     made = part_segment(segment, {name: piece.surface for name, piece in named.items()})
     findings.append(
-        Finding(
-            "note",
+        Finding.note(
             "motion-torn",
             f"{segment.name} moved as {len(made)} pieces: {', '.join(p.name for p in made)}",
-            case.where(_plan_key(case, segment.name)),
-            "between them neighbouring vertices moved apart by millimetres, so that the bone was "
+            where=case.where(_plan_key(case, segment.name)),
+            why="between them neighbouring vertices moved apart by millimetres, so that the bone "
+            "was "
             "cut there: no tissue is joined to the gap, and each piece has its contact surface",
-            "look at the picture of the plan; nothing to do",
+            fix="look at the picture of the plan; nothing to do",
         )
     )
     return [(piece, named[piece.name]) for piece in made]
@@ -246,14 +247,17 @@ def _removed_finding(
     at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
     used = "its vertices are not used" if severity == "warning" else "it had no say in the motion"
     return Finding(
-        severity,
-        "bone-removed",
-        f"{patch.area:.0f} mm² of {name} about ({at}) mm are no longer there after the operation, "
+        severity=severity,
+        code="bone-removed",
+        what=f"{patch.area:.0f} mm² of {name} about ({at}) mm are no longer there after the "
+        "operation, "
         f"by up to {patch.depth:.1f} mm: taken as removed bone, not as motion",
-        case.where(_plan_key(case, bone)),
-        "bone that is ground away does not pull the tissue over it: that tissue follows the rest "
+        where=case.where(_plan_key(case, bone)),
+        why="bone that is ground away does not pull the tissue over it: that tissue follows the "
+        "rest "
         f"of the segment; {used}",
-        "look at the bone there; if it was pushed in (fracture, impaction), give that part as a "
+        fix="look at the bone there; if it was pushed in (fracture, impaction), give that part as "
+        "a "
         "bone of its own",
     )
 
@@ -265,13 +269,13 @@ def _quiet(
     smooth, noise = smooth_motion(motion)
     if smooth is not motion:
         findings.append(
-            Finding(
-                "note",
+            Finding.note(
                 "motion-noisy",
                 f"the vertices of {name} moved with {noise:.2f} mm of noise, which is averaged out",
-                case.where(_plan_key(case, bone)),
-                "bone does not bend from one vertex to the next; tissue would be crumpled on it",
-                "nothing to do",
+                where=case.where(_plan_key(case, bone)),
+                why="bone does not bend from one vertex to the next; tissue would be crumpled on "
+                "it",
+                fix="nothing to do",
             )
         )
     return smooth

@@ -15,9 +15,10 @@ from cmfsim.io.images import read_image_file
 from cmfsim.pipeline.building.inputs import read_case_landmarks, segment_options
 from cmfsim.surfaces.levels import surface_of_level
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
-from cmfsim.values.anatomy import Finding, ImageData
 from cmfsim.values.case_parts import CasePostoperative
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["REFERENCES", "Postoperative", "read_postoperative"]
 

@@ -5,7 +5,8 @@ from numpy.typing import NDArray
 
 from cmfsim._core import distance_image
 from cmfsim.meshing import near_skin
-from cmfsim.values.anatomy import Anatomy, ImageData
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["GAP_REFINEMENTS", "allowed_halvings", "needed_halvings"]
 

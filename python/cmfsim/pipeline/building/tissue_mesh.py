@@ -19,7 +19,9 @@ from cmfsim.meshing import (
     part_mesh,
 )
 from cmfsim.pipeline.building.refinement import GAP_REFINEMENTS, allowed_halvings, needed_halvings
-from cmfsim.values.anatomy import Anatomy, Finding, ImageData
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 
 __all__ = ["end_planes", "region_of", "tissue_mesh"]
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["MIDLINE", "MidlineProfile", "midline_profile"]
 

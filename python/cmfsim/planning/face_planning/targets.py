@@ -13,7 +13,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, measure_sites
 from cmfsim.planning.replanning import Motions, PlanningModel
 from cmfsim.values.prediction import carried_share
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
     "CarriedPoints",

@@ -15,9 +15,9 @@ from cmfsim.planning.page.segment_points import segment_points
 from cmfsim.planning.page.tooth_rows import tooth_rows
 from cmfsim.planning.replanning import ExpectedError, Motions, PlanningModel, segment_boxes
 from cmfsim.surfaces.levels import simplified_surface
-from cmfsim.values.anatomy import Finding
+from cmfsim.values.finding import Finding
 from cmfsim.values.prediction import Prediction, carried_share
-from cmfsim.values.scene import SurfaceData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["PageContent", "page_content"]
 
@@ -158,14 +158,13 @@ def _fewer(name: str, surface: SurfaceData, most: int, findings: list[Finding]) 
     closest, _, _ = there.closest(fewer.vertices)
     away = float(np.linalg.norm(closest - np.asarray(fewer.vertices), axis=1).max())
     findings.append(
-        Finding(
-            "note",
+        Finding.note(
             "page-simplified",
             f"{name} has {count} triangles: the page draws "
             f"{len(np.asarray(fewer.triangles))}, at most {away:.2f} mm away",
-            name,
-            "a page with all of them is slow to open and to send",
-            "nothing: predictions are made with all of them",
+            where=name,
+            why="a page with all of them is slow to open and to send",
+            fix="nothing: predictions are made with all of them",
         )
     )
     return fewer

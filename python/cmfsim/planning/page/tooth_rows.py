@@ -14,7 +14,9 @@ from cmfsim._core import Surface
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.node_kinds import dental_arches
-from cmfsim.values.anatomy import BoneSegment, DentalArch, ImageData
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.dental_arch import DentalArch
+from cmfsim.values.image_data import ImageData
 from cmfsim.values.patient_model import PatientModel
 
 __all__ = ["ToothRows", "tooth_rows"]

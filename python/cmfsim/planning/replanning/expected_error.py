@@ -1,7 +1,7 @@
 """How far the plan operator deviates from exact solutions, away from its reference plan."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, ContactError, SolverError
 from cmfsim.planning.replanning.model import Motions, PlanningModel
+from cmfsim.progress import Progress
 from cmfsim.values.motion import rigid_motion
 
 __all__ = ["ExpectedError", "PlanTrial", "expected_error", "plan_distance", "segment_boxes"]
@@ -141,7 +142,7 @@ def expected_error(
     shift: float = 5.0,
     turn: float = 5.0,
     seed: int = 0,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> ExpectedError:
     """How far the product deviates from exact solutions at plans around the reference.
 

@@ -16,7 +16,8 @@ from cmfsim.solving.simulation import scene_plan, scene_solver
 from cmfsim.values.motion import rigid_matrix
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction, carried_points
-from cmfsim.values.scene import MovedSurface, Scene, SurfaceData
+from cmfsim.values.scene import Scene
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = ["Motions", "PlanningModel", "planning_model"]
 

@@ -1,0 +1,123 @@
+"""What is checked of a case while it is built, since the doctor could not know it before."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from cmfsim._core import Surface, TetMesh
+from cmfsim.checks import Floats
+from cmfsim.doctor import SizedMotion, check_motion_size
+from cmfsim.doctor.landmarks import check_landmarks, nearest_of_level, nearest_of_surfaces
+from cmfsim.errors import CaseInputError
+from cmfsim.io import Case
+from cmfsim.pipeline.building.motions import PlannedBones
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.surface_data import MovedSurface
+
+__all__ = ["cut_segments", "misplaced", "plan_sizes", "untouched"]
+
+
+def misplaced(
+    case: Case,
+    landmarks: Mapping[str, Mapping[str, Floats]],
+    anatomy: Anatomy,
+    segments: tuple[BoneSegment, ...],
+) -> list[Finding]:
+    """Findings about landmarks that do not lie on the bones and the skin that were segmented."""
+    surfaces = [Surface(s.surface.vertices, s.surface.triangles) for s in segments]
+    findings: list[Finding] = []
+    for key, places in landmarks.items():
+        where = case.where(f"landmarks.{key}")
+        on_bone = key == "skull"
+        nearest = (
+            nearest_of_surfaces(surfaces)
+            if on_bone
+            else nearest_of_level(anatomy.skin, 0.0, places)
+        )
+        findings += check_landmarks(key, places, where, nearest)
+    # What is too far from the bone of the CT has ended the work before; what only lies far from the
+    # bone that was segmented may lie on bone that was lost.
+    return [replace(f, severity="warning") if f.severity == "error" else f for f in findings]
+
+
+def cut_segments(case: Case) -> list[str]:
+    """The names of the segments that the osteotomies of a case make."""
+    return [name for osteotomy in case.osteotomies for name in osteotomy.segments]
+
+
+def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> list[Finding]:
+    """What is to be found about the sizes of the motions now that every segment has its surface.
+
+    The doctor has no surface of bone that is still to be segmented. Raises what it would have
+    raised: a bone that is torn away.
+    """
+    seen = {(finding.code, finding.where) for finding in known}
+    surfaces = {segment.name: segment.surface for segment in bones.segments}
+    found: list[Finding] = []
+    for name, motion in bones.motions.items():
+        if isinstance(motion, MovedSurface):
+            continue
+        given = case.plan.get(name)
+        sized = SizedMotion(
+            name,
+            motion,
+            case.where("plan" if case.achieved else f"plan.{name}"),
+            points=np.asarray(surfaces[name].vertices),
+            typed=given is not None and given.typed,
+            has_centre=given is not None and given.centre is not None,
+        )
+        # A measured motion may be as small as it likes.
+        found += [
+            finding
+            for finding in check_motion_size(sized)
+            if (finding.code, finding.where) not in seen
+            and not (case.achieved and finding.code.startswith("plan-tiny"))
+        ]
+    if case.surfaces is None and (errors := [f for f in found if f.severity == "error"]):
+        raise CaseInputError(f"{errors[0].where}: {errors[0].what}; {errors[0].fix}")
+    return found
+
+
+def untouched(
+    case: Case, mesh: TetMesh, kinds: NodeKinds, bones: PlannedBones
+) -> tuple[Finding, ...]:
+    """A finding for each moved segment that lies beyond the mesh and holds none of its nodes.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A moved segment that holds no node and is named in the case, or lies at
+        the mesh: the face would not follow it.
+    """
+    findings = []
+    segments = {segment.name: segment for segment in bones.segments}
+    nodes = np.asarray(mesh.nodes)
+    low, high = nodes.min(axis=0), nodes.max(axis=0)
+    for name, motion in bones.motions.items():
+        if len(kinds.nodes("joined", name)) or len(kinds.nodes("sliding", name)):
+            continue
+        if not isinstance(motion, MovedSurface) and np.array_equal(motion, np.eye(4)):
+            continue
+        vertices = np.asarray(segments[name].surface.vertices)
+        beside = ((vertices > low) & (vertices < high)).all(axis=1).any()
+        what = (
+            f"segment {name!r} moves, but no node of the tissue is joined to it or slides on it "
+            "(segment-touches-no-tissue)"
+        )
+        where = case.where(f"plan.{name}")
+        fix = "check the cut that makes it, bone_distance in [node_kinds], and the posterior plane"
+        if name in case.plan or name in cut_segments(case) or beside:
+            raise CaseInputError(f"{where}: {what}: the face would not follow it; {fix}")
+        findings.append(
+            Finding.warning(
+                "segment-touches-no-tissue",
+                f"{what}; it lies beyond the meshed tissue, and the case does not name it",
+                where=where,
+                why="its motion does not reach the face",
+                fix="if it belongs to the face, widen [region]",
+            )
+        )
+    return tuple(findings)

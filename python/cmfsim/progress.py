@@ -1,0 +1,12 @@
+"""Progress callbacks: what is called with the name of each stage as it begins."""
+
+from collections.abc import Callable
+
+__all__ = ["Progress", "no_progress"]
+
+Progress = Callable[[str], None]
+
+
+def no_progress(stage: str) -> None:
+    """Reports nothing: what stages call where nobody asked for their progress."""
+    del stage

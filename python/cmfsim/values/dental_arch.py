@@ -1,0 +1,96 @@
+"""Dental arches: where the teeth of one jaw stand."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim.checks import (
+    Floats,
+    as_number,
+    as_rows,
+    check_one_of,
+)
+from cmfsim.errors import CaseInputError
+from cmfsim.values.frozen import Frozen
+
+__all__ = ["JAWS", "LEAST_ARCH", "SHEET_DEPTH", "DentalArch"]
+
+JAWS = ("upper", "lower")
+# Half the width, and the length, of the smallest arch, mm: less is landmarks exchanged or in cm.
+LEAST_ARCH = 2.0
+# How far a node that slides lies from its contact sheet at most, mm: what lies deeper behind is on
+# another face of the bone, on the palate or where teeth bite.
+SHEET_DEPTH = 2.5
+
+
+@dataclass(frozen=True, eq=False)
+class DentalArch(Frozen):
+    """Where the teeth of one jaw stand.
+
+    Attributes
+    ----------
+    jaw : str
+        "upper" or "lower".
+    tip, left, right : (3,) float64, mm
+        On the alveolar bone: between the central incisors, and at the second molars (`supradentale`
+        and `supra_m2`, or `infradentale` and `sub_m2`).
+    out : (3,) float64
+        Unit vector from the bite to the roots of this arch.
+    depth_front, depth_molars : float, mm
+        From `tip`, and from the middle between `left` and `right`, to the other arch's, against
+        `out`: the edges of the teeth lie about half-way.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Not three finite numbers, or places that span no arch.
+    """
+
+    jaw: str
+    tip: ArrayLike
+    left: ArrayLike
+    right: ArrayLike
+    out: ArrayLike
+    depth_front: float
+    depth_molars: float
+
+    def __post_init__(self) -> None:
+        check_one_of("jaw", self.jaw, JAWS)
+        for name in ("tip", "left", "right", "out"):
+            value = as_rows(f"{self.jaw} arch: {name}", np.reshape(getattr(self, name), (1, -1)), 3)
+            object.__setattr__(self, name, value[0])
+        for name in ("depth_front", "depth_molars"):
+            as_number(f"{self.jaw} arch: {name}", getattr(self, name))
+        axes = self.axes()
+        tip, left, right = (np.asarray(place) for place in (self.tip, self.left, self.right))
+        if self.half_width < LEAST_ARCH or float(axes[1] @ (tip - self.middle)) < LEAST_ARCH:
+            raise CaseInputError(
+                f"{self.jaw} arch: its front {tip.round(1).tolist()} and its molars "
+                f"{left.round(1).tolist()} and {right.round(1).tolist()} mm span "
+                f"no arch: the front lies ahead of the molars, and these apart, by {LEAST_ARCH:g} "
+                "mm at least; are landmarks exchanged?"
+            )
+
+    @property
+    def middle(self) -> Floats:
+        """Half-way between the molars, (3,) mm."""
+        return np.asarray(0.5 * (np.asarray(self.left) + np.asarray(self.right)))
+
+    @property
+    def half_width(self) -> float:
+        """Half the distance between the molars, mm."""
+        return 0.5 * float(np.linalg.norm(np.asarray(self.left) - np.asarray(self.right)))
+
+    def axes(self) -> Floats:
+        """Unit vectors to the left, ahead, and along `out`, as rows (3, 3).
+
+        The last two are at right angles to the first, but not quite to each other: `ahead` is.
+        """
+        out = np.asarray(self.out)
+        across = np.asarray(self.left) - np.asarray(self.right)
+        across = across / max(float(np.linalg.norm(across)), np.finfo(float).tiny)
+        ahead = np.asarray(self.tip) - self.middle
+        ahead = ahead - (ahead @ across) * across - (ahead @ out) * out
+        ahead = ahead / max(float(np.linalg.norm(ahead)), np.finfo(float).tiny)
+        return np.stack([across, ahead, out])

@@ -1,0 +1,116 @@
+"""Images: scalar values on an axis-aligned grid in LPS."""
+
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim.checks import (
+    Floats,
+    as_rows,
+)
+from cmfsim.errors import CaseInputError
+from cmfsim.values.frozen import Frozen
+
+__all__ = ["ImageData"]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageData(Frozen):
+    """A scalar image on an axis-aligned grid: values[i, j, k] lies at origin + (i, j, k)·spacing.
+
+    Attributes
+    ----------
+    values : (nx, ny, nz) array of real numbers
+        Axes along +L, +P, +S. Kept as given, without a copy; treated as read-only.
+    spacing : (3,) float64, mm
+    origin : (3,) float64, mm
+        Centre of voxel (0, 0, 0), LPS.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Not three axes, an empty axis, spacing not positive, NaN or infinity in
+        spacing or origin.
+
+    Examples
+    --------
+    >>> import cmfsim, numpy as np
+    >>> image = cmfsim.ImageData(np.zeros((4, 5, 6)), spacing=(1, 1, 2), origin=(0, 0, 10))
+    >>> image.highest.tolist()
+    [3.0, 4.0, 20.0]
+    """
+
+    values: NDArray[Any]
+    spacing: ArrayLike
+    origin: ArrayLike = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        values = np.asarray(self.values)
+        if values.ndim != 3 or 0 in values.shape:
+            raise CaseInputError(f"image has shape {values.shape}: three axes, none empty, needed")
+        if values.dtype.kind not in "fiub":
+            raise CaseInputError(f"image has dtype {values.dtype}: real numbers are needed")
+        spacing = as_rows("image spacing", np.reshape(self.spacing, (1, -1)), 3)[0]
+        if (spacing <= 0.0).any():
+            raise CaseInputError(f"image spacing is {spacing.tolist()} mm: must be above 0")
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "spacing", spacing)
+        object.__setattr__(
+            self, "origin", as_rows("image origin", np.reshape(self.origin, (1, -1)), 3)[0]
+        )
+
+    @property
+    def lowest(self) -> Floats:
+        """Centre of the first voxel, (3,) mm."""
+        return cast("Floats", self.origin)
+
+    @property
+    def highest(self) -> Floats:
+        """Centre of the last voxel, (3,) mm."""
+        steps = np.array(self.values.shape) - 1
+        return cast("Floats", self.lowest + steps * np.asarray(self.spacing))
+
+    def with_values(self, values: NDArray[Any]) -> "ImageData":
+        """Other values on the same grid."""
+        if np.shape(values) != self.values.shape:
+            raise CaseInputError(f"values have shape {np.shape(values)}, not {self.values.shape}")
+        return ImageData(values, self.spacing, self.origin)
+
+    def axes(self) -> tuple[Floats, Floats, Floats]:
+        """The coordinates of the voxel centres along each axis, mm, shaped to broadcast."""
+        x, y, z = (
+            o + s * np.arange(n)
+            for o, s, n in zip(
+                self.lowest, np.asarray(self.spacing), self.values.shape, strict=True
+            )
+        )
+        return x[:, None, None], y[None, :, None], z[None, None, :]
+
+    def sample(self, points: ArrayLike) -> Floats:
+        """The values at points, trilinear; beyond the border those of the nearest border point.
+
+        Parameters
+        ----------
+        points : (n, 3) float64, mm
+
+        Returns
+        -------
+        (n,) float64
+        """
+        shape = np.array(self.values.shape)
+        place = (as_rows("points", points, 3) - self.lowest) / np.asarray(self.spacing)
+        place = np.clip(place, 0.0, shape - 1.0)
+        low = np.minimum(place.astype(np.intp), np.maximum(shape - 2, 0))
+        part = place - low
+        high = np.minimum(low + 1, shape - 1)
+        total = np.zeros(len(place))
+        for corner in range(8):
+            ends = [(corner >> axis) & 1 for axis in range(3)]
+            index = tuple((high if end else low)[:, axis] for axis, end in enumerate(ends))
+            weight = np.prod(
+                [part[:, a] if end else 1.0 - part[:, a] for a, end in enumerate(ends)], axis=0
+            )
+            total += weight * self.values[index]
+        return total

@@ -1,0 +1,85 @@
+"""Solver options: how a scene is solved."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from cmfsim._core import ELEMENTS, KINEMATICS, METHODS
+from cmfsim.checks import (
+    as_positive,
+    check_one_of,
+)
+from cmfsim.errors import CaseInputError
+
+__all__ = ["CONTACTS", "SolverOptions"]
+
+CONTACTS = ("bilateral", "unilateral")
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """How a scene is solved; the defaults are those of `MassTensors` and `StaticSolver`.
+
+    Attributes
+    ----------
+    method : str
+        "auto", "cholesky", "pcg" or "relaxation".
+    contact : str
+        "bilateral" or "unilateral".
+    tolerance : float
+        Estimated error of the iterative methods, over the length of the motion.
+    max_iterations : int or None
+    contact_tolerance : float, mm
+        Largest distance of a held node from its contact surface; a tenth of it is the way that the
+        force along the surface may still move any node by itself.
+    contact_iterations : int
+        Newton steps of the contact solver.
+    memory_limit : float or None, MB
+    element : str
+        "p1", "anp" or "p2", as `cmfsim.MassTensors` takes it.
+    kinematics : str
+        "linear", "corotational" or "hyperelastic".
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.SolverOptions(method="cholesky").contact
+    'bilateral'
+    """
+
+    method: str = "auto"
+    contact: str = "bilateral"
+    tolerance: float = 1e-8
+    max_iterations: int | None = None
+    contact_tolerance: float = 1e-4
+    contact_iterations: int = 50
+    memory_limit: float | None = None
+    element: str = "p1"
+    kinematics: str = "linear"
+
+    def __post_init__(self) -> None:
+        check_one_of("method", self.method, METHODS)
+        check_one_of("element", self.element, ELEMENTS)
+        check_one_of("kinematics", self.kinematics, KINEMATICS)
+        check_one_of("contact", self.contact, CONTACTS)
+        for name in ("tolerance", "contact_tolerance"):
+            as_positive(name, getattr(self, name))
+        if self.memory_limit is not None:
+            as_positive("memory_limit", self.memory_limit)
+        for name in ("max_iterations", "contact_iterations"):
+            value = getattr(self, name)
+            if value is None and name == "max_iterations":
+                continue
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise CaseInputError(f"{name} is {value!r}: a whole number from 1 on is needed")
+
+    def as_dict(self) -> dict[str, Any]:
+        """The options by name, as `MassTensors` (`element`) and `StaticSolver` take them."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def header(self) -> dict[str, Any]:
+        """The options as a scene file holds them: element and kinematics where unusual.
+
+        So a scene that asks for neither has the content, and the hash, that it has always had.
+        """
+        usual = {"element": "p1", "kinematics": "linear"}
+        return {k: v for k, v in self.as_dict().items() if usual.get(k) != v}

@@ -1,0 +1,78 @@
+"""Triangle surfaces, and surfaces before and after a motion."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim.checks import (
+    as_index_rows,
+    as_number,
+    as_rows,
+)
+from cmfsim.errors import CaseInputError
+from cmfsim.values.frozen import Frozen
+
+__all__ = ["MovedSurface", "SurfaceData"]
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceData(Frozen):
+    """A triangle surface.
+
+    Attributes
+    ----------
+    vertices : (v, 3) float64, mm
+    triangles : (t, 3) uint32
+        Outward normals by the right-hand rule.
+    crease_angle : float, degrees
+        Edges sharper than this keep the normals of their triangles apart.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).vertices.shape
+    (3, 3)
+    """
+
+    vertices: ArrayLike
+    triangles: ArrayLike
+    crease_angle: float = 60.0
+
+    def __post_init__(self) -> None:
+        vertices = as_rows("surface vertices", self.vertices, 3)
+        triangles = as_index_rows("surface triangles", self.triangles, 3, len(vertices), "vertices")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "triangles", triangles)
+        object.__setattr__(self, "crease_angle", as_number("crease_angle", self.crease_angle))
+
+
+@dataclass(frozen=True, eq=False)
+class MovedSurface(Frozen):
+    """A motion of a segment given by a surface before and after.
+
+    Attributes
+    ----------
+    surface : SurfaceData
+    moved_vertices : (v, 3) float64, mm
+        Where each vertex of `surface` goes.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> bone = cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    >>> cmfsim.MovedSurface(bone, bone.vertices + [0, 0, 2.0]).moved_vertices[0].tolist()
+    [0.0, 0.0, 2.0]
+    """
+
+    surface: SurfaceData
+    moved_vertices: ArrayLike
+
+    def __post_init__(self) -> None:
+        moved = as_rows("moved_vertices", self.moved_vertices, 3)
+        count = len(np.asarray(self.surface.vertices))
+        if len(moved) != count:
+            raise CaseInputError(
+                f"moved_vertices has {len(moved)} rows, but the surface has {count} vertices"
+            )
+        object.__setattr__(self, "moved_vertices", moved)
