@@ -221,7 +221,10 @@ def check_python(root: Path) -> Iterator[str]:
         for line, module in _top_imports(tree):
             if module not in PYTHON_PACKAGES | {"cmfsim"} | sys.stdlib_module_names:
                 yield f"{place}:{line}: import {module} inside the function that needs it"
-    yield from _circles(files)
+    # A folder's own `__init__` gives names of its files to others, and is left out.
+    graph = {f: {g for g in found if not f.startswith(f"{g}/")} for f, found in files.items()}
+    for circle in _circles(graph):
+        yield f"python/cmfsim: a circle of imports: {' → '.join(circle)}"
 
 
 def _file_of(package: Path, dotted: str) -> str:
@@ -233,22 +236,6 @@ def _file_of(package: Path, dotted: str) -> str:
             break
         parts.pop()
     return "/".join(parts)
-
-
-def _circles(files: Mapping[str, set[str]]) -> Iterator[str]:
-    """The files that reach themselves through what they import.
-
-    A folder's own `__init__` is left out: it gives names of its files to others.
-    """
-    inner = {f: {g for g in found if not f.startswith(f"{g}/")} for f, found in files.items()}
-    for start in sorted(inner):
-        seen: set[str] = set()
-        front = set(inner[start])
-        while front:
-            seen |= front
-            front = {name for file in front for name in inner.get(file, ())} - seen
-        if start in seen:
-            yield f"python/cmfsim/{start}: imports itself through other files"
 
 
 def _package_imports(tree: ast.AST) -> Iterator[tuple[int, str]]:

@@ -35,6 +35,15 @@ impl Reduction {
         self.unknowns.iter().map(|&j| values[j as usize]).collect()
     }
 
+    /// Values of every node: `all`, with `rows` at the unknown nodes.
+    pub fn filled(&self, all: &[[f64; 3]], rows: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let mut out = all.to_vec();
+        for (&j, v) in self.unknowns.iter().zip(rows) {
+            out[j as usize] = *v;
+        }
+        out
+    }
+
     /// Rows and columns of `matrix` that belong to unknown nodes.
     pub fn matrix(&self, matrix: &BlockMatrix) -> BlockMatrix {
         let Self { unknowns, row_of } = self;

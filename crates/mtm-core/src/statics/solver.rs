@@ -20,7 +20,7 @@ use crate::statics::solution::{Clock, ContactResult, Solution, Timings};
 use crate::statics::system::{
     Begin, BodyRows, Frozen, Linked, Settle, Solved, System, touching_needs_pcg,
 };
-use crate::statics::touching::{Path, Touch};
+use crate::statics::touching::{Path, Prescribes, Touch};
 use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Multiple of the correction of a solution by factor that stands for the error of the corrected one.
@@ -32,7 +32,7 @@ pub struct StaticSolver {
     boundary: Arc<Boundary>,
     /// The boundary with the nodes in the middle of edges, where the element has them.
     pub(crate) node_kinds: Arc<Boundary>,
-    pub(super) options: StaticOptions,
+    options: StaticOptions,
     method: Method,
     /// Whether solutions by factor are corrected once.
     refines: bool,
@@ -316,17 +316,8 @@ impl StaticSolver {
         Ok(())
     }
 
-    /// Displacements of all nodes: `prescribed` ones, and `rows` at the unknown nodes, mm.
-    pub(super) fn filled(&self, prescribed: &[[f64; 3]], rows: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        let mut u = prescribed.to_vec();
-        for (&j, v) in self.reduction.unknowns.iter().zip(rows) {
-            u[j as usize] = *v;
-        }
-        u
-    }
-
     /// Displacements of all nodes with the prescribed ones filled in, mm.
-    pub(super) fn prescribed(&self, motions: &[&Motion]) -> Result<Vec<[f64; 3]>> {
+    fn prescribed(&self, motions: &[&Motion]) -> Result<Vec<[f64; 3]>> {
         let nodes = self.tensors.element_nodes().positions();
         let mut u = vec![[0.0; 3]; nodes.len()];
         for (s, motion) in motions.iter().enumerate() {
@@ -373,7 +364,17 @@ impl StaticSolver {
     fn solve_rows(&self, posed: &Posed<'_>, solve: &mut Solve<'_>) -> Result<(Solved, Touch)> {
         let &Posed { b, u, loads, motions, start } = posed;
         if let (Mechanics::Linear(system), Some(pairs)) = (&self.mechanics, &self.pairs) {
-            let path = Path { solver: self, system, pairs, motions, loads };
+            let path = Path {
+                body: self,
+                mesh: self.tensors.mesh(),
+                reduction: &self.reduction,
+                sliding: self.sliding.as_ref(),
+                options: &self.options,
+                system,
+                pairs,
+                motions,
+                loads,
+            };
             return path.solve(solve).map_err(|e| by_node(e, &self.reduction.unknowns));
         }
         let found = match (&self.mechanics, &self.sliding) {
@@ -510,6 +511,16 @@ impl StaticSolver {
         system
             .solve_columns(columns, scales, self.sliding.as_ref().zip(frozen), interrupted)
             .map_err(|e| by_node(e, &self.reduction.unknowns))
+    }
+}
+
+impl Prescribes for StaticSolver {
+    fn prescribed(&self, motions: &[&Motion]) -> Result<Vec<[f64; 3]>> {
+        self.prescribed(motions)
+    }
+
+    fn coupled(&self, u: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        self.coupled(u)
     }
 }
 

@@ -8,12 +8,14 @@ use std::sync::Arc;
 
 use crate::boundary::Motion;
 use crate::contact::pairs::{Left, Pairs, Round, Touching};
-use crate::contact::{ContactStart, ContactState};
+use crate::contact::{ContactStart, ContactState, Sliding};
 use crate::error::{MtmError, Result};
 use crate::geometry::motion::SurfaceMotion;
+use crate::mesh::TetMesh;
 use crate::statics::effort::Solve;
+use crate::statics::options::StaticOptions;
+use crate::statics::reduction::Reduction;
 use crate::statics::solution::{Clock, TouchResult};
-use crate::statics::solver::StaticSolver;
 use crate::statics::system::{Begin, Linked, Settle, Settled, Solved, System};
 use crate::vector::{add, between, norm, scaled, sub};
 
@@ -58,9 +60,25 @@ pub(super) struct Touch {
     pub forces: Vec<[f64; 3]>,
 }
 
+/// How the nodes of a body follow from the motions of its segments.
+pub(super) trait Prescribes {
+    /// Displacements of all nodes with the prescribed ones filled in, mm.
+    ///
+    /// # Errors
+    /// Those of the motions.
+    fn prescribed(&self, motions: &[&Motion]) -> Result<Vec<[f64; 3]>>;
+
+    /// Forces that prescribed nodes bring to the unknown rows, N.
+    fn coupled(&self, u: &[[f64; 3]]) -> Vec<[f64; 3]>;
+}
+
 /// A plan on a body whose parts may touch.
 pub(super) struct Path<'a> {
-    pub solver: &'a StaticSolver,
+    pub body: &'a dyn Prescribes,
+    pub mesh: &'a TetMesh,
+    pub reduction: &'a Reduction,
+    pub sliding: Option<&'a Sliding>,
+    pub options: &'a StaticOptions,
     pub system: &'a System,
     pub pairs: &'a Pairs,
     /// One for each segment.
@@ -96,7 +114,7 @@ impl Path<'_> {
     /// step penetrates however short it is; those of the solves.
     pub fn solve(&self, solve: &mut Solve<'_>) -> Result<(Solved, Touch)> {
         let clock = Clock::new();
-        let sliding = self.solver.sliding.as_ref();
+        let sliding = self.sliding;
         let farthest = sliding.map_or(0.0, |s| s.farthest(self.motions)).max(solve.scale);
         let mut step = 1.0 / (farthest / (STEP_EDGES * self.pairs.mean_edge())).ceil().max(1.0);
         let (mut pose, mut here, mut rounds) = (self.rest(), 0.0, 0);
@@ -121,8 +139,8 @@ impl Path<'_> {
 
     fn rest(&self) -> Pose {
         Pose {
-            u: vec![[0.0; 3]; self.solver.tensors.element_nodes().n_nodes()],
-            rows: vec![[0.0; 3]; self.solver.reduction.unknowns.len()],
+            u: vec![[0.0; 3]; self.reduction.row_of.len()],
+            rows: vec![[0.0; 3]; self.reduction.unknowns.len()],
             contact: None,
             touching: self.pairs.at_rest(),
         }
@@ -130,7 +148,7 @@ impl Path<'_> {
 
     /// Distance that counts as touching, mm.
     fn close(&self) -> f64 {
-        CLOSE.min(CLOSE_SHARE * self.solver.tensors.mesh().diagonal())
+        CLOSE.min(CLOSE_SHARE * self.mesh.diagonal())
     }
 
     /// `pose`, reached at the share `from` of the plan, carried on to the share `to`; nothing where the step is too
@@ -143,14 +161,14 @@ impl Path<'_> {
     ) -> Result<Option<(Pose, Done)>> {
         let (before, after) = (self.partial(from)?, self.partial(to)?);
         let motions: Vec<&Motion> = after.iter().collect();
-        let prescribed = self.solver.prescribed(&motions)?;
+        let prescribed = self.body.prescribed(&motions)?;
         let b = self.forces(&prescribed, to);
         let is_last = to == 1.0;
         let most = if is_last { MOST_ROUNDS } else { MOST_ROUNDS_ON_THE_WAY };
         let close = if is_last { self.close() } else { LOOSE * self.close() };
         let mut begin = self.carried(pose, &before.iter().collect::<Vec<_>>(), &motions);
         // Where prescribed nodes go is known before anything is solved.
-        let u = self.solver.filled(&prescribed, &pose.rows);
+        let u = self.reduction.filled(&prescribed, &pose.rows);
         let mut pose = Pose { u, ..pose.clone() };
         let (mut rough, mut rounds) = (true, 0);
         loop {
@@ -159,7 +177,7 @@ impl Path<'_> {
             let begun = Begun { b: &b, rows: &pose.rows, contact: begin };
             let (rows, contact) =
                 self.linked(&round, begun, &motions, rough.then_some(close), solve)?;
-            let u = self.solver.filled(&prescribed, &rows);
+            let u = self.reduction.filled(&prescribed, &rows);
             let mut touching = pose.touching.clone();
             let left = self.pairs.follow(&round, &u, &motions, &mut touching)?;
             if rounds == 1 && left.penetration > DEEP_EDGES * self.pairs.mean_edge() {
@@ -172,13 +190,12 @@ impl Path<'_> {
             // Nodes at a rim may meet two facets by turns: half steps lead between them.
             let share = if is_over || near || rounds < EAGER_ROUNDS { 1.0 } else { 0.5 };
             let rows = between(&pose.rows, &rows, share);
-            let u = self.solver.filled(&prescribed, &rows);
+            let u = self.reduction.filled(&prescribed, &rows);
             pose = Pose { u, rows, contact, touching };
             if is_over {
                 return Ok(Some((pose, Done { round, left, rounds, change, converged })));
             }
-            begin =
-                pose.contact.as_ref().zip(self.solver.sliding.as_ref()).map(|(c, s)| s.start_of(c));
+            begin = pose.contact.as_ref().zip(self.sliding).map(|(c, s)| s.start_of(c));
             rough = !(is_last && (near || rounds + 2 >= most));
         }
     }
@@ -196,10 +213,10 @@ impl Path<'_> {
     ) -> Result<(Vec<[f64; 3]>, Option<ContactState>)> {
         let Begun { b, rows, contact } = begun;
         let linked = Linked { links: &round.links, share: rough.map(|_| ROUGH_SHARE) };
-        let Some(sliding) = &self.solver.sliding else {
+        let Some(sliding) = self.sliding else {
             return Ok((self.system.solve_linked(b, linked, rows, solve)?, None));
         };
-        let mut options = self.solver.options;
+        let mut options = *self.options;
         options.contact.allowed = options.contact.allowed.max(rough.unwrap_or(0.0));
         let begin = contact.map(|contact| Begin { rows, contact });
         let settle = Settle { sliding, motions, begin, options: &options, linked };
@@ -212,7 +229,7 @@ impl Path<'_> {
         if share == 1.0 {
             return Ok(self.motions.iter().map(|&m| m.clone()).collect());
         }
-        let centre = self.solver.tensors.mesh().centre();
+        let centre = self.mesh.centre();
         let part = |motion: &&Motion| {
             Ok(match motion {
                 Motion::Rigid(rigid) => Motion::Rigid(rigid.partial(share, centre)),
@@ -232,9 +249,9 @@ impl Path<'_> {
 
     /// Forces on the rows at `share` of the plan, N.
     fn forces(&self, prescribed: &[[f64; 3]], share: f64) -> Vec<[f64; 3]> {
-        let mut b = self.solver.coupled(prescribed);
+        let mut b = self.body.coupled(prescribed);
         if let Some(loads) = self.loads {
-            for (b, &j) in b.iter_mut().zip(&self.solver.reduction.unknowns) {
+            for (b, &j) in b.iter_mut().zip(&self.reduction.unknowns) {
                 *b = add(*b, scaled(loads[j as usize], share));
             }
         }
@@ -243,7 +260,7 @@ impl Path<'_> {
 
     /// Sliding nodes carried with their segments from where `pose` has them.
     fn carried(&self, pose: &Pose, from: &[&Motion], to: &[&Motion]) -> Option<ContactStart> {
-        let sliding = self.solver.sliding.as_ref()?;
+        let sliding = self.sliding?;
         let rest = sliding.carried_back(from, pose.contact.as_ref()?)?;
         sliding.carried(to, &rest)
     }
