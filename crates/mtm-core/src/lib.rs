@@ -1,6 +1,6 @@
 //! Mass-tensor mechanics of soft tissue: materials, tensors, sliding contact, exact re-planning.
 //!
-//! # The way of a scene
+//! # How a scene is solved
 //!
 //! ```text
 //! nodes, tets ─ TetMesh ─┐
@@ -9,7 +9,25 @@
 //!                                                         └ plan_operator ─ PlanOperator(plan)
 //! ```
 //!
-//! One value per stage, each built from the ones before, none changed afterwards.
+//! Each stage is one value, built from the values before it and never changed afterwards.
+//!
+//! # Folders
+//!
+//! From the ground up; each folder imports only those above it in this list, which
+//! `scripts/check_imports.py` checks:
+//!
+//! | Folder | Contents |
+//! |---|---|
+//! | `error`, `vector`, `mesh` | the error type, vectors in space, the tetrahedral mesh |
+//! | `geometry` | triangles, closed surfaces, winding numbers, rigid motions |
+//! | `algebra` | block matrices, Cholesky, conjugate gradients, multigrid |
+//! | `mechanics` | materials, mass tensors, strain energy and its laws |
+//! | `boundary` | node kinds, segments, plans |
+//! | `meshing` | tetrahedra from label images, cracks, signed distances |
+//! | `muscles` | fibre directions and the share of muscle in each tet |
+//! | `registration` | rigid fits, ICP, thin-plate splines |
+//! | `contact` | sliding nodes, their surfaces and the contact solver |
+//! | `statics` | the solvers: linear, Newton's method, plan operators |
 //!
 //! # Units and signs
 //!
