@@ -61,11 +61,6 @@ PYTHON: tuple[frozenset[str], ...] = tuple(
         "__init__ __main__",
     )
 )
-# Single imports that the order forbids, with the reason why they stay.
-PYTHON_EXCEPTIONS: Mapping[tuple[str, str], str] = {
-    ("cli/parsing", "cmfsim"): "the version that --version prints",
-    ("cli/view_command", "cmfsim"): "the public mesh that a file of tets is read as",
-}
 # Outside packages that a module may import at its top: `import cmfsim` needs numpy alone.
 PYTHON_PACKAGES = frozenset({"numpy"})
 # A file is called after its subject.
@@ -215,8 +210,7 @@ def check_python(root: Path) -> Iterator[str]:
             files.setdefault(file, set()).add(_file_of(package, dotted))
             if module == name and len(inside.parts) > 1:
                 continue
-            upwards = level.get(module, len(PYTHON)) >= level[name]
-            if upwards and (file, module) not in PYTHON_EXCEPTIONS:
+            if level.get(module, len(PYTHON)) >= level[name]:
                 yield f"{place}:{line}: {name} may not import {module}: see PYTHON"
         for line, module in _top_imports(tree):
             if module not in PYTHON_PACKAGES | {"cmfsim"} | sys.stdlib_module_names:

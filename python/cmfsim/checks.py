@@ -1,6 +1,7 @@
 """Checks of what comes in: shape, range and name, with the index and value at fault."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +15,7 @@ __all__ = [
     "as_index_rows",
     "as_indices",
     "as_number",
+    "as_point",
     "as_positive",
     "as_rows",
     "as_text",
@@ -59,6 +61,11 @@ def as_rows(name: str, value: ArrayLike, width: int) -> Floats:
     if array.ndim != 2 or array.shape[1] != width:
         raise CaseInputError(f"{name} has shape {array.shape}: (rows, {width}) is needed")
     return frozen(array)
+
+
+def as_point(name: str, value: ArrayLike) -> Floats:
+    """A read-only (3,) float64 copy of a place or a direction."""
+    return cast("Floats", as_rows(name, np.reshape(np.asarray(value), (1, -1)), 3)[0])
 
 
 def _whole_numbers(name: str, value: ArrayLike, count: int | None, of: str) -> Indices:
@@ -133,7 +140,9 @@ def check_instance(name: str, value: object, kind: type) -> None:
         raise CaseInputError(f"{name} is of type {found}: a {kind.__name__} is needed")
 
 
-def check_one_of(name: str, value: object, known: tuple[str, ...]) -> None:
+def check_one_of(
+    name: str, value: object, known: Sequence[str], error: type[Exception] = CaseInputError
+) -> None:
     """Refuses a name that is not among the known ones."""
     if value not in known:
-        raise CaseInputError(f"{name} is {value!r}: use one of {', '.join(known)}")
+        raise error(f"{name} is {value!r}: use one of {', '.join(known)}")

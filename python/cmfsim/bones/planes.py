@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_rows, as_text, check_instance
+from cmfsim.checks import Floats, as_point, as_rows, as_text, check_instance
 from cmfsim.errors import CaseInputError
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
@@ -48,8 +48,8 @@ class CuttingPlane:
     def __post_init__(self) -> None:
         as_text("plane name", self.name)
         where = f"plane {self.name!r}"
-        point = as_rows(f"{where} point", np.reshape(self.point, (1, -1)), 3)[0]
-        normal = as_rows(f"{where} normal", np.reshape(self.normal, (1, -1)), 3)[0]
+        point = as_point(f"{where} point", self.point)
+        normal = as_point(f"{where} normal", self.normal)
         largest = float(np.abs(normal).max())
         if largest == 0.0:
             raise CaseInputError(f"{where} normal is (0, 0, 0): give a direction of any length")

@@ -4,8 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from cmfsim import __version__
-from cmfsim._core import ELEMENTS, KINEMATICS, METHODS
+from cmfsim._core import ELEMENTS, KINEMATICS, METHODS, __version__
 from cmfsim.bench import EDGES, FACTORS
 from cmfsim.cli import (
     bench_command,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cmfsim import TetMesh
+from cmfsim._core import TetMesh
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_parts, read_result, read_scene, read_surface

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_rows
+from cmfsim.checks import Floats, as_point
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.air import air_level
 from cmfsim.imaging.attached import attached_findings
@@ -139,7 +139,4 @@ def _image(whole: Working, level: Volume, box: Block) -> ImageData:
 
 
 def _checked(landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:
-    return {
-        name: as_rows(f"landmark {name!r}", np.reshape(np.asarray(place), (1, -1)), 3)[0]
-        for name, place in landmarks.items()
-    }
+    return {name: as_point(f"landmark {name!r}", place) for name, place in landmarks.items()}

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim import _core
 from cmfsim._core import Surface, TetMesh
-from cmfsim.checks import as_number, as_positive, as_rows
+from cmfsim.checks import as_number, as_point, as_positive
 from cmfsim.errors import MeshInputError
 from cmfsim.meshing.quality import MeshReport, mesh_findings, mesh_report
 from cmfsim.values.finding import Finding
@@ -220,8 +220,8 @@ def _stuffed(
 ) -> tuple[TetMesh, dict[str, float]]:
     steps = np.asarray(spacing, dtype=np.float64)
     steps = np.full(3, steps) if steps.ndim == 0 else steps
-    x, y, z = as_rows("spacing", np.reshape(steps, (1, -1)), 3)[0]
-    o = as_rows("origin", np.reshape(origin, (1, -1)), 3)[0]
+    x, y, z = as_point("spacing", steps)
+    o = as_point("origin", origin)
     return _core.stuff_image(
         values,
         (float(x), float(y), float(z)),

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim import _core
-from cmfsim.checks import as_number, as_positive, as_rows
+from cmfsim.checks import as_number, as_point, as_positive
 from cmfsim.errors import MeshInputError
 from cmfsim.extras import third_party
 from cmfsim.values.anatomy import Anatomy
@@ -56,7 +56,7 @@ class TissueRegion:
 
     def __post_init__(self) -> None:
         for name in ("point", "normal"):
-            row = as_rows(name, np.reshape(getattr(self, name), (1, -1)), 3)[0]
+            row = as_point(name, getattr(self, name))
             object.__setattr__(self, name, row)
         length = float(np.linalg.norm(np.asarray(self.normal)))
         if length == 0.0:

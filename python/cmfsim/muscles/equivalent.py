@@ -16,7 +16,7 @@ import numpy as np
 
 from cmfsim import _core
 from cmfsim._core import PRESETS, MuscleFibres, Surface, TetMesh, Tissue
-from cmfsim.checks import Floats, check_instance, frozen
+from cmfsim.checks import Floats, check_instance, check_one_of, frozen
 from cmfsim.errors import MaterialInputError, MeshError, MeshInputError
 from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import MuscleSurface
@@ -204,9 +204,9 @@ def equivalent_material(
     True
     """
     check_instance("mesh", mesh, TetMesh)
-    _check_name("preset", preset, PRESETS)
-    _check_name("mixing", mixing, MIXINGS)
-    _check_name("inside", inside, INSIDE_TESTS)
+    check_one_of("preset", preset, PRESETS, MaterialInputError)
+    check_one_of("mixing", mixing, MIXINGS, MaterialInputError)
+    check_one_of("inside", inside, INSIDE_TESTS, MaterialInputError)
     start = time.perf_counter()
     named = _named(muscles)
     with ThreadPoolExecutor() as pool:  # most of the work is the core's, without the GIL
@@ -259,11 +259,6 @@ def equivalent_material(
     held, points = mixture.summary["muscle_tets"], mixture.samples
     _log.info("muscle in %d of %d tets, %d points", held, mesh.n_tets, points)
     return mixture
-
-
-def _check_name(what: str, value: object, known: Sequence[str]) -> None:
-    if value not in known:
-        raise MaterialInputError(f"{what} is {value!r}: use one of {', '.join(known)}")
 
 
 def _named(

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats, as_rows
+from cmfsim.checks import Floats, as_point
 from cmfsim.errors import CaseInputError
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.dental_arch import DentalArch
@@ -84,7 +84,7 @@ def dental_arches(
             return DentalArches(findings=(_nothing_slides(missing),))
         findings = (_from_teeth(missing),)
     else:
-        places = {n: as_rows(f"landmark {n!r}", np.reshape(landmarks[n], (1, -1)), 3)[0]
+        places = {n: as_point(f"landmark {n!r}", landmarks[n])
                   for n in (*UPPER_ARCH, *LOWER_ARCH)}  # fmt: skip
     up = _above(places)
     arches = {}

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats, Indices, as_index_rows, as_rows, check_instance
+from cmfsim.checks import Floats, Indices, as_index_rows, as_point, as_rows, check_instance
 from cmfsim.errors import CaseInputError
 from cmfsim.node_kinds.arches import DentalArches, dental_arches
 from cmfsim.node_kinds.options import BORDERS, KindOptions
@@ -311,8 +311,8 @@ def _on_planes(
     reach = options.plane_distance * border.edge_length
     found = np.zeros(len(border.ids), dtype=bool)
     for name, (point, normal) in planes.items():
-        at = as_rows(f"point of fixed plane {name!r}", np.reshape(point, (1, -1)), 3)[0]
-        along = as_rows(f"normal of fixed plane {name!r}", np.reshape(normal, (1, -1)), 3)[0]
+        at = as_point(f"point of fixed plane {name!r}", point)
+        along = as_point(f"normal of fixed plane {name!r}", normal)
         length = float(np.linalg.norm(along))
         if length == 0.0:
             raise CaseInputError(f"normal of fixed plane {name!r} is (0, 0, 0)")

@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats, as_number, as_positive, as_rows, as_text, check_one_of
+from cmfsim.checks import Floats, as_number, as_point, as_positive, as_rows, as_text, check_one_of
 from cmfsim.errors import CaseInputError
 
 __all__ = ["BORDERS", "KindOptions", "SlidingBox", "SlidingSphere", "kind_options"]
@@ -65,7 +65,7 @@ class SlidingSphere:
     def __post_init__(self) -> None:
         as_text("segment of a sliding sphere", self.segment)
         where = f"sliding sphere on {self.segment!r}"
-        centre = as_rows(f"{where} centre", np.reshape(self.centre, (1, -1)), 3)[0]
+        centre = as_point(f"{where} centre", self.centre)
         object.__setattr__(self, "centre", centre)
         object.__setattr__(self, "radius", as_positive(f"{where} radius", self.radius))
 

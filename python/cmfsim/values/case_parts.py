@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_rows, as_text, check_one_of
+from cmfsim.checks import Floats, as_point, as_rows, as_text, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.values.frozen import Frozen
 
@@ -86,8 +86,8 @@ class Plane(Frozen):
     normal: ArrayLike
 
     def __post_init__(self) -> None:
-        point = as_rows("plane point", np.reshape(self.point, (1, -1)), 3)[0]
-        normal = as_rows("plane normal", np.reshape(self.normal, (1, -1)), 3)[0]
+        point = as_point("plane point", self.point)
+        normal = as_point("plane normal", self.normal)
         largest = float(np.abs(normal).max())
         if largest == 0.0:
             raise CaseInputError("plane normal is (0, 0, 0): give its direction, any length")

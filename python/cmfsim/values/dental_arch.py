@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from cmfsim.checks import (
     Floats,
     as_number,
-    as_rows,
+    as_point,
     check_one_of,
 )
 from cmfsim.errors import CaseInputError
@@ -58,8 +58,8 @@ class DentalArch(Frozen):
     def __post_init__(self) -> None:
         check_one_of("jaw", self.jaw, JAWS)
         for name in ("tip", "left", "right", "out"):
-            value = as_rows(f"{self.jaw} arch: {name}", np.reshape(getattr(self, name), (1, -1)), 3)
-            object.__setattr__(self, name, value[0])
+            value = as_point(f"{self.jaw} arch: {name}", getattr(self, name))
+            object.__setattr__(self, name, value)
         for name in ("depth_front", "depth_molars"):
             as_number(f"{self.jaw} arch: {name}", getattr(self, name))
         axes = self.axes()

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import (
     Floats,
+    as_point,
     as_rows,
 )
 from cmfsim.errors import CaseInputError
@@ -52,14 +53,12 @@ class ImageData(Frozen):
             raise CaseInputError(f"image has shape {values.shape}: three axes, none empty, needed")
         if values.dtype.kind not in "fiub":
             raise CaseInputError(f"image has dtype {values.dtype}: real numbers are needed")
-        spacing = as_rows("image spacing", np.reshape(self.spacing, (1, -1)), 3)[0]
+        spacing = as_point("image spacing", self.spacing)
         if (spacing <= 0.0).any():
             raise CaseInputError(f"image spacing is {spacing.tolist()} mm: must be above 0")
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "spacing", spacing)
-        object.__setattr__(
-            self, "origin", as_rows("image origin", np.reshape(self.origin, (1, -1)), 3)[0]
-        )
+        object.__setattr__(self, "origin", as_point("image origin", self.origin))
 
     @property
     def lowest(self) -> Floats:
