@@ -20,6 +20,7 @@ from cmfsim.cli import (
 )
 from cmfsim.io import result_suffixes
 from cmfsim.muscles.template import WHERE
+from cmfsim.planning.replanning import CORRECTIONS
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import CONTACTS
 from cmfsim.virtual import PATIENTS
@@ -180,6 +181,14 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         type=int,
         default=plan_command.TRIALS,
         help=f"exact solutions that measure the page's error (default {plan_command.TRIALS})",
+    )
+    plan.add_argument(
+        "--corrections",
+        metavar="N",
+        type=int,
+        default=CORRECTIONS,
+        help="exact solutions that correct the face away from the case's plan, where tissue "
+        f"slides; 0 for none (default {CORRECTIONS})",
     )
     plan.add_argument(
         "--towards",

@@ -25,7 +25,14 @@ from cmfsim.pipeline.predicting import build_patient
 from cmfsim.pipeline.preparation import prepare
 from cmfsim.planning.face_planning import FacePlan, FaceSearch, plan_for_face
 from cmfsim.planning.page import PAGE_FILE, PageContent, page_content, write_planning_page
-from cmfsim.planning.replanning import ExpectedError, PlanningModel, expected_error, planning_model
+from cmfsim.planning.replanning import (
+    ExpectedError,
+    PlanCorrection,
+    PlanningModel,
+    corrected_planning,
+    expected_error,
+    planning_model,
+)
 from cmfsim.planning.server import check_serving, serve_planning
 
 __all__ = ["TRIALS", "plan"]
@@ -72,6 +79,7 @@ def plan(options: argparse.Namespace) -> int:
             "bytes": size,
             "seconds": seconds,
             "expected_error": made.errors.as_dict(),
+            "correction": _correction_values(made.planning.correction),
             "towards": None if made.found is None else _towards_values(made.found),
             "findings": notices.as_dicts(),
         }
@@ -79,6 +87,8 @@ def plan(options: argparse.Namespace) -> int:
         return DONE
     print(f"page   {escaped(str(path))} ({size / 1e6:.1f} MB)")
     print(f"error  {_error_text(made.errors)}")
+    if made.planning.correction is not None:
+        print(f"       {_correction_text(made.planning.correction)}")
     if made.found is not None:
         print(_towards_text(made.found, case.output / PLAN_FILE))
     print(f"time   {seconds:.0f} s")
@@ -103,6 +113,7 @@ def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
         planning = planning_model(patient, options.model)
         progress.stage("solving the case's plan")
         reference = planning.solve(planning.reference)
+        planning = corrected_planning(planning, options.corrections, progress=progress.stage)
         errors = expected_error(planning, trials=options.trials, progress=progress.stage)
         found = None
         if targets is not None:
@@ -146,6 +157,27 @@ def _error_text(errors: ExpectedError) -> str:
         f"up to {errors.reach:.1f} mm from the case's own"
     )
     return f"{text}; {failed} could not be solved" if failed else text
+
+
+def _correction_text(correction: PlanCorrection) -> str:
+    before, after = float(correction.before.max()), float(correction.left_out.max())
+    return (
+        f"corrected by {len(correction.plans)} other plans: {before:.2f} mm at most before, "
+        f"{after:.2f} mm where each was left out"
+    )
+
+
+def _correction_values(correction: PlanCorrection | None) -> dict[str, Any] | None:
+    """What is known of the correction; None where there is none."""
+    if correction is None:
+        return None
+    return {
+        "plans": len(correction.plans),
+        "shapes": correction.weights.shape[1],
+        "length_mm": correction.length,
+        "largest_before_mm": correction.before.tolist(),
+        "largest_left_out_mm": correction.left_out.tolist(),
+    }
 
 
 def _search(options: argparse.Namespace, planning: PlanningModel) -> FaceSearch:

@@ -40,8 +40,16 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def planning(folder):
+def bare(folder):
     return cmfsim.planning_model(planning_patient(folder / "case"), "H+S")
+
+
+@pytest.fixture(scope="module")
+def planning(bare):
+    """With a correction, which the page must evaluate as Python does."""
+    corrected = cmfsim.corrected_planning(bare, 24)
+    assert corrected.correction is not None
+    return corrected
 
 
 @pytest.fixture(scope="module")
@@ -92,12 +100,43 @@ def test_the_product_is_the_exact_solution_at_the_reference(planning, reference)
     np.testing.assert_allclose(product, reference.skin_displacements, atol=2e-4)
 
 
-def test_the_columns_are_the_operator_of_the_core(planning):
-    plan = other_plan(planning)
-    operator = planning.solver.plan_operator(
-        nodes=planning.patient.skin_nodes, plan=dict(planning.reference)
+def test_the_columns_are_the_operator_of_the_core(bare):
+    plan = other_plan(bare)
+    operator = bare.solver.plan_operator(nodes=bare.patient.skin_nodes, plan=dict(bare.reference))
+    np.testing.assert_allclose(bare.displacements(plan), operator(plan), atol=1e-9)
+
+
+def test_the_correction_lowers_the_error_at_plans_that_it_was_not_fitted_to(bare, planning, errors):
+    plans = [trial.plan for trial in errors.trials]
+    plans += [other_plan(planning), other_plan(planning, 0.5)]
+    squares = []
+    for plan in plans:
+        exact = planning.solve(plan).skin_displacements
+        away = [np.linalg.norm(m.displacements(plan) - exact, axis=1) for m in (bare, planning)]
+        squares.append([(row**2).sum() for row in away])
+    before, after = np.sum(squares, axis=0)
+    assert after < before
+    fitted = planning.correction.plans
+    apart = [
+        np.abs(fitted - planning.correction.numbers.of(plan)).max(axis=(1, 2)) for plan in plans
+    ]
+    assert np.min(apart) > 0.5
+    # Carried points are corrected too.
+    points = np.asarray(planning.skin_before.vertices)[::300]
+    difference = planning.carried(plans[0], points) - bare.carried(plans[0], points)
+    np.testing.assert_allclose(
+        difference, planning.correction.displacements(plans[0])[::300], atol=1e-9
     )
-    np.testing.assert_allclose(planning.displacements(plan), operator(plan), atol=1e-9)
+
+
+def test_corrections_that_cannot_be_fitted_leave_the_operator_alone(bare, planning):
+    assert cmfsim.corrected_planning(planning, 0).correction is None
+    assert cmfsim.corrected_planning(bare, 4).correction is None
+    assert (
+        cmfsim.corrected_planning(cmfsim.planning_model(bare.patient, "H"), 24).correction is None
+    )
+    with pytest.raises(cmfsim.CaseError, match="plans is -1"):
+        cmfsim.corrected_planning(bare, -1)
 
 
 def test_without_sliding_the_product_is_exact_for_every_plan(planning):
@@ -648,7 +687,9 @@ def test_a_large_page_computes_a_face_within_a_frame(browser, content, tmp_path)
         arrays[name] = arrays[name][picked]
     arrays["face_triangles"] = np.tile(arrays["face_triangles"], (5, 1))[: 2 * count]
     assert len(arrays["face_triangles"]) == 2 * count
-    assert arrays["columns"].shape == (count, 3, 48)
+    shapes = -(-content.arrays["correction_weights"].shape[1] // 4) * 4
+    assert shapes >= 4
+    assert arrays["columns"].shape == (count, 3, 48 + shapes)
     path = tmp_path / "large.html"
     size = cmfsim.write_planning_page(path, dataclasses.replace(content, arrays=arrays))
     assert size < 12e6

@@ -207,10 +207,13 @@ class CarriedPoints:
         self._columns = columns
         self._matrix = columns.matrix[nodes].reshape(3 * len(nodes), -1)
         self._offset = columns.offset[nodes].ravel()
+        self._correction = None if planning.correction is None else planning.correction.at(nodes)
 
     def displacements(self, plan: Motions) -> Floats:
         """How the points move, (n, 3) mm."""
         moved = self._offset + self._matrix @ self._columns.numbers(plan)
+        if self._correction is not None:
+            moved = moved + self._correction.displacements(plan).ravel()
         motion = SurfaceMotion(self._surface, self._places + moved.reshape(-1, 3))
         return np.asarray(self.share[:, None] * motion.displacement(self.points))
 

@@ -13,7 +13,13 @@ from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, midline_profile
 from cmfsim.planning.page.segment_points import segment_points
 from cmfsim.planning.page.tooth_rows import tooth_rows
-from cmfsim.planning.replanning import ExpectedError, Motions, PlanningModel, segment_boxes
+from cmfsim.planning.replanning import (
+    ExpectedError,
+    Motions,
+    PlanCorrection,
+    PlanningModel,
+    segment_boxes,
+)
 from cmfsim.surfaces.levels import simplified_surface
 from cmfsim.values.finding import Finding
 from cmfsim.values.prediction import Prediction, carried_share
@@ -27,6 +33,8 @@ FACE_TRIANGLES, BONE_TRIANGLES, LEAST_BONE = 40_000, 60_000, 500
 MOST_NODES = 60_000
 # A node moves if a plan of the range moves it by this, mm: a tenth of what rounding does.
 STILL = 4e-4
+# The product of the page takes columns in steps of so many.
+PRODUCT_STEP = 4
 # Motions that decide whether a node moves: entries of R − I, and shifts in mm.
 LARGE_TURN, LARGE_SHIFT = 0.5, 30.0
 # How far behind its foremost point the profile is drawn, mm.
@@ -131,6 +139,7 @@ def page_content(
         **profile,
         **teeth,
         "expected_error": errors.as_dict(),
+        "correction": _correction(planning),
         **_framing(skin, arrays["active"]),
     }
     return PageContent(values, arrays, tuple(findings))
@@ -171,18 +180,55 @@ def _fewer(name: str, surface: SurfaceData, most: int, findings: list[Finding]) 
 
 
 def _operator(planning: PlanningModel, reference: Prediction) -> dict[str, NDArray[Any]]:
-    """The columns of the nodes that move, in half precision, and the reference in single."""
-    columns = planning.columns
+    """The columns of the nodes that move, in half precision, and the reference in single.
+
+    After the columns of the segments come the shapes of the correction, in fours as the product
+    takes them.
+    """
+    columns, correction = planning.columns, planning.correction
     largest = np.tile([LARGE_TURN] * 9 + [LARGE_SHIFT] * 3, len(columns.segments))
     moves = (np.abs(columns.matrix) * largest).max(axis=2).max(axis=1) > STILL
     moves |= np.abs(columns.offset).max(axis=1) > STILL
+    if correction is not None:
+        moves |= np.abs(correction.shapes).max(axis=(1, 2)) > STILL
     active = np.flatnonzero(moves)
+    rows = columns.matrix[active]
+    weights = np.zeros((0, 0))
+    if correction is not None:
+        spare = -correction.shapes.shape[2] % PRODUCT_STEP
+        rows = np.concatenate(
+            [rows, np.pad(correction.shapes[active], ((0, 0), (0, 0), (0, spare)))], axis=2
+        )
+        weights = np.pad(correction.weights, ((0, 0), (0, spare)))
     with np.errstate(over="ignore"):
-        half = columns.matrix[active].astype(np.float16)
+        half = rows.astype(np.float16)
     return {
+        "correction_plans": _singles(_solved_plans(correction)),
+        "correction_weights": _singles(weights),
         "active": _indices(active),
         "columns": half,
         "reference_shift": _singles(reference.skin_displacements[active]),
+    }
+
+
+def _solved_plans(correction: PlanCorrection | None) -> Floats:
+    """The numbers of the plans that a correction goes through, (n, 6 s) mm."""
+    if correction is None:
+        return np.zeros((0, 0))
+    return correction.plans.reshape(len(correction.plans), -1)
+
+
+def _correction(planning: PlanningModel) -> dict[str, Any] | None:
+    """What the amounts of the correction's shapes depend on; none where there is no correction."""
+    if planning.correction is None:
+        return None
+    numbers = planning.correction.numbers
+    return {
+        "length": planning.correction.length,
+        "segments": [planning.segments.index(name) for name in numbers.segments],
+        "middles": numbers.middles.tolist(),
+        "arms": numbers.arms.tolist(),
+        "plans": len(planning.correction.plans),
     }
 
 

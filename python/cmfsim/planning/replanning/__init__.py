@@ -1,5 +1,7 @@
 """New plans for a patient who is built: by one small product, or solved exactly."""
 
+from cmfsim.planning.replanning.corrected import CORRECTIONS, corrected_planning
+from cmfsim.planning.replanning.correction import PlanCorrection
 from cmfsim.planning.replanning.expected_error import (
     ExpectedError,
     PlanTrial,
@@ -10,10 +12,13 @@ from cmfsim.planning.replanning.expected_error import (
 from cmfsim.planning.replanning.model import Motions, PlanningModel, planning_model
 
 __all__ = [
+    "CORRECTIONS",
     "ExpectedError",
     "Motions",
+    "PlanCorrection",
     "PlanTrial",
     "PlanningModel",
+    "corrected_planning",
     "expected_error",
     "plan_distance",
     "planning_model",

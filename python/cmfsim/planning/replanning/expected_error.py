@@ -13,7 +13,15 @@ from cmfsim.planning.replanning.model import Motions, PlanningModel
 from cmfsim.progress import Progress
 from cmfsim.values.motion import rigid_motion
 
-__all__ = ["ExpectedError", "PlanTrial", "expected_error", "plan_distance", "segment_boxes"]
+__all__ = [
+    "ExpectedError",
+    "PlanTrial",
+    "expected_error",
+    "moving_segments",
+    "plan_distance",
+    "plan_near",
+    "segment_boxes",
+]
 
 # Plans are tried at these shares of the range, one after the other.
 SHARES = (1.0, 0.5)
@@ -187,18 +195,24 @@ def expected_error(
         if progress is not None:
             progress(f"solving a plan nearby exactly ({number + 1})")
         share = SHARES[number % len(SHARES)]
-        plan = _plan_near(planning, rng, share * shift, share * turn)
+        plan = plan_near(planning, rng, share * shift, share * turn)
         found.append(_trial(planning, plan))
     return ExpectedError(tuple(found), shift, turn, planning.slides)
 
 
-def _plan_near(
+def moving_segments(planning: PlanningModel) -> tuple[str, ...]:
+    """The segments that the reference moves; all of them, if it moves none."""
+    moving = [n for n, m in planning.reference.items() if not np.array_equal(m, np.eye(4))]
+    return tuple(moving) or planning.segments
+
+
+def plan_near(
     planning: PlanningModel, rng: np.random.Generator, shift: float, turn: float
 ) -> dict[str, Floats]:
-    moving = [n for n, m in planning.reference.items() if not np.array_equal(m, np.eye(4))]
+    """A random plan around the reference: up to `shift` mm along each axis, and `turn` degrees."""
     boxes = segment_boxes(planning)
     plan = {name: np.asarray(motion) for name, motion in planning.reference.items()}
-    for name in moving or planning.segments:
+    for name in moving_segments(planning):
         centre = boxes[name].mean(axis=0)
         more = rigid_motion(
             rng.uniform(-shift, shift, 3), turn * rng.uniform(), rng.normal(size=3), centre

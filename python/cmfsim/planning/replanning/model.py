@@ -11,6 +11,7 @@ from cmfsim._core import StaticSolver
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.planning.replanning.columns import PlanColumns, plan_columns
+from cmfsim.planning.replanning.correction import PlanCorrection
 from cmfsim.solving.models import model_scene, predict_patient
 from cmfsim.solving.simulation import scene_plan, scene_solver
 from cmfsim.values.motion import rigid_matrix
@@ -31,7 +32,8 @@ class PlanningModel:
 
     Two answers to a plan: `displacements`, `skin`, `face` and `carried` by one product with the
     columns of the plan operator, in which contact is continued to first order about the reference
-    plan; `solve`, exactly. Both are the same at the reference and wherever no tissue slides.
+    plan, and corrected by `correction`; `solve`, exactly. Both are the same at the reference and
+    wherever no tissue slides.
 
     Attributes
     ----------
@@ -44,6 +46,8 @@ class PlanningModel:
         Of the nodes of the skin.
     reference : mapping of str to (4, 4) float64, mm
         The plan about which contact is continued.
+    correction : PlanCorrection or None
+        What exact solutions add to the product away from the reference (`corrected_planning`).
     """
 
     patient: PatientModel
@@ -51,6 +55,7 @@ class PlanningModel:
     solver: StaticSolver
     columns: PlanColumns
     reference: Mapping[str, Floats]
+    correction: PlanCorrection | None = None
 
     @property
     def segments(self) -> tuple[str, ...]:
@@ -94,7 +99,9 @@ class PlanningModel:
 
     def displacements(self, plan: Motions) -> Floats:
         """How each vertex of the skin moves under a plan, (k, 3) mm, by one product."""
-        return self.columns.displacements(self.whole(plan))
+        whole = self.whole(plan)
+        found = self.columns.displacements(whole)
+        return found if self.correction is None else found + self.correction.displacements(whole)
 
     def skin(self, plan: Motions) -> SurfaceData:
         """The skin of the mesh under a plan, by one product."""

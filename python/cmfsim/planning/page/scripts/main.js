@@ -248,7 +248,9 @@ class App {
     } else {
       const count = trials.filter((t) => !t.failed).length;
       const failed = trials.length - count;
-      box.textContent = `Expected error of the face: ${found.mean.toFixed(2)} mm on average, ${found.largest.toFixed(2)} mm at most (an estimate from ${count} exact solutions; this plan is ${distance.toFixed(1)} mm from the case's own, where contact was solved).`;
+      const { correction } = this.page;
+      const corrected = correction ? `, others than the ${correction.plans} by which the face is corrected` : "";
+      box.textContent = `Expected error of the face: ${found.mean.toFixed(2)} mm on average, ${found.largest.toFixed(2)} mm at most (an estimate from ${count} exact solutions${corrected}; this plan is ${distance.toFixed(1)} mm from the case's own, where contact was solved).`;
       if (failed) box.textContent += ` ${failed} more could not be solved.`;
       warned = found.largest > WARNED_ERROR;
     }

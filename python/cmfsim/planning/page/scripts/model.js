@@ -2,7 +2,7 @@
 
 import { Carrier } from "./carrier.js";
 import { measure } from "./measures.js";
-import { displace, planNumbers } from "./operator.js";
+import { Correction, displace, planNumbers } from "./operator.js";
 import { moved } from "./rigid.js";
 
 // Points of the profile further apart than this, mm, before, have skin between them that is left out.
@@ -19,6 +19,8 @@ export class PatientFace {
     this.active = take("active");
     this.referenceShift = take("reference_shift");
     this.numbersOfReference = planNumbers(this.reference, this.centres);
+    this.correction = page.correction &&
+      new Correction(page.correction, this.reference, arrays.correction_plans, arrays.correction_weights);
     this.before = take("face");
     this.triangles = take("face_triangles");
     const carried = (part) => ({
@@ -50,10 +52,18 @@ export class PatientFace {
     }
     // Nodes that the operator leaves out do not move; an exact solution may have moved them.
     if (this.exact) this.shift.fill(0);
-    const numbers = planNumbers(motions, this.centres);
-    for (let i = 0; i < numbers.length; i++) numbers[i] -= this.numbersOfReference[i];
-    displace(this.shift, this.columns, this.active, this.referenceShift, numbers);
+    displace(this.shift, this.columns, this.active, this.referenceShift, this.operatorNumbers(motions));
     return this.shift;
+  }
+
+  /** What the operator's columns are multiplied by: numbers less the reference's, then amounts. */
+  operatorNumbers(motions) {
+    const numbers = planNumbers(motions, this.centres);
+    const { correction, numbersOfReference } = this;
+    const all = new Float64Array(numbers.length + (correction ? correction.shapes : 0));
+    for (let i = 0; i < numbers.length; i++) all[i] = numbers[i] - numbersOfReference[i];
+    correction?.amounts(all.subarray(numbers.length), motions);
+    return all;
   }
 
   /** Takes an exact solution: the displacements of all nodes under the motions, mm. */

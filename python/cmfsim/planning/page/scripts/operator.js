@@ -2,7 +2,10 @@
 //
 // u = u_ref + A (q − q_ref), with twelve numbers of each segment: R − I row by row, then the shift
 // of the segment's centre. So the case's own plan has the face that was solved for it, and the
-// rounding of A, in half precision, counts only for what a plan differs from it.
+// rounding of A, in half precision, counts only for what a plan differs from it. Further columns are
+// the shapes of a correction, with their amounts.
+
+import { inverse, moved, product, rotationVector, DEGREE } from "./rigid.js";
 
 /** The twelve numbers of each segment, one after the other. */
 export function planNumbers(motions, centres) {
@@ -30,25 +33,74 @@ export function planNumbers(motions, centres) {
 export function displace(out, columns, active, reference, difference) {
   const width = difference.length;
   // Segments that stand where the reference has them add nothing.
-  const moved = [];
-  for (let s = 0; s < width; s += 12) {
-    if (difference.subarray(s, s + 12).some((v) => v !== 0)) moved.push(s);
+  const counted = [];
+  for (let s = 0; s < width; s += 4) {
+    if (difference.subarray(s, s + 4).some((v) => v !== 0)) counted.push(s);
   }
   for (let i = 0; i < active.length; i++) {
     for (let axis = 0; axis < 3; axis++) {
       const row = width * (3 * i + axis);
       // Four sums, so that one need not wait for the other.
       let a = reference[3 * i + axis], b = 0, c = 0, d = 0;
-      for (let m = 0; m < moved.length; m++) {
-        const s = moved[m], at = row + s;
-        for (let k = 0; k < 12; k += 4) {
-          a += columns[at + k] * difference[s + k];
-          b += columns[at + k + 1] * difference[s + k + 1];
-          c += columns[at + k + 2] * difference[s + k + 2];
-          d += columns[at + k + 3] * difference[s + k + 3];
-        }
+      for (let m = 0; m < counted.length; m++) {
+        const s = counted[m], at = row + s;
+        a += columns[at] * difference[s];
+        b += columns[at + 1] * difference[s + 1];
+        c += columns[at + 2] * difference[s + 2];
+        d += columns[at + 3] * difference[s + 3];
       }
       out[3 * active[i] + axis] = a + b + c + d;
     }
   }
 }
+
+/** How much of each shape a plan adds: as cmfsim.PlanCorrection, which explains the formula. */
+export class Correction {
+  /** values: of the page; reference: the motions of the case's own plan; plans, weights: arrays. */
+  constructor({ length, segments, middles, arms }, reference, plans, weights) {
+    this.length = length;
+    this.segments = segments;
+    this.middles = middles;
+    this.arms = arms;
+    this.backwards = segments.map((s) => inverse(reference[s]));
+    this.plans = plans.values;
+    this.weights = weights.values;
+    [this.count, this.shapes] = weights.shape;
+  }
+
+  /** Six numbers of each segment, in multiples of the length: shift of its middle, turn times arm. */
+  numbers(motions) {
+    return this.segments.flatMap((s, i) => {
+      const apart = product(this.backwards[i], motions[s]);
+      const to = moved(apart, this.middles[i]);
+      const turn = rotationVector(apart).map((v) => v * DEGREE * this.arms[i]);
+      return [...to.map((v, k) => v - this.middles[i][k]), ...turn].map((v) => v / this.length);
+    });
+  }
+
+  /** Writes the amounts under the motions into `out`. */
+  amounts(out, motions) {
+    const { plans, weights, shapes, length } = this;
+    const here = this.numbers(motions);
+    const width = here.length;
+    out.fill(0);
+    for (let n = 0; n < this.count; n++) {
+      let inner = 0, square = 0, near = 0;
+      for (let s = 0; s < width; s += 6) {
+        let i = 0, q = 0;
+        for (let k = s; k < s + 6; k++) {
+          const there = plans[n * width + k] / length;
+          i += here[k] * there;
+          q += here[k] * here[k] + there * there;
+        }
+        near += covariance(i, q);
+        inner += i;
+        square += q;
+      }
+      near += covariance(inner, square);
+      for (let m = 0; m < shapes; m++) out[m] += near * weights[n * shapes + m];
+    }
+  }
+}
+
+const covariance = (inner, square) => Math.exp(inner - square / 2) - Math.exp(-square / 2) * (1 + inner);

@@ -1,0 +1,92 @@
+"""A planning model whose operator is corrected by exact solutions of plans around the reference."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from cmfsim.checks import as_positive
+from cmfsim.errors import CaseInputError, ContactError, SolverError
+from cmfsim.planning.replanning.correction import PlanNumbers, fitted_correction
+from cmfsim.planning.replanning.expected_error import moving_segments, plan_near, segment_boxes
+from cmfsim.planning.replanning.model import PlanningModel
+
+__all__ = ["CORRECTIONS", "corrected_planning"]
+
+# Plans that are solved for a correction.
+CORRECTIONS = 96
+# Fewer solved plans tell nothing about those between them.
+LEAST_PLANS = 8
+
+
+def corrected_planning(
+    planning: PlanningModel,
+    plans: int = CORRECTIONS,
+    *,
+    shift: float = 5.0,
+    turn: float = 5.0,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> PlanningModel:
+    """The planning model with its operator corrected by exact solutions, where that pays.
+
+    Plans are drawn as `expected_error` draws them, but others, and all from the whole range. What
+    the operator misses there is interpolated between them (`PlanCorrection`). The correction is
+    left out where it does not lower the error at plans that it was not fitted to.
+
+    Parameters
+    ----------
+    planning : PlanningModel
+    plans : int
+        How many are solved exactly; 0 leaves the model as it is.
+    shift : float, mm
+    turn : float, degrees
+        The range of the plans: along each axis, and about any axis.
+    seed : int
+    progress : callable, optional
+        Called with the name of each stage as it begins.
+
+    Returns
+    -------
+    PlanningModel
+        The same model, unless tissue slides, enough plans could be solved, and correcting pays.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A count below 0; a range that is not above 0.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> planning = cmfsim.corrected_planning(planning)  # doctest: +SKIP
+    >>> planning.correction.left_out.max()  # doctest: +SKIP
+    0.33
+    """
+    shift, turn = as_positive("shift", shift), as_positive("turn", turn)
+    if isinstance(plans, bool) or not isinstance(plans, int) or plans < 0:
+        raise CaseInputError(f"plans is {plans!r}: a whole number from 0 on is needed")
+    bare = replace(planning, correction=None)
+    if not planning.slides or plans < LEAST_PLANS:
+        return bare
+    boxes = segment_boxes(bare)
+    numbers = PlanNumbers.about(bare.reference, {n: boxes[n] for n in moving_segments(bare)})
+    # A stream of its own, so that no plan is one of those by which the error is measured.
+    rng = np.random.default_rng((seed, 1))
+    places, errors = [], []
+    for number in range(plans):
+        if progress is not None:
+            progress(f"solving a plan nearby to correct the operator ({number + 1} of {plans})")
+        plan = plan_near(bare, rng, shift, turn)
+        try:
+            exact = bare.solve(plan)
+        except (ContactError, SolverError):
+            continue
+        # What stopped above its tolerance is no answer to interpolate.
+        if exact.result.summary["contact_converged"]:
+            places.append(numbers.of(plan))
+            errors.append(exact.skin_displacements - bare.displacements(plan))
+    if len(places) < LEAST_PLANS:
+        return bare
+    correction, pays = fitted_correction(numbers, np.array(places), np.array(errors))
+    return replace(bare, correction=correction) if pays else bare

@@ -1,0 +1,211 @@
+"""What exact solutions add to the plan operator away from its reference: a smooth interpolation.
+
+The operator continues contact to first order. What it misses, e(x), vanishes at the reference
+together with its gradient. It is interpolated between plans that were solved exactly as a Gaussian
+process of which that is known: with the covariance g(x, y) = exp(−|x − y|²/2ℓ²), a process that
+vanishes with its gradient at 0 has
+
+    k(x, y) = g(x, y) − g(x, 0) g(0, y) (1 + x·y/ℓ²)
+
+(Rasmussen and Williams 2006, section 9.4), here summed over the segments, each by itself, and all
+of them together. x holds six numbers of each segment: the shift of its middle, mm, and the turn
+times an arm, mm. Far away k goes to 0, and the operator is what it was. Length ℓ and noise are
+those with the least error at plans that were left out.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim.checks import Floats
+
+__all__ = ["PlanCorrection", "PlanNumbers", "fitted_correction"]
+
+# Lengths ℓ, mm, and noise as a share of the variance, among which plans that are left out choose.
+LENGTHS = (7.0, 10.0, 14.0, 20.0)
+NOISES = (1e-3, 1e-2, 1e-1)
+# A turn counts by the way of a point at this share of the distance of the furthest corner.
+ARM_SHARE = 0.6
+# Shapes of the correction: as few as keep this share of what is corrected, and at most so many.
+KEPT_ENERGY, MOST_SHAPES = 0.99, 16
+# A correction is used if, at plans that were left out, the largest error falls to this share.
+PAYS = 0.9
+# Twice the sine of a turn below this is twice the turn itself.
+SMALL_SINE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class PlanNumbers:
+    """The numbers of a plan that a correction depends on.
+
+    Attributes
+    ----------
+    segments : tuple of str
+        Those that count; others may move, and change nothing.
+    backwards : (s, 4, 4) float64, mm
+        The inverse of each segment's motion under the reference plan.
+    middles : (s, 3) float64, mm
+        The middle of each segment, before.
+    arms : (s,) float64, mm
+        What turns are multiplied by, in radians.
+    """
+
+    segments: tuple[str, ...]
+    backwards: Floats
+    middles: Floats
+    arms: Floats
+
+    @classmethod
+    def about(cls, reference: Mapping[str, Floats], boxes: Mapping[str, Floats]) -> "PlanNumbers":
+        """The numbers of the segments in `boxes`, (8, 3) mm each, away from a reference plan."""
+        middles = np.array([corners.mean(axis=0) for corners in boxes.values()])
+        reach = [
+            np.linalg.norm(corners - middle, axis=1).max()
+            for corners, middle in zip(boxes.values(), middles, strict=True)
+        ]
+        backwards = np.array([np.linalg.inv(reference[name]) for name in boxes])
+        return cls(tuple(boxes), backwards, middles, ARM_SHARE * np.array(reach))
+
+    def of(self, plan: Mapping[str, ArrayLike]) -> Floats:
+        """The numbers of a plan, (s, 6) mm: shift of the middle, and turn times the arm."""
+        rows = []
+        for name, back, middle, arm in zip(
+            self.segments, self.backwards, self.middles, self.arms, strict=True
+        ):
+            apart = back @ np.asarray(plan[name], dtype=np.float64)
+            shift = apart[:3, :3] @ middle + apart[:3, 3] - middle
+            rows.append(np.concatenate([shift, arm * _turn(apart)]))
+        return np.array(rows)
+
+
+@dataclass(frozen=True, eq=False)
+class PlanCorrection:
+    """A sum of shapes whose amounts depend smoothly on the plan; nothing at the reference.
+
+    Attributes
+    ----------
+    numbers : PlanNumbers
+    length : float, mm
+        ℓ: over this the correction changes.
+    plans : (n, s, 6) float64, mm
+        The numbers of the plans that were solved exactly.
+    weights : (n, m) float64
+        Of k(x, plan) in the amount of each shape.
+    shapes : (k, 3, m) float64, mm
+        Displacements of the operator's nodes, their largest component 1.
+    before, left_out : (n,) float64, mm
+        The largest error at each plan without the correction, and with the one that is fitted to
+        all other plans.
+    """
+
+    numbers: PlanNumbers
+    length: float
+    plans: Floats
+    weights: Floats
+    shapes: Floats
+    before: Floats
+    left_out: Floats
+
+    def amounts(self, plan: Mapping[str, ArrayLike]) -> Floats:
+        """The amount of each shape under a plan, (m,)."""
+        here = self.numbers.of(plan)[None]
+        return np.asarray((_covariance(here, self.plans, self.length) @ self.weights)[0])
+
+    def displacements(self, plan: Mapping[str, ArrayLike]) -> Floats:
+        """What is added to the operator's displacements under a plan, (k, 3) mm."""
+        return np.asarray(self.shapes @ self.amounts(plan))
+
+    def at(self, nodes: NDArray[np.integer]) -> "PlanCorrection":
+        """The correction of some of the nodes, by their places in the operator."""
+        return replace(self, shapes=self.shapes[nodes])
+
+
+def fitted_correction(
+    numbers: PlanNumbers, plans: Floats, errors: Floats
+) -> tuple[PlanCorrection, bool]:
+    """The correction that interpolates errors of the operator, and whether it pays.
+
+    Parameters
+    ----------
+    numbers : PlanNumbers
+    plans : (n, s, 6) float64, mm
+        Their values at plans that were solved exactly; two at least.
+    errors : (n, k, 3) float64, mm
+        Exact displacements less the operator's.
+
+    Returns
+    -------
+    correction : PlanCorrection
+    pays : bool
+        Whether the largest error at plans that are left out falls to `PAYS`, RMS over the plans.
+    """
+    count, nodes, _ = errors.shape
+    rows = errors.reshape(count, -1)
+    gram = rows @ rows.T
+    length, noise = min(
+        ((length, noise) for length in LENGTHS for noise in NOISES),
+        key=lambda choice: _left_out_energy(plans, gram, *choice),
+    )
+    inverse = _inverse(plans, length, noise)
+    # Each plan's error with the interpolation of all others (Rasmussen and Williams 2006, 5.12).
+    apart = inverse / np.diagonal(inverse)[:, None]
+    left_out = np.linalg.norm((apart @ rows).reshape(errors.shape), axis=2).max(axis=1)
+    before = np.linalg.norm(errors, axis=2).max(axis=1)
+    energy, vectors = np.linalg.eigh(gram)
+    energy, vectors = energy[::-1].clip(min=0.0), vectors[:, ::-1]
+    total = max(float(energy.sum()), np.finfo(np.float64).tiny)
+    kept = int(np.searchsorted(np.cumsum(energy) / total, KEPT_ENERGY)) + 1
+    vectors = vectors[:, : min(kept, MOST_SHAPES)]
+    shapes = rows.T @ vectors
+    largest = np.maximum(np.abs(shapes).max(axis=0), np.finfo(np.float64).tiny)
+    correction = PlanCorrection(
+        numbers,
+        length,
+        plans,
+        inverse @ vectors * largest,
+        (shapes / largest).reshape(nodes, 3, -1),
+        before,
+        left_out,
+    )
+    pays = float((left_out**2).sum()) < PAYS**2 * float((before**2).sum())
+    return correction, pays
+
+
+def _turn(motion: Floats) -> Floats:
+    """The rotation vector of a motion, (3,) radians: (R − Rᵀ)∨ is twice its sine along the axis."""
+    (_, xy, xz), (yx, _, yz), (zx, zy, _) = motion[:3, :3].tolist()
+    twice = np.array([zy - yz, xz - zx, yx - xy])
+    sine = math.hypot(*twice)
+    angle = math.atan2(sine, float(np.trace(motion[:3, :3])) - 1.0)
+    # A half turn has no such axis; it is far beyond the plans that correct anything.
+    return np.asarray(twice * (angle / sine if sine > SMALL_SINE else 0.5))
+
+
+def _covariance(a: Floats, b: Floats, length: float) -> Floats:
+    """The covariance k of plans (n, s, 6) and (m, s, 6): of each segment, and of all together."""
+    whole = (a.reshape(len(a), 1, -1), b.reshape(len(b), 1, -1))
+    pairs = [whole, *((a[:, s : s + 1], b[:, s : s + 1]) for s in range(a.shape[1]))]
+    total = np.zeros((len(a), len(b)))
+    for here, there in pairs:
+        x, y = here[:, 0] / length, there[:, 0] / length
+        inner = x @ y.T
+        square = (x * x).sum(axis=1)[:, None] + (y * y).sum(axis=1)
+        total += np.exp(inner - 0.5 * square) - np.exp(-0.5 * square) * (1.0 + inner)
+    return total
+
+
+def _inverse(plans: Floats, length: float, noise: float) -> Floats:
+    covariance = _covariance(plans, plans, length)
+    scale = float(np.diagonal(covariance).mean())
+    inverse = np.linalg.inv(covariance + noise * scale * np.eye(len(plans)))
+    return np.asarray(inverse, dtype=np.float64)
+
+
+def _left_out_energy(plans: Floats, gram: Floats, length: float, noise: float) -> float:
+    """The sum of squared errors at all plans, each with the interpolation of all others."""
+    inverse = _inverse(plans, length, noise)
+    apart = inverse / np.diagonal(inverse)[:, None]
+    return float(np.einsum("ij,jk,ik->", apart, gram, apart))
