@@ -11,6 +11,7 @@ import { MeasurePanel } from "./measure_panel.js";
 import { PatientFace } from "./model.js";
 import { ExactSolver } from "./serving.js";
 import { PlanPanel } from "./plan_panel.js";
+import { PullPanel } from "./pull_panel.js";
 import { NUMBERS, clinicalNumbers } from "./clinical.js";
 import { Plans, beyondLimits } from "./plans.js";
 import { connectKeys, connectPointing } from "./pointing.js";
@@ -59,21 +60,20 @@ class App {
   }
 
   get motions() {
-    const { motions } = this.plans.active;
-    if (!this.pending) return motions;
-    return motions.map((m, i) => (i === this.pending.segment ? this.pending.motion : m));
+    return this.pending ?? this.plans.active.motions;
   }
 
   build() {
     this.view = new ViewPanel(this);
     this.panel = new PlanPanel(this);
+    this.pulling = new PullPanel(this);
     this.variants = new VariantPanel(this);
     this.measuring = new MeasurePanel(this);
     this.exporting = new ExportPanel(this);
     this.profile = element("canvas", { className: "profile", role: "img", "aria-label": "Midline profile" });
     this.profileNote = element("p", { className: "note" });
     document.getElementById("panel").append(
-      this.panel.root, this.variants.root,
+      this.panel.root, this.pulling.root, this.variants.root,
       element("div", {}, element("h2", { textContent: "Profile in the midline" }), this.profile, this.profileNote),
       this.measuring.root, this.exporting.root);
     connectPointing(this);
@@ -85,9 +85,14 @@ class App {
 
   // Changes of the plan -----------------------------------------------------------------------
 
-  /** Shows a plan that is not kept yet; null shows the kept one. */
-  preview(pending) {
-    this.pending = pending;
+  /** Shows another motion of a segment that is not kept yet. */
+  preview({ segment, motion }) {
+    this.previewMotions(this.plans.active.motions.map((m, i) => (i === segment ? motion : m)));
+  }
+
+  /** Shows a plan that is not kept yet. */
+  previewMotions(motions) {
+    this.pending = motions;
     this.settled = false;
     this.schedule("plan");
   }
@@ -96,11 +101,9 @@ class App {
   commit() {
     const { pending } = this;
     this.pending = null;
-    if (pending) {
-      const was = this.plans.active.motions[pending.segment];
-      if (pending.motion.some((v, i) => v !== was[i])) {
-        this.plans.take(this.plans.withMotion(pending.segment, pending.motion));
-      }
+    const was = this.plans.active.motions;
+    if (pending?.some((motion, s) => motion.some((v, i) => v !== was[s][i]))) {
+      this.plans.take(this.plans.withMotions(pending));
     }
     this.changed();
   }
@@ -174,6 +177,7 @@ class App {
     for (let i = 0; i < before.length; i++) this.after[i] = before[i] + this.shift[i];
     this.timing.compute = performance.now() - begun;
     this.panel.show();
+    this.pulling.show();
     this.measuring.show();
     this.exporting.show();
     if (this.settled) this.variants.show();
@@ -225,9 +229,17 @@ class App {
     }
     document.getElementById("caption-left").textContent = side ? "Before" : after;
     document.getElementById("caption-right").textContent = side ? after : "";
-    // Handles stand where the segment is after the move, so only there.
-    const handled = handles && !side && share === 1;
+    // Handles stand where the segment is after the move, so only there; a point that is pulled lies
+    // under them.
+    const handled = handles && !side && share === 1 && !this.canPull;
     this.handles.draw(this.camera, handled ? this.panel.motion : null, this.panel.place, this.panel.turnsAbout);
+    if (this.canPull) this.pulling.draw(this.handles.context, this.camera, this.overlay.clientWidth, this.overlay.clientHeight);
+  }
+
+  /** Whether the picture shows the skin where the plan has it, so that it can be pulled. */
+  get canPull() {
+    const { pull, side, share, skin } = this.view.values;
+    return pull && !side && share === 1 && skin > 0;
   }
 
   showError() {

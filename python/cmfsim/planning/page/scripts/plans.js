@@ -36,10 +36,6 @@ export class Plans {
     return { ...this.now, variants };
   }
 
-  withMotion(segment, motion) {
-    return this.withMotions(this.active.motions.map((m, i) => (i === segment ? motion : m)));
-  }
-
   choose(index) {
     this.now = { ...this.now, active: index };
   }

@@ -6,11 +6,17 @@ const KEY_ZOOM = 1.1;
 
 /** Connects the overlay with the app; `reset` forgets fingers that were lifted elsewhere. */
 export function connectPointing(app) {
-  const { overlay, camera, handles } = app;
+  const { overlay, camera, handles, pulling } = app;
   const down = new Map();
   const place = (e) => {
     const box = overlay.getBoundingClientRect();
     return [e.clientX - box.left, e.clientY - box.top];
+  };
+  const released = () => {
+    if (pulling.pull) pulling.release();
+    if (!handles.held) return;
+    handles.release();
+    app.commit();
   };
   overlay.addEventListener("pointerdown", (e) => {
     overlay.focus({ preventScroll: true });
@@ -20,10 +26,12 @@ export function connectPointing(app) {
     if (shape) {
       handles.grab(shape, ...place(e));
       app.grabbed();
-    } else if (handles.held) {
+    } else if (handles.held || pulling.pull) {
       // A second finger: the first one no longer pulls.
-      handles.release();
-      app.commit();
+      released();
+    } else if (down.size === 1 && e.button === 0 && !e.shiftKey && app.canPull) {
+      pulling.grab(place(e));
+      app.redraw();
     }
   });
   overlay.addEventListener("pointermove", (e) => {
@@ -34,6 +42,10 @@ export function connectPointing(app) {
     const [x, y] = place(e);
     if (handles.held) {
       app.pull(handles.held.key, handles.pulled(x, y));
+      return;
+    }
+    if (pulling.pull) {
+      pulling.drag([x, y]);
       return;
     }
     const [ox, oy] = down.get(e.pointerId);
@@ -52,10 +64,7 @@ export function connectPointing(app) {
   });
   const lifted = (e) => {
     down.delete(e.pointerId);
-    if (handles.held && !down.size) {
-      handles.release();
-      app.commit();
-    }
+    if (!down.size) released();
   };
   overlay.addEventListener("pointerup", lifted);
   overlay.addEventListener("pointercancel", lifted);

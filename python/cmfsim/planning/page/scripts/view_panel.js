@@ -7,7 +7,7 @@ import { button, element } from "./elements.js";
 export class ViewPanel {
   constructor(app) {
     this.app = app;
-    this.values = { skin: 1, bones: 1, share: 1, side: false, map: false, handles: true };
+    this.values = { skin: 1, bones: 1, share: 1, side: false, map: false, handles: true, pull: false };
     const views = document.getElementById("views");
     views.append(
       ...VIEWS.map((view, i) => button(view.name, () => this.look(i), { title: `key ${i + 1}` })),
@@ -22,7 +22,8 @@ export class ViewPanel {
     }), label);
     document.getElementById("controls").append(
       slider("share", "Before – after"), slider("skin", "Skin"), slider("bones", "Bones"),
-      box("side", "Side by side"), box("map", "Colours of movement"), box("handles", "Handles"));
+      box("side", "Side by side"), box("map", "Colours of movement"), box("handles", "Handles"),
+      box("pull", "Pull the skin"));
     this.legend = document.getElementById("legend");
   }
 

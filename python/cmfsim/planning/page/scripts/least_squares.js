@@ -1,0 +1,71 @@
+// Least squares with bounds by Levenberg-Marquardt steps: as cmfsim.face_planning searches.
+
+// Central differences, mm and degrees; a step below STILL ends the search.
+const DIFFERENCE = 1e-3;
+const STILL = 1e-6;
+const [FIRST_DAMPING, HARDER, SOFTER, MOST_DAMPING] = [1e-3, 10, 0.1, 1e12];
+
+/** The x within low and high, from `start`, with the least sum of squares of `residuals`(x). */
+export function boundedLeastSquares(residuals, start, low, high, steps) {
+  const inside = (x) => x.map((v, i) => Math.min(high[i], Math.max(low[i], v)));
+  let x = inside(start);
+  let r = residuals(x);
+  let damping = FIRST_DAMPING;
+  for (let taken = 0; taken < steps; taken++) {
+    const columns = derivatives(residuals, x);
+    const gradient = columns.map((column) => inner(column, r));
+    const free = x.map((_, i) => i).filter((i) => !(x[i] <= low[i] && gradient[i] > 0) && !(x[i] >= high[i] && gradient[i] < 0));
+    if (!free.length) return x;
+    const normal = free.map((i) => free.map((j) => inner(columns[i], columns[j])));
+    const largest = Math.max(...normal.map((row, i) => row[i]), 1e-30);
+    for (;;) {
+      const damped = normal.map((row, i) => row.map((v, j) => (i === j ? v + damping * Math.max(v, 1e-12 * largest) : v)));
+      const step = solved(damped, free.map((i) => -gradient[i]));
+      const next = [...x];
+      free.forEach((i, k) => { next[i] += step[k]; });
+      const there = inside(next);
+      if (Math.max(...there.map((v, i) => Math.abs(v - x[i]))) <= STILL || damping > MOST_DAMPING) return x;
+      const reached = residuals(there);
+      if (inner(reached, reached) < inner(r, r)) {
+        [x, r] = [there, reached];
+        damping *= SOFTER;
+        break;
+      }
+      damping *= HARDER;
+    }
+  }
+  return x;
+}
+
+function derivatives(residuals, x) {
+  return x.map((_, i) => {
+    const at = (step) => residuals(x.map((v, k) => (k === i ? v + step : v)));
+    const [ahead, behind] = [at(DIFFERENCE), at(-DIFFERENCE)];
+    return ahead.map((v, k) => (v - behind[k]) / (2 * DIFFERENCE));
+  });
+}
+
+const inner = (a, b) => a.reduce((sum, v, i) => sum + v * b[i], 0);
+
+/** The solution of a symmetric positive definite system, by its Cholesky factor. */
+function solved(matrix, right) {
+  const n = right.length;
+  const factor = matrix.map((row) => [...row]);
+  for (let j = 0; j < n; j++) {
+    for (let i = j; i < n; i++) {
+      let sum = factor[i][j];
+      for (let k = 0; k < j; k++) sum -= factor[i][k] * factor[j][k];
+      factor[i][j] = i === j ? Math.sqrt(sum) : sum / factor[j][j];
+    }
+  }
+  const x = [...right];
+  for (let i = 0; i < n; i++) {
+    for (let k = 0; k < i; k++) x[i] -= factor[i][k] * x[k];
+    x[i] /= factor[i][i];
+  }
+  for (let i = n - 1; i >= 0; i--) {
+    for (let k = i + 1; k < n; k++) x[i] -= factor[k][i] * x[k];
+    x[i] /= factor[i][i];
+  }
+  return x;
+}
