@@ -22,6 +22,7 @@ import cmfsim
 import cmfsim.planning.page.content
 from cmfsim.planning.page.page import joined_scripts
 from cmfsim.planning.replanning import plan_distance
+from cmfsim.planning.replanning.expected_error import plan_near
 from cmfsim.planning.server import PlanningServer
 
 pytest.importorskip("skimage")
@@ -127,6 +128,24 @@ def test_the_correction_lowers_the_error_at_plans_that_it_was_not_fitted_to(bare
     np.testing.assert_allclose(
         difference, planning.correction.displacements(plans[0])[::300], atol=1e-9
     )
+
+
+def test_corrections_are_the_same_each_time(bare, planning):
+    again = cmfsim.corrected_planning(bare, 24).correction
+    np.testing.assert_array_equal(again.shapes, planning.correction.shapes)
+    np.testing.assert_array_equal(again.weights, planning.correction.weights)
+    serial = [planning.solve(plan).skin_displacements for plan in again_plans(bare, 2)]
+    largest = [
+        np.linalg.norm(exact - bare.displacements(plan), axis=1).max()
+        for exact, plan in zip(serial, again_plans(bare, 2), strict=True)
+    ]
+    np.testing.assert_array_equal(again.before[:2], largest)
+
+
+def again_plans(bare, count):
+    """The first plans of a correction, by its seed."""
+    rng = np.random.default_rng((0, 1))
+    return [plan_near(bare, rng, 5.0, 5.0) for _ in range(count)]
 
 
 def test_corrections_that_cannot_be_fitted_leave_the_operator_alone(bare, planning):

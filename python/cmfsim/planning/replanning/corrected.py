@@ -1,15 +1,17 @@
 """A planning model whose operator is corrected by exact solutions of plans around the reference."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 
-from cmfsim.checks import as_positive
+from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, ContactError, SolverError
 from cmfsim.planning.replanning.correction import PlanNumbers, fitted_correction
 from cmfsim.planning.replanning.expected_error import moving_segments, plan_near, segment_boxes
-from cmfsim.planning.replanning.model import PlanningModel
+from cmfsim.planning.replanning.model import Motions, PlanningModel
 
 __all__ = ["CORRECTIONS", "corrected_planning"]
 
@@ -17,6 +19,8 @@ __all__ = ["CORRECTIONS", "corrected_planning"]
 CORRECTIONS = 96
 # Fewer solved plans tell nothing about those between them.
 LEAST_PLANS = 8
+# Solutions at once: each takes memory for its own vectors.
+MOST_AT_ONCE = 4
 
 
 def corrected_planning(
@@ -38,7 +42,8 @@ def corrected_planning(
     ----------
     planning : PlanningModel
     plans : int
-        How many are solved exactly; 0 leaves the model as it is.
+        How many are solved exactly. Fewer than 8 say nothing of those between them: then, as with 0,
+        nothing is corrected.
     shift : float, mm
     turn : float, degrees
         The range of the plans: along each axis, and about any axis.
@@ -73,20 +78,37 @@ def corrected_planning(
     numbers = PlanNumbers.about(bare.reference, {n: boxes[n] for n in moving_segments(bare)})
     # A stream of its own, so that no plan is one of those by which the error is measured.
     rng = np.random.default_rng((seed, 1))
+    drawn = [plan_near(bare, rng, shift, turn) for _ in range(plans)]
     places, errors = [], []
-    for number in range(plans):
+    for number, exact in enumerate(_solved(bare, drawn)):
         if progress is not None:
-            progress(f"solving a plan nearby to correct the operator ({number + 1} of {plans})")
-        plan = plan_near(bare, rng, shift, turn)
-        try:
-            exact = bare.solve(plan)
-        except (ContactError, SolverError):
-            continue
-        # What stopped above its tolerance is no answer to interpolate.
-        if exact.result.summary["contact_converged"]:
-            places.append(numbers.of(plan))
-            errors.append(exact.skin_displacements - bare.displacements(plan))
+            progress(f"solving plans nearby to correct the operator ({number + 1} of {plans})")
+        if exact is not None:
+            places.append(numbers.of(drawn[number]))
+            errors.append(exact - bare.displacements(drawn[number]))
     if len(places) < LEAST_PLANS:
         return bare
     correction, pays = fitted_correction(numbers, np.array(places), np.array(errors))
     return replace(bare, correction=correction) if pays else bare
+
+
+def _solved(planning: PlanningModel, plans: Sequence[Motions]) -> Iterator[Floats | None]:
+    """The exact displacements of each plan, in order; None where it has no answer.
+
+    Several at once: what is serial in a solution leaves the other processors idle.
+    """
+
+    def solved(plan: Motions) -> Floats | None:
+        try:
+            exact = planning.solve(plan)
+        except (ContactError, SolverError):
+            return None
+        # What stopped above its tolerance is no answer to interpolate.
+        return exact.skin_displacements if exact.result.summary["contact_converged"] else None
+
+    pool = ThreadPoolExecutor(min(MOST_AT_ONCE, os.cpu_count() or 1))
+    try:
+        yield from pool.map(solved, plans)
+    finally:
+        # After Ctrl-C nothing more is begun.
+        pool.shutdown(cancel_futures=True)
