@@ -41,14 +41,14 @@ translation = [0.0, 1.0, 0.5]
 """
 HEAD = (
     "| points | noise, mm | prior | plans | worst number | 95 % of numbers "
-    "| determined directions | their 95 % | within two deviations | s: median | worst |"
+    "| determined directions | their 95 % | within two deviations | processor s: median | worst |"
 )
 FREE = {"prior_shift": None, "prior_turn": None, "shift": 60.0, "turn": 60.0}
 
 
 @dataclass(frozen=True)
 class Found:
-    """One search: errors of the numbers and of the directions that are determined, and its time."""
+    """One search: errors of numbers and determined directions; processor time, s."""
 
     errors: NDArray[np.float64]
     within: NDArray[np.bool_]
@@ -94,9 +94,9 @@ def search_again(
     goals = points + planning.carried(plan, points) + rng.normal(scale=noise, size=points.shape)
     target = cmfsim.PointTarget(points, goals, std=noise or 0.5)
     search = cmfsim.FaceSearch(names) if prior else cmfsim.FaceSearch(names, **FREE)
-    begun = time.perf_counter()
+    begun = time.process_time()
     found = cmfsim.plan_for_face(planning, [target], search, exact=False)
-    seconds = time.perf_counter() - begun
+    seconds = time.process_time() - begun
     off = stated(planning, found.plan, names) - stated(planning, plan, names)
     variance, axes = np.linalg.eigh(found.covariance)
     deviations = np.sqrt(np.diagonal(found.covariance))

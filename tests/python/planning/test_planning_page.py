@@ -551,12 +551,12 @@ def test_plans_that_are_none_are_refused_whole(opened, tmp_path):
     )
     faults = {
         "moves skull": good.replace("maxilla", "skull") + good + rest,
-        "says nothing of ramus_right": good + rest.rsplit("[plan", 1)[0],
+        "does not mention ramus_right": good + rest.rsplit("[plan", 1)[0],
         "not a rotation": good.replace("[[1.0", "[[-1.0") + rest,
         "not 4 × 4": good.replace("[0, 1, 0, 0], ", "") + rest,
         "not numbers": good.replace("1.0", "NaN") + rest,
         "second time": good + good + rest,
-        "ends within": good + rest + "[plan.more]\n",
+        "ends inside": good + rest + "[plan.more]\n",
         "not a matrix": good.replace("matrix", "translation") + rest,
         "at most 30 mm": good.replace("0, 0, 1]", "0, 0, 31]", 1) + rest,
         "last row": good.replace("[0, 0, 0, 1]", "[0, 0, 0, 2]") + rest,
@@ -612,13 +612,13 @@ def test_the_error_is_stated_and_warned_of_beyond_what_was_tried(opened, errors,
     assert f"{mean:.2f} mm on average, {largest:.2f} mm at most" in state.inner_text()
     type_number(opened, "forwards", -28)
     until(opened, "document.querySelector('#error-state.warning')")
-    assert "further than any that was tried" in state.inner_text()
+    assert "farther than any plan that was tried" in state.inner_text()
 
 
 def test_teeth_that_pass_through_each_other_are_warned_of(opened, planning):
     rows = cmfsim.planning.page.tooth_rows(planning.patient)
     state = opened.locator("#teeth-state")
-    assert "do not pass" in state.inner_text()
+    assert "do not overlap" in state.inner_text()
     type_number(opened, "up", 8)
     until(opened, "document.querySelector('#teeth-state.warning')")
     depth = float(re.search(r"by ([0-9.]+) mm", state.inner_text())[1])
@@ -669,7 +669,7 @@ def test_the_keyboard_alone_plans_and_looks(opened, planning):
 
 def test_a_point_of_the_skin_is_pulled_by_numbers_as_python_plans_it(opened, planning):
     site = cmfsim.face_sites(planning.patient).skin["pogonion"]
-    opened.get_by_role("button", name="New without a move").click()
+    opened.get_by_role("button", name="New without movement").click()
     opened.locator("#pull-point").select_option(label="pogonion")
     for key, value in {"forwards": -3, "up": 1.5, "left": 1}.items():
         opened.locator(f"#wish-{key}").fill(str(value))
@@ -771,7 +771,7 @@ def test_pulls_that_nothing_follows_are_refused(opened, planning):
     opened.locator("#wish-up").fill("")
     opened.locator("#follows-0").check()
     opened.locator("#pull-typed").click()
-    assert "the plan is as it was" in opened.locator("#message").inner_text()
+    assert "the plan was not changed" in opened.locator("#message").inner_text()
     assert opened.evaluate("cmfsimPage.plans.past.length") == 0
     for number, name in enumerate(planning.segments):
         moves = not np.array_equal(planning.reference[name], np.eye(4))

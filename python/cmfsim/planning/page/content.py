@@ -304,12 +304,12 @@ def _measured(planning: PlanningModel, sites: FaceSites) -> dict[str, Any]:
     found = ", ".join(name.replace("_", " ") for name in sites.found)
     notes = [
         (
-            "Heights are along S of the data, not in natural head position. Sites are points of "
-            "the tissue: they are not found again on the moved face."
+            "Heights are along S of the data, not in natural head position. Sites move "
+            "with the tissue; they are not located again on the moved face."
         )
     ]
     if found:
-        notes.append(f"Found on profile and bone, not given by the case: {found}.")
+        notes.append(f"Located on the profile and the bone, not given in the case: {found}.")
     return {
         "skin_sites": [{"name": name} for name in sites.skin],
         "bone_sites": [

@@ -33,8 +33,8 @@ STATE = re.compile(rb'<meta name="cmfsim-made-for" content="([0-9a-f]{64})">')
 # The state stands before the style and scripts.
 HEAD_BYTES = 2048
 EXACT_NOTE = (
-    "Contact of soft tissue with teeth and gums is continued from the case's plan, not solved "
-    "again. Save the plan next to the case file and run:"
+    "Away from the case's own plan, contact of soft tissue with teeth and gums is extrapolated, "
+    "not solved again. Save the plan next to the case file and run:"
 )
 
 

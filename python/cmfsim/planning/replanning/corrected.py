@@ -42,8 +42,8 @@ def corrected_planning(
     ----------
     planning : PlanningModel
     plans : int
-        How many are solved exactly. Fewer than 8 say nothing of those between them: then, as with 0,
-        nothing is corrected.
+        How many are solved exactly. Below 8 they tell nothing about the plans between them, and
+        nothing is corrected; 0 solves none.
     shift : float, mm
     turn : float, degrees
         The range of the plans: along each axis, and about any axis.

@@ -55,7 +55,7 @@ export class Drawing {
   constructor(canvas, mapColours) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true });
     if (!gl) {
-      throw new Error("this browser gives no WebGL 2: allow hardware graphics, or use another one");
+      throw new Error("this browser offers no WebGL 2: switch on hardware graphics, or use another browser");
     }
     this.canvas = canvas;
     this.gl = gl;

@@ -59,7 +59,7 @@ export class ExportPanel {
     const file = input.files[0];
     if (!file) return;
     try {
-      if (file.size > MOST_BYTES) throw new Error(`it has ${file.size} bytes: no plan is so large`);
+      if (file.size > MOST_BYTES) throw new Error(`it has ${file.size} bytes: a plan is never that large`);
       const { motions, warning } = planOf(this.app.page, await file.text());
       this.app.load(motions, warning);
     } catch (error) {

@@ -41,7 +41,7 @@ export function planOf(page, text) {
   const strange = Object.keys(found).filter((name) => !names.includes(name));
   if (strange.length) throw new Error(`the plan moves ${strange[0]}, which this page does not have: ${names.join(", ")}`);
   const missing = names.filter((name) => !(name in found));
-  if (missing.length) throw new Error(`the plan says nothing of ${missing.join(", ")}: give the unit matrix to what stays`);
+  if (missing.length) throw new Error(`the plan does not mention ${missing.join(", ")}: give the unit matrix to what stays`);
   for (const name of names) {
     const matrix = found[name];
     if (matrix.slice(12).join() !== "0,0,0,1") throw new Error(`${name}: the last row is not 0, 0, 0, 1`);
@@ -50,8 +50,8 @@ export function planOf(page, text) {
   }
   const made = /^# made for: (.+)$/m.exec(text)?.[1].trim();
   let warning = "";
-  if (!made) warning = "The file does not say for which case it was made: check the numbers.";
-  else if (made !== page.built_for) warning = "The file was made for another case, or for another state of this one: check the numbers.";
+  if (!made) warning = "The file does not state which case it was made for: check the numbers.";
+  else if (made !== page.built_for) warning = "The file was made for another case, or for an earlier version of this one: check the numbers.";
   return { motions: names.map((name) => found[name]), warning };
 }
 
@@ -62,11 +62,11 @@ function readTables(text) {
   text.split(/\r?\n/).forEach((raw, i) => {
     const line = raw.trim();
     if (!line || line.startsWith("#")) return;
-    const fail = (why) => { throw new Error(`line ${i + 1}: ${why}; the page reads plans that it has saved`); };
+    const fail = (why) => { throw new Error(`line ${i + 1}: ${why}; the page reads only plans that it saved itself`); };
     const head = /^\[plan\.(?:([A-Za-z0-9_-]+)|("(?:[^"\\]|\\.)*"))\]$/.exec(line);
     if (head && !pending) {
       name = head[1] ?? JSON.parse(head[2]);
-      if (Object.hasOwn(found, name)) fail(`${name} stands here a second time`);
+      if (Object.hasOwn(found, name)) fail(`${name} appears here a second time`);
       return;
     }
     if (name === null) fail("not a table [plan.SEGMENT]");
@@ -83,7 +83,7 @@ function readTables(text) {
     name = null;
     pending = "";
   });
-  if (pending || name !== null) throw new Error("the file ends within a table");
+  if (pending || name !== null) throw new Error("the file ends inside a table");
   return found;
 }
 

@@ -255,13 +255,13 @@ class App {
     } else if (distance <= SAME_PLAN) box.textContent = "The case's plan: this face was solved exactly.";
     else if (!slides) box.textContent = "No tissue slides in this model: the face is that of an exact solution (rounding 0.01 mm).";
     else if (!found) {
-      box.textContent = `This plan is ${distance.toFixed(1)} mm from the case's own, further than any that was tried (${reach.toFixed(1)} mm): the face may be wrong. Solve it exactly.`;
+      box.textContent = `This plan is ${distance.toFixed(1)} mm from the case's own, farther than any plan that was tried (${reach.toFixed(1)} mm): the face may be wrong. Solve it exactly.`;
       warned = true;
     } else {
       const count = trials.filter((t) => !t.failed).length;
       const failed = trials.length - count;
       const { correction } = this.page;
-      const corrected = correction ? `, others than the ${correction.plans} by which the face is corrected` : "";
+      const corrected = correction ? ` that are not among the ${correction.plans} used to correct the operator` : "";
       box.textContent = `Expected error of the face: ${found.mean.toFixed(2)} mm on average, ${found.largest.toFixed(2)} mm at most (an estimate from ${count} exact solutions${corrected}; this plan is ${distance.toFixed(1)} mm from the case's own, where contact was solved).`;
       if (failed) box.textContent += ` ${failed} more could not be solved.`;
       warned = found.largest > WARNED_ERROR;
@@ -281,8 +281,8 @@ class App {
     const depth = this.face.toothDepth(this.motions);
     const warned = depth > TEETH_TOLERANCE && depth > this.depthBefore + TEETH_TOLERANCE;
     box.textContent = warned
-      ? `Tooth rows pass through each other by ${depth.toFixed(1)} mm (before: ${this.depthBefore.toFixed(1)} mm).`
-      : "Tooth rows do not pass through each other further than before.";
+      ? `Tooth rows overlap by ${depth.toFixed(1)} mm (before: ${this.depthBefore.toFixed(1)} mm).`
+      : "Tooth rows do not overlap more than before.";
     box.classList.toggle("warning", warned);
   }
 

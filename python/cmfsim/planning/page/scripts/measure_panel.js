@@ -10,7 +10,7 @@ export class MeasurePanel {
     this.root = element("div", {},
       element("h2", { textContent: "Measures of the face" }),
       element("div", { className: "wide" }, element("table", { id: "measures" },
-        element("caption", { textContent: "Change: now compared with before. mm and degrees." }),
+        element("caption", { textContent: "Change: now minus before; mm and degrees." }),
         element("thead", {}, element("tr", {}, ...heads.map((h) => element("th", { scope: "col", textContent: h })))),
         this.body)),
       ...app.page.measure_notes.map((text) => element("p", { className: "note", textContent: text })));

@@ -43,8 +43,8 @@ export class PlanPanel {
       element("div", { className: "row" },
         this.undo = button("Undo", () => this.app.undo(), { title: "Ctrl+Z" }),
         this.redo = button("Redo", () => this.app.redo(), { title: "Ctrl+Y" }),
-        button("Segment back to the case's plan", () => this.set(page.segments[this.segment].reference)),
-        button("Segment stays", () => this.set(STAYS))),
+        button("Reset segment to the case's plan", () => this.set(page.segments[this.segment].reference)),
+        button("No movement", () => this.set(STAYS))),
       this.table,
     );
     this.fill();
@@ -102,7 +102,7 @@ export class PlanPanel {
     // An empty or half-typed field is no zero.
     const value = input.value.trim() === "" ? NaN : input.valueAsNumber;
     if (!Number.isFinite(value)) {
-      this.app.report("Type a number; the plan is as it was.");
+      this.app.report("Type a number; the plan was not changed.");
       this.app.changed();
       return;
     }
@@ -115,7 +115,7 @@ export class PlanPanel {
     const motion = withNumber(was, this.place, this.turnsAbout, key, value);
     const why = beyondLimits(motion, was, this.place, NUMBERS);
     if (why) {
-      this.app.report(`${why}. ${keep ? "The plan is as it was." : ""}`);
+      this.app.report(`${why}. ${keep ? "The plan was not changed." : ""}`);
       // A field must not show what the plan does not have.
       if (keep) this.app.changed();
       return;

@@ -32,7 +32,7 @@ export class PullPanel {
     this.state = element("p", { className: "note", id: "pull-state", role: "status" });
     this.root = element("div", {},
       element("h2", { textContent: "Pull the skin" }),
-      element("p", { className: "note", textContent: "The chosen segments follow with the smallest change of the plan. In the picture: switch on “Pull the skin” and drag a point." }),
+      element("p", { className: "note", textContent: "The selected segments follow, with the smallest change of the plan. To pull in the picture, switch on “Pull the skin” below it and drag a point of the face. To type a movement, choose a point here." }),
       element("div", { className: "row", role: "group", "aria-label": "Segments that follow" },
         ...app.page.segments.map((s, i) => element("label", {}, this.follows[i], ` ${s.label}`))),
       element("div", { className: "row" }, element("label", { for: "pull-point", textContent: "Point" }), this.choice),
@@ -73,12 +73,12 @@ export class PullPanel {
   begin() {
     const { app } = this;
     if (!this.following.length) {
-      app.report("No segment follows: choose one under “Pull the skin”.");
+      app.report("No segment follows: select one under “Pull the skin”.");
       return null;
     }
     const pull = new Pull(this.point, app.page.segments, app.motions, this.following);
     if (pull.moves) return pull;
-    app.report("The chosen segments do not move this point: choose another point, or other segments.");
+    app.report("The selected segments do not move this point: choose another point or other segments.");
     return null;
   }
 
@@ -127,7 +127,7 @@ export class PullPanel {
     for (const { key, axis, sign } of WISHES) {
       const value = this.fields[key].valueAsNumber;
       if (!Number.isFinite(value) || Math.abs(value) > MOST_WISH) {
-        this.app.report(`Type three numbers of at most ${MOST_WISH} mm; the plan is as it was.`);
+        this.app.report(`Type three numbers of at most ${MOST_WISH} mm; the plan was not changed.`);
         return;
       }
       wish[axis] = sign * value;
@@ -152,7 +152,7 @@ export class PullPanel {
     });
     const moved = WISHES.map(({ key }, i) => `${signed(numbers[i])} ${key}`).join(", ");
     const away = this.goal && Math.hypot(...place.map((v, k) => v - this.goal[k]));
-    this.state.textContent = `The point has moved by ${moved} (mm).` +
+    this.state.textContent = `The point moves by ${moved} (mm).` +
       (away === null || away === undefined || away < 0.1 ? "" : ` It is still ${away.toFixed(1)} mm from where it was pulled to.`);
   }
 

@@ -21,7 +21,7 @@ export class VariantPanel {
         element("label", { for: "variant-name", textContent: "Name" }), this.name,
         button("Copy to a new variant", () => this.add(app.plans.active.motions)),
         button("New from the case's plan", () => this.add(app.plans.reference)),
-        button("New without a move", () => this.add(app.plans.reference.map(() => STAYS))),
+        button("New without movement", () => this.add(app.plans.reference.map(() => STAYS))),
         this.removal = button("Remove", () => { app.plans.remove(); app.changed(); }),
         button("Reset all", () => app.reset(), { title: "The case's plan alone; undo brings the variants back" })),
       this.differences);
@@ -70,7 +70,7 @@ export class VariantPanel {
       const numbers = measured.map((m) => m[i]);
       rows.push([`${label}, ${unit}`, ...numbers.map((n) => shown(n)), spread(numbers)]);
     });
-    return table("Segments at their first point, and measures of the face", ["", ...variants.map((v) => v.name), "differ by"], rows);
+    return table("Movement of each segment at its first point, and measures of the face", ["", ...variants.map((v) => v.name), "differ by"], rows);
   }
 }
 

@@ -22,7 +22,7 @@ export class ViewPanel {
     }), label);
     document.getElementById("controls").append(
       slider("share", "Before – after"), slider("skin", "Skin"), slider("bones", "Bones"),
-      box("side", "Side by side"), box("map", "Colours of movement"), box("handles", "Handles"),
+      box("side", "Side by side"), box("map", "Colour by movement"), box("handles", "Handles"),
       box("pull", "Pull the skin"));
     this.legend = document.getElementById("legend");
   }
