@@ -20,6 +20,8 @@ import pytest
 
 import cmfsim
 import cmfsim.planning.page.content
+from cmfsim.cli import main
+from cmfsim.cli.plan_command import _correction_text
 from cmfsim.planning.page.page import joined_scripts
 from cmfsim.planning.replanning import plan_distance
 from cmfsim.planning.replanning.expected_error import plan_near
@@ -128,6 +130,23 @@ def test_the_correction_lowers_the_error_at_plans_that_it_was_not_fitted_to(bare
     np.testing.assert_allclose(
         difference, planning.correction.displacements(plans[0])[::300], atol=1e-9
     )
+
+
+def test_the_command_corrects_the_page_and_states_it(folder, planning, capsys):
+    case, out = folder / "case/case.toml", folder / "corrected"
+    words = ["plan", str(case), "-o", str(out), "--model", "H+S", "--no-doctor", "-q", "--no-open"]
+    assert main([*words, "--trials", "1", "--corrections", "24", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    found = answer["correction"]
+    assert 8 <= found["plans"] <= 24
+    assert len(found["largest_left_out_mm"]) == found["plans"]
+    page = (out / "plan.html").read_text("utf-8")
+    values = json.loads(re.search(r'id="page-values">([^<]*)<', page)[1])
+    assert values["correction"]["plans"] == found["plans"]
+    correction = planning.correction
+    text = _correction_text(correction)
+    assert f"by {len(correction.plans)} other plans: {correction.before.max():.2f} mm" in text
+    assert f"{correction.left_out.max():.2f} mm where each was left out" in text
 
 
 def test_corrections_are_the_same_each_time(bare, planning):
