@@ -18,12 +18,20 @@ from cmfsim.values.anatomy import BoneSegment, ImageData, NodeKinds
 from cmfsim.values.scene import SurfaceData
 from cmfsim.virtual.body import HyperelasticBody
 from cmfsim.virtual.carried_skin import carried
-from cmfsim.virtual.equilibrium import Equilibrium, EquilibriumOptions, find_equilibrium
+from cmfsim.virtual.equilibrium import (
+    Contact,
+    Equilibrium,
+    EquilibriumOptions,
+    find_equilibrium,
+)
 from cmfsim.virtual.hyperelastic import HyperelasticTissue
+from cmfsim.virtual.lip_contact import ContactSum, LipContact, lips_of
 from cmfsim.virtual.muscle_field import muscle_field, thickened
+from cmfsim.virtual.open_mouth import MouthSlit, with_open_mouth
 from cmfsim.virtual.operation import (
     Operation,
     bone_distances,
+    node_areas,
     operate,
     without_bite,
     without_gaps,
@@ -67,6 +75,8 @@ class PostoperativeTruth:
         Volume after over before, of each tet.
     last_step : float, mm
         The most that the last Newton iteration moved the skin.
+    lips : LipContact or None
+        The contact of the lips, where these are separate.
     """
 
     nodes: Floats
@@ -84,6 +94,7 @@ class PostoperativeTruth:
     operation: Operation
     volume_ratios: Floats
     last_step: float
+    lips: LipContact | None = None
 
     @property
     def penetration(self) -> float:
@@ -102,6 +113,7 @@ def postoperative_truth(
     grid: float = 1.5,
     skin_spacing: float = 2.0,
     options: EquilibriumOptions | None = None,
+    lip_contact: bool = True,
     progress: Progress | None = None,
 ) -> PostoperativeTruth:
     """The face after the operation of a case, by other means than those that are tested on it.
@@ -127,6 +139,8 @@ def postoperative_truth(
     skin_spacing : float, mm
         Of the marching cubes that draw the skin.
     options : EquilibriumOptions, optional
+    lip_contact : bool
+        False: separate lips do not touch each other but pass, to see what their contact does.
     progress : callable, optional
         Called with the name of each stage as it begins.
 
@@ -142,6 +156,10 @@ def postoperative_truth(
     fine = replace(case, region=region, mesh=mesh, muscles=None, postoperative=None)
     stage("drawing the true anatomy")
     anatomy = head.anatomy(as_positive("grid", grid))
+    bite = head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE
+    slit = MouthSlit(head) if patient.separate_lips else None
+    if slit is not None:
+        anatomy = with_open_mouth(head, anatomy, bite)
     model = build_model(fine, progress=progress, check=False, anatomy=anatomy)
     segments = {segment.name: segment for segment in model.segments}
     motions = {name: _motion(case, name) for name in segments}
@@ -154,7 +172,8 @@ def postoperative_truth(
         model.kinds,
         distances,
         motions,
-        head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE,
+        bite,
+        open_mouth=slit is not None,
     )
     nodes, tets = opened.nodes, opened.tets
 
@@ -166,17 +185,25 @@ def postoperative_truth(
 
     stage("moving the bones")
     body = HyperelasticBody(nodes, tets, tissue)
+    boundary = TetMesh(nodes, tets).boundary_triangles()
+    lips, bared = None, opened.bared
+    if slit is not None:
+        lips = LipContact(nodes, *lips_of(slit, nodes, boundary, node_areas(nodes, boundary)))
+        bared = np.union1d(bared, np.concatenate([lips.upper.nodes, lips.lower.nodes]))
     operation = operate(
         nodes,
         tets,
-        TetMesh(nodes, tets).boundary_triangles(),
+        boundary,
         opened.kinds,
         distances,
         {name: np.asarray(s.surface.vertices).mean(axis=0) for name, s in segments.items()},
         motions,
-        opened.bared,
+        bared,
     )
-    found = find_equilibrium(body, operation.held, operation.path, operation.contact, options)
+    contact: Contact = operation.contact
+    if lips is not None and lip_contact:
+        contact = ContactSum((operation.contact, lips))
+    found = find_equilibrium(body, operation.held, operation.path, contact, options)
 
     stage("carrying the skin along")
     before = head.surface("skin", skin_spacing)
@@ -201,6 +228,7 @@ def postoperative_truth(
         operation=operation,
         volume_ratios=body.volume_ratios(found.displacements),
         last_step=float(np.linalg.norm(found.last_step[on_skin], axis=1).max()),
+        lips=lips,
     )
 
 
@@ -236,13 +264,19 @@ def _opened(
     distances: Mapping[str, ImageData],
     motions: Mapping[str, Floats],
     gap: float,
+    *,
+    open_mouth: bool,
 ) -> _Opened:
-    """The largest body that is left without what lies between tooth rows and parted bones."""
-    kept = without_gaps(nodes, tets, distances, motions)
-    upper = distances.get("maxilla", distances.get("cranium"))
-    lower = distances.get("mandible_body", distances.get("mandible"))
-    if upper is not None and lower is not None:
-        kept &= without_bite(nodes, tets, upper, lower, gap)
+    """The largest body that is left without what lies between tooth rows and parted bones.
+
+    Where the mouth is open already, nothing is taken from between the jaws.
+    """
+    upper = next((name for name in ("maxilla", "cranium") if name in distances), None)
+    lower = next((name for name in ("mandible_body", "mandible") if name in distances), None)
+    jaws = tuple(name for name in (upper, lower) if name is not None)
+    kept = without_gaps(nodes, tets, distances, motions, jaws if open_mouth else ())
+    if upper is not None and lower is not None and not open_mouth:
+        kept &= without_bite(nodes, tets, distances[upper], distances[lower], gap)
     bared = np.zeros(len(nodes), dtype=bool)
     bared[tets[~kept]] = True
     tets = tets[kept]
