@@ -29,6 +29,9 @@ CANDIDATES = 16
 # A node this deep or deeper, mm, lies behind the other lip, not in it: lips are thicker than twice
 # that, and a step of Newton's method that leads further is cut.
 DEEPEST = 4.0
+# Least cosine between the way to the border of a lip's surface and the normal there, for which a
+# node lies behind it: others lie beside it.
+BEHIND = 0.7
 # Parts of a triangle below this are none: the closest point lies on an edge or a corner.
 ON_EDGE = 1e-9
 
@@ -227,8 +230,10 @@ def _touch(places: Floats, lip: Lip, other: Lip) -> _Touch:
     way = places[lip.nodes] - np.einsum("ck,cki->ci", weights, places[at])
     normal = _outward(places, other, triangle, weights)
     distance = np.linalg.norm(way, axis=1)
-    inside = (way * normal).sum(axis=1) < 0.0
-    inside &= (distance < DEEPEST) & ~_on_border(other, triangle, weights)
+    behind = -(way * normal).sum(axis=1)
+    # What is closest to the border and not about behind it lies beside the surface.
+    least = np.where(_on_border(other, triangle, weights), BEHIND * distance, 0.0)
+    inside = (behind > least) & (distance < DEEPEST)
     at, weights, depth = at[inside], weights[inside], distance[inside]
     # On the surface itself the way has no direction, and no force.
     along = -way[inside] / np.maximum(depth, np.finfo(np.float64).tiny)[:, None]
@@ -296,7 +301,7 @@ def _weights(points: Floats, corners: Floats) -> Floats:
 
 
 def _outward(places: Floats, lip: Lip, triangle: NDArray[np.int64], weights: Floats) -> Floats:
-    """Outward directions at points of triangles, (c, 3), whose sign is right on edges and corners.
+    """Outward unit vectors at points of triangles, (c, 3), also right on edges and corners.
 
     Angle-weighted normals (Bærentzen & Aanæs 2005): of the face inside it, of the two faces on an
     edge, of all faces about a corner.
@@ -320,14 +325,12 @@ def _outward(places: Floats, lip: Lip, triangle: NDArray[np.int64], weights: Flo
     neighbour = lip.neighbours[triangle[on_edge], none[on_edge].argmax(axis=1)]
     two = neighbour >= 0
     found[on_edge[two]] += face[neighbour[two]]
-    return found
+    length = np.linalg.norm(found, axis=1, keepdims=True)
+    return np.asarray(found / np.maximum(length, np.finfo(np.float64).tiny))
 
 
 def _on_border(lip: Lip, triangle: NDArray[np.int64], weights: Floats) -> NDArray[np.bool_]:
-    """Whether points of triangles lie on the border of the surface, (c,).
-
-    What is closest to a border lies beside the surface, and has no side.
-    """
+    """Whether points of triangles lie on the border of the surface, (c,)."""
     none = weights <= ON_EDGE
     edge = (none & (lip.neighbours[triangle] < 0)).any(axis=1)
     corner = lip.triangles[triangle, weights.argmax(axis=1)]

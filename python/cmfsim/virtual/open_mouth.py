@@ -20,16 +20,15 @@ from cmfsim.values.anatomy import Anatomy
 
 __all__ = ["LEAST_GAP", "MouthSlit", "with_open_mouth"]
 
-# Of the slit between the lips in the drawn head, mm: distance from the midline, height of its line,
-# and half its thickness in half the gap at the midline (as the phantom's skin has them).
+# Of the slit between the lips in the drawn head, mm: distance from the midline and height of its
+# line, as the phantom's skin has them. Its thickness is the same to near the corner, for the mesh
+# does not resolve a slit that narrows as the skin's does.
 DISTANCE = np.array([0.0, 12.0, 25.0])
 LINE = np.array([-44.4, -44.0, -44.5])
-# The slit keeps this share of its thickness up to here, mm from the midline, and is rounded off
-# from there to its end: the corner of the mouth.
-LATERAL_SHARE = 0.7
+# It is rounded off from here to its end, mm from the midline: the corner of the mouth.
 ROUNDED_FROM, CORNER = 20.0, 23.5
 # Lips must be this far apart in the phantom, mm: a slit narrower than that closes in the mesh.
-LEAST_GAP = 1.5
+LEAST_GAP = 1.0
 # Lips reach this far above and below the line of the mouth, and no further to the side, mm.
 LIP_HEIGHT, LIP_SIDE = 15.0, 22.0
 # Spacing of the surfaces of the tooth rows, and up to where their distance is known, mm.
@@ -77,7 +76,7 @@ class MouthSlit:
         """The level of the slit at points (k, 3), (k,) mm: positive between the lips."""
         p = self.head.parameters
         u, v, w = self._drawn(points)
-        half = 0.5 * p.lip_gap * np.interp(u, [0.0, 12.0, ROUNDED_FROM], [1.0, 0.8, LATERAL_SHARE])
+        half = 0.5 * p.lip_gap
         past = np.clip((u - ROUNDED_FROM) / (CORNER - ROUNDED_FROM), 0.0, 1.0)
         half = half * np.sqrt(1.0 - past**2) - np.maximum(u - CORNER, 0.0)
         level = half - np.abs(w - np.interp(u, DISTANCE, LINE))

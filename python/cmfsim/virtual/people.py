@@ -169,6 +169,7 @@ PATIENTS: Mapping[int, VirtualPatient] = MappingProxyType(
                     "chin": Relocation((-3.0, -1.5, 1.0), -2.0, (0.0, 0.0, 1.0), "infradentale"),
                 },
             ),
+            # Lips stand 2 mm apart here too: an open mandible widens `lip_gap`.
             # The mouth closes and the lower lip goes behind the upper one: turned about the
             # incisors, the mandible rises half as much at the molars.
             VirtualPatient(
@@ -178,13 +179,13 @@ PATIENTS: Mapping[int, VirtualPatient] = MappingProxyType(
                     face_height=1.03,
                     nose_projection=1.0,
                     mandible_advance=5.0,
-                    lip_gap=2.0,
+                    lip_gap=1.1,
                     bite_gap=6.0,
                 ),
                 0.9,
                 1.1,
                 ("bsso",),
-                {"mandible_body": Relocation((0.0, 6.0, 5.0), -3.8, centre="infradentale")},
+                {"mandible_body": Relocation((0.0, 5.0, 5.0), -3.8, centre="infradentale")},
                 separate_lips=True,
             ),
             # Vertical excess: the maxilla goes up and the mandible follows, turning about its
@@ -198,15 +199,15 @@ PATIENTS: Mapping[int, VirtualPatient] = MappingProxyType(
                     lip_fullness=1.1,
                     chin_projection=-1.0,
                     fat_thickness=1.0,
-                    lip_gap=2.0,
-                    bite_gap=3.0,
+                    lip_gap=1.4,
+                    bite_gap=4.0,
                 ),
                 1.1,
                 0.85,
                 ("le_fort_1",),
                 {
-                    "maxilla": Relocation((0.0, -1.0, 5.0), 1.0),
-                    "mandible": Relocation((0.0, -3.6, 6.2), -4.6, centre="infradentale"),
+                    "maxilla": Relocation((0.0, -1.0, 4.0), 1.0),
+                    "mandible": Relocation((0.0, -4.15, 7.2), -5.35, centre="infradentale"),
                 },
                 separate_lips=True,
             ),

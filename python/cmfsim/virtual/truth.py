@@ -44,8 +44,12 @@ Progress = Callable[[str], None]
 
 # Tissue of which the tooth rows together are nearer than the bite's own gap and this, mm, is none.
 BEYOND_BITE = 1.5
+# The same where the mouth is open and no other tissue is taken from between the jaws, mm.
+BEYOND_OPEN_BITE = 4.0
 # Tissue is held from this height over the nasion on, mm: no operation of the jaws moves skin there.
 ABOVE_NASION = 20.0
+# Parts of the motion where lips may meet.
+STEPS_WITH_LIPS = 6
 # Nodes within this distance from the skin lie on it, mm.
 NEAR_SKIN = 0.5
 
@@ -133,12 +137,13 @@ def postoperative_truth(
     edge_length : float, mm
         Of the true mesh.
     refine : bool
-        Whether its tets are smaller where tissue is thin.
+        Whether its tets are smaller where tissue is thin; they are where lips are separate.
     grid : float, mm
         Spacing of the level images that the mesh is made from.
     skin_spacing : float, mm
         Of the marching cubes that draw the skin.
     options : EquilibriumOptions, optional
+        Where lips are separate the motion has `STEPS_WITH_LIPS` parts, if it is not given.
     lip_contact : bool
         False: separate lips do not touch each other but pass, to see what their contact does.
     progress : callable, optional
@@ -151,14 +156,18 @@ def postoperative_truth(
     """
     stage = progress or _quiet
     length = as_positive("edge_length", edge_length)
+    separate = patient.separate_lips
+    if options is None and separate:
+        options = EquilibriumOptions(steps=STEPS_WITH_LIPS)
     region = replace(case.region, upper=float(head.skull_landmarks["nasion"][2]) + ABOVE_NASION)
-    mesh = replace(case.mesh, edge_length=length, refine=refine)
+    mesh = replace(case.mesh, edge_length=length, refine=refine or separate)
     fine = replace(case, region=region, mesh=mesh, muscles=None, postoperative=None)
     stage("drawing the true anatomy")
     anatomy = head.anatomy(as_positive("grid", grid))
     bite = head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE
-    slit = MouthSlit(head) if patient.separate_lips else None
+    slit = MouthSlit(head) if separate else None
     if slit is not None:
+        bite += BEYOND_OPEN_BITE - BEYOND_BITE
         anatomy = with_open_mouth(head, anatomy, bite)
     model = build_model(fine, progress=progress, check=False, anatomy=anatomy)
     segments = {segment.name: segment for segment in model.segments}
