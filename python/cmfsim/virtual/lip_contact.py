@@ -122,12 +122,16 @@ class _Touch:
         from the closest point to the node.
     normal : (c, 3) float64
         Unit vectors along which the distance grows.
+    swing : (c, 3, 3) float64
+        Projections on the ways in which the normal swings when the node moves: none over a face,
+        across an edge, both across a corner.
     depth, area : (c,) float64, mm and mm²
     """
 
     corners: NDArray[np.int64]
     parts: Floats
     normal: Floats
+    swing: Floats
     depth: Floats
     area: Floats
 
@@ -193,21 +197,30 @@ class LipContact:
         del part
         force = np.zeros_like(self.points)
         for touch in self._touches(displacements):
-            d, onset = touch.depth, self.onset
-            pressing = np.where(d < onset, 0.5 * d**2 / onset, d - 0.5 * onset)
-            weight = -0.5 * self.stiffness * touch.area * pressing
+            weight = -self._pressing(touch)
             shares = (weight[:, None] * touch.parts)[:, :, None] * touch.normal[:, None, :]
             np.add.at(force, touch.corners, shares)
         return force, np.zeros((len(self.points), 3, 3))
 
+    def _pressing(self, touch: _Touch) -> Floats:
+        """The force of each node, half from either lip, (c,) N."""
+        d, onset = touch.depth, self.onset
+        pressure = np.where(d < onset, 0.5 * d**2 / onset, d - 0.5 * onset)
+        return np.asarray(0.5 * self.stiffness * touch.area * pressure)
+
     def coupling(self, displacements: Floats, part: float) -> Any:
-        """∂ forces / ∂ displacements with closest points and normals as they are, (3n, 3n) N/mm."""
+        """∂ forces / ∂ displacements, (3n, 3n) N/mm, with the closest feature of each node frozen.
+
+        Over a face its normal is frozen, too; about an edge or a corner it swings, which stiffens.
+        """
         del part
         rows, columns, data = [], [], []
         for touch in self._touches(displacements):
             rise = 0.5 * self.stiffness * touch.area * np.minimum(touch.depth / self.onset, 1.0)
-            along = touch.normal[:, :, None] * touch.normal[:, None, :]
-            pairs = rise[:, None, None] * touch.parts[:, :, None] * touch.parts[:, None, :]
+            along = rise[:, None, None] * touch.normal[:, :, None] * touch.normal[:, None, :]
+            lever = self._pressing(touch) / np.maximum(touch.depth, np.finfo(np.float64).tiny)
+            along += lever[:, None, None] * touch.swing
+            pairs = touch.parts[:, :, None] * touch.parts[:, None, :]
             rows.append(np.repeat(touch.corners, 4, axis=1).ravel())
             columns.append(np.tile(touch.corners, (1, 4)).ravel())
             data.append((pairs.reshape(-1, 16, 1, 1) * along[:, None]).reshape(-1, 3, 3))
@@ -238,13 +251,29 @@ def _touch(places: Floats, lip: Lip, other: Lip) -> _Touch:
     # On the surface itself the way has no direction, and no force.
     along = -way[inside] / np.maximum(depth, np.finfo(np.float64).tiny)[:, None]
     nodes = lip.nodes[inside]
+    swing = _swing(along, places[at], weights)
     return _Touch(
         np.column_stack([nodes, at]),
         np.column_stack([np.ones(len(nodes)), -weights]),
         along,
+        swing,
         depth,
         lip.area[inside],
     )
+
+
+def _swing(normal: Floats, corners: Floats, weights: Floats) -> Floats:
+    """The projections of `_Touch.swing`, (c, 3, 3), at points of triangles (c, 3, 3)."""
+    none = weights <= ON_EDGE
+    count = none.sum(axis=1)
+    found = np.eye(3) - normal[:, :, None] * normal[:, None, :]
+    found[count == 0] = 0.0
+    edge = np.flatnonzero(count == 1)
+    opposite = none[edge].argmax(axis=1)
+    way = corners[edge, (opposite + 2) % 3] - corners[edge, (opposite + 1) % 3]
+    way /= np.maximum(np.linalg.norm(way, axis=1), np.finfo(np.float64).tiny)[:, None]
+    found[edge] -= way[:, :, None] * way[:, None, :]
+    return np.asarray(found)
 
 
 def _closest(

@@ -76,9 +76,8 @@ class MouthSlit:
         """The level of the slit at points (k, 3), (k,) mm: positive between the lips."""
         p = self.head.parameters
         u, v, w = self._drawn(points)
-        half = 0.5 * p.lip_gap
         past = np.clip((u - ROUNDED_FROM) / (CORNER - ROUNDED_FROM), 0.0, 1.0)
-        half = half * np.sqrt(1.0 - past**2) - np.maximum(u - CORNER, 0.0)
+        half = 0.5 * p.lip_gap * np.sqrt(1.0 - past**2) - np.maximum(u - CORNER, 0.0)
         level = half - np.abs(w - np.interp(u, DISTANCE, LINE))
         # It ends in the middle of the upper tooth row.
         return np.asarray(p.scale * np.minimum(level, _arch(u) - v))

@@ -185,7 +185,7 @@ PATIENTS: Mapping[int, VirtualPatient] = MappingProxyType(
                 0.9,
                 1.1,
                 ("bsso",),
-                {"mandible_body": Relocation((0.0, 5.0, 5.0), -3.8, centre="infradentale")},
+                {"mandible_body": Relocation((0.0, 4.0, 4.5), -3.4, centre="infradentale")},
                 separate_lips=True,
             ),
             # Vertical excess: the maxilla goes up and the mandible follows, turning about its
