@@ -15,17 +15,17 @@ from cmfsim.checks import Floats, as_index_rows, as_positive, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.extras import third_party
 from cmfsim.virtual.equilibrium import Contact
-from cmfsim.virtual.open_mouth import MouthSlit
+from cmfsim.virtual.open_mouth import MARGIN, MouthSlit
 
 __all__ = ["ContactSum", "Lip", "LipContact", "lips_of"]
 
-# Pressure per depth of penetration, MPa/mm: pressures between lips (some 10 kPa) stay within
-# 0.05 mm.
-STIFFNESS = 1.0
+# Pressure per depth of penetration, MPa/mm: pressures between lips (some kPa) stay within a tenth
+# of a millimetre. A stiffer contact stalls Newton's method where rough surfaces slide.
+STIFFNESS = 0.2
 # Depth over which that pressure sets in, mm.
-ONSET = 0.02
+ONSET = 0.05
 # Triangles whose middles lie nearest to a node are tried for its closest point.
-CANDIDATES = 16
+CANDIDATES = 32
 # A node this deep or deeper, mm, lies behind the other lip, not in it: lips are thicker than twice
 # that, and a step of Newton's method that leads further is cut.
 DEEPEST = 4.0
@@ -45,7 +45,7 @@ class Lip:
     triangles : (t, 3) whole numbers
         Boundary triangles, outward normals.
     nodes : (k,) whole numbers
-        Those of the triangles.
+        Those of the triangles that meet the other lip.
     area : (k,) float64, mm²
         Of the boundary about each.
     """
@@ -55,10 +55,13 @@ class Lip:
     area: Floats
 
     @classmethod
-    def of(cls, triangles: NDArray[Any], area: Floats) -> "Lip":
-        """The lip of boundary triangles (t, 3); area (n,) mm² of every node of the mesh."""
-        nodes = np.unique(triangles).astype(np.int64)
-        return cls(np.asarray(triangles, dtype=np.int64), nodes, area[nodes])
+    def of(cls, triangles: NDArray[Any], area: Floats, nodes: NDArray[Any] | None = None) -> "Lip":
+        """The lip of boundary triangles (t, 3); area (n,) mm² of every node of the mesh.
+
+        All nodes of the triangles meet the other lip if they are not given.
+        """
+        chosen = np.unique(triangles if nodes is None else nodes).astype(np.int64)
+        return cls(np.asarray(triangles, dtype=np.int64), chosen, area[chosen])
 
     @cached_property
     def neighbours(self) -> NDArray[np.int64]:
@@ -101,12 +104,15 @@ def lips_of(
     CaseError
         (also `ValueError`) The mesh has no upper or no lower lip, or its lips are one.
     """
-    side = slit.lips(nodes)[boundary]
-    upper, lower = (Lip.of(boundary[(side == which).all(axis=1)], area) for which in (1, -1))
-    for name, lip in (("upper", upper), ("lower", lower)):
-        if not len(lip.triangles):
+    side, inner = slit.lips(nodes)[boundary], slit.lips(nodes, MARGIN)
+    lips = []
+    for name, which in (("upper", 1), ("lower", -1)):
+        triangles = boundary[(side == which).all(axis=1)]
+        meeting = np.intersect1d(triangles, np.flatnonzero(inner == which))
+        if not len(meeting):
             raise CaseInputError(f"the mesh has no surface of the {name} lip")
-    return upper, lower
+        lips.append(Lip.of(triangles, area, meeting))
+    return lips[0], lips[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +171,7 @@ class LipContact:
         as_positive("onset", self.onset)
         for name, lip in (("upper", self.upper), ("lower", self.lower)):
             as_index_rows(f"{name} lip", lip.triangles, 3, len(self.points), "points")
-        shared = np.intersect1d(self.upper.nodes, self.lower.nodes)
+        shared = np.intersect1d(self.upper.triangles, self.lower.triangles)
         if len(shared):
             x, y, z = self.points[shared[0]]
             raise CaseInputError(

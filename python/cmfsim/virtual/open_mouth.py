@@ -18,7 +18,7 @@ from cmfsim.phantom.skull import UPPER_ARCH
 from cmfsim.phantom.warp import JawWarp
 from cmfsim.values.anatomy import Anatomy
 
-__all__ = ["LEAST_GAP", "MouthSlit", "with_open_mouth"]
+__all__ = ["LEAST_GAP", "MARGIN", "MouthSlit", "with_open_mouth"]
 
 # Of the slit between the lips in the drawn head, mm: distance from the midline and height of its
 # line, as the phantom's skin has them. Its thickness is the same to near the corner, for the mesh
@@ -29,8 +29,11 @@ LINE = np.array([-44.4, -44.0, -44.5])
 ROUNDED_FROM, CORNER = 20.0, 23.5
 # Lips must be this far apart in the phantom, mm: a slit narrower than that closes in the mesh.
 LEAST_GAP = 1.0
-# Lips reach this far above and below the line of the mouth, and no further to the side, mm.
-LIP_HEIGHT, LIP_SIDE = 15.0, 22.0
+# Lips reach this far above and below the line of the mouth and to the side, mm, and past the middle
+# of the tooth rows; the parts of them that meet the other lip end by a margin before that, so that
+# nothing is closest to a border.
+LIP_HEIGHT, LIP_SIDE, LIP_BACK = 16.0, 25.0, 4.0
+MARGIN = 4.0
 # Spacing of the surfaces of the tooth rows, and up to where their distance is known, mm.
 TEETH_SPACING, TEETH_REACH = 1.0, 12.0
 
@@ -82,14 +85,15 @@ class MouthSlit:
         # It ends in the middle of the upper tooth row.
         return np.asarray(p.scale * np.minimum(level, _arch(u) - v))
 
-    def lips(self, points: Floats) -> NDArray[np.int8]:
+    def lips(self, points: Floats, margin: float = 0.0) -> NDArray[np.int8]:
         """Which lip points (k, 3) belong to, (k,): 1 the upper, −1 the lower, 0 none.
 
-        Corners of the mouth, where both join, belong to none.
+        With a margin, mm, only what is further inside than that.
         """
         u, v, _ = self._drawn(points)
         height = self.height(points)
-        near = (u < LIP_SIDE) & (v < _arch(u)) & (np.abs(height) < LIP_HEIGHT)
+        near = (u < LIP_SIDE - margin) & (np.abs(height) < LIP_HEIGHT - margin)
+        near &= v < _arch(u) + LIP_BACK - margin
         return np.asarray(np.where(near, np.sign(height), 0.0), dtype=np.int8)
 
 
