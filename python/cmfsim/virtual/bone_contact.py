@@ -161,3 +161,7 @@ class BoneContact:
             values, axes = np.linalg.eigh(-(weight * pressing)[:, None, None] * bend)
             blocks[at] += (axes * np.maximum(values, 0.0)[:, None]) @ axes.transpose(0, 2, 1)
         return force, blocks
+
+    def coupling(self, displacements: Floats, part: float) -> None:
+        """Nothing: each node meets bones alone."""
+        del displacements, part

@@ -46,6 +46,9 @@ class Contact(Protocol):
     def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
         """The gradient of the energy, (n, 3) N, and the stiffness of each node, (n, 3, 3) N/mm."""
 
+    def coupling(self, displacements: Floats, part: float) -> Any:
+        """What else its stiffness has, between nodes: (3n, 3n) scipy BSR N/mm, or None."""
+
 
 class NoContact:
     """Nothing presses."""
@@ -59,6 +62,10 @@ class NoContact:
         """Nothing."""
         del part
         return np.zeros_like(displacements), np.zeros((*displacements.shape, 3))
+
+    def coupling(self, displacements: Floats, part: float) -> None:
+        """Nothing."""
+        del displacements, part
 
 
 @dataclass(frozen=True)
@@ -200,10 +207,16 @@ class _Search:
         force, stiffness = self.contact.forces(u, part)
         return self.body.forces(u) + force, stiffness
 
+    def _stiffness(self, added: Floats, part: float, *, convex: bool) -> Any:
+        """Of tissue and contact; `added` as `_forces` gives it."""
+        matrix = self.body.stiffness(self.u, added, convex=convex)
+        coupling = self.contact.coupling(self.u, part)
+        return matrix if coupling is None else matrix + coupling
+
     def _advance(self, part: float, target: float) -> None:
         """Goes along the tangent to the target."""
         forces, added = self._forces(self.u, part)
-        matrix = self.body.stiffness(self.u, added, convex=True)
+        matrix = self._stiffness(added, part, convex=True)
         step = np.zeros_like(self.u)
         step[self.held] = self.path(target) - self.path(part)
         pull = (matrix @ step.ravel()).reshape(-1, 3)
@@ -237,7 +250,7 @@ class _Search:
             if residual <= tolerance:
                 return residual
             precision = min(LOOSEST_SOLVE, max(residual, TIGHTEST_SOLVE))
-            step, true = self._step(right, added, precision, convex=convex > 0)
+            step, true = self._step(right, added, part, precision, convex=convex > 0)
             slope = -float((step[self.free] * right).sum())
             share = 1.0
             for _ in range(HALVINGS):
@@ -270,12 +283,12 @@ class _Search:
         )
 
     def _step(
-        self, right: Floats, added: Floats, precision: float, *, convex: bool
+        self, right: Floats, added: Floats, part: float, precision: float, *, convex: bool
     ) -> tuple[Floats, bool]:
         """Newton's step, (n, 3) mm, and whether the true stiffness gave it."""
         step = np.zeros_like(self.u)
         for cut in (True,) if convex else (False, True):
-            matrix = self.body.stiffness(self.u, added, convex=cut)
+            matrix = self._stiffness(added, part, convex=cut)
             self.linear.take(_free_blocks(matrix, self.free))
             step[self.free], upright = self.linear.solve(right, precision)
             if upright:

@@ -1,6 +1,6 @@
 """The operation on the true tissue: what bones hold, what is stripped off them, what they push."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -18,7 +18,15 @@ from cmfsim.values.motion import decompose_motion, rigid_motion
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.virtual.bone_contact import BoneContact, SmoothDistance
 
-__all__ = ["Operation", "bone_distances", "operate", "screw", "without_bite", "without_gaps"]
+__all__ = [
+    "Operation",
+    "bone_distances",
+    "node_areas",
+    "operate",
+    "screw",
+    "without_bite",
+    "without_gaps",
+]
 
 # Tissue is stripped off both sides of a cut as a surgeon lifts the periosteum there: by this
 # length, mm, and by this multiple of how far the two sides part.
@@ -138,6 +146,7 @@ def without_gaps(
     tets: NDArray[Any],
     distances: Mapping[str, ImageData],
     motions: Mapping[str, Floats],
+    kept_between: Collection[str] = (),
 ) -> NDArray[np.bool_]:
     """Which tets are tissue, (m,): not between bones that part or close, where none is left.
 
@@ -152,11 +161,15 @@ def without_gaps(
         As `bone_distances` gives them.
     motions : mapping of str to (4, 4) float64, mm
         Of each of them.
+    kept_between : collection of str
+        Bones between which tissue stays: jaws that no cut separates, and whose mouth is open.
     """
     middles = nodes[tets].mean(axis=1)
     kept = np.ones(len(middles), dtype=bool)
     outside = {name: -depth.sample(middles) for name, depth in distances.items()}
     for one, other in combinations(distances, 2):
+        if one in kept_between and other in kept_between:
+            continue
         apart = motions[one] - motions[other]
         shift = np.linalg.norm(middles @ apart[:3, :3].T + apart[:3, 3], axis=1)
         near = outside[one] + outside[other] < shift + BETWEEN
@@ -237,7 +250,7 @@ def operate(
     contact = BoneContact(
         nodes,
         touching,
-        _node_areas(nodes, boundary)[touching],
+        node_areas(nodes, boundary)[touching],
         {name: SmoothDistance(depth) for name, depth in distances.items()},
         motion,
     )
@@ -287,7 +300,7 @@ def _volumes(nodes: Floats, tets: NDArray[Any]) -> Floats:
     return np.asarray(triple / 6.0)
 
 
-def _node_areas(nodes: Floats, triangles: NDArray[Any]) -> Floats:
+def node_areas(nodes: Floats, triangles: NDArray[Any]) -> Floats:
     """A third of the area of the boundary triangles about each node, mm²."""
     corners = nodes[triangles]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

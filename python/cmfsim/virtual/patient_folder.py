@@ -65,7 +65,7 @@ def virtual_patients(
     folder : path
         Patient n goes to `folder/Pn`.
     numbers : iterable of int
-        1 to 4.
+        1 to 6.
     seed : int
         Draws all noise; the same seed gives the same files.
     edge_length : float, mm
@@ -159,13 +159,13 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
     folder : path
         Made if it is not there. An earlier truth in it is replaced once the new one is complete.
     number : int
-        1 to 4.
+        1 to 6.
     seed : int
         Draws the noise of CT, landmarks and scan.
     edge_length : float, mm
         Of the true mesh.
     refine : bool
-        Whether its tets are smaller where tissue is thin.
+        Whether its tets are smaller where tissue is thin; they are where lips are separate.
     spacing : float, mm
         Of the CT.
     grid : float, mm
@@ -352,7 +352,16 @@ def _measured(truth: PostoperativeTruth) -> dict[str, Any]:
     """What the solution says of itself."""
     found = truth.equilibrium
     moved = np.asarray(truth.skin.vertices) - np.asarray(truth.skin_before.vertices)
+    lips = truth.lips
+    contact: dict[str, Any] = {}
+    if lips is not None:
+        contact = {
+            "lip_nodes": len(lips.upper.nodes) + len(lips.lower.nodes),
+            "lip_nodes_touching": lips.touching(truth.displacements),
+            "lip_penetration_mm": lips.penetration(truth.displacements),
+        }
     return {
+        **contact,
         "nodes": len(truth.nodes),
         "tets": len(truth.tets),
         "muscle_fraction": float(truth.fraction.mean()),

@@ -1,4 +1,4 @@
-"""The four virtual patients P1 to P4: who they are, and what is done to them."""
+"""The virtual patients P1 to P6: who they are, and what is done to them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -50,6 +50,9 @@ class VirtualPatient:
         Procedures, in their order.
     plan : mapping of str to Relocation
         By segment.
+    separate_lips : bool
+        Whether the true lips are separate down to the teeth and touch each other. Otherwise they
+        are one behind the slit that the skin shows, as on a CT.
     """
 
     number: int
@@ -59,13 +62,14 @@ class VirtualPatient:
     muscle_stiffness: float
     osteotomies: tuple[str, ...]
     plan: Mapping[str, Relocation] = field(default_factory=dict)
+    separate_lips: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "plan", MappingProxyType(dict(self.plan)))
 
     @property
     def name(self) -> str:
-        """P1 to P4."""
+        """P1 to P6."""
         return f"P{self.number}"
 
 
@@ -165,18 +169,60 @@ PATIENTS: Mapping[int, VirtualPatient] = MappingProxyType(
                     "chin": Relocation((-3.0, -1.5, 1.0), -2.0, (0.0, 0.0, 1.0), "infradentale"),
                 },
             ),
+            # Lips stand 2 mm apart here too: an open mandible widens `lip_gap`.
+            # The mouth closes and the lower lip goes behind the upper one: turned about the
+            # incisors, the mandible rises half as much at the molars.
+            VirtualPatient(
+                5,
+                "MSB, bite closed",
+                HeadParameters(
+                    face_height=1.03,
+                    nose_projection=1.0,
+                    mandible_advance=5.0,
+                    lip_gap=1.1,
+                    bite_gap=6.0,
+                ),
+                0.9,
+                1.1,
+                ("bsso",),
+                {"mandible_body": Relocation((0.0, 4.0, 4.5), -3.4, centre="infradentale")},
+                separate_lips=True,
+            ),
+            # Vertical excess: the maxilla goes up and the mandible follows, turning about its
+            # condyles; its motion is that turn, written about infradentale.
+            VirtualPatient(
+                6,
+                "Mx up, autorotation",
+                HeadParameters(
+                    face_height=1.06,
+                    nose_length=1.0,
+                    lip_fullness=1.1,
+                    chin_projection=-1.0,
+                    fat_thickness=1.0,
+                    lip_gap=1.2,
+                    bite_gap=5.0,
+                ),
+                1.1,
+                0.85,
+                ("le_fort_1",),
+                {
+                    "maxilla": Relocation((0.0, -1.0, 4.0), 1.0),
+                    "mandible": Relocation((0.0, -4.15, 7.2), -5.35, centre="infradentale"),
+                },
+                separate_lips=True,
+            ),
         )
     }
 )
 
 
 def patient_named(number: int) -> VirtualPatient:
-    """One of the four.
+    """One of the virtual patients.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) Another number than 1 to 4.
+        (also `ValueError`) Another number than 1 to 6.
     """
     if number not in PATIENTS:
         raise CaseInputError(f"patient is {number!r}: {', '.join(map(str, PATIENTS))} are there")

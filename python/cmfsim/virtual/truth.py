@@ -21,12 +21,20 @@ from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.body import HyperelasticBody
 from cmfsim.virtual.carried_skin import carried
-from cmfsim.virtual.equilibrium import Equilibrium, EquilibriumOptions, find_equilibrium
+from cmfsim.virtual.equilibrium import (
+    Contact,
+    Equilibrium,
+    EquilibriumOptions,
+    find_equilibrium,
+)
 from cmfsim.virtual.hyperelastic import HyperelasticTissue
+from cmfsim.virtual.lip_contact import ContactSum, LipContact, lips_of
 from cmfsim.virtual.muscle_field import muscle_field, thickened
+from cmfsim.virtual.open_mouth import MouthSlit, with_open_mouth
 from cmfsim.virtual.operation import (
     Operation,
     bone_distances,
+    node_areas,
     operate,
     without_bite,
     without_gaps,
@@ -38,8 +46,12 @@ __all__ = ["PostoperativeTruth", "largest_body", "postoperative_truth"]
 
 # Tissue of which the tooth rows together are nearer than the bite's own gap and this, mm, is none.
 BEYOND_BITE = 1.5
+# The same where the mouth is open and no other tissue is taken from between the jaws, mm.
+BEYOND_OPEN_BITE = 4.0
 # Tissue is held from this height over the nasion on, mm: no operation of the jaws moves skin there.
 ABOVE_NASION = 20.0
+# Parts of the motion where lips may meet.
+STEPS_WITH_LIPS = 6
 # Nodes within this distance from the skin lie on it, mm.
 NEAR_SKIN = 0.5
 
@@ -69,6 +81,8 @@ class PostoperativeTruth:
         Volume after over before, of each tet.
     last_step : float, mm
         The most that the last Newton iteration moved the skin.
+    lips : LipContact or None
+        The contact of the lips, where these are separate.
     """
 
     nodes: Floats
@@ -86,6 +100,7 @@ class PostoperativeTruth:
     operation: Operation
     volume_ratios: Floats
     last_step: float
+    lips: LipContact | None = None
 
     @property
     def penetration(self) -> float:
@@ -104,6 +119,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     grid: float = 1.5,
     skin_spacing: float = 2.0,
     options: EquilibriumOptions | None = None,
+    lip_contact: bool = True,
     progress: Progress | None = None,
 ) -> PostoperativeTruth:
     """The face after the operation of a case, by other means than those that are tested on it.
@@ -123,12 +139,15 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     edge_length : float, mm
         Of the true mesh.
     refine : bool
-        Whether its tets are smaller where tissue is thin.
+        Whether its tets are smaller where tissue is thin; they are where lips are separate.
     grid : float, mm
         Spacing of the level images that the mesh is made from.
     skin_spacing : float, mm
         Of the marching cubes that draw the skin.
     options : EquilibriumOptions, optional
+        Where lips are separate the motion has `STEPS_WITH_LIPS` parts, if it is not given.
+    lip_contact : bool
+        False: separate lips do not touch each other but pass, to see what their contact does.
     progress : callable, optional
         Called with the name of each stage as it begins.
 
@@ -139,11 +158,19 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     """
     stage = progress or no_progress
     length = as_positive("edge_length", edge_length)
+    separate = patient.separate_lips
+    if options is None and separate:
+        options = EquilibriumOptions(steps=STEPS_WITH_LIPS)
     region = replace(case.region, upper=float(head.skull_landmarks["nasion"][2]) + ABOVE_NASION)
-    mesh = replace(case.mesh, edge_length=length, refine=refine)
+    mesh = replace(case.mesh, edge_length=length, refine=refine or separate)
     fine = replace(case, region=region, mesh=mesh, muscles=None, postoperative=None)
     stage("drawing the true anatomy")
     anatomy = head.anatomy(as_positive("grid", grid))
+    bite = head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE
+    slit = MouthSlit(head) if separate else None
+    if slit is not None:
+        bite += BEYOND_OPEN_BITE - BEYOND_BITE
+        anatomy = with_open_mouth(head, anatomy, bite)
     model = build_model(fine, progress=progress, check=False, anatomy=anatomy)
     segments = {segment.name: segment for segment in model.segments}
     motions = {name: _motion(case, name) for name in segments}
@@ -156,7 +183,8 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
         model.kinds,
         distances,
         motions,
-        gap=head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE,
+        gap=bite,
+        open_mouth=slit is not None,
     )
     nodes, tets = opened.nodes, opened.tets
 
@@ -168,17 +196,25 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
 
     stage("moving the bones")
     body = HyperelasticBody(nodes, tets, tissue)
+    boundary = TetMesh(nodes, tets).boundary_triangles()
+    lips, bared = None, opened.bared
+    if slit is not None:
+        lips = LipContact(nodes, *lips_of(slit, nodes, boundary, node_areas(nodes, boundary)))
+        bared = np.union1d(bared, np.concatenate([lips.upper.nodes, lips.lower.nodes]))
     operation = operate(
         nodes,
         tets,
-        TetMesh(nodes, tets).boundary_triangles(),
+        boundary,
         opened.kinds,
         distances=distances,
         centres={name: np.asarray(s.surface.vertices).mean(axis=0) for name, s in segments.items()},
         plan=motions,
-        bared=opened.bared,
+        bared=bared,
     )
-    found = find_equilibrium(body, operation.held, operation.path, operation.contact, options)
+    contact: Contact = operation.contact
+    if lips is not None and lip_contact:
+        contact = ContactSum((operation.contact, lips))
+    found = find_equilibrium(body, operation.held, operation.path, contact, options)
 
     stage("carrying the skin along")
     before = head.surface("skin", skin_spacing)
@@ -203,6 +239,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
         operation=operation,
         volume_ratios=body.volume_ratios(found.displacements),
         last_step=float(np.linalg.norm(found.last_step[on_skin], axis=1).max()),
+        lips=lips,
     )
 
 
@@ -235,13 +272,18 @@ def _opened(
     motions: Mapping[str, Floats],
     *,
     gap: float,
+    open_mouth: bool,
 ) -> _Opened:
-    """The largest body that is left without what lies between tooth rows and parted bones."""
-    kept = without_gaps(nodes, tets, distances, motions)
-    upper = distances.get("maxilla", distances.get("cranium"))
-    lower = distances.get("mandible_body", distances.get("mandible"))
-    if upper is not None and lower is not None:
-        kept &= without_bite(nodes, tets, upper, lower, gap)
+    """The largest body that is left without what lies between tooth rows and parted bones.
+
+    Where the mouth is open already, nothing is taken from between the jaws.
+    """
+    upper = next((name for name in ("maxilla", "cranium") if name in distances), None)
+    lower = next((name for name in ("mandible_body", "mandible") if name in distances), None)
+    jaws = tuple(name for name in (upper, lower) if name is not None)
+    kept = without_gaps(nodes, tets, distances, motions, jaws if open_mouth else ())
+    if upper is not None and lower is not None and not open_mouth:
+        kept &= without_bite(nodes, tets, distances[upper], distances[lower], gap)
     bared = np.zeros(len(nodes), dtype=bool)
     bared[tets[~kept]] = True
     tets = tets[kept]

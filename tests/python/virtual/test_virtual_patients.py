@@ -256,11 +256,11 @@ def test_a_screw_ends_with_the_whole_motion_and_starts_with_none():
     assert np.abs(half @ half - matrix[:3, :3]).max() < 1e-12
 
 
-def test_the_four_patients_differ():
-    """Four people, four operations, muscles other than those that the phantom draws."""
-    assert sorted(PATIENTS) == [1, 2, 3, 4]
-    assert len({patient.parameters for patient in PATIENTS.values()}) == 4
-    assert len({patient.label for patient in PATIENTS.values()}) == 4
+def test_the_patients_differ():
+    """Six people, six operations, muscles other than those that the phantom draws."""
+    assert sorted(PATIENTS) == [1, 2, 3, 4, 5, 6]
+    assert len({patient.parameters for patient in PATIENTS.values()}) == 6
+    assert len({patient.label for patient in PATIENTS.values()}) == 6
     for patient in PATIENTS.values():
         assert (patient.muscle_thickness, patient.muscle_stiffness) != (1.0, 1.0)
         assert replace(patient.parameters) == patient.parameters
@@ -268,14 +268,14 @@ def test_the_four_patients_differ():
 
 def test_bad_input_is_named(tmp_path, capsys):
     """Number, length and seed out of range, before any work."""
-    with pytest.raises(CaseInputError, match="patient is 5: 1, 2, 3, 4"):
-        cmfsim.write_virtual_patient(tmp_path, 5)
+    with pytest.raises(CaseInputError, match="patient is 7: 1, 2, 3, 4, 5, 6"):
+        cmfsim.write_virtual_patient(tmp_path, 7)
     with pytest.raises(CaseInputError, match="edge_length"):
         cmfsim.write_virtual_patient(tmp_path, 1, edge_length=-1.0)
     with pytest.raises(CaseInputError, match=r"seed is 0.5"):
         cmfsim.write_virtual_patient(tmp_path, 1, seed=0.5)
-    assert main(["virtual-patients", str(tmp_path), "--patients", "7"]) == 2
-    assert "patient is 7" in capsys.readouterr().err
+    assert main(["virtual-patients", str(tmp_path), "--patients", "8"]) == 2
+    assert "patient is 8" in capsys.readouterr().err
     nodes, tets = meshes.box((1, 1, 1))
     with pytest.raises(CaseInputError, match="displacements for"):
         carried(nodes, nodes, tets, nodes[:3])
