@@ -5,7 +5,9 @@
 //! boundary of the tissue itself, deformed with it. Solved by the method of multipliers (Hestenes 1969, Powell
 //! 1969; for inequalities Rockafellar 1973; for contact Simo & Laursen 1992): each round takes the least of
 //!
-//!     E(u) + Σ ½ k (g(u) − λ/k)²     over the nodes with λ − k g > 0,
+//! ```text
+//! E(u) + Σ ½ k (g(u) − λ/k)²     over the nodes with λ − k g > 0,
+//! ```
 //!
 //! g linearised at the last state, and follows it by λ ← max(0, λ − k g). The stiffness k only says how many rounds
 //! it takes: forces and gaps at the end do not depend on it.
