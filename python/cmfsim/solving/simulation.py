@@ -55,21 +55,36 @@ def scene_solver(scene: Scene) -> StaticSolver:
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
     options = scene.options.as_dict()
     tensors = MassTensors(mesh, _tissue(scene.tissue), element=options.pop("element"))
+    boundary = _boundary(scene)
+    if boundary.conflicts:
+        _log.warning("%d nodes had two kinds; the stronger one was kept", boundary.conflicts)
+    solver = StaticSolver(tensors, boundary, options.pop("method"), **options)
+    _log.info("solver: %s, %d unknowns", solver.method, solver.n_unknowns)
+    return solver
+
+
+def _boundary(scene: Scene) -> Boundary:
+    """What holds and moves the nodes of a scene."""
     segments = scene.segments.items()
     sliding = {name: s.sliding for name, s in segments if np.size(s.sliding)}
-    boundary = Boundary(
+    # A scene without one-sided contact does not pay for it.
+    one_sided: dict[str, Any] = {}
+    if scene.touching:
+        one_sided["touching"] = [(touch.nodes, touch.triangles) for touch in scene.touching]
+    if scene.obstacles:
+        one_sided["obstacles"] = [
+            (obstacle.nodes, obstacle.segment, _surface(obstacle.surface))
+            for obstacle in scene.obstacles
+        ]
+    return Boundary(
         fixed=scene.fixed,
         joined={name: s.joined for name, s in segments if np.size(s.joined)},
         sliding=sliding,
         contact={name: _surface(s.contact) for name, s in segments if s.contact is not None},
         gap={name: s.gap for name, s in segments if name in sliding},
         conflicts=scene.conflicts,
+        **one_sided,
     )
-    if boundary.conflicts:
-        _log.warning("%d nodes had two kinds; the stronger one was kept", boundary.conflicts)
-    solver = StaticSolver(tensors, boundary, options.pop("method"), **options)
-    _log.info("solver: %s, %d unknowns", solver.method, solver.n_unknowns)
-    return solver
 
 
 def scene_plan(scene: Scene) -> dict[str, NDArray[np.float64] | SurfaceMotion]:

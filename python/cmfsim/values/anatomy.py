@@ -27,6 +27,7 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.scene import SurfaceData
 
 __all__ = [
+    "LIPS",
     "NODE_KINDS",
     "SEVERITIES",
     "SHEET_DEPTH",
@@ -35,6 +36,7 @@ __all__ = [
     "DentalArch",
     "Finding",
     "ImageData",
+    "LipRegion",
     "NodeKinds",
 ]
 
@@ -42,6 +44,7 @@ SEVERITIES = ("error", "warning", "note")
 # Kinds of node (paper 2.5), by the number that files hold.
 NODE_KINDS = ("free", "fixed", "joined", "sliding")
 JAWS = ("upper", "lower")
+LIPS = ("upper", "lower")
 # Half the width, and the length, of the smallest arch, mm: less is landmarks exchanged or in cm.
 LEAST_ARCH = 2.0
 # How far a node that slides lies from its contact sheet at most, mm: what lies deeper behind is on
@@ -360,3 +363,29 @@ class NodeKinds(Frozen):
             check_one_of("segment", segment, self.segments)
             chosen &= self.segment == self.segments.index(segment)
         return np.flatnonzero(chosen).astype(np.uint32)
+
+
+@dataclass(frozen=True, eq=False)
+class LipRegion(Frozen):
+    """One lip on the boundary of a mesh that was separated between the lips.
+
+    Attributes
+    ----------
+    triangles : (t, 3) uint32
+        Skin and red of the lip, the face that it turns to the other lip, and the one towards the
+        teeth: mesh nodes, outward, one connected patch from corner to corner of the mouth.
+    nodes : (n,) uint32
+        Free nodes of the triangles that the other lip has not, ascending.
+    released : mapping of str to (k,) uint32
+        Those of the nodes that lie on a segment and would slide on it, by segment: they may lift
+        off.
+    """
+
+    triangles: NDArray[np.uint32]
+    nodes: NDArray[np.uint32]
+    released: Mapping[str, NDArray[np.uint32]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("triangles", "nodes"):
+            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), np.uint32)))
+        object.__setattr__(self, "released", MappingProxyType(dict(self.released)))

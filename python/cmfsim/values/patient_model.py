@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.checks import Floats, Indices
 from cmfsim.errors import CaseInputError
 from cmfsim.surfaces.levels import surface_of_level
-from cmfsim.values.anatomy import Anatomy, BoneSegment, Finding, NodeKinds
+from cmfsim.values.anatomy import Anatomy, BoneSegment, Finding, LipRegion, NodeKinds
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.scene import MovedSurface, Scene, SurfaceData, TissueData
 
@@ -54,6 +54,8 @@ class PatientModel(Frozen):
         Unit direction of the fibres of each tet; zero where there is no muscle.
     landmarks : mapping of str to mapping of str to (3,) float64, mm
         "skull" and "skin", where given.
+    lips : mapping of str to LipRegion
+        "upper" and "lower", where the mesh was separated between them.
     findings : tuple of Finding
         What every stage noticed.
     summary : mapping
@@ -72,6 +74,7 @@ class PatientModel(Frozen):
     fraction: Floats | None = None
     fibre: Floats | None = None
     landmarks: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
+    lips: Mapping[str, LipRegion] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
 

@@ -35,12 +35,14 @@ from cmfsim.values.motion import rigid_matrix
 
 __all__ = [
     "MovedSurface",
+    "ObstacleData",
     "Scene",
     "SceneResult",
     "SegmentData",
     "SolverOptions",
     "SurfaceData",
     "TissueData",
+    "TouchingData",
 ]
 
 
@@ -257,6 +259,71 @@ class SegmentData(Frozen):
         object.__setattr__(self, "gap", frozen(gap))
 
 
+@dataclass(frozen=True, eq=False)
+class TouchingData(Frozen):
+    """Nodes that may not enter other tissue: of one lip, before the surface of the other.
+
+    Contact is one-sided and without friction: nodes may lift off.
+
+    Attributes
+    ----------
+    nodes : (k,) uint32
+        Free or sliding.
+    triangles : (t, 3) uint32
+        Nodes of the mesh, on its boundary, outward; they deform with the tissue.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.TouchingData(nodes=[7, 9], triangles=[[0, 1, 2]]).nodes.tolist()
+    [7, 9]
+    """
+
+    nodes: ArrayLike
+    triangles: ArrayLike
+
+    def __post_init__(self) -> None:
+        nodes = as_indices("nodes that touch", self.nodes)
+        corners = np.asarray(self.triangles)
+        count = 1 + int(corners.max(initial=0)) if corners.dtype.kind in "iu" else 0
+        triangles = as_index_rows("triangles that are touched", corners, 3, count, "nodes")
+        object.__setattr__(self, "nodes", nodes)
+        object.__setattr__(self, "triangles", triangles)
+
+
+@dataclass(frozen=True, eq=False)
+class ObstacleData(Frozen):
+    """Nodes that may not enter behind a surface that moves with a segment: lips before teeth.
+
+    Contact is one-sided and without friction: nodes may lift off. Behind the border of an open
+    surface there is no contact.
+
+    Attributes
+    ----------
+    nodes : (k,) uint32
+    segment : str
+        Segment of the scene, with nodes of its own or without.
+    surface : SurfaceData
+        At rest, outward.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> teeth = cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    >>> cmfsim.ObstacleData(nodes=[7, 9], segment="maxilla", surface=teeth).segment
+    'maxilla'
+    """
+
+    nodes: ArrayLike
+    segment: str
+    surface: SurfaceData
+
+    def __post_init__(self) -> None:
+        as_text("segment of an obstacle", self.segment)
+        check_instance("surface of an obstacle", self.surface, SurfaceData)
+        object.__setattr__(self, "nodes", as_indices("nodes before an obstacle", self.nodes))
+
+
 @dataclass(frozen=True)
 class SolverOptions:
     """How a scene is solved; the defaults are those of `MassTensors` and `StaticSolver`.
@@ -349,6 +416,10 @@ class Scene(Frozen):
     options : SolverOptions
     conflicts : str
         "error", or "resolve": fixed wins over joined, joined over sliding.
+    touching : tuple of TouchingData
+        Tissue that may not enter other tissue.
+    obstacles : tuple of ObstacleData
+        Tissue that may not enter segments.
 
     Raises
     ------
@@ -382,6 +453,8 @@ class Scene(Frozen):
     loads: ArrayLike | None = None
     options: SolverOptions = field(default_factory=SolverOptions)
     conflicts: str = "error"
+    touching: tuple[TouchingData, ...] = ()
+    obstacles: tuple[ObstacleData, ...] = ()
 
     def __post_init__(self) -> None:
         nodes = as_rows("nodes", self.nodes, 3)
@@ -411,6 +484,24 @@ class Scene(Frozen):
         object.__setattr__(self, "loads", loads)
         object.__setattr__(self, "segments", MappingProxyType(dict(self.segments)))
         object.__setattr__(self, "plan", MappingProxyType(self._checked_plan()))
+        self._check_contact(len(nodes))
+
+    def _check_contact(self, n_nodes: int) -> None:
+        """One-sided contact: nodes of the mesh, and segments that there are."""
+        object.__setattr__(self, "touching", tuple(self.touching))
+        object.__setattr__(self, "obstacles", tuple(self.obstacles))
+        for number, touch in enumerate(self.touching):
+            check_instance(f"touching[{number}]", touch, TouchingData)
+            as_indices(f"touching[{number}] nodes", touch.nodes, n_nodes)
+            as_index_rows(f"touching[{number}] triangles", touch.triangles, 3, n_nodes, "nodes")
+        for number, obstacle in enumerate(self.obstacles):
+            check_instance(f"obstacles[{number}]", obstacle, ObstacleData)
+            as_indices(f"obstacles[{number}] nodes", obstacle.nodes, n_nodes)
+            if obstacle.segment not in self.segments:
+                known = ", ".join(repr(s) for s in self.segments) or "none"
+                raise CaseInputError(
+                    f"obstacles[{number}] is of segment {obstacle.segment!r}; segments are: {known}"
+                )
 
     def _checked_plan(self) -> dict[str, Floats | MovedSurface]:
         for name in self.plan:
@@ -470,11 +561,21 @@ class Scene(Frozen):
             tissue["law"] = self.tissue.law
         elif self.tissue.kind == "preset":
             tissue |= {"preset": self.tissue.preset, "mixing": self.tissue.mixing}
+        # A scene without one-sided contact has the content, and the hash, that it has always had.
+        contact: dict[str, Any] = {}
+        if self.touching:
+            contact["touching"] = len(self.touching)
+        if self.obstacles:
+            contact["obstacles"] = [
+                {"segment": obstacle.segment, "crease_angle": obstacle.surface.crease_angle}
+                for obstacle in self.obstacles
+            ]
         return {
             "tissue": tissue,
             "segments": segments,
             "conflicts": self.conflicts,
             "solver": self.options.header(),
+            **contact,
         }
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -506,6 +607,13 @@ class Scene(Frozen):
                 yield f"{key}.motion.moved_vertices", np.asarray(motion.moved_vertices)
             else:
                 yield f"{key}.motion", np.asarray(motion)
+        for number, touch in enumerate(self.touching):
+            yield f"touching.{number}.nodes", np.asarray(touch.nodes)
+            yield f"touching.{number}.triangles", np.asarray(touch.triangles)
+        for number, obstacle in enumerate(self.obstacles):
+            yield f"obstacle.{number}.nodes", np.asarray(obstacle.nodes)
+            yield f"obstacle.{number}.vertices", np.asarray(obstacle.surface.vertices)
+            yield f"obstacle.{number}.triangles", np.asarray(obstacle.surface.triangles)
 
     def sha256(self) -> str:
         """The SHA-256 of the scene's content, the same from whichever file it was read."""

@@ -30,6 +30,7 @@ from cmfsim.doctor.landmarks import (
 )
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Case, CaseOrPath, as_case, write_model
+from cmfsim.lips import seam_faces
 from cmfsim.meshing import (
     MeshReport,
     report_of_part,
@@ -54,13 +55,20 @@ from cmfsim.pipeline.building.inputs import (
     read_anatomy,
     read_case_landmarks,
 )
+from cmfsim.pipeline.building.lips import (
+    CaseLipContact,
+    find_seam,
+    lip_contact,
+    lip_summary,
+    separated_at_seam,
+)
 from cmfsim.pipeline.building.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.skin_part import on_skin
 from cmfsim.pipeline.building.tissue_mesh import end_planes, region_of, tissue_mesh
 from cmfsim.values.anatomy import NODE_KINDS, Anatomy, BoneSegment, Finding, NodeKinds
 from cmfsim.values.patient_model import PatientModel
-from cmfsim.values.scene import MovedSurface, Scene, SurfaceData
+from cmfsim.values.scene import MovedSurface, Scene, SegmentData, SurfaceData
 
 __all__ = ["build_case", "build_model"]
 
@@ -199,12 +207,20 @@ def build_model(
     level, noticed = tissue_level(anatomy, region)
     findings += noticed
 
+    arches = None
+    if options.sliding or case.lips.contact:
+        arches = dental_arches(anatomy, bones.segments, skull)
+    seam = None
+    if case.lips.contact:
+        stages.begin("finding the seam between the lips")
+        seam = find_seam(case, anatomy, arches, landmarks.get("skin", {}))
+        findings += seam.findings
+
     stages.begin("filling the tissue with tets")
-    mesh, report, noticed = tissue_mesh(case, level, anatomy)
+    mesh, report, noticed = tissue_mesh(case, level, anatomy, seam)
     findings += noticed
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
 
-    arches = dental_arches(anatomy, bones.segments, skull) if options.sliding else None
     contacts = CaseContacts()
     if arches is not None:
         stages.begin("making the contact sheets")
@@ -232,7 +248,22 @@ def build_model(
         findings += noticed
     mesh, kinds, noticed = held_part(mesh, kinds)
     findings += noticed
-    if mesh.n_tets < whole:
+    lips = CaseLipContact({}, kinds)
+    if seam is not None:
+        stages.begin("separating the lips")
+        mesh, kinds, noticed = separated_at_seam(mesh, kinds, seam)
+        findings += noticed
+        lips = lip_contact(
+            mesh,
+            kinds,
+            seam,
+            height=case.lips.height,
+            arches=arches,
+            contacts=contacts,
+            segments=bones.segments,
+        )
+        kinds = lips.kinds
+    if mesh.n_tets < whole or lips.regions:
         report = report_of_part(mesh, report)
     findings += end_findings(
         np.asarray(mesh.nodes),
@@ -248,10 +279,14 @@ def build_model(
 
     stages.begin("assembling the scene")
     slid = contacts.of_scene(bones.segments, kinds)
-    scene = _scene(case, mesh, kinds, bones, slid)
+    scene = _scene(case, mesh, kinds, bones, slid, lips)
     departures = contacts.summary(bones.segments, kinds, np.asarray(mesh.nodes), slid)
     boundary = np.asarray(mesh.boundary_triangles())
-    skin = boundary[on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)]
+    is_skin = on_skin(np.asarray(mesh.nodes), boundary, anatomy, level)
+    if lips.regions:
+        # What the lips turn to each other is inside the mouth.
+        is_skin &= ~seam_faces(mesh.nodes, boundary)
+    skin = boundary[is_skin]
     stages.end()
     patient = PatientModel(
         name=case.name,
@@ -263,10 +298,12 @@ def build_model(
         anatomy=anatomy,
         fat=case.tissue,
         landmarks=landmarks,
+        lips=lips.regions,
         findings=tuple(findings),
         summary={
             **_summary(case, kinds, report, anatomy, findings, stages.seconds, cut.procedures),
             "contact": departures,
+            **({} if seam is None else {"lips": lip_summary(seam, lips)}),
             **({} if bones.achieved is None else {"achieved": bones.achieved.as_dict()}),
             "plan_sources": dict(bones.sources),
         },
@@ -285,7 +322,9 @@ def _draw(model: PatientModel, folder: Path) -> list[str]:
     anatomy, kinds = folder / "anatomy.png", folder / "node_kinds.png"
     try:
         picture_anatomy(anatomy, model.skin, model.segments)
-        picture_node_kinds(kinds, model.scene.nodes, model.boundary_triangles, model.kinds)
+        picture_node_kinds(
+            kinds, model.scene.nodes, model.boundary_triangles, model.kinds, lips=model.lips
+        )
     except CmfsimError as error:
         _log.warning("no pictures: %s", error)
     return [path.name for path in (anatomy, kinds) if path.exists()]
@@ -462,8 +501,11 @@ def _scene(
     kinds: NodeKinds,
     bones: PlannedBones,
     contacts: Mapping[str, SurfaceData],
+    lips: CaseLipContact,
 ) -> Scene:
     data = segment_data(kinds, bones.segments, contacts=contacts)
+    # Teeth that no node is attached to or slides on may still be before the lips.
+    data |= {o.segment: SegmentData() for o in lips.obstacles if o.segment not in data}
     plan = {name: bones.motions.get(name, np.eye(4)) for name in data}
     return Scene(
         nodes=mesh.nodes,
@@ -473,6 +515,8 @@ def _scene(
         plan=plan,
         fixed=kinds.nodes("fixed"),
         options=case.solver,
+        touching=lips.touching,
+        obstacles=lips.obstacles,
     )
 
 
