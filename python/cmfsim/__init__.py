@@ -124,6 +124,11 @@ __getattr__, __dir__, __all__ = deferred(
             "write_surface",
             "write_transform",
         ),
+        "lips": (
+            "LipSeam",
+            "lip_regions",
+            "lip_seam",
+        ),
         "meshing": (
             "MeshOptions",
             "MeshReport",
@@ -252,6 +257,7 @@ __getattr__, __dir__, __all__ = deferred(
             "DentalArch",
             "Finding",
             "ImageData",
+            "LipRegion",
             "NodeKinds",
         ),
         "values.case_parts": ("CaseMuscles",),
@@ -278,12 +284,14 @@ __getattr__, __dir__, __all__ = deferred(
         ),
         "values.scene": (
             "MovedSurface",
+            "ObstacleData",
             "Scene",
             "SceneResult",
             "SegmentData",
             "SolverOptions",
             "SurfaceData",
             "TissueData",
+            "TouchingData",
         ),
         "virtual": (
             "virtual_patients",

@@ -108,6 +108,7 @@ from cmfsim.io import (
     write_surface,
     write_transform,
 )
+from cmfsim.lips import LipSeam, lip_regions, lip_seam
 from cmfsim.meshing import (
     MeshOptions,
     MeshReport,
@@ -187,7 +188,15 @@ from cmfsim.study import SensitivityReport, StudyReport, landmark_trials, run_st
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
 from cmfsim.surfaces.levels import contact_surface
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
-from cmfsim.values.anatomy import Anatomy, BoneSegment, DentalArch, Finding, ImageData, NodeKinds
+from cmfsim.values.anatomy import (
+    Anatomy,
+    BoneSegment,
+    DentalArch,
+    Finding,
+    ImageData,
+    LipRegion,
+    NodeKinds,
+)
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion, planned_motion
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
@@ -197,12 +206,14 @@ from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.scene import (
     MovedSurface,
+    ObstacleData,
     Scene,
     SceneResult,
     SegmentData,
     SolverOptions,
     SurfaceData,
     TissueData,
+    TouchingData,
 )
 from cmfsim.virtual import virtual_patients, write_virtual_patient
 
@@ -259,6 +270,8 @@ __all__ = [
     "LandmarkAgreement",
     "LandmarkError",
     "LandmarkMatch",
+    "LipRegion",
+    "LipSeam",
     "MassTensors",
     "MatchOptions",
     "MaterialError",
@@ -279,6 +292,7 @@ __all__ = [
     "MuscleVolume",
     "Musculature",
     "NodeKinds",
+    "ObstacleData",
     "PageContent",
     "PairedTest",
     "PatientModel",
@@ -318,6 +332,7 @@ __all__ = [
     "TissueData",
     "TissueMesh",
     "TissueRegion",
+    "TouchingData",
     "VolumeAlignment",
     "__version__",
     "achieved_plan",
@@ -352,6 +367,8 @@ __all__ = [
     "kind_options",
     "landmark_trials",
     "leave_one_out",
+    "lip_regions",
+    "lip_seam",
     "make_head",
     "match_landmarks",
     "measure_face",

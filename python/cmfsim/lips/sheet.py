@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.checks import Floats
-from cmfsim.lips.crease import MouthLine, SkinProfiles, smoothed, solid
+from cmfsim.lips.crease import MIDDLE, MouthLine, SkinProfiles, smoothed, solid
 from cmfsim.lips.frame import MouthFrame
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.scene import SurfaceData
@@ -56,7 +56,8 @@ class LipSheet:
     thickness : float, mm
         Median length of its rows from the mouth's line to the arches: the thickness of the lips.
     opening : float, mm
-        Median height of the gap between the lips behind the line's edges, 0 where they are closed.
+        Median height of the gap between the lips in the middle of the mouth, close to its end; 0
+        where they are closed.
     """
 
     surface: SurfaceData
@@ -156,7 +157,7 @@ def _in_front(profiles: SkinProfiles, line: MouthLine) -> Floats:
 def _heights(
     anatomy: Anatomy, frame: MouthFrame, line: MouthLine, plane: Floats, away: Floats
 ) -> tuple[Floats, float]:
-    """The heights of the sheet at places of the plane, and the opening of the lips, mm."""
+    """The heights of the sheet at places of the plane, and the opening in its middle, mm."""
     n_columns, n_rows = plane.shape[:2]
     count = round(0.5 * HIGHEST_GAP / FINE)
     fine = np.linspace(-count * FINE, count * FINE, 2 * count + 1)
@@ -181,7 +182,8 @@ def _heights(
             end = away[column, known[-1]]
             inner = known[away[column, known] <= end - WITHIN]
             deep = len(inner) and end - away[column, known[0]] >= LEAST_GAP
-            sizes.append(float((high - low)[column, inner[-1]]) if deep else 0.0)
+            if abs(line.across[column] - line.across.mean()) <= MIDDLE:
+                sizes.append(float((high - low)[column, inner[-1]]) if deep else 0.0)
         heights[column] = line.heights[column] + offset
     even = np.ones(n_columns)
     smooth = np.stack([smoothed(heights[:, k], even, SMOOTH) for k in range(n_rows)], axis=1)

@@ -73,8 +73,8 @@ CLEFT = 4.0
 LIP_CONTACT = False
 # Ways to find the seam between the lips, besides a surface.
 LIP_SEAMS = ("auto", "landmarks")
-# How far it goes on past the teeth, mm: through the tissue between their rows.
-LIP_DEPTH = 4.0
+# How far it goes on past the front of the teeth, mm: through the tissue between their rows.
+LIP_DEPTH = 8.0
 # How far from it a lip reaches, mm: over its red, and inside to the roots of the front teeth.
 LIP_HEIGHT = 13.0
 
