@@ -181,6 +181,7 @@ def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneRes
         "contact_converged": solution.contact_converged,
         "contact_iterations": solution.contact_iterations,
         "inverted_tets": inverted,
+        **_touching(scene, solution),
         "findings": findings,
         "factor_bytes": solver.factor_bytes,
         "timings": {"set_up": dict(solver.timings), "solve": dict(solution.timings)},
@@ -218,21 +219,47 @@ def _inverted(solver: StaticSolver, solution: Solution) -> tuple[int | None, lis
     return count, [] if found is None else [_told(found)]
 
 
+def _touching(scene: Scene, solution: Solution) -> dict[str, dict[str, Any]]:
+    """What a result states of one-sided contact; nothing where the scene has none."""
+    if not scene.touching and not scene.obstacles:
+        return {}
+    return {
+        "touching": {
+            "pressed": int(np.count_nonzero(np.asarray(solution.touching_forces) > 0.0)),
+            "penetration": _finite(solution.penetration),
+            "rounds": solution.touching_rounds,
+            "converged": solution.touching_converged,
+        }
+    }
+
+
 def _contact_findings(solution: Solution) -> list[dict[str, str]]:
     """That contact stopped above its tolerance, with figures that no face would show."""
-    if solution.contact_converged:
-        return []
-    found = Finding(
-        "warning",
-        "contact-stopped",
-        f"contact stopped after {solution.contact_iterations} steps with gaps of "
-        f"{solution.contact_gap:.1e} mm and nodes {solution.contact_unbalanced:.1e} mm out of "
-        "balance",
-        "contact",
-        "the tolerance asks for less, though no face would show it",
-        "allow more contact_iterations or a larger contact_tolerance, or smooth the surface",
-    )
-    return [_told(found)]
+    findings = []
+    if not solution.contact_converged:
+        found = Finding(
+            "warning",
+            "contact-stopped",
+            f"contact stopped after {solution.contact_iterations} steps with gaps of "
+            f"{solution.contact_gap:.1e} mm and nodes {solution.contact_unbalanced:.1e} mm out of "
+            "balance",
+            "contact",
+            "the tolerance asks for less, though no face would show it",
+            "allow more contact_iterations or a larger contact_tolerance, or smooth the surface",
+        )
+        findings.append(_told(found))
+    if not solution.touching_converged:
+        found = Finding(
+            "warning",
+            "touching-stopped",
+            f"one-sided contact stopped after {solution.touching_rounds} rounds with tissue "
+            f"{solution.penetration:.1e} mm deep in other tissue or bone",
+            "contact",
+            "what touches may have changed had it gone on",
+            "look at the lips in the result; a smaller motion or a smoother surface converges",
+        )
+        findings.append(_told(found))
+    return findings
 
 
 def _told(found: Finding) -> dict[str, str]:
