@@ -53,7 +53,7 @@ PYTHON: tuple[frozenset[str], ...] = tuple(
         "io registration surfaces",
         "phantom",
         # The stages: none knows another.
-        "bones evaluation imaging meshing muscles node_kinds solving",
+        "bones evaluation imaging lips meshing muscles node_kinds solving",
         "doctor pictures planning report",
         "pipeline",
         "bench study virtual",

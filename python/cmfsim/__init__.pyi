@@ -95,6 +95,9 @@ from cmfsim.io import write_result as write_result
 from cmfsim.io import write_scene as write_scene
 from cmfsim.io import write_surface as write_surface
 from cmfsim.io import write_transform as write_transform
+from cmfsim.lips import LipSeam as LipSeam
+from cmfsim.lips import lip_regions as lip_regions
+from cmfsim.lips import lip_seam as lip_seam
 from cmfsim.meshing import MeshOptions as MeshOptions
 from cmfsim.meshing import MeshReport as MeshReport
 from cmfsim.meshing import TissueMesh as TissueMesh
@@ -193,6 +196,7 @@ from cmfsim.values.dental_arch import DentalArch as DentalArch
 from cmfsim.values.finding import Finding as Finding
 from cmfsim.values.image_data import ImageData as ImageData
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS as SKULL_LANDMARKS
+from cmfsim.values.lip_region import LipRegion as LipRegion
 from cmfsim.values.motion import RigidMotion as RigidMotion
 from cmfsim.values.motion import decompose_motion as decompose_motion
 from cmfsim.values.motion import rigid_matrix as rigid_matrix
@@ -210,5 +214,7 @@ from cmfsim.values.solver_options import SolverOptions as SolverOptions
 from cmfsim.values.surface_data import MovedSurface as MovedSurface
 from cmfsim.values.surface_data import SurfaceData as SurfaceData
 from cmfsim.values.tissue_data import TissueData as TissueData
+from cmfsim.values.touching import ObstacleData as ObstacleData
+from cmfsim.values.touching import TouchingData as TouchingData
 from cmfsim.virtual import virtual_patients as virtual_patients
 from cmfsim.virtual import write_virtual_patient as write_virtual_patient

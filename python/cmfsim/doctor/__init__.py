@@ -15,6 +15,7 @@ from types import MappingProxyType
 from cmfsim.doctor.after import check_after
 from cmfsim.doctor.ends import check_ends
 from cmfsim.doctor.evidence import gather
+from cmfsim.doctor.lips import check_lips
 from cmfsim.doctor.moved import check_moved
 from cmfsim.doctor.operation import check_cuts, check_plan, pieces_of
 from cmfsim.doctor.placement import check_placement
@@ -104,7 +105,7 @@ def examine(case: CaseOrPath, models: Sequence[str] | None = None) -> Examinatio
     """
     case = as_case(case)
     evidence = gather(case)
-    findings = [*evidence.findings, *check_cuts(evidence)]
+    findings = [*evidence.findings, *check_cuts(evidence), *check_lips(evidence)]
     placement = check_placement(evidence)
     findings += placement
     findings += [*check_image(evidence), *check_surfaces(evidence)]

@@ -165,6 +165,8 @@ def gather(case: Case) -> Evidence:
     skin_points = _landmarks(case, "landmarks.skin", case.landmarks.skin, findings)
     if case.mesh.parting is not None:
         _check_file(case, "mesh.parting.surface", case.mesh.parting, findings)
+    if case.lips.contact and isinstance(case.lips.seam, Path):
+        _check_file(case, "lips.seam", case.lips.seam, findings)
     if case.mesh.file is not None:
         _check_file(case, "mesh.file", case.mesh.file, findings)
     after = case.postoperative

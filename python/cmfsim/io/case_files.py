@@ -19,10 +19,12 @@ from cmfsim.io.transforms import DIRECTION_CHOICE, is_itk_file, motion_in_lps
 from cmfsim.values.case_parts import (
     DIRECTIONS,
     FRAMES,
+    LIP_SEAMS,
     PROCEDURES,
     UNITS,
     CaseImage,
     CaseLandmarks,
+    CaseLips,
     CaseMesh,
     CaseMotion,
     CaseMuscles,
@@ -53,6 +55,7 @@ TABLES = (
     "landmarks",
     "region",
     "mesh",
+    "lips",
     "osteotomies",
     "plan",
     "node_kinds",
@@ -67,6 +70,9 @@ SAMPLES = (1, 100_000)
 # Edge lengths that make a mesh of a head, mm: below, more tets than any memory; above, no face.
 EDGE_LENGTHS = (0.3, 30.0)
 MOST_CLEFT = 20.0
+# How far the seam between the lips may go on past the teeth, and lips may reach from it, mm.
+MOST_LIP_DEPTH = 20.0
+LIP_HEIGHTS = (3.0, 30.0)
 # CT values above this are clipped, HU.
 MOST_HU = 4000.0
 # What takes the values of an image to HU: images from 0 to 1 have a slope of some 4000.
@@ -93,6 +99,7 @@ class Case:
     landmarks : CaseLandmarks
     region : Region
     mesh : CaseMesh
+    lips : CaseLips
     osteotomies : tuple of CaseOsteotomy
         In the order in which they are made.
     plan : mapping of str to CaseMotion
@@ -126,6 +133,7 @@ class Case:
     landmarks: CaseLandmarks = field(default_factory=CaseLandmarks)
     region: Region = field(default_factory=Region)
     mesh: CaseMesh = field(default_factory=CaseMesh)
+    lips: CaseLips = field(default_factory=CaseLips)
     osteotomies: tuple[CaseOsteotomy, ...] = ()
     plan: Mapping[str, CaseMotion] = field(default_factory=dict)
     achieved: bool = False
@@ -264,6 +272,7 @@ def _read(path: Path) -> Case:
         landmarks=_landmarks(document.table("landmarks"), folder),
         region=_region(document.table("region")),
         mesh=_mesh(document.table("mesh"), folder),
+        lips=_lips(document, folder),
         osteotomies=_osteotomies(document),
         plan={} if _is_achieved(document) else _plan(document, folder),
         achieved=_is_achieved(document),
@@ -423,6 +432,29 @@ def _mesh(table: Table, folder: Path) -> CaseMesh:
         default.cleft if cleft is None else cleft,
         None if parting is None else _file(parting, "surface", folder),
         _file_or_none(table, "file", folder),
+    )
+
+
+def _lips(document: Table, folder: Path) -> CaseLips:
+    """Whether and where lips are separated; a seam is a way to find it, or a surface."""
+    table = document.table("lips").only("contact", "seam", "depth", "height")
+    default = CaseLips()
+    contact = table.flag("contact", default=default.contact)
+    seam: Path | str = default.seam
+    if "seam" in table:
+        seam = table.text("seam")
+        if seam not in LIP_SEAMS:
+            seam = _file(table, "seam", folder)
+            if "parting" in document.table("mesh"):
+                table.fail("seam", "is a surface, as parting in [mesh] is: give one of them")
+    depth = table.number("depth", "mm", low=0.0, high=MOST_LIP_DEPTH)
+    low, high = LIP_HEIGHTS
+    height = table.number("height", "mm", low=low, high=high)
+    return CaseLips(
+        contact,
+        seam,
+        default.depth if depth is None else depth,
+        default.height if height is None else height,
     )
 
 

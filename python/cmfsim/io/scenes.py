@@ -28,6 +28,7 @@ from cmfsim.values.scene import Scene, SegmentData
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 from cmfsim.values.tissue_data import TISSUE_ARRAYS, TissueData
+from cmfsim.values.touching import ObstacleData, TouchingData
 
 __all__ = ["read_plan", "read_scene", "write_scene"]
 
@@ -37,7 +38,10 @@ SCENE_KEYS = (
     *("tissue", "segments", "plan", "solver"),
 )
 # Keys of the JSON text of an archive, and of an entry of its segments.
-ARCHIVE_KEYS = ("format", "version", "units", "tissue", "segments", "conflicts", "solver")
+ARCHIVE_KEYS = (
+    *("format", "version", "units", "tissue", "segments", "conflicts", "solver"),
+    *("touching", "obstacles"),
+)
 ENTRY_KEYS = ("name", "crease_angle", "gap", "motion", "motion_crease_angle")
 # Arrays of an archive, and of its segment number N as segment.N.…; a name that is none of these is
 # refused, for an array that may be absent would else be lost by one letter.
@@ -46,6 +50,12 @@ SEGMENT_ARRAYS = (
     *("joined", "sliding", "gap", "contact.vertices", "contact.triangles"),
     *("motion", "motion.vertices", "motion.triangles", "motion.moved_vertices"),
 )
+# The same of one-sided contact, as touching.N.… and obstacle.N.….
+TOUCHING_ARRAYS = ("nodes", "triangles")
+OBSTACLE_ARRAYS = ("nodes", "vertices", "triangles")
+OBSTACLE_KEYS = ("segment", "crease_angle")
+# More pairs of surfaces than any face has.
+MOST_CONTACTS = 1000
 PLAN_KEYS = ("format", "version", "name", "note", "units", "plan")
 # Texts of a tissue, beside its arrays.
 TISSUE_TEXTS = ("kind", "law", "preset", "mixing")
@@ -195,8 +205,11 @@ def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray
             plan[name] = MovedSurface(surface, member_of(members, f"{key}.motion.moved_vertices"))
         else:
             plan[name] = member_of(members, f"{key}.motion")
+    touching, obstacles = _one_sided(header, members)
     known = {
         "scene",
+        *(f"touching.{i}.{name}" for i in range(len(touching)) for name in TOUCHING_ARRAYS),
+        *(f"obstacle.{i}.{name}" for i in range(len(obstacles)) for name in OBSTACLE_ARRAYS),
         *ARCHIVE_ARRAYS,
         *(f"tissue.{name}" for name in TISSUE_ARRAYS[kind]),
         *(f"segment.{i}.{name}" for i in range(len(entries)) for name in SEGMENT_ARRAYS),
@@ -214,7 +227,34 @@ def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray
         loads=members.get("loads"),
         options=_options(header),
         conflicts=header.get("conflicts", "error"),
+        touching=touching,
+        obstacles=obstacles,
     )
+
+
+def _one_sided(
+    header: Mapping[str, Any], members: Mapping[str, NDArray[Any]]
+) -> tuple[tuple[TouchingData, ...], tuple[ObstacleData, ...]]:
+    """What tissue may not enter, as an archive holds it."""
+    count = header.get("touching", 0)
+    if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= MOST_CONTACTS:
+        raise CaseInputError(f"'touching' is {count!r}: a number from 0 to {MOST_CONTACTS}")
+    touching = tuple(
+        TouchingData(*(member_of(members, f"touching.{i}.{name}") for name in TOUCHING_ARRAYS))
+        for i in range(count)
+    )
+    entries = header.get("obstacles", [])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise CaseInputError("'obstacles' is not a list of tables")
+    obstacles = []
+    for number, entry in enumerate(entries):
+        known_keys(f"obstacles[{number}]", entry, OBSTACLE_KEYS)
+        nodes, vertices, triangles = (
+            member_of(members, f"obstacle.{number}.{name}") for name in OBSTACLE_ARRAYS
+        )
+        surface = SurfaceData(vertices, triangles, entry.get("crease_angle", 60.0))
+        obstacles.append(ObstacleData(nodes, entry.get("segment", ""), surface))
+    return touching, tuple(obstacles)
 
 
 def _tissue_kind(table: Mapping[str, Any]) -> str:

@@ -12,6 +12,7 @@ from cmfsim.checks import Floats, as_index_rows, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
 from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.surface_data import SurfaceData
 
@@ -28,6 +29,8 @@ SKIN_COLOUR = "#e3b7a0"
 KIND_COLOURS: Mapping[str, str] = MappingProxyType(
     {"fixed": "#f08cb4", "joined": "#f28500", "sliding": "#2f6fd0", "free": "#ffffff"}
 )
+# Their nodes that are not attached.
+LIP_COLOURS: Mapping[str, str] = MappingProxyType({"upper": "#8e3b9e", "lower": "#2a9d5c"})
 SEGMENT_COLOURS: Mapping[str, str] = MappingProxyType(
     {
         "cranium": "#e6dcc3",
@@ -131,6 +134,7 @@ def picture_node_kinds(
     boundary_triangles: ArrayLike,
     kinds: NodeKinds,
     *,
+    lips: Mapping[str, LipRegion] | None = None,
     size: tuple[int, int] = SIZE,
 ) -> None:
     """Writes a picture of the node kinds in the colours of Kim et al. (2010), Figure 4.
@@ -146,6 +150,9 @@ def picture_node_kinds(
     nodes : (n, 3) float64, mm
     boundary_triangles : (t, 3) uint32
     kinds : NodeKinds
+    lips : mapping of str to LipRegion, optional
+        "upper" and "lower": their nodes have colours of their own, and show where the free part is
+        left away.
     size : (int, int), pixels
 
     Raises
@@ -166,7 +173,11 @@ def picture_node_kinds(
         raise CaseInputError(f"kinds are of {len(kinds.kind)} nodes, but there are {len(points)}")
     if not len(triangles):
         raise CaseInputError("the mesh has no boundary triangles to draw")
-    held = (kinds.kind[triangles] > 0).any(axis=1)
+    shown_as = np.array(kinds.kind, dtype=np.intp)
+    for number, region in enumerate((lips or {}).values(), start=len(NODE_KINDS)):
+        shown_as[region.nodes] = number
+    held = (shown_as[triangles] > 0).any(axis=1)
+    colours = [KIND_COLOURS[name] for name in NODE_KINDS] + [LIP_COLOURS[n] for n in lips or {}]
     corners = bounds([points[np.unique(triangles)]])
     # What closes the mesh behind would hide all else from there: the rearmost cut is left out.
     edge = points[triangles[:, 0]] - points[triangles[:, 1]]
@@ -176,18 +187,22 @@ def picture_node_kinds(
         (f"{name} {len(kinds.nodes(name))}", KIND_COLOURS[name])
         for name in ("fixed", "joined", "sliding", "free")
     ]
+    entries += [
+        (f"{name} lip {len(region.nodes)}", LIP_COLOURS[name])
+        for name, region in (lips or {}).items()
+    ]
 
     def paint(plotter: Any, view: View) -> None:
         shown = triangles
         if view.bare:
             shown = triangles[held & ~closing]
-        for number, name in enumerate(NODE_KINDS):
-            corner = _corners_of_kind(points, shown, kinds.kind == number)
+        for number, colour in enumerate(colours):
+            corner = _corners_of_kind(points, shown, shown_as == number)
             if len(corner):
                 count = np.arange(3 * len(corner)).reshape(-1, 3)
                 plotter.add_mesh(
                     polydata(corner.reshape(-1, 3), count),
-                    color=KIND_COLOURS[name],
+                    color=colour,
                     ambient=0.25,
                     specular=0.0,
                 )

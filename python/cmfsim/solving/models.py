@@ -27,7 +27,8 @@ def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
     """The scene of a patient under one of the paper's four models.
 
     Homogeneous models have the patient's fat everywhere. Models without sliding move the nodes at
-    teeth and mucosa with their bone segment, as those that are joined to it.
+    teeth and mucosa with their bone segment, as those that are joined to it, and have no contact
+    of the lips, with each other or with the teeth.
 
     Parameters
     ----------
@@ -60,11 +61,12 @@ def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
         scene = replace(scene, tissue=patient.fat)
     if model.endswith("+S"):
         return scene
-    joined = {
-        name: SegmentData(joined=np.union1d(segment.joined, segment.sliding))
-        for name, segment in scene.segments.items()
-    }
-    return replace(scene, segments=joined)
+    joined = {}
+    for name, segment in scene.segments.items():
+        lifted = [lip.released[name] for lip in patient.lips.values() if name in lip.released]
+        nodes = np.concatenate([np.asarray(segment.joined), np.asarray(segment.sliding), *lifted])
+        joined[name] = SegmentData(joined=np.unique(nodes))
+    return replace(scene, segments=joined, touching=(), obstacles=())
 
 
 def predict_patient(

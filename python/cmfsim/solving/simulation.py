@@ -57,21 +57,36 @@ def scene_solver(scene: Scene) -> StaticSolver:
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
     options = scene.options.as_dict()
     tensors = MassTensors(mesh, _tissue(scene.tissue), element=options.pop("element"))
+    boundary = _boundary(scene)
+    if boundary.conflicts:
+        _log.warning("%d nodes had two kinds; the stronger one was kept", boundary.conflicts)
+    solver = StaticSolver(tensors, boundary, options.pop("method"), **options)
+    _log.info("solver: %s, %d unknowns", solver.method, solver.n_unknowns)
+    return solver
+
+
+def _boundary(scene: Scene) -> Boundary:
+    """What holds and moves the nodes of a scene."""
     segments = scene.segments.items()
     sliding = {name: s.sliding for name, s in segments if np.size(s.sliding)}
-    boundary = Boundary(
+    # A scene without one-sided contact does not pay for it.
+    one_sided: dict[str, Any] = {}
+    if scene.touching:
+        one_sided["touching"] = [(touch.nodes, touch.triangles) for touch in scene.touching]
+    if scene.obstacles:
+        one_sided["obstacles"] = [
+            (obstacle.nodes, obstacle.segment, _surface(obstacle.surface))
+            for obstacle in scene.obstacles
+        ]
+    return Boundary(
         fixed=scene.fixed,
         joined={name: s.joined for name, s in segments if np.size(s.joined)},
         sliding=sliding,
         contact={name: _surface(s.contact) for name, s in segments if s.contact is not None},
         gap={name: s.gap for name, s in segments if name in sliding},
         conflicts=scene.conflicts,
+        **one_sided,
     )
-    if boundary.conflicts:
-        _log.warning("%d nodes had two kinds; the stronger one was kept", boundary.conflicts)
-    solver = StaticSolver(tensors, boundary, options.pop("method"), **options)
-    _log.info("solver: %s, %d unknowns", solver.method, solver.n_unknowns)
-    return solver
 
 
 def scene_plan(scene: Scene) -> dict[str, NDArray[np.float64] | SurfaceMotion]:
@@ -168,6 +183,7 @@ def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneRes
         "contact_converged": solution.contact_converged,
         "contact_iterations": solution.contact_iterations,
         "inverted_tets": inverted,
+        **_touching(scene, solution),
         "findings": findings,
         "factor_bytes": solver.factor_bytes,
         "timings": {"set_up": dict(solver.timings), "solve": dict(solution.timings)},
@@ -205,20 +221,46 @@ def _inverted(solver: StaticSolver, solution: Solution) -> tuple[int | None, lis
     return count, [] if found is None else [_told(found)]
 
 
+def _touching(scene: Scene, solution: Solution) -> dict[str, dict[str, Any]]:
+    """What a result states of one-sided contact; nothing where the scene has none."""
+    if not scene.touching and not scene.obstacles:
+        return {}
+    return {
+        "touching": {
+            "pressed": int(np.count_nonzero(np.asarray(solution.touching_forces) > 0.0)),
+            "penetration": _finite(solution.penetration),
+            "rounds": solution.touching_rounds,
+            "converged": solution.touching_converged,
+        }
+    }
+
+
 def _contact_findings(solution: Solution) -> list[dict[str, str]]:
     """That contact stopped above its tolerance, with figures that no face would show."""
-    if solution.contact_converged:
-        return []
-    found = Finding.warning(
-        "contact-stopped",
-        f"contact stopped after {solution.contact_iterations} steps with gaps of "
-        f"{solution.contact_gap:.1e} mm and nodes {solution.contact_unbalanced:.1e} mm out of "
-        "balance",
-        where="contact",
-        why="the tolerance asks for less, though no face would show it",
-        fix="allow more contact_iterations or a larger contact_tolerance, or smooth the surface",
-    )
-    return [_told(found)]
+    findings = []
+    if not solution.contact_converged:
+        found = Finding.warning(
+            "contact-stopped",
+            f"contact stopped after {solution.contact_iterations} steps with gaps of "
+            f"{solution.contact_gap:.1e} mm and nodes {solution.contact_unbalanced:.1e} mm out of "
+            "balance",
+            where="contact",
+            why="the tolerance asks for less, though no face would show it",
+            fix="allow more contact_iterations or a larger contact_tolerance, or smooth the "
+            "surface",
+        )
+        findings.append(_told(found))
+    if not solution.touching_converged:
+        found = Finding.warning(
+            "touching-stopped",
+            f"one-sided contact stopped after {solution.touching_rounds} rounds with tissue "
+            f"{solution.penetration:.1e} mm deep in other tissue or bone",
+            where="contact",
+            why="what touches may have changed had it gone on",
+            fix="look at the lips in the result; a smaller motion or a smoother surface converges",
+        )
+        findings.append(_told(found))
+    return findings
 
 
 def _told(found: Finding) -> dict[str, str]:

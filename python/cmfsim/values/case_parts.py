@@ -20,10 +20,15 @@ from cmfsim.values.frozen import Frozen
 __all__ = [
     "DIRECTIONS",
     "FRAMES",
+    "LIP_CONTACT",
+    "LIP_DEPTH",
+    "LIP_HEIGHT",
+    "LIP_SEAMS",
     "PROCEDURES",
     "UNITS",
     "CaseImage",
     "CaseLandmarks",
+    "CaseLips",
     "CaseMesh",
     "CaseMotion",
     "CaseMuscles",
@@ -64,6 +69,14 @@ POSTERIOR_LANDMARKS = ("supraglenoid_L", "supraglenoid_R")
 EDGE_LENGTH = 4.0
 # Tooth rows rest 2 to 4 mm apart, and a mucoperiosteal flap is lifted about as far at a cut, mm.
 CLEFT = 4.0
+# Whether lips are separated, and kept apart by contact, where a case does not ask for it.
+LIP_CONTACT = False
+# Ways to find the seam between the lips, besides a surface.
+LIP_SEAMS = ("auto", "landmarks")
+# How far it goes on past the front of the teeth, mm: through the tissue between their rows.
+LIP_DEPTH = 8.0
+# How far from it a lip reaches, mm: over its red, and inside to the roots of the front teeth.
+LIP_HEIGHT = 13.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,6 +259,29 @@ class CaseMesh:
     cleft: float = CLEFT
     parting: Path | None = None
     file: Path | None = None
+
+
+@dataclass(frozen=True)
+class CaseLips:
+    """Whether the lips of a case are separated, and where; see `lip_seam` and `lip_regions`.
+
+    Attributes
+    ----------
+    contact : bool
+        The tissue is separated between the lips, and neither lip enters the other or the teeth.
+    seam : Path or str
+        "auto": from the gap or crease that the skin shows, else from landmarks; "landmarks"; or the
+        file of a surface between the lips, its normals towards the upper lip.
+    depth : float, mm
+        How far the seam goes on past the teeth, between their rows.
+    height : float, mm
+        How far from the seam the lips reach.
+    """
+
+    contact: bool = LIP_CONTACT
+    seam: Path | str = "auto"
+    depth: float = LIP_DEPTH
+    height: float = LIP_HEIGHT
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
+from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.scene import Scene
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
@@ -53,6 +54,8 @@ class PatientModel(Frozen):
         Unit direction of the fibres of each tet; zero where there is no muscle.
     landmarks : mapping of str to mapping of str to (3,) float64, mm
         "skull" and "skin", where given.
+    lips : mapping of str to LipRegion
+        "upper" and "lower", where the mesh was separated between them.
     findings : tuple of Finding
         What every stage noticed.
     summary : mapping
@@ -73,6 +76,7 @@ class PatientModel(Frozen):
     fraction: Floats | None = None
     fibre: Floats | None = None
     landmarks: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
+    lips: Mapping[str, LipRegion] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
     detailed_skin: Callable[[], SurfaceData | None] | None = None

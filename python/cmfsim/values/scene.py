@@ -33,6 +33,7 @@ from cmfsim.values.motion import rigid_matrix
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 from cmfsim.values.tissue_data import TissueData
+from cmfsim.values.touching import ObstacleData, TouchingData
 
 __all__ = [
     "Scene",
@@ -111,6 +112,10 @@ class Scene(Frozen):
     options : SolverOptions
     conflicts : str
         "error", or "resolve": fixed wins over joined, joined over sliding.
+    touching : tuple of TouchingData
+        Tissue that may not enter other tissue.
+    obstacles : tuple of ObstacleData
+        Tissue that may not enter segments.
 
     Raises
     ------
@@ -144,6 +149,8 @@ class Scene(Frozen):
     loads: ArrayLike | None = None
     options: SolverOptions = field(default_factory=SolverOptions)
     conflicts: str = "error"
+    touching: tuple[TouchingData, ...] = ()
+    obstacles: tuple[ObstacleData, ...] = ()
 
     def __post_init__(self) -> None:
         nodes = as_rows("nodes", self.nodes, 3)
@@ -173,6 +180,24 @@ class Scene(Frozen):
         object.__setattr__(self, "loads", loads)
         object.__setattr__(self, "segments", MappingProxyType(dict(self.segments)))
         object.__setattr__(self, "plan", MappingProxyType(self._checked_plan()))
+        self._check_contact(len(nodes))
+
+    def _check_contact(self, n_nodes: int) -> None:
+        """One-sided contact: nodes of the mesh, and segments that there are."""
+        object.__setattr__(self, "touching", tuple(self.touching))
+        object.__setattr__(self, "obstacles", tuple(self.obstacles))
+        for number, touch in enumerate(self.touching):
+            check_instance(f"touching[{number}]", touch, TouchingData)
+            as_indices(f"touching[{number}] nodes", touch.nodes, n_nodes)
+            as_index_rows(f"touching[{number}] triangles", touch.triangles, 3, n_nodes, "nodes")
+        for number, obstacle in enumerate(self.obstacles):
+            check_instance(f"obstacles[{number}]", obstacle, ObstacleData)
+            as_indices(f"obstacles[{number}] nodes", obstacle.nodes, n_nodes)
+            if obstacle.segment not in self.segments:
+                known = ", ".join(repr(s) for s in self.segments) or "none"
+                raise CaseInputError(
+                    f"obstacles[{number}] is of segment {obstacle.segment!r}; segments are: {known}"
+                )
 
     def _checked_plan(self) -> dict[str, Floats | MovedSurface]:
         for name in self.plan:
@@ -232,11 +257,21 @@ class Scene(Frozen):
             tissue["law"] = self.tissue.law
         elif self.tissue.kind == "preset":
             tissue |= {"preset": self.tissue.preset, "mixing": self.tissue.mixing}
+        # A scene without one-sided contact has the content, and the hash, that it has always had.
+        contact: dict[str, Any] = {}
+        if self.touching:
+            contact["touching"] = len(self.touching)
+        if self.obstacles:
+            contact["obstacles"] = [
+                {"segment": obstacle.segment, "crease_angle": obstacle.surface.crease_angle}
+                for obstacle in self.obstacles
+            ]
         return {
             "tissue": tissue,
             "segments": segments,
             "conflicts": self.conflicts,
             "solver": self.options.header(),
+            **contact,
         }
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -268,6 +303,13 @@ class Scene(Frozen):
                 yield f"{key}.motion.moved_vertices", np.asarray(motion.moved_vertices)
             else:
                 yield f"{key}.motion", np.asarray(motion)
+        for number, touch in enumerate(self.touching):
+            yield f"touching.{number}.nodes", np.asarray(touch.nodes)
+            yield f"touching.{number}.triangles", np.asarray(touch.triangles)
+        for number, obstacle in enumerate(self.obstacles):
+            yield f"obstacle.{number}.nodes", np.asarray(obstacle.nodes)
+            yield f"obstacle.{number}.vertices", np.asarray(obstacle.surface.vertices)
+            yield f"obstacle.{number}.triangles", np.asarray(obstacle.surface.triangles)
 
     def sha256(self) -> str:
         """The SHA-256 of the scene's content, the same from whichever file it was read."""

@@ -75,6 +75,12 @@ tolerance = 1e-9
 
 [output]
 folder = "results/first"
+
+[lips]
+contact = true
+seam = "landmarks"
+depth = 5
+height = 11.5
 """
 
 
@@ -97,6 +103,9 @@ def test_everything_in_a_case_file_arrives(tmp_path):
     assert (case.region.lower, case.region.upper) == (-40.0, 120.5)
     assert (case.mesh.edge_length, case.mesh.refine) == (2.5, False)
     assert case.mesh.parting == tmp_path / "lips.ply"
+    assert case.lips == cmfsim.values.case_parts.CaseLips(
+        contact=True, seam="landmarks", depth=5.0, height=11.5
+    )
     assert case.osteotomies[0].segments == ("maxilla",)
     assert dict(case.osteotomies[0].options) == {"height": 4.5}
     assert case.osteotomies[1].segments == ("half",)
@@ -120,6 +129,8 @@ def test_what_a_case_file_leaves_out_has_its_default(tmp_path):
     assert case.tissue.preset == "kim2010"
     assert case.tissue.fraction.tolist() == [0.0]
     assert case.mesh == cmfsim.values.case_parts.CaseMesh(edge_length=4.0, refine=True)
+    assert case.lips == cmfsim.values.case_parts.CaseLips()
+    assert not case.lips.contact
     assert case.output == tmp_path / "out"
     assert (case.osteotomies, dict(case.plan)) == ((), {})
 
@@ -341,3 +352,28 @@ def test_a_plan_typed_in_ras_is_the_same_motion_in_lps(tmp_path):
     assert plan["a"].matrix[:3, 3].tolist() == [-1.0, -5.0, 2.0]
     np.testing.assert_allclose(plan["b"].matrix, plan["c"].matrix, rtol=0, atol=1e-12)
     assert plan["b"].centre.tolist() == plan["c"].centre.tolist()
+
+
+def test_the_seam_between_the_lips_may_be_a_surface(tmp_path):
+    """Beside the case; and not together with another surface that separates the mesh."""
+    case = load(tmp_path, HEAD + SURFACES + '[lips]\ncontact = true\nseam = "seam.ply"\n')
+    assert case.lips.seam == tmp_path / "seam.ply"
+    both = '[mesh]\nparting = {surface = "a.ply"}\n[lips]\nseam = "b.ply"\n'
+    with pytest.raises(cmfsim.CaseError, match="give one of them"):
+        load(tmp_path, HEAD + SURFACES + both)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("contact = 1", "true or false"),
+        ("depth = -1", "depth"),
+        ("height = 300", "height"),
+        ("gap = 2", "gap"),
+        ("seam = 3", "a text is needed"),
+    ],
+)
+def test_wrong_values_of_the_lips_name_their_line(tmp_path, line, message):
+    with pytest.raises(cmfsim.CaseError, match=message) as error:
+        load(tmp_path, HEAD + SURFACES + "[lips]\n" + line + "\n")
+    assert "lips" in str(error.value)

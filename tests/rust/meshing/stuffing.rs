@@ -291,6 +291,23 @@ fn a_parting_surface_parts_the_mesh_and_leaves_its_rim_joined() {
     assert!(matches!(part(&mesh, &far.expect("a sheet")), Err(MtmError::OutOfRange { .. })));
 }
 
+#[test]
+fn a_bent_parting_surface_leaves_no_bridge_along_its_bends() {
+    let grid = Grid::new([20, 20, 20], [1.0; 3], [0.0; 3]).expect("a grid");
+    let level = LevelImage::from_labels(grid, &[true; 8000]).expect("a level");
+    let mesh = stuff(&level, &options(3.0, 0), &Halvings::default()).expect("a mesh").mesh;
+    // A roof and its mirror image, a gutter: slopes of 30° on either side of the bend.
+    for (edge, bend) in [(5.0, 13.7), (14.0, 5.3)] {
+        let row = |x: f64, z: f64| [[x, -5.0, z], [x, 25.0, z]];
+        let corners = [row(-5.0, edge), row(9.8, bend), row(25.0, edge)].concat();
+        let triangles = vec![[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]];
+        let roof = Surface::new(corners, triangles).expect("a roof");
+        let whole = part(&mesh, &roof).expect("parted");
+        assert_eq!(n_bodies(&whole.mesh), 2, "bend at {bend}");
+        assert_conforming(&whole.mesh);
+    }
+}
+
 fn n_bodies(mesh: &TetMesh) -> usize {
     let mut body: Vec<usize> = (0..mesh.n_nodes()).collect();
     fn root(body: &mut [usize], mut v: usize) -> usize {

@@ -16,7 +16,7 @@ use crate::vector::{add, dot, norm, scaled, sub};
 const REACH: f64 = 0.4;
 /// Smallest dihedral angle that a move may leave, radians.
 const LEAST_DIHEDRAL: f64 = 10.0 * std::f64::consts::PI / 180.0;
-/// Sine of the angle between the normal and the way to the surface, above which a point lies beside it.
+/// Sine of the angle between the normal and the way to the rim, above which a point lies beside it.
 const BESIDE: f64 = 0.2;
 
 /// A parted mesh.
@@ -51,12 +51,14 @@ pub fn part(mesh: &TetMesh, surface: &Surface) -> Result<Parted> {
 }
 
 /// Signed distance from the surface; none beside its rim, where "above" and "below" mean nothing.
+///
+/// Over a bend of the surface the way to it leads off the normal too, but there the side is known.
 fn height(surface: &Surface, x: [f64; 3]) -> Option<f64> {
     let closest = surface.closest_one(x);
-    let way = sub(x, closest.point);
-    let (length, along) = (norm(way), dot(way, closest.normal));
+    let along = dot(sub(x, closest.point), closest.normal);
+    let length = closest.distance;
     let aside = (length * length - along * along).max(0.0).sqrt();
-    (aside <= BESIDE * length).then_some(along)
+    (!closest.on_border || aside <= BESIDE * length).then_some(closest.signed_distance)
 }
 
 fn snap(mesh: &TetMesh, surface: &Surface, nodes: &mut [[f64; 3]]) {

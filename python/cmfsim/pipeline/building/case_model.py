@@ -27,6 +27,7 @@ from cmfsim.doctor.landmarks import (
 )
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Case, CaseOrPath, as_case, write_model
+from cmfsim.lips import LipSeam, seam_faces
 from cmfsim.meshing import (
     MeshReport,
     TissueRegion,
@@ -34,6 +35,7 @@ from cmfsim.meshing import (
     tissue_level,
 )
 from cmfsim.node_kinds import (
+    DentalArches,
     KindOptions,
     classify_nodes,
     dental_arches,
@@ -53,6 +55,13 @@ from cmfsim.pipeline.building.inputs import (
     read_anatomy,
     read_case_landmarks,
 )
+from cmfsim.pipeline.building.lips import (
+    CaseLipContact,
+    find_seam,
+    lip_contact,
+    lip_summary,
+    separated_at_seam,
+)
 from cmfsim.pipeline.building.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.skin_part import on_skin
@@ -65,7 +74,7 @@ from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.patient_model import PatientModel
-from cmfsim.values.scene import Scene
+from cmfsim.values.scene import Scene, SegmentData
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["build_case", "build_model", "model_of"]
@@ -193,7 +202,7 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         stages.add(noticed)
     head = _Head(case, landmarks, anatomy)
     bones, procedures = _bones(head, stages, options.after)
-    tissue = _tissue(head, stages)
+    tissue = _tissue(head, stages, bones, kinds)
     nodes = _nodes(head, stages, bones, tissue, kinds)
     patient = _assembled(head, stages, bones, nodes, procedures)
     if case.muscles is None:
@@ -226,6 +235,8 @@ class _Tissue:
     level: ImageData
     mesh: TetMesh
     report: MeshReport
+    arches: DentalArches | None
+    seam: LipSeam | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,6 +248,8 @@ class _Nodes:
     kinds: NodeKinds
     contacts: CaseContacts
     level: ImageData
+    seam: LipSeam | None
+    lips: CaseLipContact
 
 
 def _bones(
@@ -261,17 +274,26 @@ def _bones(
     return bones, cut.procedures
 
 
-def _tissue(head: _Head, stages: Stages) -> _Tissue:
+def _tissue(head: _Head, stages: Stages, bones: PlannedBones, options: KindOptions) -> _Tissue:
+    case, anatomy = head.case, head.anatomy
     stages.begin("finding the soft tissue")
     region = region_of(head.case, head.anatomy, head.skull)
     level, noticed = tissue_level(head.anatomy, region)
     stages.add(noticed)
 
+    arches = seam = None
+    if options.sliding or case.lips.contact:
+        arches = dental_arches(anatomy, bones.segments, head.skull)
+    if case.lips.contact:
+        stages.begin("finding the seam between the lips")
+        seam = find_seam(case, anatomy, arches, head.landmarks.get("skin", {}))
+        stages.add(seam.findings)
+
     stages.begin("filling the tissue with tets")
-    mesh, report, noticed = tissue_mesh(head.case, level, head.anatomy)
+    mesh, report, noticed = tissue_mesh(case, level, anatomy, seam)
     stages.add(noticed)
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
-    return _Tissue(region, level, mesh, report)
+    return _Tissue(region, level, mesh, report, arches, seam)
 
 
 def _nodes(
@@ -279,7 +301,7 @@ def _nodes(
 ) -> _Nodes:
     case, anatomy, mesh, report = head.case, head.anatomy, tissue.mesh, tissue.report
     moved = [*dict.fromkeys([*cut_segments(case), *bones.motions])]
-    arches = dental_arches(anatomy, bones.segments, head.skull) if options.sliding else None
+    arches, seam = tissue.arches, tissue.seam
     contacts = CaseContacts()
     if arches is not None:
         stages.begin("making the contact sheets")
@@ -307,7 +329,22 @@ def _nodes(
         stages.add(noticed)
     mesh, kinds, noticed = held_part(mesh, kinds)
     stages.add(noticed)
-    if mesh.n_tets < whole:
+    lips = CaseLipContact({}, kinds)
+    if seam is not None:
+        stages.begin("separating the lips")
+        mesh, kinds, noticed = separated_at_seam(mesh, kinds, seam)
+        stages.add(noticed)
+        lips = lip_contact(
+            mesh,
+            kinds,
+            seam,
+            height=case.lips.height,
+            arches=arches,
+            contacts=contacts,
+            segments=bones.segments,
+        )
+        kinds = lips.kinds
+    if mesh.n_tets < whole or lips.regions:
         report = report_of_part(mesh, report)
     found = end_findings(
         np.asarray(mesh.nodes),
@@ -321,7 +358,7 @@ def _nodes(
     stages.add(found)
     stages.add(untouched(case, mesh, kinds, bones))
     stages.drop_repeated()
-    return _Nodes(mesh, report, kinds, contacts, tissue.level)
+    return _Nodes(mesh, report, kinds, contacts, tissue.level, seam, lips)
 
 
 def _assembled(
@@ -336,9 +373,13 @@ def _assembled(
     stages.begin("assembling the scene")
     places, boundary = np.asarray(nodes.mesh.nodes), np.asarray(nodes.mesh.boundary_triangles())
     slid = nodes.contacts.of_scene(bones.segments, kinds)
-    scene = _scene(case, nodes.mesh, kinds, bones, slid)
+    scene = _scene(case, nodes, bones, slid)
     departures = nodes.contacts.summary(bones.segments, kinds, places, slid)
-    skin = boundary[on_skin(places, boundary, anatomy, nodes.level)]
+    is_skin = on_skin(places, boundary, anatomy, nodes.level)
+    if nodes.lips.regions:
+        # What the lips turn to each other is inside the mouth.
+        is_skin &= ~seam_faces(places, boundary)
+    skin = boundary[is_skin]
     stages.end()
     return PatientModel(
         name=case.name,
@@ -350,10 +391,12 @@ def _assembled(
         anatomy=anatomy,
         fat=case.tissue,
         landmarks=head.landmarks,
+        lips=nodes.lips.regions,
         findings=tuple(stages.findings),
         summary={
             **_summary(head, nodes, stages, procedures),
             "contact": departures,
+            **({} if nodes.seam is None else {"lips": lip_summary(nodes.seam, nodes.lips)}),
             **({} if bones.achieved is None else {"achieved": bones.achieved.as_dict()}),
             "plan_sources": dict(bones.sources),
         },
@@ -366,7 +409,9 @@ def _draw(model: PatientModel, folder: Path) -> list[str]:
     anatomy, kinds = folder / "anatomy.png", folder / "node_kinds.png"
     try:
         picture_anatomy(anatomy, model.skin, model.segments)
-        picture_node_kinds(kinds, model.scene.nodes, model.boundary_triangles, model.kinds)
+        picture_node_kinds(
+            kinds, model.scene.nodes, model.boundary_triangles, model.kinds, lips=model.lips
+        )
     except CmfsimError as error:
         _log.warning("no pictures: %s", error)
     return [path.name for path in (anatomy, kinds) if path.exists()]
@@ -402,13 +447,12 @@ def _kind_options(case: Case) -> KindOptions:
 
 
 def _scene(
-    case: Case,
-    mesh: TetMesh,
-    kinds: NodeKinds,
-    bones: PlannedBones,
-    contacts: Mapping[str, SurfaceData],
+    case: Case, nodes: _Nodes, bones: PlannedBones, contacts: Mapping[str, SurfaceData]
 ) -> Scene:
+    mesh, kinds, lips = nodes.mesh, nodes.kinds, nodes.lips
     data = segment_data(kinds, bones.segments, contacts=contacts)
+    # Teeth that no node is attached to or slides on may still be before the lips.
+    data |= {o.segment: SegmentData() for o in lips.obstacles if o.segment not in data}
     plan = {name: bones.motions.get(name, np.eye(4)) for name in data}
     return Scene(
         nodes=mesh.nodes,
@@ -418,6 +462,8 @@ def _scene(
         plan=plan,
         fixed=kinds.nodes("fixed"),
         options=case.solver,
+        touching=lips.touching,
+        obstacles=lips.obstacles,
     )
 
 

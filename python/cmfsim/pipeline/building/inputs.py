@@ -279,6 +279,8 @@ def _files(case: Case) -> Iterator[Path]:
         yield case.surfaces.skin
         yield from case.surfaces.bones.values()
     optional = [case.landmarks.skull, case.landmarks.skin, case.mesh.parting, case.mesh.file]
+    if isinstance(case.lips.seam, Path):
+        optional.append(case.lips.seam)
     if case.muscles is not None and isinstance(case.muscles.template, Path):
         optional.append(case.muscles.template)
     after = case.postoperative

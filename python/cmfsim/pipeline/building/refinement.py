@@ -3,12 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim._core import distance_image
+from cmfsim._core import Surface, distance_image
+from cmfsim.lips import LipSeam
 from cmfsim.meshing import near_skin
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["GAP_REFINEMENTS", "allowed_halvings", "needed_halvings"]
+__all__ = ["GAP_REFINEMENTS", "allowed_halvings", "lip_halvings", "needed_halvings"]
 
 Counts = NDArray[np.uint8]
 
@@ -25,6 +26,9 @@ MOUTH_DEPTH = 15.0
 # How far behind its foremost tissue, mm: the corners of the mouth and what is beside them. The arch
 # of the cheekbone and the mandible's processes, as near to each other, lie farther back.
 MOUTH_LENGTH = 35.0
+# Tets from the skin of a lip to the teeth at least; and how far about the seam, mm.
+TETS_IN_LIP = 3.0
+SEAM_REACH = 4.0
 
 
 def allowed_halvings(anatomy: Anatomy) -> Counts:
@@ -67,3 +71,39 @@ def needed_halvings(level: ImageData, anatomy: Anatomy) -> Counts:
         # The second axis of the grid runs from front to back.
         mouth[:, rows[0] + int(MOUTH_LENGTH / sy) + 1 :] = False
     return mouth.astype(np.uint8)
+
+
+def lip_halvings(level: ImageData, seam: LipSeam, edge_length: float) -> Counts:
+    """How often the edge is halved at least along the seam between the lips, where these are thin.
+
+    Parameters
+    ----------
+    level : ImageData
+        Of the tissue.
+    seam : LipSeam
+        With a surface.
+    edge_length : float, mm
+
+    Returns
+    -------
+    (nx, ny, nz) uint8
+    """
+    values = np.asarray(level.values)
+    needed = np.zeros(values.shape, dtype=np.uint8)
+    if seam.surface is None:
+        return needed
+    thickness = float(seam.summary.get("thickness", np.inf))
+    wanted = int(np.ceil(np.log2(max(TETS_IN_LIP * edge_length / max(thickness, 1e-3), 1.0))))
+    vertices, spacing = np.asarray(seam.surface.vertices), np.asarray(level.spacing)
+    low = np.floor((vertices.min(axis=0) - SEAM_REACH - level.lowest) / spacing).astype(int)
+    high = np.ceil((vertices.max(axis=0) + SEAM_REACH - level.lowest) / spacing).astype(int) + 1
+    low, high = np.maximum(low, 0), np.clip(high, 0, values.shape)
+    if wanted < 1 or (high <= low).any():
+        return needed
+    crop = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    index = np.argwhere(values[crop] > 0.0) + low
+    points = level.lowest + index * spacing
+    closest, _, _ = Surface(vertices, seam.surface.triangles).closest(points)
+    near = index[np.linalg.norm(closest - points, axis=1) <= SEAM_REACH]
+    needed[tuple(near.T)] = min(wanted, GAP_REFINEMENTS)
+    return needed

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim._core import TetMesh
 from cmfsim.checks import Floats
 from cmfsim.io import Case, read_surface, read_tet_mesh
+from cmfsim.lips import LipSeam
 from cmfsim.meshing import (
     MeshOptions,
     MeshReport,
@@ -18,7 +19,12 @@ from cmfsim.meshing import (
     mesh_report,
     part_mesh,
 )
-from cmfsim.pipeline.building.refinement import GAP_REFINEMENTS, allowed_halvings, needed_halvings
+from cmfsim.pipeline.building.refinement import (
+    GAP_REFINEMENTS,
+    allowed_halvings,
+    lip_halvings,
+    needed_halvings,
+)
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
@@ -77,9 +83,13 @@ def end_planes(region: TissueRegion) -> dict[str, tuple[ArrayLike, ArrayLike]]:
 
 
 def tissue_mesh(
-    case: Case, level: ImageData, anatomy: Anatomy
+    case: Case, level: ImageData, anatomy: Anatomy, seam: LipSeam | None = None
 ) -> tuple[TetMesh, MeshReport, tuple[Finding, ...]]:
-    """The mesh that the case names or that fills the tissue, its report, and what to say of it."""
+    """The mesh that the case names or that fills the tissue, its report, and what to say of it.
+
+    It is refined along a seam between the lips, and not separated there: that follows when the
+    kinds of its nodes are known.
+    """
     if case.mesh.file is not None:
         mesh = TetMesh(*read_tet_mesh(case.mesh.file))
         report = mesh_report(mesh)
@@ -90,8 +100,10 @@ def tissue_mesh(
         options = replace(options, refinements=GAP_REFINEMENTS)
         allowed = allowed_halvings(anatomy)
         needed = needed_halvings(level, anatomy)
+        if seam is not None and seam.surface is not None:
+            needed = np.maximum(needed, lip_halvings(level, seam, case.mesh.edge_length))
     made = mesh_from_level(level, options, allowed=allowed, needed=needed)
-    if case.mesh.parting is None:
+    if case.mesh.parting is None or seam is not None:
         return made.mesh, made.report, made.findings
     units, frame = ("mm", "LPS")
     if case.surfaces is not None:

@@ -1,0 +1,62 @@
+"""Whether the lips of a case can be separated, and their contact solved."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from cmfsim.doctor.evidence import Evidence
+from cmfsim.values.finding import Finding
+from cmfsim.values.landmark_sites import label_key
+
+__all__ = ["check_lips"]
+
+CORNERS = ("cheilion_R", "cheilion_L")
+BORDERS = ("labiale_superius", "labiale_inferius")
+# Methods that solve contact of the lips.
+METHODS = ("auto", "pcg")
+
+
+def check_lips(evidence: Evidence) -> Iterator[Finding]:
+    """Findings about the contact of the lips, where a case asks for it."""
+    case = evidence.case
+    lips = case.lips
+    if not lips.contact:
+        return
+    if case.solver.method not in METHODS:
+        yield Finding.error(
+            "lips-method",
+            f"contact of the lips is not solved by method = {case.solver.method!r}",
+            where=case.where("solver.method"),
+            why="the solver would refuse the case",
+            fix=f"write one of {', '.join(METHODS)}, or contact = false in [lips]",
+        )
+    if case.node_kinds.get("sliding") is False:
+        yield Finding.warning(
+            "lips-attached",
+            "contact of the lips is asked for, and tissue does not slide on the teeth",
+            where=case.where("node_kinds.sliding"),
+            why="the lips stay attached to the teeth and can hardly come to each other",
+            fix="remove sliding = false from [node_kinds], or set contact = false in [lips]",
+        )
+    if isinstance(lips.seam, Path) or case.mesh.parting is not None:
+        return
+    known = {label_key(name) for name in evidence.skin_landmarks}
+    missing = [name for name in (*CORNERS, *BORDERS) if label_key(name) not in known]
+    if not missing:
+        return
+    if lips.seam == "landmarks":
+        yield Finding.error(
+            "lips-landmarks-missing",
+            f'seam = "landmarks", and the skin landmarks {", ".join(missing)} are missing',
+            where=case.where("lips.seam"),
+            why="the lips would not be separated",
+            fix='place them, or set seam = "auto" in [lips]',
+        )
+        return
+    yield Finding.note(
+        "lips-landmarks-few",
+        f"the skin landmarks {', '.join(missing)} are missing",
+        where=case.where("landmarks.skin"),
+        why="where lips meet and the mouth ends is then read off the skin alone, with nothing to "
+        "check it against, and the lips are not separated where it shows neither gap nor crease",
+        fix="place them",
+    )

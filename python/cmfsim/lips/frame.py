@@ -1,0 +1,75 @@
+"""The frame of a mouth: left, ahead and up along the dental arches."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cmfsim.checks import Floats
+from cmfsim.values.dental_arch import DentalArch
+
+__all__ = ["MouthFrame", "mouth_frame"]
+
+
+@dataclass(frozen=True, eq=False)
+class MouthFrame:
+    """Axes of a mouth, with its origin half-way between the fronts of the two arches.
+
+    Attributes
+    ----------
+    origin : (3,) float64, mm
+    axes : (3, 3) float64
+        Rows: unit vectors to the left, ahead and up, at right angles. The frame is left-handed in
+        LPS, where ahead is −y.
+    reach_up, reach_down : float, mm
+        Heights of the fronts of the upper and lower arch: between them the lips meet.
+    half_width : float, mm
+        Half the distance between the second molars.
+    molars : float, mm
+        How far ahead of the origin the second molars lie; negative.
+    """
+
+    origin: Floats
+    axes: Floats
+    reach_up: float
+    reach_down: float
+    half_width: float
+    molars: float
+
+    def into(self, points: Floats) -> Floats:
+        """Coordinates to the left, ahead and up of points in space, (n, 3) mm."""
+        return np.asarray((points - self.origin) @ self.axes.T)
+
+    def out_of(self, places: Floats) -> Floats:
+        """The points in space of coordinates to the left, ahead and up, (n, 3) mm."""
+        return np.asarray(self.origin + places @ self.axes)
+
+
+def mouth_frame(arches: Mapping[str, DentalArch]) -> MouthFrame:
+    """The frame of a mouth from its two dental arches.
+
+    Parameters
+    ----------
+    arches : mapping of str to DentalArch
+        "upper" and "lower".
+    """
+    upper, lower = arches["upper"], arches["lower"]
+    up = np.asarray(upper.out) - np.asarray(lower.out)
+    up = up / np.linalg.norm(up)
+    left = np.asarray(upper.left) - np.asarray(upper.right)
+    left = left + np.asarray(lower.left) - np.asarray(lower.right)
+    left = left - (left @ up) * up
+    left = left / np.linalg.norm(left)
+    tips = [np.asarray(upper.tip), np.asarray(lower.tip)]
+    molars = 0.5 * (upper.middle + lower.middle)
+    origin = 0.5 * (tips[0] + tips[1])
+    ahead = np.cross(left, up)
+    ahead = ahead * np.sign(ahead @ (origin - molars))
+    return MouthFrame(
+        origin,
+        np.stack([left, ahead, up]),
+        float((tips[0] - origin) @ up),
+        float((tips[1] - origin) @ up),
+        0.5 * (upper.half_width + lower.half_width),
+        float((molars - origin) @ ahead),
+    )

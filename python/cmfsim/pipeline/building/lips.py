@@ -1,0 +1,252 @@
+"""The lips of a case: the seam between them, the mesh separated there, what they may not enter."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim._core import Surface, TetMesh
+from cmfsim.checks import Floats
+from cmfsim.errors import MeshError
+from cmfsim.io import Case, read_surface
+from cmfsim.lips import LipSeam, lip_regions, lip_seam
+from cmfsim.meshing import part_mesh
+from cmfsim.node_kinds import DentalArches
+from cmfsim.pipeline.building.contacts import CaseContacts
+from cmfsim.pipeline.building.held import held_part
+from cmfsim.surfaces.levels import contact_surface
+from cmfsim.surfaces.topology import connected_labels, edges_of
+from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.finding import Finding
+from cmfsim.values.lip_region import LipRegion
+from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
+from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.touching import ObstacleData, TouchingData
+
+__all__ = ["CaseLipContact", "find_seam", "lip_contact", "lip_summary", "separated_at_seam"]
+
+# Nodes of a lip further than this from the other lip, or from the teeth, do not come to them, mm.
+REACH = 8.0
+# Where a sheet goes on past the edges of the teeth it lies further from them than this, mm: a wall
+# for the lip of its own jaw, which it supports, and none for the other lip.
+ON_TEETH = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class CaseLipContact:
+    """The lips of a case, and what they may not enter.
+
+    Attributes
+    ----------
+    regions : mapping of str to LipRegion
+        "upper" and "lower"; none where the lips are not separated.
+    kinds : NodeKinds
+        Of all nodes, those that may lift off the teeth free.
+    touching : tuple of TouchingData
+    obstacles : tuple of ObstacleData
+    """
+
+    regions: Mapping[str, LipRegion]
+    kinds: NodeKinds
+    touching: tuple[TouchingData, ...] = ()
+    obstacles: tuple[ObstacleData, ...] = ()
+
+
+def find_seam(
+    case: Case, anatomy: Anatomy, arches: DentalArches | None, skin: Mapping[str, ArrayLike]
+) -> LipSeam:
+    """The seam of a case that asks for contact of the lips."""
+    seam = case.lips.seam
+    file = seam if isinstance(seam, Path) else case.mesh.parting
+    if file is not None:
+        units, frame = ("mm", "LPS")
+        if case.surfaces is not None:
+            units, frame = case.surfaces.units, case.surfaces.frame
+        surface = read_surface(file, units=units, frame=frame)
+        return LipSeam(_upwards(surface), "file", {"source": "file", "file": file.name})
+    by_jaw = {} if arches is None else arches.by_jaw
+    return lip_seam(anatomy, by_jaw, skin, way=str(seam), depth=case.lips.depth)
+
+
+def _upwards(surface: SurfaceData) -> SurfaceData:
+    """The surface, turned if its normals look down."""
+    vertices, triangles = np.asarray(surface.vertices), np.asarray(surface.triangles)
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    if float(np.cross(b - a, c - a)[:, 2].sum()) >= 0.0:
+        return surface
+    return replace(surface, triangles=triangles[:, ::-1])
+
+
+def separated_at_seam(
+    mesh: TetMesh, kinds: NodeKinds, seam: LipSeam
+) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
+    """The mesh separated at the seam, where copies of nodes have the kinds of their originals.
+
+    Kinds are found before: the faces of the lips along the edges of teeth look at these without
+    being attached to them.
+
+    Raises
+    ------
+    MeshError
+        (also `ValueError`) A surface given as a file runs through no tissue.
+    """
+    if seam.surface is None:
+        return mesh, kinds, ()
+    try:
+        separated = part_mesh(mesh, seam.surface)
+    except MeshError:
+        if seam.source != "gap":
+            raise
+        finding = Finding.note(
+            "lips-apart",
+            "the image shows the lips apart as far as the teeth: there was no tissue to separate",
+            where="lips",
+            why="they are kept apart by contact all the same",
+            fix="none is needed",
+        )
+        return mesh, kinds, (finding,)
+    _, place = np.unique(np.asarray(separated.nodes), axis=0, return_inverse=True)
+    place = place.reshape(-1)
+    first = np.full(place.max() + 1, -1)
+    first[place[: mesh.n_nodes]] = np.arange(mesh.n_nodes)
+    origin = first[place]
+    copied = NodeKinds(kinds.kind[origin], kinds.segment[origin], kinds.segments)
+    return held_part(separated, copied)
+
+
+def lip_contact(
+    mesh: TetMesh,
+    kinds: NodeKinds,
+    seam: LipSeam,
+    *,
+    height: float,
+    arches: DentalArches | None,
+    contacts: CaseContacts,
+    segments: Sequence[BoneSegment],
+) -> CaseLipContact:
+    """The lips of a separated mesh, free to lift off the teeth, and what they may not enter.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    kinds : NodeKinds
+    seam : LipSeam
+    height : float, mm
+        How far from the seam the lips reach.
+    arches : DentalArches or None
+    contacts : CaseContacts
+        The sheets of the arches.
+    segments : sequence of BoneSegment
+        Those that the kinds were found with.
+    """
+    if seam.surface is None:
+        return CaseLipContact({}, kinds)
+    nodes = np.asarray(mesh.nodes)
+    by_jaw = {} if arches is None else arches.by_jaw
+    regions = lip_regions(
+        nodes,
+        np.asarray(mesh.boundary_triangles()),
+        kinds,
+        seam.surface,
+        height=height,
+    )
+    touching = tuple(
+        _touching(nodes, regions[one], regions[other])
+        for one, other in (("lower", "upper"), ("upper", "lower"))
+    )
+    obstacles: list[ObstacleData] = []
+    for jaw in by_jaw:
+        obstacles += _obstacles(
+            nodes, regions, jaw, arches=arches, contacts=contacts, segments=segments
+        )
+    return CaseLipContact(regions, _released(kinds, regions), touching, tuple(obstacles))
+
+
+def _touching(nodes: Floats, lip: LipRegion, other: LipRegion) -> TouchingData:
+    """The nodes of a lip that may come to the other one, and that one."""
+    ids = np.asarray(lip.nodes)
+    away = _distances(nodes[ids], Surface(nodes, other.triangles))
+    return TouchingData(ids[away <= REACH], other.triangles)
+
+
+def _released(kinds: NodeKinds, regions: Mapping[str, LipRegion]) -> NodeKinds:
+    """The kinds with the nodes free that may lift off."""
+    kind, segment = np.array(kinds.kind), np.array(kinds.segment)
+    for region in regions.values():
+        for ids in region.released.values():
+            kind[ids] = NODE_KINDS.index("free")
+            segment[ids] = -1
+    return NodeKinds(kind, segment, kinds.segments)
+
+
+def _obstacles(
+    nodes: Floats,
+    regions: Mapping[str, LipRegion],
+    jaw: str,
+    *,
+    arches: DentalArches | None,
+    contacts: CaseContacts,
+    segments: Sequence[BoneSegment],
+) -> list[ObstacleData]:
+    """The teeth of a jaw before both lips: of each segment that bears them, its nearest nodes."""
+    if arches is None:
+        return []
+    bearers = [segments[number] for number in sorted(arches.bearers[jaw])]
+    bones = [Surface(s.surface.vertices, s.surface.triangles) for s in bearers]
+    found = []
+    for lip, region in regions.items():
+        ids = np.asarray(region.nodes)
+        if not len(ids):
+            continue
+        away = np.array([_distances(nodes[ids], bone) for bone in bones])
+        nearest = np.argmin(away, axis=0)
+        for number, segment in enumerate(bearers):
+            mine = ids[(nearest == number) & (away[number] <= REACH)]
+            if not len(mine):
+                continue
+            whole = _sheet(segment, contacts)
+            surface = whole if lip == jaw else _on_teeth(whole, bones)
+            if surface is not None:
+                found.append(ObstacleData(mine, segment.name, surface))
+    return found
+
+
+def _sheet(segment: BoneSegment, contacts: CaseContacts) -> SurfaceData:
+    """What tissue slides on at a segment: its contact sheet, else the blurred bone."""
+    if segment.name in contacts.sheets:
+        return contacts.sheets[segment.name].surface
+    return contact_surface(segment)
+
+
+def _on_teeth(sheet: SurfaceData, bones: Sequence[Surface]) -> SurfaceData | None:
+    """The part of a sheet that lies on bones and teeth, its largest piece; None if none does."""
+    vertices, triangles = np.asarray(sheet.vertices), np.asarray(sheet.triangles)
+    away = np.min([_distances(vertices, bone) for bone in bones], axis=0)
+    kept = triangles[(away[triangles] <= ON_TEETH).all(axis=1)]
+    if not len(kept):
+        return None
+    label = connected_labels(edges_of(kept.astype(np.int64)).pairs, len(kept))
+    kept = kept[label == np.argmax(np.bincount(label))]
+    used, corners = np.unique(kept, return_inverse=True)
+    return SurfaceData(vertices[used], corners.reshape(-1, 3), sheet.crease_angle)
+
+
+def _distances(points: Floats, surface: Surface) -> Floats:
+    closest, _, _ = surface.closest(points)
+    return np.asarray(np.linalg.norm(closest - points, axis=1))
+
+
+def lip_summary(seam: LipSeam, lips: CaseLipContact) -> dict[str, Any]:
+    """What build.json states of the lips."""
+    counts = {
+        name: {
+            "nodes": len(region.nodes),
+            "triangles": len(region.triangles),
+            "released": {segment: len(ids) for segment, ids in region.released.items()},
+        }
+        for name, region in lips.regions.items()
+    }
+    return {**seam.summary, **counts}
