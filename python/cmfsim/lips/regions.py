@@ -37,8 +37,8 @@ def lip_regions(
     boundary_triangles : (t, 3) uint32
         Boundary of the separated mesh, outward.
     kinds : NodeKinds
-        Before nodes of the lips are released. Triangles between joined or fixed nodes alone are no
-        part of a lip.
+        Before nodes of the lips are released. Joined and fixed nodes may be corners of a lip's
+        triangles, as at the edges of teeth, which would else cut it in two, but are no nodes of it.
     seam : SurfaceData
         Open, its normals towards the upper lip; from in front of the skin to past the teeth.
     height : float, mm
@@ -64,7 +64,6 @@ def lip_regions(
     triangles = as_index_rows("boundary triangles", boundary_triangles, 3, len(points), "nodes")
     side = _sides(points, triangles, seam, as_positive("height of the lips", height))
     held = np.isin(kinds.kind, [NODE_KINDS.index("fixed"), NODE_KINDS.index("joined")])
-    side[held[triangles].all(axis=1)] = 0
     patches = {}
     for name, sign in zip(LIPS, (1, -1), strict=True):
         mine = triangles[side == sign]
