@@ -19,6 +19,9 @@ __all__ = ["lip_regions", "seam_faces"]
 ASLANT, ASLANT_MM = 0.5, 1.0
 # A triangle is looked at from so far inside the tissue, as a share of its size, for its side.
 INSIDE = 0.25
+# Patches below this share of the largest are scraps. The side towards the teeth may be a patch of
+# its own, where the cut ends at an edge of many triangles.
+LEAST_PATCH = 0.1
 
 
 def lip_regions(
@@ -73,7 +76,7 @@ def lip_regions(
                 f"{'above' if sign > 0 else 'below'} the seam between the lips: it must run "
                 "through the mouth, with its normals up"
             )
-        patches[name] = _largest_patch(mine)
+        patches[name] = _without_scraps(mine)
     return {
         name: _region(patches[name], patches[LIPS[name == "upper"]], kinds, held) for name in LIPS
     }
@@ -106,11 +109,12 @@ def _sides(
     return side
 
 
-def _largest_patch(triangles: Indices) -> Indices:
-    """The largest part of triangles that is connected by edges."""
+def _without_scraps(triangles: Indices) -> Indices:
+    """The triangles without small patches that no edge connects to the rest."""
     edges = edges_of(triangles.astype(np.int64))
     label = connected_labels(edges.pairs, len(triangles))
-    return np.asarray(triangles[label == np.argmax(np.bincount(label))])
+    size = np.bincount(label)
+    return np.asarray(triangles[size[label] >= LEAST_PATCH * size.max()])
 
 
 def _region(mine: Indices, other: Indices, kinds: NodeKinds, held: NDArray[np.bool_]) -> LipRegion:
