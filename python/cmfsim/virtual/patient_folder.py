@@ -27,7 +27,7 @@ from cmfsim.virtual.equilibrium import EquilibriumOptions
 from cmfsim.virtual.people import PATIENTS, Relocation, VirtualPatient, patient_named
 from cmfsim.virtual.truth import PostoperativeTruth, postoperative_truth
 
-__all__ = ["case_text", "virtual_patients", "write_virtual_patient"]
+__all__ = ["PATIENTS_WITH_JOINED_LIPS", "case_text", "virtual_patients", "write_virtual_patient"]
 
 _log = logging.getLogger(__name__)
 
@@ -41,6 +41,8 @@ SCAN_WHITE, SCAN_SMOOTH = 0.1, 0.2
 CT_DRAW, SKULL_DRAW, SKIN_DRAW, SCAN_DRAW, AFTER_DRAW = range(5)
 # Edge length of the mesh that the case file asks for, in that of the truth.
 COARSER = 1.25
+# Who is made unless others are asked for.
+PATIENTS_WITH_JOINED_LIPS = tuple(n for n, p in PATIENTS.items() if not p.separate_lips)
 TRUTH = "truth"
 RECORD = "truth.json"
 COHORT = "cohort.toml"
@@ -48,7 +50,7 @@ COHORT = "cohort.toml"
 
 def virtual_patients(
     folder: str | os.PathLike[str],
-    numbers: Iterable[int] = tuple(PATIENTS),
+    numbers: Iterable[int] = PATIENTS_WITH_JOINED_LIPS,
     *,
     seed: int = 0,
     edge_length: float = 6.0,
@@ -65,7 +67,7 @@ def virtual_patients(
     folder : path
         Patient n goes to `folder/Pn`.
     numbers : iterable of int
-        1 to 6.
+        1 to 6. Those whose lips meet, 5 and 6, take many times as long and are made on request.
     seed : int
         Draws all noise; the same seed gives the same files.
     edge_length : float, mm

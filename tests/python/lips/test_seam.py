@@ -86,7 +86,7 @@ def test_a_smooth_face_has_no_seam_and_the_finding_says_what_to_do():
         (finding,) = seam.findings
         assert (finding.severity, finding.code) == ("warning", "lip-seam-not-found")
         assert "labiale_superius" in finding.what
-        assert "[lips]" in finding.mend
+        assert "[lips]" in finding.fix
     without = cmfsim.lip_seam(lip_head.head(), {}, lip_head.landmarks())
     assert without.surface is None
     assert "arches" in without.findings[0].what

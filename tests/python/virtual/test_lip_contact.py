@@ -1,7 +1,5 @@
 """Contact of the true lips: derivatives, closed forms, symmetry, and the mouth that is opened."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -9,14 +7,11 @@ import cmfsim
 import meshes
 from cmfsim import HeadParameters, make_head
 from cmfsim.errors import CaseInputError
-from cmfsim.virtual import PATIENTS
 from cmfsim.virtual.body import HyperelasticBody
 from cmfsim.virtual.equilibrium import EquilibriumOptions, find_equilibrium
 from cmfsim.virtual.hyperelastic import FAT, HyperelasticTissue
 from cmfsim.virtual.lip_contact import ContactSum, Lip, LipContact
 from cmfsim.virtual.open_mouth import MouthSlit
-from cmfsim.virtual.patient_folder import case_text
-from cmfsim.virtual.truth import postoperative_truth
 
 SIDE = 6.0
 
@@ -278,57 +273,3 @@ def test_lips_that_are_too_near_are_refused():
     """A slit that the mesh would not resolve is an error that names gap and limit."""
     with pytest.raises(CaseInputError, match=r"lip_gap is 0.5 mm: 1 mm or more"):
         MouthSlit(make_head(HeadParameters(lip_gap=0.5)))
-
-
-@pytest.fixture(scope="module")
-def closed_mouth(tmp_path_factory):
-    """The truth of a coarse P5 whose mouth closes further, over a gap that coarse tets resolve."""
-    patient = PATIENTS[5]
-    plan = {
-        name: replace(move, translation=(0.0, 3.0, 5.5), angle=-3.8)
-        for name, move in patient.plan.items()
-    }
-    parameters = replace(patient.parameters, lip_gap=2.0)
-    patient = replace(patient, parameters=parameters, plan=plan)
-    head = make_head(parameters)
-    folder = tmp_path_factory.mktemp("closed_mouth")
-    cmfsim.write_landmarks(folder / "skull.mrk.json", head.skull_landmarks)
-    cmfsim.write_landmarks(folder / "skin.mrk.json", head.skin_landmarks)
-    (folder / "case.toml").write_text(case_text(patient, head.skull_landmarks, 12.0))
-    options = EquilibriumOptions(steps=3, tolerance=5e-3, loose=0.05)
-    return postoperative_truth(
-        patient,
-        head,
-        cmfsim.Case.load(folder / "case.toml"),
-        edge_length=12.0,
-        grid=2.5,
-        skin_spacing=6.0,
-        options=options,
-    )
-
-
-def test_a_mouth_that_closes_brings_its_lips_together(closed_mouth):
-    """They were apart by 1 mm or more, now press on each other, and hardly enter each other."""
-    truth = closed_mouth
-    lips = truth.lips
-    rest = np.zeros_like(truth.nodes)
-    assert lips.touching(rest) == 0
-    places = truth.nodes[lips.upper.nodes][:, None] - truth.nodes[lips.lower.nodes]
-    assert np.linalg.norm(places, axis=2).min() > 1.0
-    assert lips.touching(truth.displacements) > 10
-    assert 0.0 < lips.penetration(truth.displacements) < 0.1
-    assert truth.equilibrium.residual <= 5e-3
-    assert truth.volume_ratios.min() > 0.0
-    force = lips.forces(truth.displacements, 1.0)[0]
-    size = np.linalg.norm(force, axis=1).sum()
-    assert size > 0.0
-    assert np.abs(force.sum(axis=0)).max() < 1e-10 * size
-
-
-def test_lips_touch_the_bones_of_both_jaws(closed_mouth):
-    """Every node of either lip is asked for its depth in every bone."""
-    contact, lips = closed_mouth.operation.contact, closed_mouth.lips
-    held = closed_mouth.operation.held
-    nodes = np.setdiff1d(np.concatenate([lips.upper.nodes, lips.lower.nodes]), held)
-    assert np.isin(nodes, contact.nodes).all()
-    assert {"cranium", "mandible_body"} <= set(contact.bones)
