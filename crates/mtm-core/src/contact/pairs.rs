@@ -28,7 +28,7 @@ use crate::vector::{add, dot, norm, scaled, sub};
 const NO_ROW: u32 = u32::MAX;
 /// Stiffness of a link over that of its node by itself: with more, each round takes more iterations, with less
 /// there are more rounds.
-const LINK_STIFFNESS: f64 = 5.0;
+const LINK_STIFFNESS: f64 = 10.0;
 /// Way to the surface, over its mean edge, below which its direction is that of the continuous normal: the way
 /// itself turns from facet to facet, and means nothing at the surface.
 const NEAR_SHARE: f64 = 0.5;
@@ -38,6 +38,8 @@ const NEAR_SHARE: f64 = 0.5;
 const RIM_SHARE: f64 = 0.05;
 /// Way past the border of an open surface, over its mean edge, up to which a node may still touch it.
 const BORDER_REACH: f64 = 0.25;
+/// Depth behind a surface, over its mean edge, from which a node that was past its border has come round it.
+const ROUND_SHARE: f64 = 0.1;
 /// Depth behind a surface, over its mean edge, from which a node counts as on the far side of it: it is not pushed
 /// back through.
 const DEEPEST: f64 = 2.0;
@@ -59,6 +61,11 @@ impl Link {
         self.ends.iter().map(|(row, c)| dot(*c, x[*row as usize])).sum()
     }
 
+    /// k (goal − c·x): the force that it puts on c at x, N.
+    pub fn pull(&self, x: &[[f64; 3]]) -> f64 {
+        self.stiffness * (self.goal - self.along(x))
+    }
+
     /// Adds k (c·x) c to rows y.
     pub fn add_product(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
         self.add(self.stiffness * self.along(x), y);
@@ -71,12 +78,12 @@ impl Link {
 
     /// Adds k (goal − c·x) c to rows y: the force that it puts on them at x, N.
     pub fn add_force(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
-        self.add(self.stiffness * (self.goal - self.along(x)), y);
+        self.add(self.pull(x), y);
     }
 
     /// Takes it off again.
     pub fn take_force(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
-        self.add(self.stiffness * (self.along(x) - self.goal), y);
+        self.add(-self.pull(x), y);
     }
 
     fn add(&self, force: f64, y: &mut [[f64; 3]]) {
@@ -96,6 +103,8 @@ struct Candidate {
     allowed: f64,
     /// Stiffness of its link, N/mm.
     stiffness: f64,
+    /// Whether it lies over its surface at rest, not past its border.
+    is_over: bool,
 }
 
 /// A surface that nodes may not enter.
@@ -141,6 +150,8 @@ struct Meeting {
 pub(crate) struct Touching {
     /// λ of each candidate, N.
     pub multipliers: Vec<f64>,
+    /// Whether each lay over its surface last.
+    over: Vec<bool>,
 }
 
 /// A round of the method of multipliers: what it is linearised about, and the links that follow.
@@ -231,7 +242,8 @@ impl Pairs {
                 let closest = wall.surface().closest_one(place);
                 let mean_edge = wall.surface().mean_edge_length();
                 let way = sub(place, closest.point);
-                let behind = over(&closest, way, mean_edge).map_or(0.0, |d| d.min(0.0));
+                let distance = over(&closest, way, mean_edge);
+                let behind = distance.map_or(0.0, |d| d.min(0.0));
                 if behind < -DEEPEST * mean_edge {
                     continue;
                 }
@@ -240,6 +252,7 @@ impl Pairs {
                     wall: out.walls.len(),
                     allowed: behind,
                     stiffness: LINK_STIFFNESS * stiffness(node as usize),
+                    is_over: distance.is_some(),
                 });
             }
             out.walls.push(wall);
@@ -249,7 +262,10 @@ impl Pairs {
 
     /// No forces yet.
     pub fn at_rest(&self) -> Touching {
-        Touching { multipliers: vec![0.0; self.candidates.len()] }
+        Touching {
+            multipliers: vec![0.0; self.candidates.len()],
+            over: self.candidates.iter().map(|c| c.is_over).collect(),
+        }
     }
 
     /// Mean edge of the surfaces of tissue, mm, or of all where there is none of tissue.
@@ -263,11 +279,17 @@ impl Pairs {
         if tissue.is_empty() { mean(self.walls.iter().collect()) } else { mean(tissue) }
     }
 
-    /// Where every candidate is under displacements `u` of all nodes.
+    /// Where every candidate is under displacements `u` of all nodes; nothing for those past a border, and those that
+    /// came behind their surface round it: what was not `over` it last did not go through it.
     ///
     /// # Errors
     /// A triangle of the tissue that has collapsed.
-    fn meetings(&self, u: &[[f64; 3]], motions: &[&Motion]) -> Result<Vec<Option<Meeting>>> {
+    fn meetings(
+        &self,
+        u: &[[f64; 3]],
+        motions: &[&Motion],
+        over: &[bool],
+    ) -> Result<Vec<Option<Meeting>>> {
         let there = |j: u32| add(self.positions[j as usize], u[j as usize]);
         let mut moved = Vec::with_capacity(self.walls.len());
         for wall in &self.walls {
@@ -288,8 +310,11 @@ impl Pairs {
                 },
             });
         }
-        let meet = |c: &Candidate| self.meet(c, &moved[c.wall], there(c.node));
-        Ok(self.candidates.par_iter().with_min_len(64).map(meet).collect())
+        let meet = |(c, over): (&Candidate, &bool)| {
+            let deepest = -ROUND_SHARE * self.walls[c.wall].surface().mean_edge_length();
+            self.meet(c, &moved[c.wall], there(c.node)).filter(|m| *over || m.gap >= deepest)
+        };
+        Ok(self.candidates.par_iter().zip(over).with_min_len(64).map(meet).collect())
     }
 
     /// Where candidate `c` at `place` is; nothing past the border of its surface.
@@ -325,7 +350,7 @@ impl Pairs {
     /// # Errors
     /// A triangle of the tissue that has collapsed.
     pub fn round(&self, u: &[[f64; 3]], motions: &[&Motion], touching: &Touching) -> Result<Round> {
-        let meetings = self.meetings(u, motions)?;
+        let meetings = self.meetings(u, motions, &touching.over)?;
         let (mut links, mut active) = (Vec::new(), vec![false; self.candidates.len()]);
         for (i, c) in self.candidates.iter().enumerate() {
             let Some(meeting) = &meetings[i] else { continue };
@@ -360,7 +385,23 @@ impl Pairs {
         ends
     }
 
-    /// Follows `round` by the forces that gaps at displacements `u` ask for; what is left open.
+    /// Σ ½ k ⟨λ/k − g⟩₊² at displacements `u` of all nodes, N mm: what pressing adds to the elastic energy.
+    ///
+    /// # Errors
+    /// A triangle of the tissue that has collapsed.
+    pub fn energy(&self, u: &[[f64; 3]], motions: &[&Motion], touching: &Touching) -> Result<f64> {
+        let meetings = self.meetings(u, motions, &touching.over)?;
+        let each = self.candidates.iter().zip(&meetings).zip(&touching.multipliers);
+        Ok(each
+            .map(|((c, meeting), force)| {
+                let deep = meeting.map_or(0.0, |m| (force / c.stiffness - m.gap).max(0.0));
+                0.5 * c.stiffness * deep * deep
+            })
+            .sum())
+    }
+
+    /// Follows `round` by the forces that gaps at displacements `u` ask for, where these are the `is_whole` step of the
+    /// round; what is left open.
     ///
     /// # Errors
     /// A triangle of the tissue that has collapsed.
@@ -370,8 +411,10 @@ impl Pairs {
         u: &[[f64; 3]],
         motions: &[&Motion],
         touching: &mut Touching,
+        is_whole: bool,
     ) -> Result<Left> {
-        let meetings = self.meetings(u, motions)?;
+        let meetings = self.meetings(u, motions, &touching.over)?;
+        touching.over = meetings.iter().map(Option::is_some).collect();
         let mut left = Left { penetration: 0.0, gap: 0.0, changed: 0 };
         let mut forces = touching.multipliers.clone();
         for (i, c) in self.candidates.iter().enumerate() {
@@ -388,7 +431,7 @@ impl Pairs {
             }
         }
         // Forces follow once it is known what touches under the last ones, but for a few nodes at the rim.
-        if left.changed as f64 <= RIM_SHARE * round.links.len() as f64 {
+        if is_whole && left.changed as f64 <= RIM_SHARE * round.links.len() as f64 {
             touching.multipliers = forces;
         }
         Ok(left)
@@ -413,12 +456,13 @@ impl Pairs {
         motions: &[&Motion],
         rows: &[[f64; 3]],
     ) -> Result<Vec<Met>> {
-        let meetings = self.meetings(u, motions)?;
+        let over: Vec<bool> = round.meetings.iter().map(Option::is_some).collect();
+        let meetings = self.meetings(u, motions, &over)?;
         let mut links = round.links.iter();
         let mut out = Vec::new();
         for (i, c) in self.candidates.iter().enumerate() {
             let link = if round.active[i] { links.next() } else { None };
-            let force = link.map_or(0.0, |l| l.stiffness * (l.goal - l.along(rows)));
+            let force = link.map_or(0.0, |l| l.pull(rows));
             if let Some(meeting) = meetings[i].or(round.meetings[i]) {
                 let (gap, normal) = (meeting.gap, meeting.normal);
                 out.push(Met { node: c.node, gap, normal, force });

@@ -281,6 +281,13 @@ impl System {
         }
     }
 
+    /// Forces out of balance of the rows at displacements `x`, A x − b, N; nothing where the matrix is not kept.
+    pub fn out_of_balance(&self, x: &[[f64; 3]], b: &[[f64; 3]]) -> Option<Rows> {
+        let Kept::Matrix(system) = &self.kept else { return None };
+        let product = system.matrix().multiply(x);
+        Some(product.iter().zip(b).map(|(f, b)| sub(*f, *b)).collect())
+    }
+
     /// Rows under links where no node slides, begun from displacements `start`.
     ///
     /// # Errors

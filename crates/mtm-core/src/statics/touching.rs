@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use crate::boundary::Motion;
 use crate::contact::pairs::{Left, Pairs, Round, Touching};
-use crate::contact::{ContactStart, ContactState, Sliding};
+use crate::contact::{ContactStart, ContactState, Sliding, SlidingNode};
 use crate::error::{MtmError, Result};
 use crate::geometry::motion::SurfaceMotion;
 use crate::mesh::TetMesh;
@@ -17,7 +17,7 @@ use crate::statics::options::StaticOptions;
 use crate::statics::reduction::Reduction;
 use crate::statics::solution::{Clock, TouchResult};
 use crate::statics::system::{Begin, Linked, Settle, Settled, Solved, System};
-use crate::vector::{add, between, norm, scaled, sub};
+use crate::vector::{add, between, dot, norm, scaled, sub};
 
 /// Way of the bones in one step, over the mean edge of the tissue that may be touched.
 const STEP_EDGES: f64 = 0.75;
@@ -32,10 +32,14 @@ const CLOSE_SHARE: f64 = 2e-5;
 /// Multiple of it that is enough on the way, and where the rounds ran out: five hundredths of a millimetre.
 const LOOSE: f64 = 10.0;
 /// Rounds of a step on the way, and of the last one.
-const MOST_ROUNDS_ON_THE_WAY: usize = 6;
-const MOST_ROUNDS: usize = 80;
-/// Rounds of a step that go the whole way.
-const EAGER_ROUNDS: usize = 8;
+const MOST_ROUNDS_ON_THE_WAY: usize = 30;
+const MOST_ROUNDS: usize = 40;
+/// Rounds of the last step after which nothing that a face would show may be open: a node inside the mouth may
+/// meet one facet or the next for ever.
+const PATIENCE: usize = 25;
+/// Share of its slope by which the energy has to fall, and shortest share of a round.
+const DESCENT: f64 = 1e-4;
+const SHORTEST_SHARE: f64 = 1.0 / 32.0;
 /// Share of what a round changes to which it is solved until the last ones: small forces decide what touches.
 const ROUGH_SHARE: f64 = 1e-4;
 /// Most nodes that an error names.
@@ -177,27 +181,82 @@ impl Path<'_> {
             let begun = Begun { b: &b, rows: &pose.rows, contact: begin };
             let (rows, contact) =
                 self.linked(&round, begun, &motions, rough.then_some(close), solve)?;
-            let u = self.reduction.filled(&prescribed, &rows);
+            let whole = self.reduction.filled(&prescribed, &rows);
             let mut touching = pose.touching.clone();
-            let left = self.pairs.follow(&round, &u, &motions, &mut touching)?;
+            let mut left = self.pairs.follow(&round, &whole, &motions, &mut touching, true)?;
             if rounds == 1 && left.penetration > DEEP_EDGES * self.pairs.mean_edge() {
                 return Ok(None);
             }
-            let change = largest_change(&pose.u, &u);
+            let change = largest_change(&pose.u, &whole);
             let near = rounds > 1 && left.distance() <= close && change <= 2.0 * close;
             let converged = near && left.changed == 0 && !rough;
             let is_over = converged || rounds >= most || (near && !is_last);
-            // Nodes at a rim may meet two facets by turns: half steps lead between them.
-            let share = if is_over || near || rounds < EAGER_ROUNDS { 1.0 } else { 0.5 };
+            let share = if is_over || near || rounds == 1 {
+                1.0
+            } else {
+                self.share(&pose, &round, &rows, (&prescribed, &b), &motions)?
+            };
             let rows = between(&pose.rows, &rows, share);
             let u = self.reduction.filled(&prescribed, &rows);
+            if share < 1.0 {
+                touching = pose.touching.clone();
+                left = self.pairs.follow(&round, &u, &motions, &mut touching, false)?;
+            }
             pose = Pose { u, rows, contact, touching };
-            if is_over {
+            let will_do = !rough && rounds > PATIENCE && left.distance() <= LOOSE * self.close();
+            if is_over || will_do {
                 return Ok(Some((pose, Done { round, left, rounds, change, converged })));
             }
-            begin = pose.contact.as_ref().zip(self.sliding).map(|(c, s)| s.start_of(c));
-            rough = !(is_last && (near || rounds + 2 >= most));
+            begin = self.begun(&pose);
+            rough = !(is_last && (near || rounds >= PATIENCE));
         }
+    }
+
+    /// How far to go from `pose` to the solution `rows` of a round: halves of the way until elastic energy and pressing
+    /// together fall (Armijo 1966).
+    fn share(
+        &self,
+        pose: &Pose,
+        round: &Round,
+        rows: &[[f64; 3]],
+        (prescribed, b): (&[[f64; 3]], &[[f64; 3]]),
+        motions: &[&Motion],
+    ) -> Result<f64> {
+        let (Some(first), Some(last)) =
+            (self.system.out_of_balance(&pose.rows, b), self.system.out_of_balance(rows, b))
+        else {
+            return Ok(1.0);
+        };
+        let mut way: Vec<[f64; 3]> =
+            rows.iter().zip(&pose.rows).map(|(to, from)| sub(*to, *from)).collect();
+        let pressing: f64 = round.links.iter().map(|l| l.pull(&pose.rows) * l.along(&way)).sum();
+        // Contact forces of sliding nodes do no work along their surfaces.
+        for node in self.sliding.iter().flat_map(|s| s.nodes()) {
+            way[node.row as usize] = [0.0; 3];
+        }
+        let work = |f: &[[f64; 3]]| -> f64 { f.iter().zip(&way).map(|(f, w)| dot(*f, *w)).sum() };
+        let (from, to) = (work(&first), work(&last));
+        let slope = from - pressing;
+        let start = self.pairs.energy(&pose.u, motions, &pose.touching)?;
+        let mut share = 1.0;
+        while share > SHORTEST_SHARE {
+            let u = self.reduction.filled(prescribed, &between(&pose.rows, rows, share));
+            let elastic = share * (from + 0.5 * share * (to - from));
+            let rise = elastic + self.pairs.energy(&u, motions, &pose.touching)? - start;
+            if rise <= DESCENT * share * slope {
+                break;
+            }
+            share *= 0.5;
+        }
+        Ok(share)
+    }
+
+    /// Where sliding nodes are in `pose`.
+    fn begun(&self, pose: &Pose) -> Option<ContactStart> {
+        let (sliding, state) = (self.sliding?, pose.contact.as_ref()?);
+        let at = |node: &SlidingNode, place: &[f64; 3]| add(*place, pose.rows[node.row as usize]);
+        let places = sliding.nodes().iter().zip(&sliding.positions).map(|(n, x)| at(n, x));
+        Some(ContactStart { places: places.collect(), reactions: state.reactions.clone() })
     }
 
     /// The body under the links of a round: displacements of the rows, and contact where nodes slide.
@@ -273,11 +332,13 @@ impl Path<'_> {
         rounds: usize,
         solve: &mut Solve<'_>,
     ) -> Result<(Solved, Touch)> {
-        let open = done.left.distance().max(done.change);
+        let open = done.left.distance();
         if !done.converged && open > LOOSE * self.close() {
             return Err(self.lost(&pose, rounds, open));
         }
-        solve.effort.error_estimate = solve.effort.error_estimate.max(open);
+        // What a node still moved by may be its own way between two facets, and is no less than its error.
+        let error = open.max(done.change);
+        solve.effort.error_estimate = solve.effort.error_estimate.max(error);
         let met = self.pairs.met(&done.round, &pose.u, self.motions, &pose.rows)?;
         let mut forces = vec![[0.0; 3]; pose.rows.len()];
         for link in &done.round.links {
