@@ -47,81 +47,90 @@ FIGURES = {
 
 INTRODUCTION = f"""# Numerical stability: the stiff and extreme suite
 
-Made by `python benches/stability.py --markdown docs/stability.md`;
+`python benches/stability.py --markdown docs/stability.md` writes this page;
 `tests/python/core/test_extreme.py` runs the linear cases and the quicker ones of the others.
 Numbers near 1e-15 differ from machine to machine.
 
 ## How to read the tables
 
 - **condition** is the extreme value of the case.
-- **κ** is the condition number κ₂ of D^-½ K D^-½ over the unknowns (K the stiffness, D its
-  diagonal): the number that bounds the error of Cholesky's method (van der Sluis 1969). Moduli in
-  another unit, or a stiff layer on a soft one, do not raise it; a stiff body that only soft tissue
-  holds does.
+- **κ** is the condition number κ₂ of D^-½ K D^-½ over the unknowns, where K is the stiffness and D
+  its diagonal. It bounds the error of Cholesky factorisation (van der Sluis 1969). Moduli in
+  another unit, or a stiff layer on a soft one, do not raise it; a stiff body attached only through
+  soft tissue does.
 - **reference** is never cmfsim. *Closed form*: a field that the mesh can represent (affine, rigid,
-  piecewise linear in layers), so the discrete answer is the analytical one. *32 digits*:
+  piecewise linear in layers), so the discrete answer equals the analytical one. *32 digits*:
   `benches/extended.py` builds elasticity from the engineering compliance with 60 decimal digits,
   sums forces tet by tet in pairs of float64 (Dekker 1971), and refines until the last correction is
-  below 1e-18 of the displacements; the tests hold it against the closed forms and against a
-  solution in exact fractions. *Mechanism*: there is no solution, and it must be refused.
-- **residual** is `result.residual`: forces out of balance over the forces that the plan brings in.
-  It is checked against the residual in 32 digits. It says little about the error where κ is large.
-- **error** is the largest distance of a node from its reference position over the largest
+  below 1e-18 of the displacements; the tests compare it with the closed forms and with a solution
+  in exact fractions. *Mechanism*: there is no solution, and the case must be refused.
+- **residual** is `result.residual`: the out-of-balance forces relative to the forces that the plan
+  introduces. It is compared with the residual in 32 digits. Where κ is large, it says little about
+  the error.
+- **error** is the largest distance of a node from its reference position, relative to the largest
   displacement.
-- **estimate** is `result.error_estimate` over the largest displacement: no bound
+- **estimate** is `result.error_estimate` relative to the largest displacement. It is not a bound
   ([error estimates](error_estimates.md)).
-- **verdict**: *ok*, *refused* with the error raised, or **WRONG**.
+- **verdict** is *ok*, *refused* with the error raised, or **WRONG**.
 
-What is *ok*, with ε = 2.2e-16: Cholesky's error is within the larger of {ERROR_LIMIT:.0e} and
-{CONDITION_FACTOR:g} ε κ. The error of `pcg` and `relaxation` is within {BOUND_FACTOR:g} × their
-estimate plus {CONDITION_FACTOR:g} ε κ: the estimates are of the equations in float64, whose own
-rounding is of the order ε κ. No such allowance is ever more than {WORTHLESS:.0e}. A solvable case
-may be refused (`SolverError`) by Cholesky where {CONDITION_FACTOR:g} ε κ > {WORTHLESS:.0e}, by
-`pcg` where {CONDITION_FACTOR:g} ε κ exceeds the tolerance asked for (1e-9 unless stated), by
-`relaxation` there or where κ exceeds the {SWEEPS} sweeps that it gets here.
+A result is *ok* under these conditions, with ε = 2.2e-16. The error of Cholesky is within the
+larger of {ERROR_LIMIT:.0e} and {CONDITION_FACTOR:g} ε κ. The error of `pcg` and `relaxation` is
+within {BOUND_FACTOR:g} × their estimate plus {CONDITION_FACTOR:g} ε κ, because the estimates are of
+the equations in float64, whose own rounding is of the order ε κ. These allowances never exceed
+{WORTHLESS:.0e}. A solvable case may be refused (`SolverError`) by Cholesky where
+{CONDITION_FACTOR:g} ε κ > {WORTHLESS:.0e}, by `pcg` where {CONDITION_FACTOR:g} ε κ exceeds the
+requested tolerance (1e-9 unless stated), and by `relaxation` in the same place or where κ exceeds
+the {SWEEPS} sweeps that it is given here.
 
-*Contact*, *lift-off*, *contact tolerance*, *held by contact*: **distance** is the largest from
-where a held node belongs, over the triangles of the moved surface, one by one; **tangential** the
-largest force across the normals over the largest contact force; **true residual** that of the
-tangential equilibrium in 32 digits, and **error** the distance from the displacements in that
-equilibrium with the same places and normals (`benches/extreme/contact.py`), whose κ is that of the
-tangential unknowns. *ok* is a distance within {DISTANCE:.0e} mm (twice the contact tolerance where
-that is wider), a tangential force within {TANGENTIAL:.0e}, an error within {CONTACT_ERROR:.0e},
-normals that are the wall's, and with lift-off no pull.
+*Contact*, *lift-off*, *contact tolerance*, *held by contact*: **distance** is the largest distance
+between a node in contact and the place where it belongs, computed over the triangles of the moved
+surface one by one. **Tangential** is the largest force across the normals, relative to the largest
+contact force. **True residual** is that of the tangential equilibrium in 32 digits, and **error**
+is the distance from the displacements in that equilibrium with the same places and normals
+(`benches/extreme/contact.py`), whose κ is that of the tangential unknowns. *Ok* means a distance
+within {DISTANCE:.0e} mm (twice the contact tolerance where that is wider), a tangential force
+within {TANGENTIAL:.0e}, an error within {CONTACT_ERROR:.0e}, normals equal to those of the wall,
+and no tension with lift-off.
 
-*Bending* and *elements*: the error is from the solution of an independent stiffness of the same
-element (`benches/independent.py`: scikit-fem; numpy for `anp`), the residual that stiffness's over
-|K| |u|. **Deflection** is that of the tip over scikit-fem's quadratic tets of half the edge: what
-the mesh makes of the tissue, where the other columns say what the solver makes of the mesh. An
-element *locks* where it bends less than {LOCKED:g} of its own share at ν = 0.3.
+*Bending* and *elements*: the error is measured from the solution of an independent stiffness of the
+same element (`benches/independent.py`: scikit-fem; numpy for `anp`), and the residual is that of
+this stiffness relative to |K| |u|. **Deflection** is the deflection of the tip relative to
+scikit-fem's quadratic tets of half the edge. It shows the effect of the mesh, while the other
+columns show the effect of the solver. An element *locks* if its deflection is below {LOCKED:g} of
+its own at ν = 0.3.
 
-*Large deformation*: **true residual** is of forces that scikit-fem assembles from numpy's stresses,
-over those at the held nodes; **error** the step that these would still bring with the tangent of
-cmfsim, or the distance from the closed form; **least J** the smallest volume of a tet over that at
-rest.
+*Large deformation*: **true residual** is that of forces which scikit-fem assembles from stresses
+computed in numpy, relative to those at the constrained nodes. **Error** is the step that these
+forces would still cause with the tangent of cmfsim, or the distance from the closed form.
+**Least J** is the smallest ratio of a tet's volume to its volume at rest.
 
 ## Where a method must not be used
 
-- **cholesky**: it loses log10 κ of its 16 digits, so an answer at κ of 1e12 (a bar 1000 times as
-  long as thick) has four; `result.error_estimate` says so. Not far above, it is refused.
-- **pcg**: where κ is above about 1e7: stiff tissue that soft tissue holds with a contrast above
-  1e6, slender bodies. Rounding then keeps it from its tolerance, and it raises `SolverError`.
-- **relaxation**: stiff bodies in soft tissue with a contrast above 1e2, ν above 0.49, slivers: it
+- **cholesky** loses log10 κ of its 16 digits, so an answer at a κ of 1e12 (a bar 1000 times as long
+  as thick) has four, as `result.error_estimate` reports. Not far above that, it is refused.
+- **pcg**: where κ is above about 1e7, that is, for stiff tissue attached through soft tissue at a
+  contrast above 1e6, and for slender bodies. Rounding then keeps it from reaching its tolerance,
+  and it raises `SolverError`.
+- **relaxation**: stiff bodies in soft tissue at a contrast above 1e2, ν above 0.49, slivers. It
   runs out of sweeps and raises `SolverError`. It measures its error by conjugate gradients, so it
   is refused wherever these are.
-- **pcg** with `p2`: κ is some twenty times that of linear tets, and it is refused as much sooner.
-- **p1**: bending tissue with ν above 0.45: it locks, silently. `anp` and `p2` do not (theory,
-  *Elements*), though `anp` keeps only two thirds of its share on a beam two boxes thick.
-- **corotational**: a body pressed to about half its length. Its energy is finite where a tet
-  inverts, so it may come to rest with tets turned over; `hyperelastic` resists longer, or is
-  refused. `solve_scene` and `predict` warn of it (`inverted-tets`: how many, which is worst) and
-  count them in the summary; after `StaticSolver.solve` look for `tensors.volume_change(u) <= -1`.
-- **contact** in a gutter of 10° across which the body is pushed may not converge: `ContactError`
-  with the nodes. A body that only walls hold is refused where they leave a motion free.
-- **relaxation** and **plan_operator** with `corotational` or `hyperelastic`: they are of the linear
-  model, and raise `SolverError`. So does a plan that Newton's method does not bring to rest in 64
-  parts.
-- Nodes that hold a body and lie within about 1e-4 of its size of one line count as in line:
+- **pcg** with `p2`: κ is about twenty times that of linear tets, and it is refused correspondingly
+  sooner.
+- **p1**: bending tissue with ν above 0.45. It locks without a warning. `anp` and `p2` do not
+  (theory, *Elements*), although `anp` keeps only two thirds of its deflection on a beam two boxes
+  thick.
+- **corotational**: a body compressed to about half its length. The energy is finite where a tet
+  inverts, so tets may be inverted at equilibrium; `hyperelastic` resists longer, or is refused.
+  `solve_scene` and `predict` warn of it (`inverted-tets`: how many, and which is worst) and
+  count them in the summary. After `StaticSolver.solve`, look for
+  `tensors.volume_change(u) <= -1`.
+- **contact** in a groove of 10° across which the body is pushed may not converge. It raises
+  `ContactError` with the nodes. A body constrained only by walls is refused if they leave a
+  motion free.
+- **relaxation** and **plan_operator** with `corotational` or `hyperelastic`: they belong to the
+  linear model and raise `SolverError`. So does a plan for which Newton's method does not converge
+  in 64 parts.
+- Constrained nodes that lie within about 1e-4 of the body's size of one line count as collinear:
   `BoundaryError`.
 """
 

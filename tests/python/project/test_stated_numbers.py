@@ -42,7 +42,7 @@ def test_the_times_of_the_readme_are_those_of_the_benchmarks():
 
 
 def test_every_command_that_makes_a_number_is_there():
-    """Files named in "Which command makes which number" exist."""
+    """Files named in "Which command produces which number" exist."""
     table = BENCHMARKS.partition("## Which command")[2].partition("## ")[0]
     files = re.findall(r"benches/[\w/]+\.(?:py|rs)", table)
     assert len(files) >= 5
