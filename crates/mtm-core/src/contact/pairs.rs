@@ -38,6 +38,9 @@ const NEAR_SHARE: f64 = 0.5;
 const RIM_SHARE: f64 = 0.05;
 /// Way past the border of an open surface, over its mean edge, up to which a node may still touch it.
 const BORDER_REACH: f64 = 0.25;
+/// Farthest that a gap shrinks in a round where a node goes through its surface, over the mean edge: bones go no
+/// farther in a step.
+const JUMP_SHARE: f64 = 1.0;
 /// Depth behind a surface, over its mean edge, from which a node that was past its border has come round it.
 const ROUND_SHARE: f64 = 0.1;
 /// Depth behind a surface, over its mean edge, from which a node counts as on the far side of it: it is not pushed
@@ -103,8 +106,8 @@ struct Candidate {
     allowed: f64,
     /// Stiffness of its link, N/mm.
     stiffness: f64,
-    /// Whether it lies over its surface at rest, not past its border.
-    is_over: bool,
+    /// Gap at rest, mm; none past the border of its surface.
+    at_rest: Option<f64>,
 }
 
 /// A surface that nodes may not enter.
@@ -150,8 +153,8 @@ struct Meeting {
 pub(crate) struct Touching {
     /// λ of each candidate, N.
     pub multipliers: Vec<f64>,
-    /// Whether each lay over its surface last.
-    over: Vec<bool>,
+    /// Gap of each where it was last, mm; none past the border of its surface.
+    gaps: Vec<Option<f64>>,
 }
 
 /// A round of the method of multipliers: what it is linearised about, and the links that follow.
@@ -252,7 +255,7 @@ impl Pairs {
                     wall: out.walls.len(),
                     allowed: behind,
                     stiffness: LINK_STIFFNESS * stiffness(node as usize),
-                    is_over: distance.is_some(),
+                    at_rest: distance.map(|d| d - behind),
                 });
             }
             out.walls.push(wall);
@@ -264,7 +267,7 @@ impl Pairs {
     pub fn at_rest(&self) -> Touching {
         Touching {
             multipliers: vec![0.0; self.candidates.len()],
-            over: self.candidates.iter().map(|c| c.is_over).collect(),
+            gaps: self.candidates.iter().map(|c| c.at_rest).collect(),
         }
     }
 
@@ -279,8 +282,9 @@ impl Pairs {
         if tissue.is_empty() { mean(self.walls.iter().collect()) } else { mean(tissue) }
     }
 
-    /// Where every candidate is under displacements `u` of all nodes; nothing for those past a border, and those that
-    /// came behind their surface round it: what was not `over` it last did not go through it.
+    /// Where every candidate is under displacements `u` of all nodes; nothing for those past a border, and for those
+    /// that came behind their surface round its border or past an edge of it: farther from their gaps `before` than
+    /// a step takes them, they did not go through it.
     ///
     /// # Errors
     /// A triangle of the tissue that has collapsed.
@@ -288,7 +292,7 @@ impl Pairs {
         &self,
         u: &[[f64; 3]],
         motions: &[&Motion],
-        over: &[bool],
+        before: &[Option<f64>],
     ) -> Result<Vec<Option<Meeting>>> {
         let there = |j: u32| add(self.positions[j as usize], u[j as usize]);
         let mut moved = Vec::with_capacity(self.walls.len());
@@ -310,11 +314,13 @@ impl Pairs {
                 },
             });
         }
-        let meet = |(c, over): (&Candidate, &bool)| {
-            let deepest = -ROUND_SHARE * self.walls[c.wall].surface().mean_edge_length();
-            self.meet(c, &moved[c.wall], there(c.node)).filter(|m| *over || m.gap >= deepest)
+        let meet = |(c, before): (&Candidate, &Option<f64>)| {
+            let edge = self.walls[c.wall].surface().mean_edge_length();
+            let through = before.map_or(0.0, |gap| gap - JUMP_SHARE * edge);
+            let deepest = through.min(-ROUND_SHARE * edge);
+            self.meet(c, &moved[c.wall], there(c.node)).filter(|m| m.gap >= deepest)
         };
-        Ok(self.candidates.par_iter().zip(over).with_min_len(64).map(meet).collect())
+        Ok(self.candidates.par_iter().zip(before).with_min_len(64).map(meet).collect())
     }
 
     /// Where candidate `c` at `place` is; nothing past the border of its surface.
@@ -350,7 +356,7 @@ impl Pairs {
     /// # Errors
     /// A triangle of the tissue that has collapsed.
     pub fn round(&self, u: &[[f64; 3]], motions: &[&Motion], touching: &Touching) -> Result<Round> {
-        let meetings = self.meetings(u, motions, &touching.over)?;
+        let meetings = self.meetings(u, motions, &touching.gaps)?;
         let (mut links, mut active) = (Vec::new(), vec![false; self.candidates.len()]);
         for (i, c) in self.candidates.iter().enumerate() {
             let Some(meeting) = &meetings[i] else { continue };
@@ -390,7 +396,7 @@ impl Pairs {
     /// # Errors
     /// A triangle of the tissue that has collapsed.
     pub fn energy(&self, u: &[[f64; 3]], motions: &[&Motion], touching: &Touching) -> Result<f64> {
-        let meetings = self.meetings(u, motions, &touching.over)?;
+        let meetings = self.meetings(u, motions, &touching.gaps)?;
         let each = self.candidates.iter().zip(&meetings).zip(&touching.multipliers);
         Ok(each
             .map(|((c, meeting), force)| {
@@ -413,8 +419,8 @@ impl Pairs {
         touching: &mut Touching,
         is_whole: bool,
     ) -> Result<Left> {
-        let meetings = self.meetings(u, motions, &touching.over)?;
-        touching.over = meetings.iter().map(Option::is_some).collect();
+        let meetings = self.meetings(u, motions, &touching.gaps)?;
+        touching.gaps = gaps(&meetings);
         let mut left = Left { penetration: 0.0, gap: 0.0, changed: 0 };
         let mut forces = touching.multipliers.clone();
         for (i, c) in self.candidates.iter().enumerate() {
@@ -456,8 +462,7 @@ impl Pairs {
         motions: &[&Motion],
         rows: &[[f64; 3]],
     ) -> Result<Vec<Met>> {
-        let over: Vec<bool> = round.meetings.iter().map(Option::is_some).collect();
-        let meetings = self.meetings(u, motions, &over)?;
+        let meetings = self.meetings(u, motions, &gaps(&round.meetings))?;
         let mut links = round.links.iter();
         let mut out = Vec::new();
         for (i, c) in self.candidates.iter().enumerate() {
@@ -491,6 +496,11 @@ fn out_of_range(pair: usize, node: u32, count: usize) -> MtmError {
         count,
         kind: ErrorKind::Boundary,
     }
+}
+
+/// Gap of each meeting, mm.
+fn gaps(meetings: &[Option<Meeting>]) -> Vec<Option<f64>> {
+    meetings.iter().map(|m| m.map(|m| m.gap)).collect()
 }
 
 /// A surface under a plan.

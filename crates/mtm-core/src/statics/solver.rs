@@ -531,7 +531,7 @@ fn method_for_touching(options: &StaticOptions) -> Result<Method> {
         return Err(MtmError::UnknownName {
             what: "kinematics for a boundary with touching pairs",
             found: options.kinematics.name().into(),
-            known: "linear".into(),
+            known: "linear",
             kind: ErrorKind::Solver,
         });
     }
