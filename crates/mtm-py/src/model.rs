@@ -64,6 +64,7 @@ impl PyBoundary {
         fixed = None, joined = None, sliding = None, contact = None, *, gap = None, touching = None,
         obstacles = None, conflicts = "error"
     ))]
+    #[expect(clippy::too_many_arguments, reason = "one for each keyword of the Python signature")]
     fn new(
         fixed: Option<&Bound<'_, PyAny>>,
         joined: Option<&Bound<'_, PyAny>>,
