@@ -243,9 +243,7 @@ impl StaticSolver {
         let (Solved { rows, contact, contact_seconds }, touch) =
             self.solve_rows(&posed, &mut solve)?;
         clock.lap("solve", true);
-        for (&j, v) in self.reduction.unknowns.iter().zip(&rows) {
-            u[j as usize] = *v;
-        }
+        u = self.reduction.filled(&u, &rows);
         let mut forces = self.forces(&u)?;
         if self.refines && contact.is_none() {
             self.refine(&mut u, &forces, loads, &mut solve)?;

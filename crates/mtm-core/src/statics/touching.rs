@@ -196,9 +196,10 @@ impl Path<'_> {
             } else {
                 self.share(&pose, &round, &rows, (&prescribed, &b), &motions)?
             };
-            let rows = between(&pose.rows, &rows, share);
-            let u = self.reduction.filled(&prescribed, &rows);
+            let (mut rows, mut u) = (rows, whole);
             if share < 1.0 {
+                rows = between(&pose.rows, &rows, share);
+                u = self.reduction.filled(&prescribed, &rows);
                 touching = pose.touching.clone();
                 left = self.pairs.follow(&round, &u, &motions, &mut touching, false)?;
             }
