@@ -141,7 +141,7 @@ def read_moved_surface(
 
 SAME_NEEDED = (
     "the same vertices and triangles in the same order are needed; where the bone was segmented or "
-    'remeshed anew, name it in [postoperative.bones] and write plan = "achieved", which lays the '
+    'remeshed, name it in [postoperative.bones] and write plan = "achieved", which lays the '
     "bone before on the one after"
 )
 

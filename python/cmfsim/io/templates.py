@@ -99,7 +99,7 @@ def survey_template(path: str | os.PathLike[str]) -> TemplateSurvey:
     if path.is_dir():
         template = _survey_folder(path, gathered)
     else:
-        with gathered.at("template-archive", "make it anew"), named(path):
+        with gathered.at("template-archive", "create it again"), named(path):
             template = read_template_archive(path)
     if gathered.has_error:
         template = None

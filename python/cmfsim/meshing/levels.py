@@ -145,7 +145,7 @@ def _outside(name: str, bone: ImageData, skin: ImageData) -> Finding | None:
         f"{volume:.0f} mm³ of bone {name!r} lie outside the skin",
         where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
         why="there is no tissue over it, so the face cannot be predicted there",
-        fix="check that skin and bone are of one patient, in one frame; a neck cut lower mends a "
+        fix="check that skin and bone are of one patient, in one frame; a neck cut lower fixes a "
         "spine "
         "that sticks out",
     )

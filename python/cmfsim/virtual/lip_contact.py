@@ -129,7 +129,7 @@ class _Touch:
     normal : (c, 3) float64
         Unit vectors along which the distance grows.
     swing : (c, 3, 3) float64
-        Projections on the ways in which the normal swings when the node moves: none over a face,
+        Projections on the ways in which the normal turns when the node moves: none over a face,
         across an edge, both across a corner.
     depth, area : (c,) float64, mm and mm²
     """
@@ -217,7 +217,7 @@ class LipContact:
     def coupling(self, displacements: Floats, part: float) -> Any:
         """∂ forces / ∂ displacements, (3n, 3n) N/mm, with the closest feature of each node frozen.
 
-        Over a face its normal is frozen, too; about an edge or a corner it swings, which stiffens.
+        Over a face its normal is frozen, too; about an edge or a corner it turns, which stiffens.
         """
         del part
         rows, columns, data = [], [], []

@@ -187,7 +187,7 @@ def _verified(folder: Path, *, must_be_known: bool) -> list[Finding]:
         return []
     named = ", ".join(f"{name}.obj" for name in other[:3]) + (", …" if len(other) > 3 else "")
     what = f"{len(other)} of {len(HASHES)} files have other SHA-256 hashes than known: {named}"
-    fix = f"get them anew from {WHERE}"
+    fix = f"download them again from {WHERE}"
     if must_be_known:
         raise CaseInputError(f"{folder.name}: {what}; {fix}, or import with verification off")
     why = "another release has other coordinates, and files may have been damaged"

@@ -150,7 +150,7 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
             f"{names[one]} and {names[other]} lie in the same place",
             where=template.name,
             why="no map takes one place to two",
-            fix="place one of them anew",
+            fix="place one of them again",
         )
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if len(points) < 4 or spread[-1] <= PLANE_SHARE * spread[0]:

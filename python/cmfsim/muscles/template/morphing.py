@@ -239,7 +239,7 @@ def _agreement(matched: LandmarkMatch) -> tuple[LandmarkAgreement | None, list[F
         f"{len(away)} landmarks lie out of line from where the others put them: {listed}",
         where="landmarks",
         why="each draws the muscles near it along, and its neighbours out of line",
-        fix="look at the first in both heads; place it anew, or leave it out, and morph again",
+        fix="look at the first in both heads; place it again, or leave it out, and morph again",
     )
     return left_out, [finding]
 

@@ -93,5 +93,5 @@ def _check_head(path: Path, text: str, head: Mapping[str, float]) -> None:
         if same.get(name) != float(value):
             raise CaseInputError(
                 f"{path}: is the face of another head: {name} is {same.get(name)}, not {value:g}; "
-                "make it anew (scripts/make_demo_truth.py)"
+                "create it again (scripts/make_demo_truth.py)"
             )
