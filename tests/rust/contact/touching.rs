@@ -238,6 +238,43 @@ fn an_obstacle_acts_as_unilateral_sliding() {
     assert!((a - b).abs() < 0.03 * a, "{a} {b} N");
 }
 
+/// A ridge as sharp as a right angle, pressed along a line of nodes and between two: each of these meets now one slope
+/// and now the other, and the rounds come to an end all the same.
+#[test]
+fn nodes_on_a_sharp_ridge_come_to_rest() {
+    let shape = BoxShape { cells: [8, 8, 4], size: [8.0, 8.0, 4.0], jitter: 0.1 };
+    let mesh = meshes::checked(shape.tets());
+    let (base, top) = (shape.side(2, false), shape.side(2, true));
+    let (tensors, columns) = (tensors(&mesh, &isotropic(0.003, 0.4)), 20);
+    for ridge in [4.0, 4.37] {
+        let vertices = (0..columns * columns).map(|k| {
+            let (x, y) = (0.5 * (k % columns) as f64 - 5.0, 0.5 * (k / columns) as f64 - 0.75);
+            [ridge + x, y, 4.0 + x.abs()]
+        });
+        let cells = (0..columns - 1).flat_map(|j| (0..columns - 1).map(move |i| (i, j)));
+        let triangles = cells.flat_map(|(i, j)| {
+            let corner = |a: usize, b: usize| ((j + b) * columns + i + a) as u32;
+            [[corner(0, 0), corner(1, 1), corner(1, 0)], [corner(0, 0), corner(0, 1), corner(1, 1)]]
+        });
+        let against = Against::Bone {
+            surface: surface((vertices.collect(), triangles.collect())),
+            segment: None,
+        };
+        let bounds = touching(
+            vec![joined("base", base.clone())],
+            vec![TouchingPair { nodes: top.clone(), against }],
+        );
+        let up = Motion::Rigid(rigid([0.0, 0.0, 1.0], 0.0, [0.0; 3], [0.1, 0.0, 0.9]));
+        let solver = solver(&tensors, &bounds, options()).unwrap();
+        let found = solver.solve(&plan([("base", up)]), None, GO_ON).unwrap();
+        assert!(found.touching.converged, "{} rounds", found.touching.rounds);
+        assert!(found.touching.penetration() <= CLOSE, "{}", found.touching.penetration());
+        let force: f64 = found.touching.forces.iter().sum();
+        assert!(force > 1e-3 && found.error_estimate < 0.02, "{force} N");
+        assert!(found.residual < 1e-6, "{}", found.residual);
+    }
+}
+
 /// Forces between parts are equal and opposite, along the normals.
 #[test]
 fn forces_between_parts_balance() {

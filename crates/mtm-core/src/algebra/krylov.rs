@@ -26,6 +26,8 @@ const TRIAL_FALL: f64 = 0.1;
 const TRIAL_PAUSE: f64 = 1.3;
 /// True rᵀz over that of the recurrence above which the recurrence has drifted: the round-off floor.
 const DRIFT: f64 = 4.0;
+/// Iterations whose decrease of the energy stands for what is left of it.
+const ENERGY_DELAY: usize = 6;
 
 /// A symmetric positive definite matrix, as conjugate gradients see it.
 ///
@@ -176,6 +178,38 @@ pub(crate) struct Problem<'a> {
     pub interrupted: &'a (dyn Fn() -> bool + Sync),
 }
 
+/// What is enough of a solution that is only a step on the way to another system.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Enough {
+    /// An estimated error, mm, of this share of that at the start.
+    Error(f64),
+    /// An error in the energy norm of this share of what the iteration has taken off: with springs much stiffer than
+    /// the preconditioner knows, the largest row of z says nothing about the error.
+    Energy(f64),
+}
+
+/// What the last iterations took off the energy: their sum estimates what is left (Hestenes & Stiefel 1952; with a
+/// delay Strakoš & Tichý 2002).
+#[derive(Default)]
+struct Decrease {
+    whole: f64,
+    last: [f64; ENERGY_DELAY],
+    count: usize,
+}
+
+impl Decrease {
+    fn push(&mut self, taken: f64) {
+        self.whole += taken;
+        self.last[self.count % ENERGY_DELAY] = taken;
+        self.count += 1;
+    }
+
+    /// Whether what is left is within the square of `share` of what was taken off.
+    fn is_within(&self, share: f64) -> bool {
+        self.count >= ENERGY_DELAY && self.last.iter().sum::<f64>() <= share * share * self.whole
+    }
+}
+
 /// Where [`pcg_near`] ended.
 pub(crate) enum Reached {
     /// Within the tolerances, checked with the true residual.
@@ -209,14 +243,14 @@ impl Reached {
 
 /// [`pcg`] for one of several systems that differ little, with the same preconditioner.
 ///
-/// `seen`: what earlier systems showed of the spectrum. With `share`, the solution is only a step on the
-/// way to another system: the iteration ends as soon as the estimate has fallen to that share of the one at
-/// `x0` (the estimate of the step is then as good as what was seen), unless that lies within the tolerances.
+/// `seen`: what earlier systems showed of the spectrum. With `enough`, the solution is only a step on the
+/// way to another system: the iteration ends as soon as that is reached (the estimate of the step is then as good
+/// as what was seen), unless it lies within the tolerances.
 pub(crate) fn pcg_near(
     problem: &Problem<'_>,
     x0: &[[f64; 3]],
     options: &PcgOptions,
-    share: Option<f64>,
+    enough: Option<Enough>,
     seen: &mut Spectrum,
 ) -> Result<Reached> {
     let &Problem { a, b, preconditioner, interrupted } = problem;
@@ -249,7 +283,11 @@ pub(crate) fn pcg_near(
     let mut state = State::new(a, b, x0, preconditioner, seen);
     in_pool(|| state.replace_residual());
     state.restart();
-    let step = share.map(|share| share * state.error_mm()).filter(|&e| e > options.tolerance);
+    let goal = match enough {
+        Some(Enough::Error(share)) => share * state.error_mm(),
+        _ => 0.0,
+    };
+    let mut decrease = Decrease::default();
     let mut rule = StoppingRule::new(options, state.rz);
     let mut iterations = 0;
     let mut history = Vec::new();
@@ -259,23 +297,29 @@ pub(crate) fn pcg_near(
         }
         let exact = state.rz == 0.0 && state.largest_z == 0.0;
         if !exact {
-            if let Err(error) = in_pool(|| state.step()) {
-                if !state.is_indefinite() {
-                    return Err(error);
+            match in_pool(|| state.step()) {
+                Ok(taken) => decrease.push(taken),
+                Err(error) if state.is_indefinite() => {
+                    return Ok(Reached::Indefinite(Box::new(Indefinite {
+                        solution: state.x,
+                        direction: state.p,
+                        error,
+                        iterations,
+                        residual_history: history,
+                    })));
                 }
-                return Ok(Reached::Indefinite(Box::new(Indefinite {
-                    solution: state.x,
-                    direction: state.p,
-                    error,
-                    iterations,
-                    residual_history: history,
-                })));
+                Err(error) => return Err(error),
             }
             iterations += 1;
             history.push(state.r_norm / b_norm);
         }
 
-        if step.is_some_and(|goal| state.error_mm() <= goal) {
+        let is_enough = match enough {
+            Some(Enough::Error(_)) => goal > options.tolerance && state.error_mm() <= goal,
+            Some(Enough::Energy(share)) => decrease.is_within(share),
+            None => false,
+        };
+        if is_enough {
             return Ok(Reached::Step(state.outcome(1.0, b_norm, iterations, history)));
         }
         let excess = || state.excess(options);
@@ -478,8 +522,8 @@ impl<'a> State<'a> {
         self.spectrum.restart();
     }
 
-    /// One iteration.
-    fn step(&mut self) -> Result<()> {
+    /// One iteration; what it takes off the square of the error in the energy norm, N mm.
+    fn step(&mut self) -> Result<f64> {
         let pq = self.a.multiply_and_dot(&self.p, &mut self.q);
         let is_held = pq > self.a.least_curvature(&self.p);
         if !(is_held && self.rz > 0.0 && pq.is_finite() && self.rz.is_finite()) {
@@ -492,7 +536,7 @@ impl<'a> State<'a> {
         if !(rz >= 0.0 && rz.is_finite() && self.r_norm.is_finite() && largest_z.is_finite()) {
             return Err(self.breakdown(pq));
         }
-        let beta = rz / self.rz;
+        let (taken, beta) = (alpha * self.rz, rz / self.rz);
         self.rz = rz;
         self.largest_z = largest_z;
         self.spectrum.push(alpha, beta);
@@ -502,7 +546,7 @@ impl<'a> State<'a> {
                 *p = [z[0] + beta * p[0], z[1] + beta * p[1], z[2] + beta * p[2]];
             }
         });
-        Ok(())
+        Ok(taken)
     }
 
     /// Whether the last step broke down at a direction of negative curvature, with finite numbers.

@@ -28,14 +28,17 @@ use crate::vector::{add, dot, norm, scaled, sub};
 const NO_ROW: u32 = u32::MAX;
 /// Stiffness of a link over that of its node by itself: with more, each round takes more iterations, with less
 /// there are more rounds.
-const LINK_STIFFNESS: f64 = 10.0;
+const LINK_STIFFNESS: f64 = 2.0;
 /// Way to the surface, over its mean edge, below which its direction is that of the continuous normal: the way
 /// itself turns from facet to facet, and means nothing at the surface.
 const NEAR_SHARE: f64 = 0.5;
+/// Length of the mean of two unit normals below which they face each other, and have no mean.
+const LEAST_MEAN: f64 = 0.5;
+/// Cosine of the turn of a normal from one round to the next above which it is steady, and factor on the share by which
+/// one turns each time that it is not.
+const STEADY_COSINE: f64 = 0.9986;
+const STEADIER: f64 = 0.8;
 
-/// Share of the links that may come and go while forces are adjusted: a node at the rim meets now one facet, now the
-/// next.
-const RIM_SHARE: f64 = 0.05;
 /// Way past the border of an open surface, over its mean edge, up to which a node may still touch it.
 const BORDER_REACH: f64 = 0.25;
 /// Farthest that a gap shrinks in a round where a node goes through its surface, over the mean edge: bones go no
@@ -142,25 +145,65 @@ pub(crate) struct Pairs {
 struct Meeting {
     /// g, mm.
     gap: f64,
+    /// Closest point of the surface, mm.
+    point: [f64; 3],
     /// Unit vector away from the surface.
     normal: [f64; 3],
     /// Nodes of the triangle that is met, with the weights of the closest point; none on bone.
     facing: Option<([u32; 3], [f64; 3])>,
 }
 
+/// The gap of a candidate about some state: g(u) = offset + Σ cⱼ·uⱼ.
+#[derive(Debug, Clone)]
+struct Plane {
+    /// Gap where it was linearised, mm.
+    gap: f64,
+    /// Unit vector away from the surface.
+    normal: [f64; 3],
+    /// mm.
+    offset: f64,
+    /// Nodes with the change of the gap by each.
+    ends: Vec<(u32, [f64; 3])>,
+    /// Share by which its normal follows the surface; 1 but for one that swings.
+    turn: f64,
+}
+
+impl Plane {
+    /// Turns it to another normal about where it is under displacements `u` of all nodes.
+    fn turn_to(&mut self, normal: [f64; 3], u: &[[f64; 3]]) {
+        for (_, c) in &mut self.ends {
+            *c = scaled(normal, dot(*c, self.normal));
+        }
+        self.normal = normal;
+        self.offset = 0.0;
+        self.offset = self.gap - self.at(u);
+    }
+
+    /// g under displacements `u` of all nodes, mm.
+    fn at(&self, u: &[[f64; 3]]) -> f64 {
+        self.ends.iter().fold(self.offset, |gap, (j, c)| gap + dot(*c, u[*j as usize]))
+    }
+}
+
+/// What every candidate may meet about some state, each surface as its tangent plane; nothing for those past a border.
+#[derive(Debug)]
+pub(crate) struct Planes {
+    at: Vec<Option<Plane>>,
+}
+
 /// Forces between what touches, from one round to the next.
 #[derive(Debug, Clone)]
 pub(crate) struct Touching {
     /// λ of each candidate, N.
-    pub multipliers: Vec<f64>,
+    multipliers: Vec<f64>,
     /// Gap of each where it was last, mm; none past the border of its surface.
     gaps: Vec<Option<f64>>,
 }
 
-/// A round of the method of multipliers: what it is linearised about, and the links that follow.
+/// A round of the method of multipliers.
 pub(crate) struct Round {
-    meetings: Vec<Option<Meeting>>,
-    active: Vec<bool>,
+    /// Link of each candidate that presses.
+    number: Vec<Option<u32>>,
     pub links: Vec<Link>,
 }
 
@@ -171,8 +214,6 @@ pub(crate) struct Left {
     pub penetration: f64,
     /// Largest gap under a force, mm.
     pub gap: f64,
-    /// Nodes that touch now and did not before, or the other way round.
-    pub changed: usize,
 }
 
 impl Left {
@@ -348,99 +389,107 @@ impl Pairs {
             }
             Wall::Bone { .. } => None,
         };
-        Some(Meeting { gap: distance - c.allowed, normal, facing })
+        Some(Meeting { gap: distance - c.allowed, point: closest.point, normal, facing })
     }
 
-    /// The round at displacements `u` of all nodes, with the forces of `touching`.
+    /// The planes at displacements `u` of all nodes.
     ///
     /// # Errors
     /// A triangle of the tissue that has collapsed.
-    pub fn round(&self, u: &[[f64; 3]], motions: &[&Motion], touching: &Touching) -> Result<Round> {
+    pub fn planes(
+        &self,
+        u: &[[f64; 3]],
+        motions: &[&Motion],
+        touching: &Touching,
+    ) -> Result<Planes> {
         let meetings = self.meetings(u, motions, &touching.gaps)?;
-        let (mut links, mut active) = (Vec::new(), vec![false; self.candidates.len()]);
+        Ok(self.linearised(&meetings, u))
+    }
+
+    /// The planes at displacements `u` under motions `from`, carried with the bones to motions `to`: closest points
+    /// tell nothing where a bone has moved into what follows it.
+    ///
+    /// # Errors
+    /// A triangle of the tissue that has collapsed.
+    pub fn planes_ahead(
+        &self,
+        u: &[[f64; 3]],
+        (from, to): (&[&Motion], &[&Motion]),
+        touching: &Touching,
+    ) -> Result<Planes> {
+        let mut meetings = self.meetings(u, from, &touching.gaps)?;
+        for (c, meeting) in self.candidates.iter().zip(&mut meetings) {
+            let Wall::Bone { segment: Some(s), .. } = &self.walls[c.wall] else { continue };
+            if let Some(meeting) = meeting {
+                let place = add(self.positions[c.node as usize], u[c.node as usize]);
+                meeting.carry(from[*s], to[*s], place);
+            }
+        }
+        Ok(self.linearised(&meetings, u))
+    }
+
+    fn linearised(&self, meetings: &[Option<Meeting>], u: &[[f64; 3]]) -> Planes {
+        let plane = |(c, meeting): (&Candidate, &Option<Meeting>)| {
+            let Meeting { gap, normal, facing, .. } = (*meeting)?;
+            let mut ends = vec![(c.node, normal)];
+            if let Some((nodes, weights)) = facing {
+                ends.extend((0..3).map(|k| (nodes[k], scaled(normal, -weights[k]))));
+            }
+            let here: f64 = ends.iter().map(|(j, c)| dot(*c, u[*j as usize])).sum();
+            Some(Plane { gap, normal, offset: gap - here, ends, turn: 1.0 })
+        };
+        Planes { at: self.candidates.iter().zip(meetings).map(plane).collect() }
+    }
+
+    /// The round at displacements `u` of all nodes, prescribed ones where they go, with the forces of `touching`.
+    pub fn round(&self, planes: &Planes, u: &[[f64; 3]], touching: &Touching) -> Round {
+        let (mut links, mut number) = (Vec::new(), vec![None; self.candidates.len()]);
         for (i, c) in self.candidates.iter().enumerate() {
-            let Some(meeting) = &meetings[i] else { continue };
+            let Some(plane) = &planes.at[i] else { continue };
             let force = touching.multipliers[i];
-            if force - c.stiffness * meeting.gap <= 0.0 {
+            if force - c.stiffness * plane.at(u) <= 0.0 {
                 continue;
             }
-            active[i] = true;
-            let ends = self.ends(c, meeting);
-            let here: f64 = ends.iter().map(|(j, n)| dot(*n, u[*j as usize])).sum();
             let row = |(j, n): &(u32, [f64; 3])| (self.row_of[*j as usize], *n);
-            let known: f64 = ends
+            let known: f64 = plane
+                .ends
                 .iter()
                 .filter(|(j, _)| self.row_of[*j as usize] == NO_ROW)
                 .map(|(j, n)| dot(*n, u[*j as usize]))
                 .sum();
+            number[i] = Some(links.len() as u32);
             links.push(Link {
-                ends: ends.iter().map(row).filter(|(row, _)| *row != NO_ROW).collect(),
+                ends: plane.ends.iter().map(row).filter(|(row, _)| *row != NO_ROW).collect(),
                 stiffness: c.stiffness,
-                goal: here - known - meeting.gap + force / c.stiffness,
+                goal: force / c.stiffness - plane.offset - known,
             });
         }
-        Ok(Round { meetings, active, links })
+        Round { number, links }
     }
 
-    /// Nodes of a meeting with the change of its gap by each.
-    fn ends(&self, c: &Candidate, meeting: &Meeting) -> Vec<(u32, [f64; 3])> {
-        let mut ends = vec![(c.node, meeting.normal)];
-        if let Some((nodes, weights)) = meeting.facing {
-            ends.extend((0..3).map(|k| (nodes[k], scaled(meeting.normal, -weights[k]))));
-        }
-        ends
+    /// Σ ½ k ⟨λ/k − g⟩₊² over `planes` at displacements `u` of all nodes, N mm: what pressing adds to the elastic
+    /// energy.
+    pub fn energy(&self, planes: &Planes, u: &[[f64; 3]], touching: &Touching) -> f64 {
+        let each = self.candidates.iter().zip(&planes.at).zip(&touching.multipliers);
+        each.map(|((c, plane), force)| {
+            let deep = plane.as_ref().map_or(0.0, |p| (force / c.stiffness - p.at(u)).max(0.0));
+            0.5 * c.stiffness * deep * deep
+        })
+        .sum()
     }
 
-    /// Σ ½ k ⟨λ/k − g⟩₊² at displacements `u` of all nodes, N mm: what pressing adds to the elastic energy.
-    ///
-    /// # Errors
-    /// A triangle of the tissue that has collapsed.
-    pub fn energy(&self, u: &[[f64; 3]], motions: &[&Motion], touching: &Touching) -> Result<f64> {
-        let meetings = self.meetings(u, motions, &touching.gaps)?;
-        let each = self.candidates.iter().zip(&meetings).zip(&touching.multipliers);
-        Ok(each
-            .map(|((c, meeting), force)| {
-                let deep = meeting.map_or(0.0, |m| (force / c.stiffness - m.gap).max(0.0));
-                0.5 * c.stiffness * deep * deep
-            })
-            .sum())
-    }
-
-    /// Follows `round` by the forces that gaps at displacements `u` ask for, where these are the `is_whole` step of the
-    /// round; what is left open.
-    ///
-    /// # Errors
-    /// A triangle of the tissue that has collapsed.
-    pub fn follow(
-        &self,
-        round: &Round,
-        u: &[[f64; 3]],
-        motions: &[&Motion],
-        touching: &mut Touching,
-        is_whole: bool,
-    ) -> Result<Left> {
-        let meetings = self.meetings(u, motions, &touching.gaps)?;
-        touching.gaps = gaps(&meetings);
-        let mut left = Left { penetration: 0.0, gap: 0.0, changed: 0 };
-        let mut forces = touching.multipliers.clone();
-        for (i, c) in self.candidates.iter().enumerate() {
-            let Some(meeting) = &meetings[i] else {
-                left.changed += usize::from(round.active[i]);
-                forces[i] = 0.0;
-                continue;
-            };
-            forces[i] = (forces[i] - c.stiffness * meeting.gap).max(0.0);
-            left.changed += usize::from((forces[i] > 0.0) != round.active[i]);
-            left.penetration = left.penetration.max(-meeting.gap);
-            if forces[i] > 0.0 {
-                left.gap = left.gap.max(meeting.gap);
+    /// What `round` leaves open at displacements `u` of all nodes and `rows` of the unknown ones.
+    pub fn left(&self, planes: &Planes, round: &Round, u: &[[f64; 3]], rows: &[[f64; 3]]) -> Left {
+        let mut left = Left { penetration: 0.0, gap: 0.0 };
+        for (plane, number) in planes.at.iter().zip(&round.number) {
+            let Some(plane) = plane else { continue };
+            let gap = plane.at(u);
+            left.penetration = left.penetration.max(-gap);
+            if number.is_some_and(|k| round.links[k as usize].pull(rows) > 0.0) {
+                left.gap = left.gap.max(gap);
             }
         }
-        // Forces follow once it is known what touches under the last ones, but for a few nodes at the rim.
-        if is_whole && left.changed as f64 <= RIM_SHARE * round.links.len() as f64 {
-            touching.multipliers = forces;
-        }
-        Ok(left)
+        left
     }
 
     /// The nodes that press most, `most` of them.
@@ -451,29 +500,68 @@ impl Pairs {
         order.iter().take(most).map(|&i| self.candidates[i].node as usize).collect()
     }
 
-    /// What met at the end of `round`: at displacements `u` of all nodes.
+    /// What met at the end of `round`: at displacements `rows` of the unknown nodes, where `planes` are.
+    pub fn met(&self, planes: &Planes, round: &Round, rows: &[[f64; 3]]) -> Vec<Met> {
+        let force = |number: Option<u32>| {
+            number.map_or(0.0, |k| round.links[k as usize].pull(rows).max(0.0))
+        };
+        let each = self.candidates.iter().zip(&planes.at).zip(&round.number);
+        each.filter_map(|((c, plane), number)| {
+            let Plane { gap, normal, .. } = plane.as_ref()?;
+            Some(Met { node: c.node, gap: *gap, normal: *normal, force: force(*number) })
+        })
+        .collect()
+    }
+}
+
+impl Planes {
+    /// Deepest that a candidate is behind its surface where the planes are, mm.
+    pub fn deepest(&self) -> f64 {
+        self.at.iter().flatten().fold(0.0, |m, p| m.max(-p.gap))
+    }
+
+    /// Steadies the normals that swing away from those of the planes `before`: each time they turn by less of the way.
     ///
-    /// # Errors
-    /// A triangle of the tissue that has collapsed.
-    pub fn met(
-        &self,
-        round: &Round,
-        u: &[[f64; 3]],
-        motions: &[&Motion],
-        rows: &[[f64; 3]],
-    ) -> Result<Vec<Met>> {
-        let meetings = self.meetings(u, motions, &gaps(&round.meetings))?;
-        let mut links = round.links.iter();
-        let mut out = Vec::new();
-        for (i, c) in self.candidates.iter().enumerate() {
-            let link = if round.active[i] { links.next() } else { None };
-            let force = link.map_or(0.0, |l| l.pull(rows));
-            if let Some(meeting) = meetings[i].or(round.meetings[i]) {
-                let (gap, normal) = (meeting.gap, meeting.normal);
-                out.push(Met { node: c.node, gap, normal, force });
+    /// `u`: displacements of all nodes.
+    pub fn steady(&mut self, before: &Self, u: &[[f64; 3]]) {
+        for (now, before) in self.at.iter_mut().zip(&before.at) {
+            let (Some(now), Some(before)) = (now, before) else { continue };
+            now.turn = before.turn;
+            if dot(now.normal, before.normal) < STEADY_COSINE {
+                now.turn *= STEADIER;
+            }
+            let sum = add(scaled(now.normal, now.turn), scaled(before.normal, 1.0 - now.turn));
+            let length = norm(sum);
+            if length > LEAST_MEAN {
+                now.turn_to(scaled(sum, 1.0 / length), u);
             }
         }
-        Ok(out)
+    }
+
+    /// Keeps the gaps in `touching`.
+    pub fn keep_gaps(&self, touching: &mut Touching) {
+        touching.gaps = self.at.iter().map(|p| p.as_ref().map(|p| p.gap)).collect();
+    }
+}
+
+impl Touching {
+    /// Follows `round` by the forces that its links put on the nodes at displacements `rows` of the unknown ones.
+    pub fn follow(&mut self, round: &Round, rows: &[[f64; 3]]) {
+        for (force, number) in self.multipliers.iter_mut().zip(&round.number) {
+            *force = number.map_or(0.0, |k| round.links[k as usize].pull(rows).max(0.0));
+        }
+    }
+}
+
+impl Meeting {
+    /// Carries the plane of a node at `place` from where motion `from` has its bone to where `to` has it; a deformed
+    /// one stays as it is.
+    fn carry(&mut self, from: &Motion, to: &Motion, place: [f64; 3]) {
+        let (Motion::Rigid(from), Motion::Rigid(to)) = (from, to) else { return };
+        let before = dot(self.normal, sub(place, self.point));
+        self.point = to.apply(from.apply_inverse(self.point));
+        self.normal = to.rotate(from.rotate_inverse(self.normal));
+        self.gap += dot(self.normal, sub(place, self.point)) - before;
     }
 }
 
@@ -496,11 +584,6 @@ fn out_of_range(pair: usize, node: u32, count: usize) -> MtmError {
         count,
         kind: ErrorKind::Boundary,
     }
-}
-
-/// Gap of each meeting, mm.
-fn gaps(meetings: &[Option<Meeting>]) -> Vec<Option<f64>> {
-    meetings.iter().map(|m| m.map(|m| m.gap)).collect()
 }
 
 /// A surface under a plan.

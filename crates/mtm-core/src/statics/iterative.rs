@@ -8,8 +8,8 @@ use std::sync::OnceLock;
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::krylov::{
-    Operator, PcgOptions, PcgOutcome, Preconditioner, Problem, Reached, Spectrum, Trial, pcg_near,
-    trial,
+    Enough, Operator, PcgOptions, PcgOutcome, Preconditioner, Problem, Reached, Spectrum, Trial,
+    pcg_near, trial,
 };
 use crate::algebra::multigrid::{Multigrid, MultigridOptions};
 use crate::algebra::relaxation::{RelaxationOptions, relax};
@@ -77,7 +77,7 @@ impl Confirmed<'_> {
         Ok(self.trial.get_or_init(|| made))
     }
 
-    /// The solution of A x = `b`, or with `share` a step towards it (see [`pcg_near`]).
+    /// The solution of A x = `b`, or with `enough` a step towards it (see [`pcg_near`]).
     ///
     /// # Errors
     /// Those of [`pcg_near`]; `NotConverged` where a known solution came back with too large an error.
@@ -86,13 +86,13 @@ impl Confirmed<'_> {
         b: &[[f64; 3]],
         start: &[[f64; 3]],
         options: &PcgOptions,
-        share: Option<f64>,
+        enough: Option<Enough>,
         seen: &mut Spectrum,
     ) -> Result<Reached> {
         let Self { a, preconditioner, interrupted, .. } = *self;
         let problem = Problem { a, b, preconditioner, interrupted };
         let near = |start: &[[f64; 3]], seen: &mut Spectrum| {
-            pcg_near(&problem, start, options, share, seen)
+            pcg_near(&problem, start, options, enough, seen)
         };
         let known = |seen: &mut Spectrum| -> Result<f64> {
             let trial = self.trial(options)?;
@@ -107,7 +107,7 @@ impl Confirmed<'_> {
             error = Some(known(seen)?);
         }
         let mut reached = near(start, seen)?;
-        if share.is_some() && seen.is_wide() {
+        if enough.is_some() && seen.is_wide() {
             // What is only a step needs no trial, but does not pass for a solution.
             return Ok(match reached {
                 Reached::Solution(found) => Reached::Step(found),
@@ -172,8 +172,8 @@ impl Trail {
 pub(crate) struct Leave<'a> {
     /// How far springs that carry nodes on may carry any of them, mm.
     pub reach: f64,
-    /// Share of the error at the start that suffices; none for the tolerance itself.
-    pub share: Option<f64>,
+    /// What suffices; none for the tolerance itself.
+    pub enough: Option<Enough>,
     /// Springs between rows.
     pub links: &'a [Link],
 }
@@ -303,8 +303,8 @@ impl Iterative {
     /// Components across the normals of w in P A P w = `b`, with springs.
     ///
     /// `b`: see [`projected_rhs`](crate::algebra::constraints::projected_rhs), with the pull of the springs.
-    /// `leave`: how far springs may carry rows, and the share of the error at the start that suffices as long as
-    /// it is more than the tolerance; see [`pcg_near`].
+    /// `leave`: how far springs may carry rows, and what suffices as long as it is more than the tolerance; see
+    /// [`pcg_near`].
     ///
     /// Where springs carry nodes on by more than the body holds, those at fault are left out, and the
     /// solution goes on to their reach along the direction that is not held, downhill.
@@ -342,7 +342,7 @@ impl Iterative {
             let product =
                 ProjectedProduct::new(&self.matrix, &constraints, &springs).with_links(links);
             let confirmed = self.confirmed(&product, &trail.trial, solve.interrupted);
-            match confirmed.solve(&b, &start, &options, leave.share, &mut trail.seen)? {
+            match confirmed.solve(&b, &start, &options, leave.enough, &mut trail.seen)? {
                 Reached::Solution(found) => break (found, true),
                 Reached::Step(found) => break (found, false),
                 Reached::Indefinite(met) => {

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::{Factor, Symbolic};
 use crate::algebra::constraints::{Constraint, add_offsets, projected, projected_rhs};
+use crate::algebra::krylov::Enough;
 use crate::algebra::multigrid::Multigrid;
 use crate::algebra::row_sums::in_pool;
 use crate::boundary::Motion;
@@ -91,7 +92,8 @@ pub(crate) struct Settle<'a> {
 #[derive(Clone, Copy, Default)]
 pub(crate) struct Linked<'a> {
     pub links: &'a [Link],
-    /// Share of what they change to which the answer may be off; none for one as exact as the tolerance asks.
+    /// Share of what they change, in the energy norm, to which the answer may be off; none for one as exact as the
+    /// tolerance asks.
     pub share: Option<f64>,
 }
 
@@ -306,7 +308,11 @@ impl System {
         for link in linked.links {
             link.add_goal(&mut b);
         }
-        let leave = Leave { reach: f64::INFINITY, share: linked.share, links: linked.links };
+        let leave = Leave {
+            reach: f64::INFINITY,
+            enough: linked.share.map(Enough::Energy),
+            links: linked.links,
+        };
         let mut trail = Trail::starting(start.to_vec());
         let conditions = RowConditions { constraints: Vec::new(), springs: Vec::new() };
         Ok(iterative.solve_projected(b, conditions, leave, &mut trail, solve)?.rows)
@@ -432,11 +438,11 @@ impl Unfactored {
         let offsets = conditions.constraints.clone();
         let mut found = match self {
             Self::Iterative(iterative) => {
-                let share = match linked.share {
-                    Some(rough) => Some(c.share.max(rough)),
-                    None => (c.share > 0.0).then_some(c.share),
+                let enough = match linked.share {
+                    Some(rough) => Some(Enough::Energy(rough)),
+                    None => (c.share > 0.0).then_some(Enough::Error(c.share)),
                 };
-                let leave = Leave { reach: c.reach, share, links: linked.links };
+                let leave = Leave { reach: c.reach, enough, links: linked.links };
                 iterative.solve_projected(rhs, conditions, leave, trail, solve)?
             }
             Self::Refactored { .. } if !linked.links.is_empty() => {

@@ -1,13 +1,14 @@
 //! Plans of bodies with parts that may touch: rounds of the method of multipliers, along the plan in steps.
 //!
-//! What touches is found by closest points, so no step of the plan may take one part through another: bones move
-//! by less than an edge of the tissue at a time. On the way rounds are rough; at the end of the plan they go on
-//! until nothing penetrates and nothing changes.
+//! What touches is found by closest points, so no step of the plan may take one part through another: bones move by
+//! a quarter of an edge of the tissue at a time. Each step first follows the tangent planes of its start, which move with
+//! the bones and have no far side, and then what is met where the nodes are. On the way there are few rounds, and
+//! rough ones; at the end of the plan they go on until nothing penetrates and nothing changes.
 
 use std::sync::Arc;
 
 use crate::boundary::Motion;
-use crate::contact::pairs::{Left, Pairs, Round, Touching};
+use crate::contact::pairs::{Left, Pairs, Planes, Round, Touching};
 use crate::contact::{ContactStart, ContactState, Sliding, SlidingNode};
 use crate::error::{MtmError, Result};
 use crate::geometry::motion::SurfaceMotion;
@@ -20,7 +21,7 @@ use crate::statics::system::{Begin, Linked, Settle, Settled, Solved, System};
 use crate::vector::{add, between, dot, norm, scaled, sub};
 
 /// Way of the bones in one step, over the mean edge of the tissue that may be touched.
-const STEP_EDGES: f64 = 0.75;
+const STEP_EDGES: f64 = 0.25;
 /// Depth, over the same, to which a step may take a node; half the step where it goes deeper.
 const DEEP_EDGES: f64 = 0.5;
 /// Shortest step, as a share of the plan.
@@ -31,17 +32,23 @@ const CLOSE: f64 = 5e-3;
 const CLOSE_SHARE: f64 = 2e-5;
 /// Multiple of it that is enough on the way, and where the rounds ran out: five hundredths of a millimetre.
 const LOOSE: f64 = 10.0;
-/// Rounds of a step on the way, and of the last one.
-const MOST_ROUNDS_ON_THE_WAY: usize = 30;
+/// Rounds of a step on the way, which the next one continues, and of the last one.
+const MOST_ROUNDS_ON_THE_WAY: usize = 2;
 const MOST_ROUNDS: usize = 40;
-/// Rounds of the last step after which nothing that a face would show may be open: a node inside the mouth may
-/// meet one facet or the next for ever.
-const PATIENCE: usize = 25;
+/// Rounds before those run out that are solved to the tolerance.
+const LAST_ROUNDS: usize = 5;
+/// Change of a node in a round, over the distance that counts as touching, up to which it is still.
+const STILL: f64 = 4.0;
+/// Rounds of a step with the normals as they are found, before those that swing are steadied.
+const SHARP_ROUNDS: usize = 6;
 /// Share of its slope by which the energy has to fall, and shortest share of a round.
 const DESCENT: f64 = 1e-4;
 const SHORTEST_SHARE: f64 = 1.0 / 32.0;
-/// Share of what a round changes to which it is solved until the last ones: small forces decide what touches.
-const ROUGH_SHARE: f64 = 1e-4;
+/// Rounds of a step with the planes of its start, and the depth behind them, over the mean edge, that ends them.
+const MOST_ROUNDS_AHEAD: usize = 8;
+const AHEAD_EDGES: f64 = 0.05;
+/// Share of what a round changes, in the energy norm, to which it is solved until the last ones.
+const ROUGH_SHARE: f64 = 0.1;
 /// Most nodes that an error names.
 const NAMED_NODES: usize = 10;
 
@@ -91,17 +98,18 @@ pub(super) struct Path<'a> {
     pub loads: Option<&'a [[f64; 3]]>,
 }
 
-/// Where a round starts.
-struct Begun<'a> {
+/// Where a step of the plan leads.
+struct Goal<'a> {
+    motions: &'a [&'a Motion],
+    /// Displacements of all nodes with the prescribed ones filled in, mm.
+    prescribed: &'a [[f64; 3]],
     /// Forces on the rows, N.
     b: &'a [[f64; 3]],
-    /// Displacements of the rows, mm.
-    rows: &'a [[f64; 3]],
-    contact: Option<ContactStart>,
 }
 
 /// The rounds of one step.
 struct Done {
+    planes: Planes,
     round: Round,
     left: Left,
     rounds: usize,
@@ -164,69 +172,130 @@ impl Path<'_> {
         solve: &mut Solve<'_>,
     ) -> Result<Option<(Pose, Done)>> {
         let (before, after) = (self.partial(from)?, self.partial(to)?);
+        let before: Vec<&Motion> = before.iter().collect();
         let motions: Vec<&Motion> = after.iter().collect();
         let prescribed = self.body.prescribed(&motions)?;
         let b = self.forces(&prescribed, to);
-        let is_last = to == 1.0;
+        let goal = Goal { motions: &motions, prescribed: &prescribed, b: &b };
+        let ahead = self.pairs.planes_ahead(&pose.u, (&before, &motions), &pose.touching)?;
+        let contact = self.carried(pose, &before, &motions);
+        let (pose, rounds) = self.go_ahead(pose, &ahead, contact, &goal, solve)?;
+        let planes = self.pairs.planes(&pose.u, &motions, &pose.touching)?;
+        if planes.deepest() > DEEP_EDGES * self.pairs.mean_edge() {
+            return Ok(None);
+        }
+        self.rounds(pose, planes, &goal, (rounds, to == 1.0), solve).map(Some)
+    }
+
+    /// `pose` with the bones where the `goal` has them, against the planes that were found `ahead` of their motion;
+    /// and the rounds that took. Planes are without end: nothing falls through them.
+    fn go_ahead(
+        &self,
+        pose: &Pose,
+        ahead: &Planes,
+        mut contact: Option<ContactStart>,
+        goal: &Goal<'_>,
+        solve: &mut Solve<'_>,
+    ) -> Result<(Pose, usize)> {
+        // Where prescribed nodes go is known before anything is solved.
+        let u = self.reduction.filled(goal.prescribed, &pose.rows);
+        let mut pose = Pose { u, ..pose.clone() };
+        let deep = AHEAD_EDGES * self.pairs.mean_edge();
+        let close = LOOSE * self.close();
+        for round in 1..=MOST_ROUNDS_AHEAD {
+            let links = self.pairs.round(ahead, &pose.u, &pose.touching);
+            let (rows, found) = self.linked(&links, &pose, contact, goal, Some(close), solve)?;
+            // The first round takes the sliding nodes along with their bones.
+            let share =
+                if round == 1 { 1.0 } else { self.share(&pose, (ahead, &links), &rows, goal) };
+            pose = self.moved(&pose, &rows, found, share, goal);
+            if share == 1.0 {
+                pose.touching.follow(&links, &pose.rows);
+                if self.pairs.left(ahead, &links, &pose.u, &pose.rows).penetration <= deep {
+                    return Ok((pose, round));
+                }
+            }
+            contact = self.begun(&pose);
+        }
+        Ok((pose, MOST_ROUNDS_AHEAD))
+    }
+
+    /// Rounds from `pose` under the motions of the `goal`, `planes` there, until nothing is open; `before` were done
+    /// already.
+    ///
+    /// A node on an edge of what it touches would meet now one facet and now the other, for ever: normals that swing
+    /// turn less and less.
+    fn rounds(
+        &self,
+        mut pose: Pose,
+        mut planes: Planes,
+        goal: &Goal<'_>,
+        (before, is_last): (usize, bool),
+        solve: &mut Solve<'_>,
+    ) -> Result<(Pose, Done)> {
         let most = if is_last { MOST_ROUNDS } else { MOST_ROUNDS_ON_THE_WAY };
         let close = if is_last { self.close() } else { LOOSE * self.close() };
-        let mut begin = self.carried(pose, &before.iter().collect::<Vec<_>>(), &motions);
-        // Where prescribed nodes go is known before anything is solved.
-        let u = self.reduction.filled(&prescribed, &pose.rows);
-        let mut pose = Pose { u, ..pose.clone() };
-        let (mut rough, mut rounds) = (true, 0);
+        let (mut rough, mut count) = (true, 0);
         loop {
-            rounds += 1;
-            let round = self.pairs.round(&pose.u, &motions, &pose.touching)?;
-            let begun = Begun { b: &b, rows: &pose.rows, contact: begin };
+            count += 1;
+            planes.keep_gaps(&mut pose.touching);
+            let round = self.pairs.round(&planes, &pose.u, &pose.touching);
+            let begun = self.begun(&pose);
             let (rows, contact) =
-                self.linked(&round, begun, &motions, rough.then_some(close), solve)?;
-            let whole = self.reduction.filled(&prescribed, &rows);
-            let mut touching = pose.touching.clone();
-            let mut left = self.pairs.follow(&round, &whole, &motions, &mut touching, true)?;
-            if rounds == 1 && left.penetration > DEEP_EDGES * self.pairs.mean_edge() {
-                return Ok(None);
+                self.linked(&round, &pose, begun, goal, rough.then_some(close), solve)?;
+            let share = if rough { self.share(&pose, (&planes, &round), &rows, goal) } else { 1.0 };
+            let next = self.moved(&pose, &rows, contact, share, goal);
+            let change = largest_change(&pose.u, &next.u);
+            pose = next;
+            let mut met = self.pairs.planes(&pose.u, goal.motions, &pose.touching)?;
+            let left = self.pairs.left(&met, &round, &pose.u, &pose.rows);
+            if share == 1.0 {
+                pose.touching.follow(&round, &pose.rows);
             }
-            let change = largest_change(&pose.u, &whole);
-            let near = rounds > 1 && left.distance() <= close && change <= 2.0 * close;
-            let converged = near && left.changed == 0 && !rough;
-            let is_over = converged || rounds >= most || (near && !is_last);
-            let share = if is_over || near || rounds == 1 {
-                1.0
-            } else {
-                self.share(&pose, &round, &rows, (&prescribed, &b), &motions)?
-            };
-            let (mut rows, mut u) = (rows, whole);
-            if share < 1.0 {
-                rows = between(&pose.rows, &rows, share);
-                u = self.reduction.filled(&prescribed, &rows);
-                touching = pose.touching.clone();
-                left = self.pairs.follow(&round, &u, &motions, &mut touching, false)?;
+            let near = share == 1.0 && left.distance() <= close && change <= STILL * close;
+            let converged = near && !rough;
+            let over = converged || count >= most || (near && !is_last);
+            if over {
+                met.keep_gaps(&mut pose.touching);
+                let rounds = before + count;
+                return Ok((pose, Done { planes: met, round, left, rounds, change, converged }));
             }
-            pose = Pose { u, rows, contact, touching };
-            let will_do = !rough && rounds > PATIENCE && left.distance() <= LOOSE * self.close();
-            if is_over || will_do {
-                return Ok(Some((pose, Done { round, left, rounds, change, converged })));
+            if count > SHARP_ROUNDS {
+                met.steady(&planes, &pose.u);
             }
-            begin = self.begun(&pose);
-            rough = !(is_last && (near || rounds >= PATIENCE));
+            planes = met;
+            rough = !(is_last && (near || count + LAST_ROUNDS >= most));
         }
     }
 
-    /// How far to go from `pose` to the solution `rows` of a round: halves of the way until elastic energy and pressing
-    /// together fall (Armijo 1966).
+    /// `pose` by `share` of its way to `rows`.
+    fn moved(
+        &self,
+        pose: &Pose,
+        rows: &[[f64; 3]],
+        contact: Option<ContactState>,
+        share: f64,
+        goal: &Goal<'_>,
+    ) -> Pose {
+        let rows = if share == 1.0 { rows.to_vec() } else { between(&pose.rows, rows, share) };
+        let u = self.reduction.filled(goal.prescribed, &rows);
+        Pose { u, rows, contact, touching: pose.touching.clone() }
+    }
+
+    /// How far to go from `pose` to the solution `rows` of a round: halves of the way until elastic energy and
+    /// pressing against the planes together fall (Armijo 1966).
     fn share(
         &self,
         pose: &Pose,
-        round: &Round,
+        (planes, round): (&Planes, &Round),
         rows: &[[f64; 3]],
-        (prescribed, b): (&[[f64; 3]], &[[f64; 3]]),
-        motions: &[&Motion],
-    ) -> Result<f64> {
-        let (Some(first), Some(last)) =
-            (self.system.out_of_balance(&pose.rows, b), self.system.out_of_balance(rows, b))
-        else {
-            return Ok(1.0);
+        goal: &Goal<'_>,
+    ) -> f64 {
+        let (Some(first), Some(last)) = (
+            self.system.out_of_balance(&pose.rows, goal.b),
+            self.system.out_of_balance(rows, goal.b),
+        ) else {
+            return 1.0;
         };
         let mut way: Vec<[f64; 3]> =
             rows.iter().zip(&pose.rows).map(|(to, from)| sub(*to, *from)).collect();
@@ -238,18 +307,18 @@ impl Path<'_> {
         let work = |f: &[[f64; 3]]| -> f64 { f.iter().zip(&way).map(|(f, w)| dot(*f, *w)).sum() };
         let (from, to) = (work(&first), work(&last));
         let slope = from - pressing;
-        let start = self.pairs.energy(&pose.u, motions, &pose.touching)?;
+        let pressed = |u: &[[f64; 3]]| self.pairs.energy(planes, u, &pose.touching);
+        let start = pressed(&pose.u);
         let mut share = 1.0;
         while share > SHORTEST_SHARE {
-            let u = self.reduction.filled(prescribed, &between(&pose.rows, rows, share));
+            let u = self.reduction.filled(goal.prescribed, &between(&pose.rows, rows, share));
             let elastic = share * (from + 0.5 * share * (to - from));
-            let rise = elastic + self.pairs.energy(&u, motions, &pose.touching)? - start;
-            if rise <= DESCENT * share * slope {
+            if elastic + pressed(&u) - start <= DESCENT * share * slope {
                 break;
             }
             share *= 0.5;
         }
-        Ok(share)
+        share
     }
 
     /// Where sliding nodes are in `pose`.
@@ -260,27 +329,30 @@ impl Path<'_> {
         Some(ContactStart { places: places.collect(), reactions: state.reactions.clone() })
     }
 
-    /// The body under the links of a round: displacements of the rows, and contact where nodes slide.
+    /// The body under the links of a `round` from `pose`: displacements of the rows, and contact where nodes slide.
     ///
     /// `rough`: gap of sliding nodes, mm, that is enough for a round on the way.
     fn linked(
         &self,
         round: &Round,
-        begun: Begun<'_>,
-        motions: &[&Motion],
+        pose: &Pose,
+        contact: Option<ContactStart>,
+        goal: &Goal<'_>,
         rough: Option<f64>,
         solve: &mut Solve<'_>,
     ) -> Result<(Vec<[f64; 3]>, Option<ContactState>)> {
-        let Begun { b, rows, contact } = begun;
+        let rows = &pose.rows[..];
         let linked = Linked { links: &round.links, share: rough.map(|_| ROUGH_SHARE) };
         let Some(sliding) = self.sliding else {
-            return Ok((self.system.solve_linked(b, linked, rows, solve)?, None));
+            return Ok((self.system.solve_linked(goal.b, linked, rows, solve)?, None));
         };
         let mut options = *self.options;
         options.contact.allowed = options.contact.allowed.max(rough.unwrap_or(0.0));
         let begin = contact.map(|contact| Begin { rows, contact });
+        let motions = goal.motions;
         let settle = Settle { sliding, motions, begin, options: &options, linked };
-        let Settled { rows, contact, .. } = self.system.solve_with_contact(b, &settle, solve)?;
+        let Settled { rows, contact, .. } =
+            self.system.solve_with_contact(goal.b, &settle, solve)?;
         Ok((rows, Some(contact)))
     }
 
@@ -340,7 +412,7 @@ impl Path<'_> {
         // What a node still moved by may be its own way between two facets, and is no less than its error.
         let error = open.max(done.change);
         solve.effort.error_estimate = solve.effort.error_estimate.max(error);
-        let met = self.pairs.met(&done.round, &pose.u, self.motions, &pose.rows)?;
+        let met = self.pairs.met(&done.planes, &done.round, &pose.rows);
         let mut forces = vec![[0.0; 3]; pose.rows.len()];
         for link in &done.round.links {
             link.add_force(&pose.rows, &mut forces);
