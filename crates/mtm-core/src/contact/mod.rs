@@ -5,8 +5,10 @@
 //! smooth distance φ is in `field`, where each node lies on it in `seat`, the solver in `newton`.
 
 mod field;
+pub(crate) mod links;
 mod newton;
 pub(crate) mod pairs;
+pub(crate) mod planes;
 mod seat;
 
 use crate::boundary::{Boundary, Gap, Motion};

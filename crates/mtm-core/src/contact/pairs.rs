@@ -18,6 +18,8 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use crate::boundary::{Against, Boundary, Motion};
+use crate::contact::links::Link;
+use crate::contact::planes::{Meeting, Plane, Planes};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::motion::RigidMotion;
 use crate::geometry::surface::{Closest, Surface};
@@ -25,20 +27,13 @@ use crate::mesh::TetMesh;
 use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Row of a node that is no unknown.
-const NO_ROW: u32 = u32::MAX;
+pub(crate) const NO_ROW: u32 = u32::MAX;
 /// Stiffness of a link over that of its node by itself: with more, each round takes more iterations, with less
 /// there are more rounds.
 const LINK_STIFFNESS: f64 = 2.0;
 /// Way to the surface, over its mean edge, below which its direction is that of the continuous normal: the way
 /// itself turns from facet to facet, and means nothing at the surface.
 const NEAR_SHARE: f64 = 0.5;
-/// Length of the mean of two unit normals below which they face each other, and have no mean.
-const LEAST_MEAN: f64 = 0.5;
-/// Cosine of the turn of a normal from one round to the next above which it is steady, and factor on the share by which
-/// one turns each time that it is not.
-const STEADY_COSINE: f64 = 0.9986;
-const STEADIER: f64 = 0.8;
-
 /// Way past the border of an open surface, over its mean edge, up to which a node may still touch it.
 const BORDER_REACH: f64 = 0.25;
 /// Farthest that a gap shrinks in a round where a node goes through its surface, over the mean edge: bones go no
@@ -49,55 +44,6 @@ const ROUND_SHARE: f64 = 0.1;
 /// Depth behind a surface, over its mean edge, from which a node counts as on the far side of it: it is not pushed
 /// back through.
 const DEEPEST: f64 = 2.0;
-
-/// A spring between an unknown node and up to three others, or none: ½ k (c·u − goal)².
-#[derive(Debug, Clone)]
-pub(crate) struct Link {
-    /// Row and coefficient of each unknown node.
-    pub ends: Vec<(u32, [f64; 3])>,
-    /// k, N/mm.
-    pub stiffness: f64,
-    /// mm.
-    pub goal: f64,
-}
-
-impl Link {
-    /// c·x of rows x, mm.
-    pub fn along(&self, x: &[[f64; 3]]) -> f64 {
-        self.ends.iter().map(|(row, c)| dot(*c, x[*row as usize])).sum()
-    }
-
-    /// k (goal − c·x): the force that it puts on c at x, N.
-    pub fn pull(&self, x: &[[f64; 3]]) -> f64 {
-        self.stiffness * (self.goal - self.along(x))
-    }
-
-    /// Adds k (c·x) c to rows y.
-    pub fn add_product(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
-        self.add(self.stiffness * self.along(x), y);
-    }
-
-    /// Adds k goal c to the right-hand side `b`.
-    pub fn add_goal(&self, b: &mut [[f64; 3]]) {
-        self.add(self.stiffness * self.goal, b);
-    }
-
-    /// Adds k (goal − c·x) c to rows y: the force that it puts on them at x, N.
-    pub fn add_force(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
-        self.add(self.pull(x), y);
-    }
-
-    /// Takes it off again.
-    pub fn take_force(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
-        self.add(-self.pull(x), y);
-    }
-
-    fn add(&self, force: f64, y: &mut [[f64; 3]]) {
-        for (row, c) in &self.ends {
-            y[*row as usize] = add(y[*row as usize], scaled(*c, force));
-        }
-    }
-}
 
 /// A node that may meet a surface.
 #[derive(Debug, Clone, Copy)]
@@ -140,64 +86,13 @@ pub(crate) struct Pairs {
     row_of: Vec<u32>,
 }
 
-/// Where a candidate is with respect to its surface.
-#[derive(Debug, Clone, Copy)]
-struct Meeting {
-    /// g, mm.
-    gap: f64,
-    /// Closest point of the surface, mm.
-    point: [f64; 3],
-    /// Unit vector away from the surface.
-    normal: [f64; 3],
-    /// Nodes of the triangle that is met, with the weights of the closest point; none on bone.
-    facing: Option<([u32; 3], [f64; 3])>,
-}
-
-/// The gap of a candidate about some state: g(u) = offset + Σ cⱼ·uⱼ.
-#[derive(Debug, Clone)]
-struct Plane {
-    /// Gap where it was linearised, mm.
-    gap: f64,
-    /// Unit vector away from the surface.
-    normal: [f64; 3],
-    /// mm.
-    offset: f64,
-    /// Nodes with the change of the gap by each.
-    ends: Vec<(u32, [f64; 3])>,
-    /// Share by which its normal follows the surface; 1 but for one that swings.
-    turn: f64,
-}
-
-impl Plane {
-    /// Turns it to another normal about where it is under displacements `u` of all nodes.
-    fn turn_to(&mut self, normal: [f64; 3], u: &[[f64; 3]]) {
-        for (_, c) in &mut self.ends {
-            *c = scaled(normal, dot(*c, self.normal));
-        }
-        self.normal = normal;
-        self.offset = 0.0;
-        self.offset = self.gap - self.at(u);
-    }
-
-    /// g under displacements `u` of all nodes, mm.
-    fn at(&self, u: &[[f64; 3]]) -> f64 {
-        self.ends.iter().fold(self.offset, |gap, (j, c)| gap + dot(*c, u[*j as usize]))
-    }
-}
-
-/// What every candidate may meet about some state, each surface as its tangent plane; nothing for those past a border.
-#[derive(Debug)]
-pub(crate) struct Planes {
-    at: Vec<Option<Plane>>,
-}
-
 /// Forces between what touches, from one round to the next.
 #[derive(Debug, Clone)]
 pub(crate) struct Touching {
     /// λ of each candidate, N.
     multipliers: Vec<f64>,
     /// Gap of each where it was last, mm; none past the border of its surface.
-    gaps: Vec<Option<f64>>,
+    pub gaps: Vec<Option<f64>>,
 }
 
 /// A round of the method of multipliers.
@@ -430,13 +325,7 @@ impl Pairs {
 
     fn linearised(&self, meetings: &[Option<Meeting>], u: &[[f64; 3]]) -> Planes {
         let plane = |(c, meeting): (&Candidate, &Option<Meeting>)| {
-            let Meeting { gap, normal, facing, .. } = (*meeting)?;
-            let mut ends = vec![(c.node, normal)];
-            if let Some((nodes, weights)) = facing {
-                ends.extend((0..3).map(|k| (nodes[k], scaled(normal, -weights[k]))));
-            }
-            let here: f64 = ends.iter().map(|(j, c)| dot(*c, u[*j as usize])).sum();
-            Some(Plane { gap, normal, offset: gap - here, ends, turn: 1.0 })
+            meeting.as_ref().map(|m| Plane::new(c.node, m, u))
         };
         Planes { at: self.candidates.iter().zip(meetings).map(plane).collect() }
     }
@@ -478,12 +367,18 @@ impl Pairs {
         .sum()
     }
 
-    /// What `round` leaves open at displacements `u` of all nodes and `rows` of the unknown ones.
-    pub fn left(&self, planes: &Planes, round: &Round, u: &[[f64; 3]], rows: &[[f64; 3]]) -> Left {
+    /// What `round` leaves open at displacements `rows` of the unknown nodes, the `gap` of each plane given.
+    pub fn left(
+        &self,
+        planes: &Planes,
+        round: &Round,
+        rows: &[[f64; 3]],
+        gap: impl Fn(&Plane) -> f64,
+    ) -> Left {
         let mut left = Left { penetration: 0.0, gap: 0.0 };
         for (plane, number) in planes.at.iter().zip(&round.number) {
             let Some(plane) = plane else { continue };
-            let gap = plane.at(u);
+            let gap = gap(plane);
             left.penetration = left.penetration.max(-gap);
             if number.is_some_and(|k| round.links[k as usize].pull(rows) > 0.0) {
                 left.gap = left.gap.max(gap);
@@ -514,54 +409,12 @@ impl Pairs {
     }
 }
 
-impl Planes {
-    /// Deepest that a candidate is behind its surface where the planes are, mm.
-    pub fn deepest(&self) -> f64 {
-        self.at.iter().flatten().fold(0.0, |m, p| m.max(-p.gap))
-    }
-
-    /// Steadies the normals that swing away from those of the planes `before`: each time they turn by less of the way.
-    ///
-    /// `u`: displacements of all nodes.
-    pub fn steady(&mut self, before: &Self, u: &[[f64; 3]]) {
-        for (now, before) in self.at.iter_mut().zip(&before.at) {
-            let (Some(now), Some(before)) = (now, before) else { continue };
-            now.turn = before.turn;
-            if dot(now.normal, before.normal) < STEADY_COSINE {
-                now.turn *= STEADIER;
-            }
-            let sum = add(scaled(now.normal, now.turn), scaled(before.normal, 1.0 - now.turn));
-            let length = norm(sum);
-            if length > LEAST_MEAN {
-                now.turn_to(scaled(sum, 1.0 / length), u);
-            }
-        }
-    }
-
-    /// Keeps the gaps in `touching`.
-    pub fn keep_gaps(&self, touching: &mut Touching) {
-        touching.gaps = self.at.iter().map(|p| p.as_ref().map(|p| p.gap)).collect();
-    }
-}
-
 impl Touching {
     /// Follows `round` by the forces that its links put on the nodes at displacements `rows` of the unknown ones.
     pub fn follow(&mut self, round: &Round, rows: &[[f64; 3]]) {
         for (force, number) in self.multipliers.iter_mut().zip(&round.number) {
             *force = number.map_or(0.0, |k| round.links[k as usize].pull(rows).max(0.0));
         }
-    }
-}
-
-impl Meeting {
-    /// Carries the plane of a node at `place` from where motion `from` has its bone to where `to` has it; a deformed
-    /// one stays as it is.
-    fn carry(&mut self, from: &Motion, to: &Motion, place: [f64; 3]) {
-        let (Motion::Rigid(from), Motion::Rigid(to)) = (from, to) else { return };
-        let before = dot(self.normal, sub(place, self.point));
-        self.point = to.apply(from.apply_inverse(self.point));
-        self.normal = to.rotate(from.rotate_inverse(self.normal));
-        self.gap += dot(self.normal, sub(place, self.point)) - before;
     }
 }
 

@@ -14,7 +14,7 @@ use crate::algebra::krylov::{
 use crate::algebra::multigrid::{Multigrid, MultigridOptions};
 use crate::algebra::relaxation::{RelaxationOptions, relax};
 use crate::contact::Spring;
-use crate::contact::pairs::Link;
+use crate::contact::links::Link;
 use crate::error::{MtmError, Result, Shortfall};
 use crate::statics::effort::Solve;
 use crate::statics::options::{Interrupt, Method, StaticOptions};

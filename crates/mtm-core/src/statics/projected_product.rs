@@ -5,7 +5,7 @@ use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::constraints::Constraint;
 use crate::algebra::krylov::Operator;
 use crate::contact::Spring;
-use crate::contact::pairs::Link;
+use crate::contact::links::Link;
 use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Length, relative to what it was, below which nothing but rounding is left of a projected vector.

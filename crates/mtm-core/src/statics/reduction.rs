@@ -4,9 +4,7 @@ use rayon::prelude::*;
 
 use crate::algebra::blocks::{Block, BlockMatrix};
 use crate::boundary::NodeKind;
-
-/// Row of a node that is no unknown.
-pub(crate) const NO_ROW: u32 = u32::MAX;
+pub(crate) use crate::contact::pairs::NO_ROW;
 
 /// Free and sliding nodes as rows of the system.
 pub(crate) struct Reduction {

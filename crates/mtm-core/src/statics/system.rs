@@ -11,7 +11,7 @@ use crate::algebra::krylov::Enough;
 use crate::algebra::multigrid::Multigrid;
 use crate::algebra::row_sums::in_pool;
 use crate::boundary::Motion;
-use crate::contact::pairs::Link;
+use crate::contact::links::Link;
 use crate::contact::{
     Body, Constraints, ContactRow, ContactStart, ContactState, Response, Sliding, Spring,
 };

@@ -8,7 +8,8 @@
 use std::sync::Arc;
 
 use crate::boundary::Motion;
-use crate::contact::pairs::{Left, Pairs, Planes, Round, Touching};
+use crate::contact::pairs::{Left, Pairs, Round, Touching};
+use crate::contact::planes::Planes;
 use crate::contact::{ContactStart, ContactState, Sliding, SlidingNode};
 use crate::error::{MtmError, Result};
 use crate::geometry::motion::SurfaceMotion;
@@ -28,13 +29,15 @@ const DEEP_EDGES: f64 = 0.5;
 const SHORTEST_STEP: f64 = 1.0 / 512.0;
 /// Distance that a node may have from what it presses on, mm, and over the diagonal of the mesh: scenes may be
 /// small.
-const CLOSE: f64 = 5e-3;
+const CLOSE: f64 = 0.01;
 const CLOSE_SHARE: f64 = 2e-5;
-/// Multiple of it that is enough on the way, and where the rounds ran out: five hundredths of a millimetre.
-const LOOSE: f64 = 10.0;
+/// Multiple of it that is enough on the way, and that may be open in the end, with a warning: a quarter of a
+/// millimetre, at a node on a fold inside the mouth.
+const LOOSE: f64 = 5.0;
+const SEEN: f64 = 25.0;
 /// Rounds of a step on the way, which the next one continues, and of the last one.
 const MOST_ROUNDS_ON_THE_WAY: usize = 2;
-const MOST_ROUNDS: usize = 40;
+const MOST_ROUNDS: usize = 60;
 /// Rounds before those run out that are solved to the tolerance.
 const LAST_ROUNDS: usize = 5;
 /// Change of a node in a round, over the distance that counts as touching, up to which it is still.
@@ -204,14 +207,14 @@ impl Path<'_> {
         let close = LOOSE * self.close();
         for round in 1..=MOST_ROUNDS_AHEAD {
             let links = self.pairs.round(ahead, &pose.u, &pose.touching);
-            let (rows, found) = self.linked(&links, &pose, contact, goal, Some(close), solve)?;
+            let (rows, found) = self.linked(&links, (&pose, contact), goal, Some(close), solve)?;
             // The first round takes the sliding nodes along with their bones.
             let share =
                 if round == 1 { 1.0 } else { self.share(&pose, (ahead, &links), &rows, goal) };
             pose = self.moved(&pose, &rows, found, share, goal);
             if share == 1.0 {
                 pose.touching.follow(&links, &pose.rows);
-                if self.pairs.left(ahead, &links, &pose.u, &pose.rows).penetration <= deep {
+                if self.left(ahead, &links, &pose).penetration <= deep {
                     return Ok((pose, round));
                 }
             }
@@ -238,17 +241,20 @@ impl Path<'_> {
         let (mut rough, mut count) = (true, 0);
         loop {
             count += 1;
-            planes.keep_gaps(&mut pose.touching);
+            pose.touching.gaps = planes.gaps();
             let round = self.pairs.round(&planes, &pose.u, &pose.touching);
             let begun = self.begun(&pose);
             let (rows, contact) =
-                self.linked(&round, &pose, begun, goal, rough.then_some(close), solve)?;
+                self.linked(&round, (&pose, begun), goal, rough.then_some(close), solve)?;
             let share = if rough { self.share(&pose, (&planes, &round), &rows, goal) } else { 1.0 };
             let next = self.moved(&pose, &rows, contact, share, goal);
             let change = largest_change(&pose.u, &next.u);
             pose = next;
             let mut met = self.pairs.planes(&pose.u, goal.motions, &pose.touching)?;
-            let left = self.pairs.left(&met, &round, &pose.u, &pose.rows);
+            if count > SHARP_ROUNDS {
+                met.steady(&planes, &pose.u);
+            }
+            let left = self.left(&met, &round, &pose);
             if share == 1.0 {
                 pose.touching.follow(&round, &pose.rows);
             }
@@ -256,16 +262,20 @@ impl Path<'_> {
             let converged = near && !rough;
             let over = converged || count >= most || (near && !is_last);
             if over {
-                met.keep_gaps(&mut pose.touching);
+                pose.touching.gaps = met.gaps();
                 let rounds = before + count;
+                let left = self.pairs.left(&met, &round, &pose.rows, |plane| plane.gap);
+                let converged = converged && left.distance() <= close;
                 return Ok((pose, Done { planes: met, round, left, rounds, change, converged }));
-            }
-            if count > SHARP_ROUNDS {
-                met.steady(&planes, &pose.u);
             }
             planes = met;
             rough = !(is_last && (near || count + LAST_ROUNDS >= most));
         }
+    }
+
+    /// What `round` leaves open in `pose`, by the planes.
+    fn left(&self, planes: &Planes, round: &Round, pose: &Pose) -> Left {
+        self.pairs.left(planes, round, &pose.rows, |plane| plane.at(&pose.u))
     }
 
     /// `pose` by `share` of its way to `rows`.
@@ -335,8 +345,7 @@ impl Path<'_> {
     fn linked(
         &self,
         round: &Round,
-        pose: &Pose,
-        contact: Option<ContactStart>,
+        (pose, contact): (&Pose, Option<ContactStart>),
         goal: &Goal<'_>,
         rough: Option<f64>,
         solve: &mut Solve<'_>,
@@ -406,7 +415,7 @@ impl Path<'_> {
         solve: &mut Solve<'_>,
     ) -> Result<(Solved, Touch)> {
         let open = done.left.distance();
-        if !done.converged && open > LOOSE * self.close() {
+        if !done.converged && open > SEEN * self.close() {
             return Err(self.lost(&pose, rounds, open));
         }
         // What a node still moved by may be its own way between two facets, and is no less than its error.

@@ -1,0 +1,52 @@
+//! Springs between rows: what nodes that touch do to each other in a round.
+
+use crate::vector::{add, dot, scaled};
+
+/// A spring between an unknown node and up to three others, or none: ½ k (c·u − goal)².
+#[derive(Debug, Clone)]
+pub(crate) struct Link {
+    /// Row and coefficient of each unknown node.
+    pub ends: Vec<(u32, [f64; 3])>,
+    /// k, N/mm.
+    pub stiffness: f64,
+    /// mm.
+    pub goal: f64,
+}
+
+impl Link {
+    /// c·x of rows x, mm.
+    pub fn along(&self, x: &[[f64; 3]]) -> f64 {
+        self.ends.iter().map(|(row, c)| dot(*c, x[*row as usize])).sum()
+    }
+
+    /// k (goal − c·x): the force that it puts on c at x, N.
+    pub fn pull(&self, x: &[[f64; 3]]) -> f64 {
+        self.stiffness * (self.goal - self.along(x))
+    }
+
+    /// Adds k (c·x) c to rows y.
+    pub fn add_product(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
+        self.add(self.stiffness * self.along(x), y);
+    }
+
+    /// Adds k goal c to the right-hand side `b`.
+    pub fn add_goal(&self, b: &mut [[f64; 3]]) {
+        self.add(self.stiffness * self.goal, b);
+    }
+
+    /// Adds k (goal − c·x) c to rows y: the force that it puts on them at x, N.
+    pub fn add_force(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
+        self.add(self.pull(x), y);
+    }
+
+    /// Takes it off again.
+    pub fn take_force(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
+        self.add(-self.pull(x), y);
+    }
+
+    fn add(&self, force: f64, y: &mut [[f64; 3]]) {
+        for (row, c) in &self.ends {
+            y[*row as usize] = add(y[*row as usize], scaled(*c, force));
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! What nodes that may touch meet about some state, linearised: a tangent plane for each.
+
+use crate::boundary::Motion;
+use crate::vector::{add, dot, norm, scaled, sub};
+
+/// Length of the mean of two unit normals below which they face each other, and have no mean.
+const LEAST_MEAN: f64 = 0.5;
+/// Factors on the share by which a plane follows its surface, where this swings back and where it does not.
+const STEADIER: f64 = 0.7;
+const FREER: f64 = 1.2;
+
+/// Where a candidate is with respect to its surface.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Meeting {
+    /// g, mm.
+    pub gap: f64,
+    /// Closest point of the surface, mm.
+    pub point: [f64; 3],
+    /// Unit vector away from the surface.
+    pub normal: [f64; 3],
+    /// Nodes of the triangle that is met, with the weights of the closest point; none on bone.
+    pub facing: Option<([u32; 3], [f64; 3])>,
+}
+
+/// The gap of a candidate about some state: g(u) = offset + Σ cⱼ·uⱼ.
+#[derive(Debug, Clone)]
+pub(crate) struct Plane {
+    /// Gap where it was linearised, mm.
+    pub gap: f64,
+    /// Unit vector away from the surface.
+    pub normal: [f64; 3],
+    /// mm.
+    pub offset: f64,
+    /// Nodes with the change of the gap by each.
+    pub ends: Vec<(u32, [f64; 3])>,
+    /// Share by which it follows the surface; 1 but for one that swings.
+    turn: f64,
+    /// What of normal and gap, mm, the surface last was ahead of it.
+    swing: ([f64; 3], f64),
+}
+
+impl Plane {
+    /// That of candidate `node` which is where `meeting` is under displacements `u` of all nodes.
+    pub fn new(node: u32, meeting: &Meeting, u: &[[f64; 3]]) -> Self {
+        let Meeting { gap, normal, facing, .. } = *meeting;
+        let mut ends = vec![(node, normal)];
+        if let Some((nodes, weights)) = facing {
+            ends.extend((0..3).map(|k| (nodes[k], scaled(normal, -weights[k]))));
+        }
+        let here: f64 = ends.iter().map(|(j, c)| dot(*c, u[*j as usize])).sum();
+        Self { gap, normal, offset: gap - here, ends, turn: 1.0, swing: ([0.0; 3], 0.0) }
+    }
+
+    /// Turns it to another normal about where nodes are under displacements `u`, with another gap there.
+    fn turn_to(&mut self, normal: [f64; 3], gap: f64, u: &[[f64; 3]]) {
+        for (_, c) in &mut self.ends {
+            *c = scaled(normal, dot(*c, self.normal));
+        }
+        self.normal = normal;
+        self.offset = 0.0;
+        self.offset = gap - self.at(u);
+    }
+
+    /// g under displacements `u` of all nodes, mm.
+    pub fn at(&self, u: &[[f64; 3]]) -> f64 {
+        self.ends.iter().fold(self.offset, |gap, (j, c)| gap + dot(*c, u[*j as usize]))
+    }
+}
+
+/// What every candidate may meet about some state, each surface as its tangent plane; nothing for those past a border.
+#[derive(Debug)]
+pub(crate) struct Planes {
+    pub at: Vec<Option<Plane>>,
+}
+
+impl Meeting {
+    /// Carries the plane of a node at `place` from where motion `from` has its bone to where `to` has it; a deformed
+    /// one stays as it is.
+    pub fn carry(&mut self, from: &Motion, to: &Motion, place: [f64; 3]) {
+        let (Motion::Rigid(from), Motion::Rigid(to)) = (from, to) else { return };
+        let before = dot(self.normal, sub(place, self.point));
+        self.point = to.apply(from.apply_inverse(self.point));
+        self.normal = to.rotate(from.rotate_inverse(self.normal));
+        self.gap += dot(self.normal, sub(place, self.point)) - before;
+    }
+}
+
+impl Planes {
+    /// Deepest that a candidate is behind its surface where the planes are, mm.
+    pub fn deepest(&self) -> f64 {
+        self.at.iter().flatten().fold(0.0, |m, p| m.max(-p.gap))
+    }
+
+    /// Steadies those that swing: where a surface is now on one side of what the planes `before` foresaw and now on the
+    /// other, they follow it by less of the way. What [`Plane::gap`] has is still the gap that was found.
+    ///
+    /// `u`: displacements of all nodes.
+    pub fn steady(&mut self, before: &Self, u: &[[f64; 3]]) {
+        for (now, before) in self.at.iter_mut().zip(&before.at) {
+            let (Some(now), Some(before)) = (now, before) else { continue };
+            let foreseen = before.at(u);
+            now.swing = (sub(now.normal, before.normal), now.gap - foreseen);
+            let (turned, jumped) = before.swing;
+            let is_back = dot(now.swing.0, turned) < 0.0 || now.swing.1 * jumped < 0.0;
+            now.turn = (before.turn * if is_back { STEADIER } else { FREER }).min(1.0);
+            let sum = add(scaled(now.normal, now.turn), scaled(before.normal, 1.0 - now.turn));
+            let length = norm(sum);
+            if length > LEAST_MEAN {
+                let gap = now.turn * now.gap + (1.0 - now.turn) * foreseen;
+                now.turn_to(scaled(sum, 1.0 / length), gap, u);
+            }
+        }
+    }
+
+    /// Gap of each candidate where the planes are, mm; none past the border of its surface.
+    pub fn gaps(&self) -> Vec<Option<f64>> {
+        self.at.iter().map(|p| p.as_ref().map(|p| p.gap)).collect()
+    }
+}
