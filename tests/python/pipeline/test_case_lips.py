@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 import cmfsim
 import phantom_case
@@ -227,25 +228,25 @@ def test_lips_do_not_enter_each_other_when_the_mandible_rises(model):
     assert _deepest(model, result) < 0.1
     through = solved(dataclasses.replace(model, scene=free), plan)
     assert "touching" not in through.summary
-    assert _deepest(model, through) > 0.5
+    assert _deepest(model, through) > 0.25
 
 
 def _deepest(model, result):
-    """How deep the lower lip's nodes lie in the upper lip, deformed, beyond their place at rest."""
-    touch = model.scene.touching[0]
-
-    triangles = np.asarray(touch.triangles)
-    edges = np.sort(np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
-    each, count = np.unique(edges, axis=0, return_counts=True)
-    at_border = np.isin(triangles, each[count == 1]).any(axis=1)
-
-    def depth(nodes):
-        surface = cmfsim.Surface(nodes, triangles)
-        closest, normals, nearest = surface.closest(nodes[touch.nodes])
-        height = np.einsum("na,na->n", nodes[touch.nodes] - closest, normals)
-        # Next to the border of the lip the sign means nothing: nodes come round it.
-        return np.where(at_border[nearest] | (height < -3.0), 0.0, height)
-
-    rest = np.asarray(model.scene.nodes)
-    now = depth(rest + result.displacements)
-    return float((np.minimum(depth(rest), 0.0) - now).max())
+    """How deep a node of either lip lies in a deformed tet that is not its own, mm."""
+    scene = model.scene
+    tets, places = np.asarray(scene.tets), np.asarray(scene.nodes) + result.displacements
+    corners = places[tets]
+    middles = corners.mean(axis=1)
+    reach = np.linalg.norm(corners - middles[:, None], axis=2).max()
+    nodes = np.unique(np.concatenate([touch.nodes for touch in scene.touching]))
+    near = cKDTree(middles).query_ball_point(places[nodes], reach)
+    node, tet = np.repeat(nodes, [len(n) for n in near]), np.concatenate(near).astype(int)
+    foreign = (tets[tet] != node[:, None]).all(axis=1)
+    node, tet = node[foreign], tet[foreign]
+    ways = np.swapaxes(corners[tet, 1:] - corners[tet, :1], 1, 2)
+    inverse = np.linalg.inv(ways)
+    three = np.einsum("nij,nj->ni", inverse, places[node] - corners[tet, 0])
+    weights = np.column_stack([1.0 - three.sum(axis=1), three])
+    # A weight changes by the length of its gradient over a millimetre.
+    slopes = np.linalg.norm(np.concatenate([inverse.sum(axis=1)[:, None], inverse], axis=1), axis=2)
+    return float((weights / slopes).min(axis=1).max(initial=0.0))
