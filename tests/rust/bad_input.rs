@@ -1,13 +1,11 @@
 //! Every kind of wrong input, and every numerical failure, gives its own error with index and value.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
-mod meshes;
-
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use meshes::{
-    BoxShape, GO_ON, boundary, isotropic, joined, plan, plane, rigid, sliding, solve, solver,
+use crate::meshes::{
+    self, BoxShape, GO_ON, boundary, isotropic, joined, plan, plane, rigid, sliding, solve, solver,
     stays, surface, tensors, with_method,
 };
 use mtm_core::{

@@ -3,13 +3,12 @@
 
 #[path = "../../fuzz/bodies.rs"]
 mod bodies;
-mod meshes;
 
 use std::sync::Arc;
 
-use meshes::{
-    BoxShape, GO_ON, Numbers, Vec3, affine, at, boundary, joined, largest, largest_difference,
-    plan, rigid, solve, solver, tensors, with_method,
+use crate::meshes::{
+    self, BoxShape, GO_ON, Numbers, Vec3, affine, at, boundary, joined, largest,
+    largest_difference, plan, rigid, solve, solver, tensors, with_method,
 };
 use mtm_core::{
     Boundary, Elastic, FibreElastic, FibreLaw, MassTensors, Method, Motion, RigidMotion, Spencer,

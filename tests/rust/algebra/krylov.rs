@@ -1,8 +1,6 @@
 //! Conjugate gradients and multigrid against dense factors.
 #![allow(clippy::unwrap_used)]
 
-mod elastic_box;
-
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use mtm_core::{
@@ -11,7 +9,7 @@ use mtm_core::{
 };
 use nalgebra::Matrix3;
 
-use elastic_box::{
+use super::elastic_box::{
     BoxCase, System, block_matrix, dense_solution, elastic_box, largest_difference, scattered,
 };
 

@@ -2,14 +2,11 @@
 //! distance, whatever way they came.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
-#[path = "../meshes/mod.rs"]
-mod meshes;
-
 use std::sync::Arc;
 
-use meshes::{
-    BoxShape, Triangles, Vec3, boundary, isotropic, joined, largest_difference, plan, plane, rigid,
-    sliding, solve, stays, surface, tensors, with_method,
+use crate::meshes::{
+    self, BoxShape, Triangles, Vec3, boundary, isotropic, joined, largest_difference, plan, plane,
+    rigid, sliding, solve, stays, surface, tensors, with_method,
 };
 use mtm_core::{
     Boundary, ContactMode, ContactOptions, Gap, Method, Motion, Plan, Solution, StaticOptions,

@@ -1,13 +1,10 @@
 //! Sliding contact against exact answers, its invariants, and the errors it must give.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
-#[path = "../meshes/mod.rs"]
-mod meshes;
-
 use std::sync::Arc;
 
-use meshes::{
-    BoxShape, GO_ON, ShellShape, Vec3, affine, along_fibre, at, boundary, carried, isotropic,
+use crate::meshes::{
+    self, BoxShape, GO_ON, ShellShape, Vec3, affine, along_fibre, at, boundary, carried, isotropic,
     joined, largest_difference, near_exact, plan, plane, rigid, sliding, solve, solver, sphere,
     stays, surface, tensors, with_method,
 };

@@ -1,14 +1,11 @@
 //! Parts that may touch, against closed forms: pressed together, slid on each other, pulled apart, and on bone.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
-#[path = "../meshes/mod.rs"]
-mod meshes;
-
 use std::sync::Arc;
 
-use meshes::{
-    BoxShape, GO_ON, Vec3, at, isotropic, joined, largest, largest_difference, near_exact, plan,
-    plane, rigid, sliding, solver, sphere, surface, tensors,
+use crate::meshes::{
+    self, BoxShape, GO_ON, Vec3, at, isotropic, joined, largest, largest_difference, near_exact,
+    plan, plane, rigid, sliding, solver, sphere, surface, tensors,
 };
 use mtm_core::{
     Against, Boundary, Conflicts, ContactMode, ContactOptions, ErrorKind, Gap, Method, Motion,

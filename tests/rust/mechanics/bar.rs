@@ -1,14 +1,11 @@
 //! Uniform stretch of a bar along, across and oblique to its fibre, by its engineering compliance.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
-#[path = "../meshes/mod.rs"]
-mod meshes;
-
 use std::sync::Arc;
 
-use meshes::{
-    BoxShape, Vec3, affine, along_fibre, boundary, isotropic, joined, largest, largest_difference,
-    plan, rigid, solve, tensors, with_method,
+use crate::meshes::{
+    self, BoxShape, Vec3, affine, along_fibre, boundary, isotropic, joined, largest,
+    largest_difference, plan, rigid, solve, tensors, with_method,
 };
 use mtm_core::{FibreElastic, Method, Motion, TetMesh, Tissue};
 use nalgebra::Matrix3;

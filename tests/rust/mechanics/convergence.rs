@@ -1,14 +1,11 @@
 //! Order of convergence in L2 on refined meshes: a manufactured solution and Lamé's thick sphere.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
-#[path = "../meshes/mod.rs"]
-mod meshes;
-
 use std::sync::Arc;
 
-use meshes::{
-    BoxShape, ShellShape, Vec3, along_fibre, at, boundary, isotropic, joined, plan, sliding, solve,
-    surface, tensors, with_method,
+use crate::meshes::{
+    self, BoxShape, ShellShape, Vec3, along_fibre, at, boundary, isotropic, joined, plan, sliding,
+    solve, surface, tensors, with_method,
 };
 use mtm_core::{FibreElastic, Gap, Method, Motion, SurfaceMotion, TetMesh, Tissue};
 

@@ -1,15 +1,12 @@
 //! Elements and kinematics past the linear tet: patch tests, rotations, derivatives, closed forms, contact.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
-#[path = "../meshes/mod.rs"]
-mod meshes;
-
 use std::sync::Arc;
 
-use meshes::{
-    BoxShape, GO_ON, Numbers, Vec3, affine, any_stiffness, at, bits, boundary, carried, isotropic,
-    joined, largest, largest_difference, plan, plane, rigid, sliding, solve, solver, surface,
-    tissues, with_method,
+use crate::meshes::{
+    self, BoxShape, GO_ON, Numbers, Vec3, affine, any_stiffness, at, bits, boundary, carried,
+    isotropic, joined, largest, largest_difference, plan, plane, rigid, sliding, solve, solver,
+    surface, tissues, with_method,
 };
 use mtm_core::{
     ContactMode, ContactOptions, Elastic, Element, FibreElastic, FibreLaw, Gap, Kinematics,

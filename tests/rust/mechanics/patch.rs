@@ -1,12 +1,9 @@
 //! Statements about the tensors that hold exactly: patch test, rigid motions, symmetry, zero modes.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
-#[path = "../meshes/mod.rs"]
-mod meshes;
-
 use std::sync::Arc;
 
-use meshes::{
+use crate::meshes::{
     BoxShape, Numbers, Vec3, affine, any_stiffness, at, boundary, joined, largest,
     largest_difference, plan, solve, tensors, tissues, with_method,
 };

@@ -1,5 +1,5 @@
 //! Procedural meshes, surfaces, motions and solvers that the tests share.
-#![allow(dead_code)] // each test binary uses a part of it
+#![allow(dead_code)] // the bench that includes this file uses a part of it
 
 use std::collections::HashMap;
 use std::sync::Arc;

@@ -1,14 +1,11 @@
 //! Muscle fractions and fibres of tets against closed forms.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
-#[path = "../meshes/mod.rs"]
-mod meshes;
-
 use std::f64::consts::PI;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use meshes::{BoxShape, GO_ON, Numbers, Triangles, Vec3, sphere, surface};
+use crate::meshes::{BoxShape, GO_ON, Numbers, Triangles, Vec3, sphere, surface};
 use mtm_core::{
     ErrorKind, InsideTest, Mixing, MtmError, Muscle, MuscleFibres, MuscleShares, Preset,
     SamplingOptions, TetMesh, sample_muscles,

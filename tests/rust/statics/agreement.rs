@@ -1,13 +1,10 @@
 //! The methods agree with one another, re-planning with solving, and one thread with two.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
-#[path = "../meshes/mod.rs"]
-mod meshes;
-
 use std::sync::Arc;
 
-use meshes::{
-    BoxShape, GO_ON, Numbers, Vec3, at, bits, boundary, contrasting, isotropic, joined,
+use crate::meshes::{
+    self, BoxShape, GO_ON, Numbers, Vec3, at, bits, boundary, contrasting, isotropic, joined,
     largest_difference, plan, plane, rigid, sliding, solve, solver, stays, surface, tensors,
     with_method,
 };

@@ -1,0 +1,39 @@
+//! The tests of the core, one folder per folder of the core: one program, so that it is linked once.
+
+mod meshes;
+
+mod bad_input;
+mod properties;
+
+mod algebra {
+    mod elastic_box;
+    mod krylov;
+}
+mod contact {
+    mod settling;
+    mod sliding;
+    mod touching;
+}
+mod geometry {
+    mod surface;
+}
+mod mechanics {
+    mod bar;
+    mod convergence;
+    mod elements;
+    mod patch;
+}
+mod meshing {
+    mod stuffing;
+}
+mod muscles {
+    mod equivalent;
+    mod fibre;
+}
+mod registration {
+    mod fits;
+}
+mod statics {
+    mod agreement;
+    mod error_estimate;
+}
