@@ -213,9 +213,9 @@ class _Grid:
         ]
         self.shape = tuple(len(line) for line in self.lines)
         places = np.stack(np.meshgrid(*self.lines, indexing="ij"), axis=-1).reshape(-1, 3)
-        values = bone.sample(self.origin + places @ self.axes)
-        # What the image does not hold is no bone, however its border is coloured.
         world = self.origin + places @ self.axes
+        values = bone.sample(world)
+        # What the image does not hold is no bone, however its border is coloured.
         held = ((world >= bone.lowest) & (world <= bone.highest)).all(axis=1)
         self.inside: Mask = ((values > 0.0) & held).reshape(self.shape)
         # Distance from the surface of the bone, mm, where it is known better than by voxels.

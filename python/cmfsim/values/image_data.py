@@ -1,5 +1,6 @@
 """Images: scalar values on an axis-aligned grid in LPS."""
 
+import itertools
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -104,12 +105,12 @@ class ImageData(Frozen):
         low = np.minimum(place.astype(np.intp), np.maximum(shape - 2, 0))
         part = place - low
         high = np.minimum(low + 1, shape - 1)
+        # Along each axis: the voxels on both sides of a point, each with its weight.
+        sides = [
+            ((before, 1.0 - share), (after, share))
+            for before, after, share in zip(low.T, high.T, part.T, strict=True)
+        ]
         total = np.zeros(len(place))
-        for corner in range(8):
-            ends = [(corner >> axis) & 1 for axis in range(3)]
-            index = tuple((high if end else low)[:, axis] for axis, end in enumerate(ends))
-            weight = np.prod(
-                [part[:, a] if end else 1.0 - part[:, a] for a, end in enumerate(ends)], axis=0
-            )
-            total += weight * self.values[index]
+        for (k, w), (j, v), (i, u) in itertools.product(*reversed(sides)):
+            total += u * v * w * self.values[i, j, k]
         return total
