@@ -45,7 +45,7 @@ def run_job(job: Mapping[str, Any], *, threads: int | None, time_limit: float) -
     path.unlink(missing_ok=True)
     environment = dict(os.environ)
     if threads is not None:
-        environment["RAYON_NUM_THREADS"] = str(threads)
+        environment["RAYON_NUM_THREADS"] = environment["OPENBLAS_NUM_THREADS"] = str(threads)
     with tempfile.TemporaryDirectory(prefix=".job-", dir=path.parent) as folder:
         file = Path(folder) / "job.json"
         file.write_text(json.dumps(job), encoding="utf-8")

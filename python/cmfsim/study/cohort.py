@@ -289,7 +289,8 @@ def run_job(job: CaseJob, processes: _Workers | None = None) -> CaseOutcome:
     output = Path(job.output)
     begun = time.perf_counter()
     command = [sys.executable, "-m", "cmfsim.study.worker", job.file, job.output, *job.models]
-    environment = {**os.environ, "RAYON_NUM_THREADS": str(job.threads)}
+    threads = str(job.threads)
+    environment = {**os.environ, "RAYON_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
     try:
         output.mkdir(parents=True, exist_ok=True)
         # Made again, so that a link of that name leads nowhere.
