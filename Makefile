@@ -58,7 +58,7 @@ test-rust: $(ENV_STAMP)
 	cargo test --workspace --release $(CARGO_FLAGS) $(CORE_FEATURES)
 
 test-python: $(DEVELOP_STAMP)
-	"$(PY)" -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+	"$(PY)" -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 lint: $(DEVELOP_STAMP) ## rustfmt, clippy, ruff, mypy, stubtest, the import rules and the licences
 	cargo fmt --all --check
