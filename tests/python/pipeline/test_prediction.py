@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import os
 import re
+import sys
 from html import escape
 
 import numpy as np
@@ -173,8 +175,10 @@ def test_evaluation_without_a_face_to_compare_with_says_so(case):
         cmfsim.evaluate(case, ["H"])
 
 
-def test_the_command_writes_faces_figures_and_report(with_truth, capsys):
+def test_the_command_writes_faces_figures_and_report(with_truth, capsys, monkeypatch):
+    """Without pictures, which take most of the time; test_demo.py counts those of a report."""
     pytest.importorskip("jinja2")
+    monkeypatch.setitem(sys.modules, "pyvista", None)
     words = ["evaluate", str(with_truth.file), "--model", "H", "--model", "M", "--no-doctor", "-q"]
     assert main(words) == 0
     out = capsys.readouterr().out
@@ -191,8 +195,16 @@ def test_the_command_writes_faces_figures_and_report(with_truth, capsys):
     assert (folder / "metrics.csv").read_text(encoding="utf-8").startswith("patient,region,model")
 
 
-def test_a_study_keeps_what_is_finished_and_reports_what_fails(with_truth, tmp_path, capsys):
+def test_a_study_keeps_what_is_finished_and_reports_what_fails(
+    with_truth, tmp_path, capsys, monkeypatch
+):
+    """Its processes are without PyVista: pictures take most of the time."""
     pytest.importorskip("jinja2")
+    absent = tmp_path / "absent"
+    absent.mkdir()
+    (absent / "pyvista.py").write_text("raise ImportError('left out')", encoding="utf-8")
+    paths = [str(absent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
     cohort = tmp_path / "cohort.toml"
     cohort.write_text(
         'format = "cmfsim-cohort"\nversion = 1\nname = "two"\nnote = "in silico"\nmodels = ["H"]\n'
