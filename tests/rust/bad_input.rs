@@ -1,5 +1,4 @@
 //! Every kind of wrong input, and every numerical failure, gives its own error with index and value.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};

@@ -1,4 +1,5 @@
 //! The tests of the core, one folder per folder of the core: one program, so that it is linked once.
+#![allow(clippy::unwrap_used, clippy::panic)]
 
 mod meshes;
 

@@ -1,5 +1,4 @@
 //! Invariants of random small scenes, and the fuzz targets on seeded bytes.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 #[path = "../../fuzz/bodies.rs"]
 mod bodies;

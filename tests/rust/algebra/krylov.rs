@@ -1,5 +1,4 @@
 //! Conjugate gradients and multigrid against dense factors.
-#![allow(clippy::unwrap_used)]
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 

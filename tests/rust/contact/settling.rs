@@ -1,6 +1,5 @@
 //! Settling of sliding contact on steep, sharp and knobbly surfaces: nodes end on the surface by true
 //! distance, whatever way they came.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::sync::Arc;
 

@@ -1,5 +1,4 @@
 //! Sliding contact against exact answers, its invariants, and the errors it must give.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::sync::Arc;
 

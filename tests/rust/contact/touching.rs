@@ -1,5 +1,4 @@
 //! Parts that may touch, against closed forms: pressed together, slid on each other, pulled apart, and on bone.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::sync::Arc;
 

@@ -1,5 +1,4 @@
 //! Surfaces, winding numbers and prescribed motions against brute force and closed forms.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::collections::HashMap;
 use std::f64::consts::PI;

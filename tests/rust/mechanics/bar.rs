@@ -1,5 +1,4 @@
 //! Uniform stretch of a bar along, across and oblique to its fibre, by its engineering compliance.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::sync::Arc;
 

@@ -1,5 +1,4 @@
 //! Order of convergence in L2 on refined meshes: a manufactured solution and Lamé's thick sphere.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::sync::Arc;
 

@@ -1,5 +1,4 @@
 //! Elements and kinematics past the linear tet: patch tests, rotations, derivatives, closed forms, contact.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::sync::Arc;
 

@@ -1,5 +1,4 @@
 //! Statements about the tensors that hold exactly: patch test, rigid motions, symmetry, zero modes.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::sync::Arc;
 

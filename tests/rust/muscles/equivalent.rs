@@ -1,5 +1,4 @@
 //! Muscle fractions and fibres of tets against closed forms.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::f64::consts::PI;
 use std::sync::Arc;

@@ -1,5 +1,4 @@
 //! Fibre directions from boxes: shapes whose fibres are known in closed form, and bad input.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 

@@ -1,5 +1,4 @@
 //! Splines, rigid fits and closest points against closed forms, brute force and known motions.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 use mtm_core::{
     ErrorKind, Fixed, IcpMethod, IcpOptions, MtmError, PointTree, RigidFitOptions, RigidMotion,

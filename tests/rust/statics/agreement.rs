@@ -1,5 +1,4 @@
 //! The methods agree with one another, re-planning with solving, and one thread with two.
-#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::sync::Arc;
 

@@ -1,5 +1,4 @@
 //! The small twin of `benches/error_estimate.rs`: scenes in which stiff and soft tissue are mixed.
-#![allow(clippy::unwrap_used)]
 
 #[path = "../../../benches/random_scenes.rs"]
 #[allow(dead_code)] // the bench sorts scenes by more than the test
