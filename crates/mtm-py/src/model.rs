@@ -691,13 +691,13 @@ impl PySolution {
         self.core.touching.rounds
     }
 
-    /// Whether what touches is within 0.005 mm; False where it is within 0.05 mm alone.
+    /// Whether what touches is at rest within 0.05 mm and no node went through; False where it is within 0.25 mm alone.
     #[getter]
     fn touching_converged(&self) -> bool {
         self.core.touching.converged || self.core.touching.rounds == 0
     }
 
-    /// Deepest that a node is behind what it touches, mm.
+    /// Deepest that a node is behind what it touches, or in a deformed tet of other tissue, mm.
     #[getter]
     fn penetration(&self) -> f64 {
         self.core.touching.penetration()

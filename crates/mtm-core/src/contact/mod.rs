@@ -7,6 +7,7 @@
 mod field;
 pub(crate) mod links;
 mod newton;
+pub(crate) mod overlap;
 pub(crate) mod pairs;
 pub(crate) mod planes;
 mod seat;

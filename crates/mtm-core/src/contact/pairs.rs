@@ -199,6 +199,11 @@ impl Pairs {
         Ok(Some(out))
     }
 
+    /// The nodes that may touch something, one for each surface.
+    pub fn nodes(&self) -> Vec<u32> {
+        self.candidates.iter().map(|c| c.node).collect()
+    }
+
     /// No forces yet.
     pub fn at_rest(&self) -> Touching {
         Touching {

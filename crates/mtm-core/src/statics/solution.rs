@@ -43,6 +43,8 @@ pub struct TouchResult {
     pub normals: Vec<[f64; 3]>,
     /// Force along it, N, not negative.
     pub forces: Vec<f64>,
+    /// Deepest that one of the nodes lies in a deformed tet of other tissue, mm, no deeper than the walls of that tet.
+    pub overlap: f64,
     /// Rounds of the method of multipliers.
     pub rounds: usize,
     /// Whether gaps, forces and changes are within the tolerance.
@@ -50,9 +52,9 @@ pub struct TouchResult {
 }
 
 impl TouchResult {
-    /// Deepest that a node is behind its surface, mm.
+    /// Deepest that a node is behind its surface or in other tissue, mm.
     pub fn penetration(&self) -> f64 {
-        self.gaps.iter().fold(0.0, |m, gap| m.max(-gap))
+        self.gaps.iter().fold(self.overlap, |m, gap| m.max(-gap))
     }
 }
 

@@ -8,6 +8,7 @@
 use std::sync::Arc;
 
 use crate::boundary::Motion;
+use crate::contact::overlap::Overlap;
 use crate::contact::pairs::{Left, Pairs, Round, Touching};
 use crate::contact::planes::Planes;
 use crate::contact::{ContactStart, ContactState, Sliding, SlidingNode};
@@ -35,6 +36,8 @@ const CLOSE_SHARE: f64 = 2e-5;
 /// millimetre, at a node on a fold inside the mouth.
 const LOOSE: f64 = 5.0;
 const SEEN: f64 = 25.0;
+/// Multiple of it that a node may lie in a tet of other tissue, where edges meet; from there on it went through.
+const THROUGH: f64 = 15.0;
 /// Rounds of a step on the way, which the next one continues, and of the last one.
 const MOST_ROUNDS_ON_THE_WAY: usize = 2;
 const MOST_ROUNDS: usize = 60;
@@ -265,7 +268,7 @@ impl Path<'_> {
                 pose.touching.gaps = met.gaps();
                 let rounds = before + count;
                 let left = self.pairs.left(&met, &round, &pose.rows, |plane| plane.gap);
-                let converged = converged && left.distance() <= close;
+                let converged = converged && left.distance() <= LOOSE * self.close();
                 return Ok((pose, Done { planes: met, round, left, rounds, change, converged }));
             }
             planes = met;
@@ -426,13 +429,16 @@ impl Path<'_> {
         for link in &done.round.links {
             link.add_force(&pose.rows, &mut forces);
         }
+        let overlap = Overlap::new(self.mesh, self.pairs.nodes()).deepest(self.mesh, &pose.u);
+        let converged = done.converged && overlap <= THROUGH * self.close();
         let result = TouchResult {
             nodes: met.iter().map(|m| m.node).collect(),
             gaps: met.iter().map(|m| m.gap).collect(),
             normals: met.iter().map(|m| m.normal).collect(),
             forces: met.iter().map(|m| m.force).collect(),
+            overlap,
             rounds,
-            converged: done.converged,
+            converged,
         };
         let Pose { rows, contact, .. } = pose;
         Ok((Solved { rows, contact, contact_seconds: 0.0 }, Touch { result, forces }))

@@ -1,0 +1,131 @@
+//! Tissue inside other tissue, found without surfaces: nodes that lie in deformed tets which are not theirs.
+//!
+//! Closest points tell on which side of a surface a node is, but not whether it has come there round an edge or
+//! through it. A tet that holds a node of another part does.
+
+use std::collections::HashMap;
+
+use rayon::prelude::*;
+
+use crate::mesh::TetMesh;
+use crate::vector::{add, cross, dot, norm, sub};
+
+/// Nodes that should lie in no tet of others.
+#[derive(Debug)]
+pub(crate) struct Overlap {
+    nodes: Vec<u32>,
+    /// Edge of a cell of the lattice in which they are looked up, mm.
+    cell: f64,
+}
+
+impl Overlap {
+    /// Those of `nodes` that lie in no other tet at rest.
+    pub fn new(mesh: &TetMesh, mut nodes: Vec<u32>) -> Self {
+        nodes.retain(|&j| (j as usize) < mesh.n_nodes());
+        nodes.sort_unstable();
+        nodes.dedup();
+        let edges = mesh.tets().iter().map(|t| {
+            let [a, b] = [t[0], t[1]].map(|j| mesh.nodes()[j as usize]);
+            norm(sub(b, a))
+        });
+        let cell = edges.sum::<f64>() / mesh.tets().len() as f64;
+        let mut out = Self { nodes, cell };
+        let inside = out.depths(mesh, &vec![[0.0; 3]; mesh.n_nodes()]);
+        let mut depth = inside.into_iter();
+        out.nodes.retain(|_| depth.next() == Some(0.0));
+        out
+    }
+
+    /// Deepest that one of them lies in a tet of others under displacements `u` of all nodes, mm; no deeper than the
+    /// tet's own walls are.
+    pub fn deepest(&self, mesh: &TetMesh, u: &[[f64; 3]]) -> f64 {
+        self.depths(mesh, u).into_iter().fold(0.0, f64::max)
+    }
+
+    fn depths(&self, mesh: &TetMesh, u: &[[f64; 3]]) -> Vec<f64> {
+        let place = |j: u32| add(mesh.nodes()[j as usize], u[j as usize]);
+        let key = |x: [f64; 3]| x.map(|v| (v / self.cell).floor() as i64);
+        let mut cells: HashMap<[i64; 3], Vec<u32>> = HashMap::new();
+        for (i, &j) in self.nodes.iter().enumerate() {
+            cells.entry(key(place(j))).or_default().push(i as u32);
+        }
+        let found: Vec<(u32, f64)> = mesh
+            .tets()
+            .par_iter()
+            .with_min_len(1024)
+            .flat_map_iter(|tet| {
+                let corners = tet.map(place);
+                let mut held = Vec::new();
+                let [low, high] = [f64::min, f64::max].map(|pick| {
+                    [0, 1, 2].map(|k| corners.iter().map(|c| c[k]).reduce(pick).unwrap_or(0.0))
+                });
+                let (first, last) = (key(low), key(high));
+                for x in first[0]..=last[0] {
+                    for y in first[1]..=last[1] {
+                        for z in first[2]..=last[2] {
+                            for &i in cells.get(&[x, y, z]).into_iter().flatten() {
+                                let node = self.nodes[i as usize];
+                                let depth = depth_in(&corners, place(node));
+                                if depth > 0.0 && !tet.contains(&node) {
+                                    held.push((i, depth));
+                                }
+                            }
+                        }
+                    }
+                }
+                held
+            })
+            .collect();
+        let mut out = vec![0.0; self.nodes.len()];
+        for (i, depth) in found {
+            out[i as usize] = f64::max(out[i as usize], depth);
+        }
+        out
+    }
+}
+
+/// Least distance of a point from the faces of a tet around it, mm; not positive outside.
+fn depth_in(corners: &[[f64; 3]; 4], point: [f64; 3]) -> f64 {
+    let face = |k: usize| {
+        let [a, b, c] = [1, 2, 3].map(|step| corners[(k + step) % 4]);
+        let normal = cross(sub(b, a), sub(c, a));
+        let (height, away) = (dot(normal, sub(corners[k], a)), dot(normal, sub(point, a)));
+        away * height.signum() / norm(normal)
+    };
+    let depth = (0..4).map(face).fold(f64::INFINITY, f64::min);
+    if depth.is_finite() { depth } else { 0.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CORNERS: [[f64; 3]; 4] =
+        [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+
+    #[test]
+    fn depth_is_the_distance_from_the_nearest_face() {
+        assert!((depth_in(&CORNERS, [0.1, 0.3, 0.3]) - 0.1).abs() < 1e-15);
+        let near_the_slope = (1.0 - 0.9) / 3.0_f64.sqrt();
+        assert!((depth_in(&CORNERS, [0.3, 0.3, 0.3]) - near_the_slope).abs() < 1e-15);
+        assert!(depth_in(&CORNERS, [0.5, 0.5, 0.5]) < 0.0);
+        let flat = [[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [3.0, 0.0, 0.0]];
+        assert_eq!(depth_in(&flat, [1.0, 0.0, 0.0]), 0.0);
+    }
+
+    #[test]
+    fn a_node_of_another_part_is_found_in_the_tet_that_holds_it() {
+        let mut nodes = CORNERS.to_vec();
+        nodes.extend(CORNERS.map(|c| add(c, [2.0, 0.0, 0.0])));
+        let mesh = TetMesh::new(nodes, vec![[0, 1, 2, 3], [4, 5, 6, 7]]);
+        let Ok(mesh) = mesh else { unreachable!("a valid mesh") };
+        let overlap = Overlap::new(&mesh, (0..8).collect());
+        let mut u = vec![[0.0; 3]; 8];
+        assert_eq!(overlap.deepest(&mesh, &u), 0.0);
+        for u in &mut u[4..] {
+            *u = [-1.9, 0.2, 0.3];
+        }
+        // Node 4 is at (0.1, 0.2, 0.3).
+        assert!((overlap.deepest(&mesh, &u) - 0.1).abs() < 1e-12);
+    }
+}
