@@ -31,7 +31,7 @@ const SHORTEST_STEP: f64 = 1.0 / 512.0;
 /// Distance that a node may have from what it presses on, mm, and over the diagonal of the mesh: scenes may be
 /// small.
 const CLOSE: f64 = 0.01;
-const CLOSE_SHARE: f64 = 2e-5;
+const CLOSE_SHARE: f64 = 4e-5;
 /// Multiple of it that is enough on the way, and that may be open in the end, with a warning: a quarter of a
 /// millimetre, at a node on a fold inside the mouth.
 const LOOSE: f64 = 5.0;
