@@ -103,7 +103,7 @@ class Evidence:
         """The motions that are given by surfaces before and after, or why they are not read."""
         found: dict[str, MovedSurface | CmfsimError] = {}
         given = self.case.surfaces
-        units, frame = ("mm", "LPS") if given is None else (given.units, given.frame)
+        units, frame = ("mm", None) if given is None else (given.units, given.frame)
         for name, motion in self.case.plan.items():
             before, after = motion.surface, motion.moved_surface
             # A file that is missing is reported where files are looked for.

@@ -1,6 +1,7 @@
 """Whether cuts and plan can be meant: names, landmarks, sizes of motions, bone through skin."""
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -9,7 +10,8 @@ from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Body, Evidence
 from cmfsim.doctor.places import place_text
 from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
-from cmfsim.errors import CaseError, LandmarkError
+from cmfsim.errors import CaseError, CmfsimError, LandmarkError
+from cmfsim.io.surfaces import surface_as_stored
 from cmfsim.io.transforms import motion_in_lps
 from cmfsim.values.case_parts import CaseOsteotomy
 from cmfsim.values.clinical_motion import ClinicalMotion
@@ -168,19 +170,27 @@ def _check_frame(evidence: Evidence, name: str, matrix: Floats) -> Iterator[Find
     stated = case.plan[name].frame is not None
     if read is not None:
         stated = "frame" not in read.assumed
-    if stated or case.surfaces is None or case.surfaces.frame == "LPS":
+    if stated or case.surfaces is None:
         return
-    if np.allclose(motion_in_lps(matrix, case.surfaces.frame), matrix, rtol=0.0, atol=1e-9):
+    frame = case.surfaces.frame or _header_frame(case.surfaces.skin)
+    if frame == "LPS" or np.allclose(motion_in_lps(matrix, frame), matrix, rtol=0.0, atol=1e-9):
         return
     yield Finding.warning(
         "plan-frame",
-        f"the motion of {name} states no frame and is taken as LPS; the surfaces are in "
-        f"{case.surfaces.frame}",
+        f"the motion of {name} states no frame and is taken as LPS; the surfaces are in {frame}",
         where=case.where(f"plan.{name}"),
         why="in the other frame forwards is backwards, and left is right",
-        fix=f'write frame = "LPS" or frame = "{case.surfaces.frame}" beside the numbers of the '
-        "motion",
+        fix=f'write frame = "LPS" or frame = "{frame}" beside the numbers of the motion',
     )
+
+
+def _header_frame(path: Path) -> str:
+    """The frame that the header of a surface states; LPS where it states none."""
+    try:
+        return surface_as_stored(path)[1] or "LPS"
+    except (CmfsimError, OSError):
+        # Reported where files are looked for.
+        return "LPS"
 
 
 def check_against_skin(

@@ -290,6 +290,11 @@ def _read(path: Path) -> Case:
     )
 
 
+def _frame(table: Table) -> str | None:
+    """The frame of numbers or files, where the case states it."""
+    return table.text("frame", choices=FRAMES) if "frame" in table else None
+
+
 def _file(table: Table, key: str, folder: Path) -> Path:
     """A path to read; the case is its owner's, so that it may lead to images kept elsewhere."""
     return table.path(key, folder)
@@ -376,7 +381,7 @@ def _surfaces(table: Table, folder: Path) -> CaseSurfaces:
         skin=_file(table, "skin", folder),
         bones={_name(bones, name, name): _file(bones, name, folder) for name in names},
         units=table.text("units", "mm", tuple(UNITS)),
-        frame=table.text("frame", "LPS", FRAMES),
+        frame=_frame(table),
     )
 
 
@@ -392,7 +397,7 @@ def _landmarks(table: Table, folder: Path) -> CaseLandmarks:
     return CaseLandmarks(
         _file_or_none(table, "skull", folder),
         _file_or_none(table, "skin", folder),
-        table.text("frame", "LPS", FRAMES) if "frame" in table else None,
+        _frame(table),
     )
 
 
@@ -532,7 +537,7 @@ def _motion(table: Table, folder: Path) -> CaseMotion:
         table.only("surface", "moved_surface")
         surface = _file(table, "surface", folder)
         return CaseMotion(surface=surface, moved_surface=_file(table, "moved_surface", folder))
-    frame = table.text("frame", choices=FRAMES) if "frame" in table else None
+    frame = _frame(table)
     if "matrix" in table:
         matrix = table.only("matrix", "frame").matrix("matrix")
         with table.at("matrix"):
@@ -571,7 +576,7 @@ def _transform(motion: Table, folder: Path) -> CaseMotion:
     table = motion.table(key).only("file", "direction", "frame")
     file = _file(table, "file", folder)
     direction = table.text("direction", choices=DIRECTIONS) if "direction" in table else None
-    frame = table.text("frame", choices=FRAMES) if "frame" in table else None
+    frame = _frame(table)
     if is_itk_file(file) and direction is None:
         table.fail(
             None, f"lacks direction, which the ITK file does not record: write {DIRECTION_CHOICE}"
@@ -648,7 +653,7 @@ def _postoperative(table: Table, folder: Path) -> CasePostoperative:
         {_name(bones, name, name): _file(bones, name, folder) for name in bones},
         table.flag("aligned", default=True),
         table.text("units", "mm", tuple(UNITS)),
-        table.text("frame", "LPS", FRAMES),
+        _frame(table),
         _dicom_series(table),
     )
 

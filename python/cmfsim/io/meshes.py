@@ -20,6 +20,7 @@ from cmfsim.io.msh import read_msh
 from cmfsim.io.obj import read_obj
 from cmfsim.io.plain_mesh import Cells, PlainMesh
 from cmfsim.io.ply import read_ply
+from cmfsim.io.stated_frames import stated_frame
 from cmfsim.io.stl import read_stl
 from cmfsim.io.vtk_legacy import read_vtk_legacy
 from cmfsim.io.vtk_xml import read_vtk_xml
@@ -36,20 +37,24 @@ LIBRARIES = ("meshio",)
 PASSED_OVER = frozenset({"vertex", "line", "triangle", "quad", "tetra"})
 
 
-def _of_triangles(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> PlainMesh:
-    return PlainMesh(points, (Cells("triangle", triangles),) if len(triangles) else ())
+def _of_triangles(
+    points: NDArray[np.float64], triangles: NDArray[np.int64], frame: str | None
+) -> PlainMesh:
+    cells = (Cells("triangle", triangles),) if len(triangles) else ()
+    return PlainMesh(points, cells, frame=frame)
 
 
 def _stl(data: bytes) -> PlainMesh:
     corners = read_stl(data)
-    return _of_triangles(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+    triangles = np.arange(3 * len(corners)).reshape(-1, 3)
+    return _of_triangles(corners.reshape(-1, 3), triangles, stated_frame(data, ".stl"))
 
 
 READERS: Mapping[str, Callable[[bytes], PlainMesh]] = MappingProxyType(
     {
         ".stl": _stl,
-        ".ply": lambda data: _of_triangles(*read_ply(data)),
-        ".obj": lambda data: _of_triangles(*read_obj(data)),
+        ".ply": lambda data: _of_triangles(*read_ply(data), stated_frame(data, ".ply")),
+        ".obj": lambda data: _of_triangles(*read_obj(data), stated_frame(data, ".obj")),
         ".vtp": lambda data: read_vtk_xml(data, "PolyData"),
         ".vtu": lambda data: read_vtk_xml(data, "UnstructuredGrid"),
         ".vtk": read_vtk_legacy,

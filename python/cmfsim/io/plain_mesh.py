@@ -56,6 +56,8 @@ class PlainMesh:
     point_data : mapping of str to (n, …) array
     cell_data : mapping of str to tuple of (m, …) array
         One array for each entry of `cells`.
+    frame : str or None
+        "LPS" or "RAS" where the file's header states it.
 
     Raises
     ------
@@ -68,6 +70,7 @@ class PlainMesh:
     cells: tuple[Cells, ...]
     point_data: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     cell_data: Mapping[str, tuple[NDArray[Any], ...]] = field(default_factory=dict)
+    frame: str | None = None
 
     def __post_init__(self) -> None:
         points = self.points

@@ -26,6 +26,7 @@ __all__ = [
     "read_moved_surface",
     "read_surface",
     "read_triangles",
+    "surface_as_stored",
     "surface_suffixes",
     "write_surface",
 ]
@@ -36,7 +37,7 @@ def read_surface(
     crease_angle: float = 60.0,
     *,
     units: str = "mm",
-    frame: str = "LPS",
+    frame: str | None = None,
 ) -> SurfaceData:
     """The triangles of a file, in LPS mm, with vertices in the same place made one.
 
@@ -48,8 +49,9 @@ def read_surface(
     crease_angle : float, degrees
     units : str
         Of the numbers in the file: "mm", "cm", "m", "um", "inch".
-    frame : str
-        Of the numbers in the file: "LPS" or "RAS".
+    frame : str, optional
+        Of the numbers in the file: "LPS" or "RAS". If left out, what the file's header states, as
+        3D Slicer writes it (`SPACE=RAS`); LPS where it states none.
 
     Returns
     -------
@@ -61,22 +63,33 @@ def read_surface(
         The file does not exist.
     CaseError
         (also `ValueError`) Not a surface, no triangles, cut short, an index that is not there, a
-        coordinate that is not finite.
+        coordinate that is not finite; another frame than the file's header states.
 
     Examples
     --------
     >>> import cmfsim
     >>> skin = cmfsim.read_surface("skin.stl", units="mm", frame="RAS")  # doctest: +SKIP
     """
-    check_one_of("units", units, tuple(UNITS))
-    check_one_of("frame", frame, FRAMES)
-    surface = read_triangles(Path(path), crease_angle)
-    if units == "mm" and frame == "LPS":
+    surface, stated = surface_as_stored(Path(path), crease_angle)
+    scale = _scale(Path(path), units, frame, stated)
+    if (scale == 1.0).all():
         return surface
+    return SurfaceData(np.asarray(surface.vertices) * scale, surface.triangles, crease_angle)
+
+
+def _scale(path: Path, units: str, frame: str | None, stated: str | None) -> NDArray[np.float64]:
+    """What takes the numbers of a file to LPS mm, axis by axis."""
+    check_one_of("units", units, tuple(UNITS))
+    if frame is not None:
+        check_one_of("frame", frame, FRAMES)
+    if frame is not None and stated is not None and frame != stated:
+        raise CaseInputError(
+            f"{path.name}: its header states {stated}, and frame is {frame}: remove frame, which "
+            "is for files that state none, or export the file again"
+        )
     # RAS to LPS is half a turn about the long axis: triangles keep their orientation.
-    signs = np.array([-1.0, -1.0, 1.0] if frame == "RAS" else [1.0, 1.0, 1.0])
-    vertices = np.asarray(surface.vertices) * (UNITS[units] * signs)
-    return SurfaceData(vertices, surface.triangles, crease_angle)
+    signs = [-1.0, -1.0, 1.0] if (frame or stated) == "RAS" else [1.0, 1.0, 1.0]
+    return UNITS[units] * np.array(signs)
 
 
 def read_moved_surface(
@@ -84,7 +97,7 @@ def read_moved_surface(
     after: str | os.PathLike[str],
     *,
     units: str = "mm",
-    frame: str = "LPS",
+    frame: str | None = None,
 ) -> MovedSurface:
     """The motion of a bone given by its surface before and after, vertex by vertex.
 
@@ -92,8 +105,10 @@ def read_moved_surface(
     ----------
     before, after : path
         Files with the same vertices in the same order.
-    units, frame : str
+    units : str
         Of the numbers in both files.
+    frame : str, optional
+        As in `read_surface`.
 
     Returns
     -------
@@ -111,12 +126,11 @@ def read_moved_surface(
     >>> import cmfsim
     >>> motion = cmfsim.read_moved_surface("mandible.ply", "mandible_post.ply")  # doctest: +SKIP
     """
-    check_one_of("units", units, tuple(UNITS))
-    check_one_of("frame", frame, FRAMES)
-    scale = UNITS[units] * np.array([-1.0, -1.0, 1.0] if frame == "RAS" else [1.0, 1.0, 1.0])
-    (here, triangles), (there, moved_triangles) = (
+    (here, triangles, its), (there, moved_triangles, other) = (
         _numbered(Path(path)) for path in (before, after)
     )
+    scale = _scale(Path(before), units, frame, its)
+    there *= _scale(Path(after), units, frame, other) / scale
     names = f"{Path(after).name} has {{}}, {Path(before).name} {{}}"
     for what, a, b in (
         ("vertices", len(there), len(here)),
@@ -147,23 +161,34 @@ SAME_NEEDED = (
 
 
 def read_triangles(path: Path, crease_angle: float = 60.0) -> SurfaceData:
-    """A surface with vertices in the same place made one: STL repeats them for each triangle."""
+    """A surface in the file's own numbers, whatever their frame: as `surface_as_stored`."""
+    return surface_as_stored(path, crease_angle)[0]
+
+
+def surface_as_stored(path: Path, crease_angle: float = 60.0) -> tuple[SurfaceData, str | None]:
+    """A surface in the file's own numbers, and the frame that its header states, if it does.
+
+    Vertices in the same place are made one: STL repeats them for each triangle.
+    """
     mesh = read_mesh(path)
     triangles = _triangles(mesh, path)
     points = np.asarray(mesh.points)
     kept, number = _welded(points)
-    return SurfaceData(points[kept], number[triangles], crease_angle)
+    return SurfaceData(points[kept], number[triangles], crease_angle), mesh.frame
 
 
-def _numbered(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The vertices and triangles of a file as it numbers them; STL has corners alone."""
+def _numbered(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], str | None]:
+    """The vertices and triangles of a file as it numbers them, and the frame that it states.
+
+    STL has corners alone.
+    """
     mesh = read_mesh(path)
     triangles = _triangles(mesh, path)
-    points = np.asarray(mesh.points, dtype=np.float64)
+    points = np.array(mesh.points, dtype=np.float64)
     if path.suffix.lower() == ".stl":
         points = points[triangles].reshape(-1, 3)
         triangles = np.arange(len(points)).reshape(-1, 3)
-    return points, triangles
+    return points, triangles, mesh.frame
 
 
 def _triangles(mesh: PlainMesh, path: Path) -> NDArray[np.int64]:

@@ -22,10 +22,12 @@ from cmfsim.io.files import (
 )
 from cmfsim.io.toml_lines import KeyPath, line_of, toml_lines
 
-__all__ = ["Table", "nearest", "read_tables"]
+__all__ = ["UNDECIDED", "Table", "nearest", "read_tables"]
 
 # A case file above this size is not what it says it is, bytes.
 MAX_CASE_TEXT = 2**20
+# What `cmfsim init` writes where it cannot tell what is meant.
+UNDECIDED = "?"
 LINE_IN_MESSAGE = re.compile(r"\(at line (\d+), column (\d+)\)")
 
 
@@ -64,7 +66,42 @@ def read_tables(path: Path) -> "Table":
         found = LINE_IN_MESSAGE.search(message)
         place = f":{found[1]}" if found else ""
         raise CaseInputError(f"{path.name}{place}: is not TOML: {message}") from error
-    return Table(values, (), path.name, toml_lines(text))
+    lines = toml_lines(text)
+    _refuse_undecided(values, lines, text, path.name)
+    return Table(values, (), path.name, lines)
+
+
+def _refuse_undecided(
+    values: Mapping[str, Any], lines: Mapping[KeyPath, int], text: str, file: str
+) -> None:
+    """Refuses a file in which a value is "?": `cmfsim init` left it to a person to decide."""
+    rows = text.split("\n")
+    found: list[tuple[int, str]] = []
+    left: list[tuple[KeyPath, Any]] = [((), values)]
+    while left:
+        path, value = left.pop()
+        if isinstance(value, dict):
+            left.extend(((*path, key), entry) for key, entry in value.items())
+        elif isinstance(value, list):
+            left.extend(((*path, number), entry) for number, entry in enumerate(value))
+        elif value == UNDECIDED:
+            line = line_of(lines, path)
+            # What may stand there is in the comment, and in those right below it.
+            _, _, question = rows[line - 1].partition('"  #')
+            words = [question.strip(" }")]
+            for row in rows[line:]:
+                if not row.lstrip().startswith("#  "):
+                    break
+                words.append(row.strip().lstrip("#").strip())
+            name = ".".join(str(part) for part in path)
+            found.append((line, f'{name} is "{UNDECIDED}": {" ".join(filter(None, words))}'))
+    if not found:
+        return
+    found.sort()
+    line, first = found[0]
+    others = ", ".join(str(number) for number, _ in found[1:])
+    more = f" (also undecided: line{'s' if len(found) > 2 else ''} {others})" if others else ""
+    raise CaseInputError(f"{file}:{line}: {first or 'decide it'}{more}")
 
 
 def nearest(name: str, known: tuple[str, ...]) -> str:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.io.plain_mesh import Cells, PlainMesh
 from cmfsim.io.polygons import triangles_of
+from cmfsim.io.stated_frames import stated_frame
 from cmfsim.io.text_cursor import Cursor
 from cmfsim.io.vtk_cells import cells_by_type
 
@@ -63,6 +64,7 @@ class _Reader:
         self.types: Integers | None = None
         self.data: dict[str, dict[str, NDArray[Any]]] = {"POINT_DATA": {}, "CELL_DATA": {}}
         self.where, self.rows = "", 0
+        self.frame = stated_frame(data, ".vtk")
 
     def mesh(self) -> PlainMesh:
         """What the file holds."""
@@ -106,9 +108,10 @@ class _Reader:
             raise CaseInputError("has triangle strips: turn them into triangles before it is saved")
         corners, counts = self.groups.get("POLYGONS", (np.zeros(0, np.int64),) * 2)
         if not len(counts):
-            return PlainMesh(points, (), self.data["POINT_DATA"])
+            return PlainMesh(points, (), self.data["POINT_DATA"], frame=self.frame)
         triangles = triangles_of(points, counts, corners)
-        return PlainMesh(points, (Cells("triangle", triangles),), self.data["POINT_DATA"])
+        cells = (Cells("triangle", triangles),)
+        return PlainMesh(points, cells, self.data["POINT_DATA"], frame=self.frame)
 
     def _volume(self, points: NDArray[np.float64]) -> PlainMesh:
         corners, counts = self.groups.get("CELLS", (np.zeros(0, np.int64),) * 2)

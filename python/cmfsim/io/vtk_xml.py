@@ -9,7 +9,7 @@ import binascii
 import itertools
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 from xml.parsers import expat
 
@@ -20,6 +20,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.blocks import UNPACKERS
 from cmfsim.io.plain_mesh import Cells, PlainMesh
 from cmfsim.io.polygons import triangles_of
+from cmfsim.io.stated_frames import stated_in_field
 from cmfsim.io.vtk_cells import cells_by_type
 from cmfsim.io.words import real_numbers, shown, whole_numbers
 
@@ -28,6 +29,8 @@ __all__ = ["read_vtk_xml"]
 # Nested elements and all elements that a file may have; VTK nests eight.
 MAX_DEPTH, MAX_ELEMENTS = 32, 100_000
 MAX_COMPONENTS = 1000
+# Characters of "LPS" or "RAS" with the zero that ends a text.
+FRAME_CODES = 4
 APPENDED = re.compile(rb"<AppendedData\s+encoding\s*=\s*[\"'](raw|base64)[\"']\s*>\s*_")
 APPENDED_END = b"</AppendedData>"
 ORDERS = {"LittleEndian": "<", "BigEndian": ">"}
@@ -99,10 +102,24 @@ def read_vtk_xml(data: bytes, kind: str) -> PlainMesh:
     # Surfaces have no use for their faces' values.
     read = _surface_piece if kind == "PolyData" else _volume_piece
     meshes = [read(piece, file) for piece in bodies[0].all("Piece")]
+    frame = _frame(bodies[0], file)
     file.check_overlaps()
     if not meshes:
         raise CaseInputError("has no Piece: it is empty")
-    return meshes[0] if len(meshes) == 1 else _joined(meshes)
+    return replace(meshes[0] if len(meshes) == 1 else _joined(meshes), frame=frame)
+
+
+def _frame(body: _Element, file: "_Arrays") -> str | None:
+    """The frame that 3D Slicer states in a text of the field data."""
+    stated = [
+        array
+        for group in body.all("FieldData")
+        for array in group.all("Array")
+        if array.attributes.get("Name") == "SPACE"
+    ]
+    if len(stated) > 1:
+        raise CaseInputError(f"has {len(stated)} texts 'SPACE': one is needed")
+    return stated_in_field(file.short_text(stated[0])) if stated else None
 
 
 def _surface_piece(piece: _Element, file: "_Arrays") -> PlainMesh:
@@ -272,6 +289,14 @@ class _Arrays:
             )
         return values if width == 1 else values.reshape(n, width)
 
+    def short_text(self, array: _Element) -> bytes:
+        """A text of three characters, which VTK ends by a zero: the name of a frame."""
+        try:
+            codes = self._decoded(array, np.dtype("u1"), FRAME_CODES)
+        except CaseInputError as error:
+            raise CaseInputError(f"its text 'SPACE' cannot be read: {error}") from error
+        return codes.tobytes().rstrip(b"\0")
+
     def _decoded(self, array: _Element, dtype: np.dtype[Any], count: int) -> NDArray[Any]:
         form = array.attributes.get("format", "ascii")
         if form == "ascii":
@@ -415,7 +440,7 @@ def _tree(text: bytes) -> _Element:
         stack.pop()
 
     def text_of(part: str) -> None:
-        if stack[-1].name == "DataArray":
+        if stack[-1].name in {"DataArray", "Array"}:
             stack[-1].text.append(part)
 
     def refuse(*_: object) -> None:

@@ -149,18 +149,20 @@ class CaseSurfaces:
     bones : mapping of str to Path
     units : str
         Of the numbers in every file: "mm", "cm", "m", "um", "inch".
-    frame : str
-        Of the numbers in every file: "LPS" or "RAS".
+    frame : str or None
+        Of the numbers in every file: "LPS" or "RAS". None: what each file's header states, and LPS
+        where it states none.
     """
 
     skin: Path
     bones: Mapping[str, Path]
     units: str = "mm"
-    frame: str = "LPS"
+    frame: str | None = None
 
     def __post_init__(self) -> None:
         check_one_of("units", self.units, tuple(UNITS))
-        check_one_of("frame", self.frame, FRAMES)
+        if self.frame is not None:
+            check_one_of("frame", self.frame, FRAMES)
         object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))
 
 
@@ -427,8 +429,10 @@ class CasePostoperative:
         Surfaces of bones or segments, by name, for the achieved plan.
     aligned : bool
         Whether it lies in the frame of the data before the operation already.
-    units, frame : str
+    units : str
         Of the surface files.
+    frame : str or None
+        Of the surface files, as in `CaseSurfaces`.
     series : str or None
         UID or number of the DICOM series of the image, where its folder holds several.
     """
@@ -439,7 +443,7 @@ class CasePostoperative:
     bones: Mapping[str, Path] = field(default_factory=dict)
     aligned: bool = True
     units: str = "mm"
-    frame: str = "LPS"
+    frame: str | None = None
     series: str | None = None
 
     def __post_init__(self) -> None:
@@ -448,5 +452,6 @@ class CasePostoperative:
         if self.image is None and self.skin is None and not self.bones:
             raise CaseInputError("after the operation there is a skin, an image, or a bone")
         check_one_of("units", self.units, tuple(UNITS))
-        check_one_of("frame", self.frame, FRAMES)
+        if self.frame is not None:
+            check_one_of("frame", self.frame, FRAMES)
         object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))

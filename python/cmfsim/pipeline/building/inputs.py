@@ -132,7 +132,8 @@ def read_motion(case: Case, motion: CaseMotion) -> Floats | MovedSurface:
         return read_transform(motion.transform, direction=motion.direction, frame=motion.frame)
     if motion.surface is None or motion.moved_surface is None:
         return np.eye(4)
-    units, frame = ("mm", "LPS")
+    units: str = "mm"
+    frame: str | None = None
     if case.surfaces is not None:
         units, frame = case.surfaces.units, case.surfaces.frame
     return read_moved_surface(motion.surface, motion.moved_surface, units=units, frame=frame)

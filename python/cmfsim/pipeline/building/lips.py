@@ -62,7 +62,8 @@ def find_seam(
     seam = case.lips.seam
     file = seam if isinstance(seam, Path) else case.mesh.parting
     if file is not None:
-        units, frame = ("mm", "LPS")
+        units: str = "mm"
+        frame: str | None = None
         if case.surfaces is not None:
             units, frame = case.surfaces.units, case.surfaces.frame
         surface = read_surface(file, units=units, frame=frame)

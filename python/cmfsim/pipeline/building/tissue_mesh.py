@@ -105,7 +105,8 @@ def tissue_mesh(
     made = mesh_from_level(level, options, allowed=allowed, needed=needed)
     if case.mesh.parting is None or seam is not None:
         return made.mesh, made.report, made.findings
-    units, frame = ("mm", "LPS")
+    units: str = "mm"
+    frame: str | None = None
     if case.surfaces is not None:
         units, frame = case.surfaces.units, case.surfaces.frame
     parted = part_mesh(made.mesh, read_surface(case.mesh.parting, units=units, frame=frame))
