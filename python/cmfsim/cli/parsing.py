@@ -10,6 +10,7 @@ from cmfsim.cli import (
     bench_command,
     case_commands,
     demo_command,
+    init_command,
     phantom_command,
     plan_command,
     scene_commands,
@@ -71,6 +72,18 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     )
     demo.add_argument("--no-open", action="store_true", help="do not open the report")
     demo.set_defaults(run=demo_command.demo, models=demo_command.DEMO_MODELS)
+
+    init = commands.add_parser(
+        "init",
+        parents=[common],
+        help="write a commented case.toml for what lies in a folder, or in a 3D Slicer scene",
+        epilog="What is not clear becomes a line with a question mark, which doctor refuses.",
+    )
+    init.add_argument(
+        "folder", metavar="FOLDER", type=Path, help="folder, or a scene of 3D Slicer (.mrml, .mrb)"
+    )
+    init.add_argument("--force", action="store_true", help="replace a case.toml that is there")
+    init.set_defaults(run=init_command.init)
 
     view = commands.add_parser(
         "view", parents=[common], help="look at a prediction, model, scene, result or surface"

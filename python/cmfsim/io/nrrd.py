@@ -24,7 +24,7 @@ from cmfsim.io.image_headers import (
 )
 from cmfsim.values.finding import Finding
 
-__all__ = ["nrrd_header"]
+__all__ = ["BYTES", "nrrd_affine", "nrrd_fields", "nrrd_header"]
 
 # NRRD's encodings whose length is known beforehand; text and hexadecimal are ITK's to read.
 PACKINGS: Mapping[str, str] = {
@@ -66,7 +66,7 @@ def nrrd_header(path: Path) -> ImageHeader:
     ImageError
         (also `ValueError`) Something impossible is stated, or a data file elsewhere.
     """
-    fields, begin = _fields(path)
+    fields, begin = nrrd_fields(path)
     kind = fields.get("type", "").lower()
     each = BYTES.get(kind)
     if each is None:
@@ -81,14 +81,14 @@ def nrrd_header(path: Path) -> ImageHeader:
         check_shape(path.name, sizes[-3:], math.prod(components))
     check_shape(path.name, sizes)
     _check_data(path, fields, begin, math.prod(sizes) * each)
-    affine, scaled, findings = _affine(path, fields, axes)
+    affine, scaled, findings = nrrd_affine(path, fields, axes)
     size = (sizes[0], sizes[1], sizes[2])
     if affine is not None:
         check_affine(path.name, affine, size)
     return ImageHeader("NrrdImageIO", size, affine, math.prod(sizes) * each, scaled, findings)
 
 
-def _fields(path: Path) -> tuple[dict[str, str], int]:
+def nrrd_fields(path: Path) -> tuple[dict[str, str], int]:
     """The fields of a header in lower case, and where the data begin."""
     with path.open("rb") as file:
         text = file.read(MOST_HEADER)
@@ -133,9 +133,10 @@ def _check_data(path: Path, fields: Mapping[str, str], begin: int, needed: int) 
         )
 
 
-def _affine(
+def nrrd_affine(
     path: Path, fields: Mapping[str, str], axes: int
 ) -> tuple[NDArray[np.float64] | None, bool, tuple[Finding, ...]]:
+    """The map from index to LPS mm, (3, 4), if it is stated; whether in mm already; findings."""
     signs = SPACES.get(fields.get("space", "").lower())
     rows = _vectors(path, "space directions", fields.get("space directions", ""))
     origin = _vectors(path, "space origin", fields.get("space origin", ""))

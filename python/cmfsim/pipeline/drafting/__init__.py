@@ -1,0 +1,91 @@
+"""A first case file from what lies in a folder: `cmfsim init`.
+
+`finds` reads and measures files, `scene_finds` what a scene of 3D Slicer holds, `gathering` both;
+`roles` knows what names say; `surfaces`, `choices` and `motions` decide what each thing is for, and
+turn what they cannot decide into questions; `draft` writes the case file.
+"""
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from cmfsim.errors import CaseInputError
+from cmfsim.io import replacing
+from cmfsim.pipeline.drafting.draft import CaseDraft, draft_case
+from cmfsim.pipeline.drafting.finds import EXTRACTED
+from cmfsim.pipeline.drafting.gathering import gather
+from cmfsim.pipeline.drafting.lines import Taken
+
+__all__ = ["CASE_FILE", "CaseDraft", "Taken", "init_case"]
+
+CASE_FILE = "case.toml"
+SCENES = (".mrml", ".mrb")
+
+
+def init_case(
+    path: str | os.PathLike[str],
+    *,
+    force: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> CaseDraft:
+    """Writes a `case.toml` for what lies in a folder, and states what each file was taken for.
+
+    Parameters
+    ----------
+    path : path
+        A folder, or a scene of 3D Slicer (`.mrml`, `.mrb`): its folder becomes the case's.
+    force : bool
+        Whether a case file that is there is replaced.
+    progress : callable
+        Called with what is being done.
+
+    Returns
+    -------
+    CaseDraft
+
+    Raises
+    ------
+    FileNotFoundError
+        There is nothing of this name.
+    CaseError
+        (also `ValueError`) A case file is there; nothing in the folder makes a case; several
+        scenes; a scene that is damaged, or whose transforms are not rigid.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such folder or scene")
+    is_scene = path.is_file()
+    if is_scene and path.suffix.lower() not in SCENES:
+        raise CaseInputError(
+            f"{path.name}: name a folder, or a scene of 3D Slicer ({', '.join(SCENES)})"
+        )
+    folder = path.parent if is_scene else path
+    case_file = folder / CASE_FILE
+    if case_file.exists() and not force:
+        raise CaseInputError(f"{case_file}: is there already; --force replaces it")
+    with tempfile.TemporaryDirectory(prefix="cmfsim-init-") as unpacked:
+        draft = _drafted(folder, path if is_scene else None, Path(unpacked), progress)
+    if draft.files:
+        (folder / EXTRACTED).mkdir(exist_ok=True)
+    for name, write in draft.files.items():
+        write(folder / name)
+    with replacing(case_file) as file:
+        file.write(draft.text.encode())
+    return draft
+
+
+def _drafted(
+    folder: Path, scene: Path | None, unpacked: Path, progress: Callable[[str], None]
+) -> CaseDraft:
+    found = gather(folder, scene, unpacked, progress)
+    if not found.surfaces and not any(not image.error for image in found.images):
+        reasons = [f"{other.label}: {other.why}" for other in found.others]
+        reasons += [f"{image.label}: {image.error}" for image in found.images if image.error]
+        more = f" ({'; '.join(reasons[:5])})" if reasons else ""
+        raise CaseInputError(
+            f"{folder}: holds neither a CT nor surfaces that can be read{more}. Looked for: DICOM, "
+            "NRRD, NIfTI, MetaImage, STL, PLY, OBJ, VTP, VTK, .seg.nrrd, .mrml and .mrb"
+        )
+    progress("deciding what each file is")
+    return draft_case(found, unpacked, folder.resolve().name or "case")

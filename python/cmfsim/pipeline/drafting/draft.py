@@ -1,0 +1,390 @@
+"""A case file drafted from what lies in a folder: what each thing was taken for, and why."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError
+from cmfsim.io.landmarks import write_landmarks
+from cmfsim.io.surfaces import write_surface
+from cmfsim.pipeline.drafting.choices import Images, Marks, choose_images, choose_landmarks
+from cmfsim.pipeline.drafting.finds import EXTRACTED, LandmarkFind, SurfaceFind
+from cmfsim.pipeline.drafting.gathering import Gathered
+from cmfsim.pipeline.drafting.lines import Taken, Text, quoted
+from cmfsim.pipeline.drafting.motions import DraftMotion, Plan, file_motions, scene_motions
+from cmfsim.pipeline.drafting.roles import MOVING, safe_key
+from cmfsim.pipeline.drafting.surfaces import Anatomy, choose_surfaces
+from cmfsim.values.case_parts import PROCEDURES
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = ["CaseDraft", "draft_case"]
+
+SAME = 1e-9
+EXAMPLE = """# No plan was found. To move a segment, state how it moves, such as:
+# [plan.maxilla]
+# translation = [0, -5, 0]          # mm, LPS: -y is forwards
+# transform = {file = "maxilla.h5", direction = "from-parent"}   # saved by 3D Slicer"""
+
+
+@dataclass
+class CaseDraft:
+    """A case file that was not written yet.
+
+    Attributes
+    ----------
+    text : str
+        Of the case file.
+    taken : list of Taken
+        What each file was taken for.
+    questions : list of str
+        What a person has to decide before the case can be used.
+    files : dict of str to callable
+        What has to be written beside it, by path; each is called with the path.
+    """
+
+    text: str = ""
+    taken: list[Taken] = field(default_factory=list)
+    questions: list[str] = field(default_factory=list)
+    files: dict[str, Callable[[Path], None]] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return {
+            "found": [taken.as_dict() for taken in self.taken],
+            "questions": self.questions,
+            "written": sorted(self.files),
+        }
+
+
+@dataclass
+class _Draft:
+    """What a case is made of, and the text that is made of it."""
+
+    found: Gathered
+    unpacked: Path
+    images: Images
+    anatomy: Anatomy
+    marks: Marks
+    plan: Plan
+    reference: Floats
+    by_image: bool
+    text: Text = field(default_factory=Text)
+    files: dict[str, Callable[[Path], None]] = field(default_factory=dict)
+
+
+def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
+    """The case file of what was gathered.
+
+    Parameters
+    ----------
+    found : Gathered
+    unpacked : Path
+        Where the files of a bundle lie for now.
+    name : str
+        Of the case.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) What is there makes no case: neither a CT, nor a skin with a bone.
+    """
+    draft = _decide(found, unpacked)
+    taken = _taken(draft)
+    text = draft.text
+    text.comment("Written by cmfsim init. Read every line: it states what each file was taken for.")
+    text.comment('A line with "?" has to be decided first: cmfsim doctor refuses the case until')
+    text.comment("then, and repeats the question. Not a medical device.")
+    text.comment()
+    for entry in taken:
+        mark = "?" if entry.question or not entry.taken_for else entry.taken_for
+        text.comment(f"{entry.label}: {mark} ({entry.why})")
+    text.lines += ["", 'format = "cmfsim-case"', "version = 1", f"name = {quoted(name)}"]
+    achieved = not draft.plan.motions and _has_after(draft)
+    if achieved:
+        text.value("plan", '"achieved"', "read off the bones after the operation: no plan is given")
+    _write_head(draft)
+    _write_landmarks(draft)
+    if not achieved:
+        _write_plan(draft)
+    _write_muscles(draft)
+    _write_after(draft)
+    text.table("output")
+    text.value("folder", '"out"')
+    return CaseDraft(str(text), taken, text.questions, draft.files)
+
+
+def _has_after(draft: _Draft) -> bool:
+    return bool(draft.anatomy.after_bones) or draft.images.after is not None
+
+
+def _decide(found: Gathered, unpacked: Path) -> _Draft:
+    images = choose_images(found.images)
+    boxes = [(i.label, i.box) for i in (images.ct,) if i is not None and i.box is not None]
+    boxes += [
+        (mark.label, np.stack([points.min(axis=0) - 60.0, points.max(axis=0) + 60.0]))
+        for mark in found.landmarks
+        if mark.read.stated and (points := np.array(list(mark.read.points.values()))).size
+    ]
+    anatomy = choose_surfaces(found.surfaces, boxes)
+    by_image = images.is_there and not (
+        anatomy.is_complete and (anatomy.skin is not None) and _is_cut(anatomy)
+    )
+    box = boxes[0][1] if boxes and images.ct is not None else _box_of(anatomy)
+    marks = choose_landmarks(found.landmarks, box)
+    reference = np.eye(4)
+    if by_image and images.ct is not None:
+        reference = images.ct.to_world
+    elif anatomy.skin is not None:
+        reference = anatomy.skin.to_world
+    elif "cranium" in anatomy.bones:
+        reference = anatomy.bones["cranium"].to_world
+    plan = Plan(anatomy, marks.points)
+    if found.scene:
+        scene_motions(plan, anatomy.bones, found.loose, reference, in_image=by_image)
+    file_motions(plan, found.transforms, by_slicer=found.by_slicer)
+    return _Draft(found, unpacked, images, anatomy, marks, plan, reference, by_image)
+
+
+def _is_cut(anatomy: Anatomy) -> bool:
+    """Whether the surfaces say more than a CT: pieces that are cut already, or that move."""
+    pieces = set(anatomy.bones) - {"cranium", "mandible"}
+    return bool(pieces) or any(find.is_moved for find in anatomy.bones.values())
+
+
+def _box_of(anatomy: Anatomy) -> Floats | None:
+    if not anatomy.chosen:
+        return None
+    points = np.concatenate([anatomy.placed(find) for find in anatomy.chosen])
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def _taken(draft: _Draft) -> list[Taken]:
+    """What everything was taken for; what the case does not use is said as well."""
+    surfaces = draft.anatomy.taken
+    if draft.by_image:
+        surfaces = [_beside_image(draft, taken) for taken in surfaces]
+    elif draft.images.is_there:
+        draft.images.taken = [
+            replace(t, taken_for="not used", why=f"the surfaces are used instead; {t.why}")
+            if t.taken_for == "CT"
+            else t
+            for t in draft.images.taken
+        ]
+    others = [Taken(o.label, "not used", o.why) for o in (*draft.found.others, *draft.plan.others)]
+    return [*draft.images.taken, *surfaces, *draft.marks.taken, *draft.plan.taken, *others]
+
+
+def _beside_image(draft: _Draft, taken: Taken) -> Taken:
+    if "after the operation" in taken.taken_for or taken.taken_for == "not used":
+        return taken
+    kept = f"would be the {taken.taken_for}" if taken.taken_for else "not clear what it is"
+    ct = draft.images.ct.label if draft.images.ct is not None else "an image"
+    why = f"a case has a CT or surfaces, and {ct} is there; {kept}; {taken.why}"
+    return replace(taken, taken_for="not used", why=why, question=False)
+
+
+def _write_head(draft: _Draft) -> None:
+    if draft.by_image:
+        _write_image(draft)
+        if draft.anatomy.skin is not None and draft.anatomy.bones:
+            draft.text.lines.append("")
+            draft.text.comment("The same head as surfaces, instead of the CT:")
+            _write_surfaces(draft, lead="# ")
+        return
+    _write_surfaces(draft)
+
+
+def _write_image(draft: _Draft) -> None:
+    text, images = draft.text, draft.images
+    text.table("image")
+    if images.question is not None:
+        text.ask("file", *images.question)
+    elif images.ct is not None:
+        low, high = images.ct.values
+        why = f"{images.ct.words}, {low:g} to {high:g}"
+        text.value("file", quoted(_image_path(draft)), why)
+        if not np.allclose(images.ct.to_world, np.eye(4), rtol=0.0, atol=SAME):
+            text.comment(
+                "The scene turns this volume; the case is in the volume's own coordinates."
+            )
+    if images.rescale is not None:
+        text.ask("rescale", *images.rescale)
+
+
+def _image_path(draft: _Draft) -> str:
+    """The path of the CT; that of a bundle is copied beside the case."""
+    image = draft.images.ct
+    if image is None:  # asked before
+        raise AssertionError
+    if not image.path.is_relative_to(draft.unpacked):
+        return "." if image.path == draft.found.folder else draft.found.shown(image.path)
+    name = f"{EXTRACTED}/{safe_key(image.path.name.partition('.')[0])}"
+    name += "".join(image.path.suffixes[-2:]) if image.path.suffix == ".gz" else image.path.suffix
+    data = image.path.read_bytes()
+    draft.files[name] = lambda path: _keep(path, data)
+    return name
+
+
+def _keep(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
+
+
+def _write_surfaces(draft: _Draft, lead: str = "") -> None:
+    text, anatomy = Text(), draft.anatomy
+    text.table("surfaces")
+    if (asked := anatomy.asks("skin")) is not None:
+        text.ask("skin", asked.text, asked.choices)
+    elif anatomy.skin is not None:
+        text.value("skin", quoted(_surface_path(draft, anatomy.skin, "skin")))
+    else:
+        text.ask("skin", "no surface that was found is a skin: which file is it?", ())
+    if (asked := anatomy.asks("units")) is not None:
+        text.ask("units", asked.text, asked.choices)
+    else:
+        text.value("units", '"mm"', anatomy.units_why)
+    if (asked := anatomy.asks("frame")) is not None:
+        text.ask("frame", asked.text, asked.choices)
+    elif anatomy.frame is not None:
+        text.value("frame", quoted(anatomy.frame), anatomy.frame_why)
+    elif anatomy.frame_why:
+        text.comment(f"frame: {anatomy.frame_why}")
+    text.table("surfaces.bones")
+    for name, find in anatomy.bones.items():
+        text.value(name, quoted(_surface_path(draft, find, name)))
+    for question in anatomy.questions:
+        part, _, name = question.key.partition(".")
+        if part == "bones":
+            text.ask(name, question.text, question.choices)
+    draft.text.lines += [f"{lead}{line}".rstrip() for line in text.lines]
+    if not lead:
+        draft.text.questions += text.questions
+
+
+def _has_copy(draft: _Draft, find: SurfaceFind) -> bool:
+    """Whether a surface is written anew: its file is packed, is voxels, or lies elsewhere."""
+    moved = not np.allclose(draft.reference, np.eye(4), rtol=0.0, atol=SAME)
+    return (find.in_scene and (moved or find.path.is_relative_to(draft.unpacked))) or find.is_made
+
+
+def _surface_path(draft: _Draft, find: SurfaceFind, name: str) -> str:
+    """The path of a surface in the case; where it lies before the operation, in LPS mm."""
+    if not _has_copy(draft, find):
+        return draft.found.shown(find.path)
+    reference = draft.reference if find.in_scene and not draft.by_image else np.eye(4)
+    if draft.anatomy.asks("units") is not None:
+        raise CaseInputError(
+            f"{find.label} is {find.extent.max():.4g} long: a scene of 3D Slicer is in mm, so that "
+            "its transforms and this surface do not fit: scale it to mm, and save the scene again"
+        )
+    vertices = draft.anatomy.placed(find) @ reference[:3, :3].T + reference[:3, 3]
+    surface = SurfaceData(vertices, find.surface.triangles)
+    path = f"{EXTRACTED}/{name}.ply"
+    if not draft.by_image:
+        draft.files[path] = lambda target: write_surface(target, surface)
+    return path
+
+
+def _write_landmarks(draft: _Draft) -> None:
+    text, marks = draft.text, draft.marks
+    if not marks.skull and not marks.skin and not marks.questions:
+        text.lines.append("")
+        text.comment("No landmarks were found: [landmarks] skull = ..., skin = ... (.mrk.json).")
+        text.comment("Cuts by procedures and muscles are placed from those of the skull.")
+        return
+    text.table("landmarks")
+    for key in ("skull", "skin"):
+        find: LandmarkFind | None = getattr(marks, key)
+        if key in marks.questions:
+            text.ask(key, *marks.questions[key])
+        elif find is not None:
+            frame = f"{find.read.frame}, stated" if find.read.stated else "frame not stated"
+            why = f"{len(find.read.points)} points, {frame}"
+            text.value(key, quoted(_landmark_path(draft, find, key)), why)
+    if "frame" in marks.questions:
+        text.ask("frame", *marks.questions["frame"])
+    elif marks.frame is not None:
+        text.value("frame", quoted(marks.frame), "read so they lie in the head, and not otherwise")
+
+
+def _landmark_path(draft: _Draft, find: LandmarkFind, key: str) -> str:
+    """The path of landmarks in the case; where they lie before the operation."""
+    # A list under a segment's transform went with the segment; before, it lay with the head.
+    apart = find.in_scene and not np.allclose(draft.reference, np.eye(4), rtol=0.0, atol=SAME)
+    if not apart and not find.path.is_relative_to(draft.unpacked):
+        return draft.found.shown(find.path)
+    reference = draft.reference if find.in_scene and not draft.by_image else np.eye(4)
+    points = {
+        label: reference[:3, :3] @ point + reference[:3, 3]
+        for label, point in find.read.points.items()
+    }
+    name = f"{EXTRACTED}/{key}.mrk.json"
+    draft.files[name] = lambda path: write_landmarks(path, points)
+    return name
+
+
+def _write_plan(draft: _Draft) -> None:
+    text, plan = draft.text, draft.plan
+    bones = set(draft.anatomy.bones) if not draft.by_image else {"cranium", "mandible"}
+    asked = {q.key.partition(".")[2] for q in draft.anatomy.questions if not draft.by_image}
+    needed: dict[str, str] = {}
+    for name in plan.motions:
+        if name in bones | asked:
+            continue
+        for procedure, segments in PROCEDURES.items():
+            if name in segments:
+                needed.setdefault(procedure, name)
+    for procedure, name in needed.items():
+        text.table("[osteotomies]")
+        text.value("procedure", quoted(procedure), f"the plan moves {name}, which it cuts")
+    if not plan.motions:
+        text.lines += ["", *EXAMPLE.splitlines()]
+    for name, motion in plan.motions.items():
+        _write_motion(text, name, motion)
+
+
+def _write_motion(text: Text, name: str, motion: DraftMotion) -> None:
+    text.table(f"plan.{name}")
+    if motion.words:
+        text.comment(f"It {motion.words}.")
+    for line in motion.source:
+        text.comment(line)
+    if motion.question:
+        key, value = ("transform", motion.transform) if motion.transform else ("matrix", '"?"')
+        text.ask(key, motion.question, motion.choices, value)
+    lead = "# " if motion.question else ""
+    if motion.matrix is not None:
+        text.matrix(np.asarray(motion.matrix).tolist(), lead)
+    elif motion.transform and not motion.question:
+        text.value("transform", motion.transform)
+
+
+def _write_muscles(draft: _Draft) -> None:
+    text = draft.text
+    if draft.marks.skull is None:
+        text.lines.append("")
+        text.comment("Muscles are placed from skull landmarks; with these, add an empty [muscles].")
+        return
+    text.table("muscles", "the package's own template, carried over by the skull landmarks")
+
+
+def _write_after(draft: _Draft) -> None:
+    text, anatomy, images = draft.text, draft.anatomy, draft.images
+    if anatomy.after_skin is None and not anatomy.after_bones and images.after is None:
+        return
+    text.table("postoperative", "after the operation, by the names of the files")
+    if images.after is not None and anatomy.after_skin is None:
+        text.value("image", quoted(draft.found.shown(images.after.path)))
+    elif anatomy.after_skin is not None:
+        text.value("skin", quoted(draft.found.shown(anatomy.after_skin.path)))
+    if draft.marks.after is not None:
+        text.value("landmarks", quoted(draft.found.shown(draft.marks.after.path)))
+    text.value("aligned", "true", "it lies in the frame of the data before: if not, write false")
+    if anatomy.after_bones and (images.after is None or anatomy.after_skin is not None):
+        text.table("postoperative.bones")
+        for name, find in anatomy.after_bones.items():
+            if name in ("cranium", *MOVING):
+                text.value(name, quoted(draft.found.shown(find.path)))

@@ -1,0 +1,294 @@
+"""What lies in a folder: surfaces, images, landmarks and transforms, each read and measured."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.io.files import is_below
+from cmfsim.io.images import read_image_file
+from cmfsim.io.landmarks import LandmarkFile, read_landmark_file
+from cmfsim.io.surfaces import surface_as_stored
+from cmfsim.pipeline.drafting.roles import NameRole, name_role
+from cmfsim.surfaces.topology import edges_of
+from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = [
+    "EXTRACTED",
+    "ImageFind",
+    "LandmarkFind",
+    "Listing",
+    "OtherFind",
+    "SurfaceFind",
+    "TransformFind",
+    "image_find",
+    "landmark_find",
+    "listing",
+    "surface_find",
+]
+
+# How far into folders, and how many files: a case has some hundred, DICOM a thousand slices.
+MAX_DEPTH, MAX_FILES = 6, 20_000
+SURFACES = (".stl", ".ply", ".obj", ".vtp", ".vtk")
+IMAGES = (".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd")
+TRANSFORMS = (".tfm", ".h5", ".txt", ".mat")
+MARKUPS = (".mrk.json", ".fcsv")
+SCENES = (".mrml", ".mrb")
+# Where what is made from a scene is put, below the folder of the case.
+EXTRACTED = "from_scene"
+# Files by which a folder is known as one that cmfsim wrote.
+OURS = ("prediction.json", "build.json", "metrics.json", "cmfsim-scene.mrml")
+# What a DICOM file holds after its preamble.
+PREAMBLE = 128
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceFind:
+    """A surface, in its file's own numbers.
+
+    Attributes
+    ----------
+    label : str
+        What reports call it: its path, or its scene and node.
+    role : NameRole
+    path : Path
+        The file; for a segment of a segmentation, that of all segments.
+    surface : SurfaceData
+    stated : str or None
+        The frame that its header, or its scene, states.
+    is_closed : bool
+    to_world : (4, 4) float64, mm, LPS
+        What its scene applies to it.
+    chain : tuple of str
+        The names of the transforms that do, the nearest first.
+    in_scene : bool
+    is_made : bool
+        Whether it was made of voxels: it has no file of its own.
+    """
+
+    label: str
+    role: NameRole
+    path: Path
+    surface: SurfaceData
+    stated: str | None
+    is_closed: bool
+    to_world: Floats = field(default_factory=lambda: np.eye(4))
+    chain: tuple[str, ...] = ()
+    in_scene: bool = False
+    is_made: bool = False
+
+    @property
+    def extent(self) -> Floats:
+        """Its length along each axis, in its file's unit, (3,)."""
+        return np.asarray(np.ptp(np.asarray(self.surface.vertices), axis=0), dtype=np.float64)
+
+    @property
+    def is_moved(self) -> bool:
+        """Whether its scene moves it."""
+        return not np.array_equal(self.to_world, np.eye(4))
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFind:
+    """A CT, or another image.
+
+    Attributes
+    ----------
+    label, role, path
+        As of a surface; `path` is a folder for DICOM.
+    modality : str
+        Of DICOM; empty where the file does not state it.
+    values : tuple of float
+        Lowest and highest.
+    words : str
+        Its size and spacing.
+    box : (2, 3) float64, mm, LPS
+        Its lowest and highest corner.
+    error : str
+        Why it cannot be read; empty if it can.
+    """
+
+    label: str
+    role: NameRole
+    path: Path
+    modality: str = ""
+    values: tuple[float, float] = (0.0, 0.0)
+    words: str = ""
+    box: Floats | None = None
+    error: str = ""
+    findings: tuple[Finding, ...] = ()
+    to_world: Floats = field(default_factory=lambda: np.eye(4))
+    chain: tuple[str, ...] = ()
+    in_scene: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkFind:
+    """A file of landmarks, as read."""
+
+    label: str
+    role: NameRole
+    path: Path
+    read: LandmarkFile
+    to_world: Floats = field(default_factory=lambda: np.eye(4))
+    chain: tuple[str, ...] = ()
+    in_scene: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class TransformFind:
+    """A transform file that stands alone: what it moves, its name says."""
+
+    label: str
+    role: NameRole
+    path: Path
+
+
+@dataclass(frozen=True)
+class OtherFind:
+    """What is not used, and why."""
+
+    label: str
+    why: str
+
+
+@dataclass
+class Listing:
+    """The paths in a folder, by what their endings say."""
+
+    surfaces: list[Path] = field(default_factory=list)
+    images: list[Path] = field(default_factory=list)
+    labels: list[Path] = field(default_factory=list)
+    transforms: list[Path] = field(default_factory=list)
+    markups: list[Path] = field(default_factory=list)
+    scenes: list[Path] = field(default_factory=list)
+    dicom: list[Path] = field(default_factory=list)
+
+
+def listing(folder: Path) -> Listing:
+    """The files of a folder and those below it, by kind.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) More files than a case has.
+    """
+    found = Listing()
+    dicom: dict[Path, None] = {}
+    for count, path in enumerate(_files(folder)):
+        if count >= MAX_FILES:
+            raise CaseInputError(
+                f"{folder}: holds more than {MAX_FILES} files: name the folder of one patient"
+            )
+        name = path.name.lower()
+        kind = (
+            found.labels
+            if name.endswith((".seg.nrrd", ".seg.nhdr"))
+            else found.markups
+            if name.endswith(MARKUPS)
+            else next(
+                (
+                    paths
+                    for endings, paths in (
+                        (SCENES, found.scenes),
+                        (SURFACES, found.surfaces),
+                        (IMAGES, found.images),
+                        (TRANSFORMS, found.transforms),
+                    )
+                    if name.endswith(endings)
+                ),
+                None,
+            )
+        )
+        if kind is not None:
+            kind.append(path)
+        elif path.parent not in dicom and _is_dicom(path):
+            dicom[path.parent] = None
+    found.dicom = list(dicom)
+    return found
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """The plain files of a folder in a fixed order; hidden ones and cmfsim's results left out."""
+    for place, folders, names in os.walk(folder):
+        here = Path(place)
+        if here != folder and any(name in names for name in OURS):
+            folders.clear()
+            continue
+        deep = len(here.relative_to(folder).parts) >= MAX_DEPTH
+        folders[:] = [] if deep else sorted(f for f in folders if f[0] != "." and f != EXTRACTED)
+        for name in sorted(names):
+            path = here / name
+            if name[0] != "." and path.is_file() and is_below(path, folder):
+                yield path
+
+
+def _is_dicom(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(PREAMBLE + 4)[PREAMBLE:] == b"DICM"
+    except OSError:
+        return False
+
+
+def surface_find(path: Path, label: str) -> SurfaceFind:
+    """A surface file, read.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) As `read_surface`.
+    """
+    surface, stated = surface_as_stored(path)
+    name = path.name[: -len(path.suffix)]
+    return SurfaceFind(label, name_role(name), path, surface, stated, is_closed(surface))
+
+
+def is_closed(surface: SurfaceData) -> bool:
+    """Whether a surface has no border."""
+    triangles = np.asarray(surface.triangles, dtype=np.int64)
+    distinct = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+    return not len(edges_of(triangles[distinct]).border)
+
+
+def image_find(path: Path, label: str) -> ImageFind:
+    """An image file or DICOM folder, read; why, where it cannot be."""
+    name = path.name.partition(".")[0] if path.is_file() else path.name
+    role = name_role(name)
+    try:
+        read = read_image_file(path)
+    except (CmfsimError, OSError) as error:
+        return ImageFind(label, role, path, error=str(error))
+    image = read.image
+    spacing = np.abs(np.asarray(image.spacing, dtype=np.float64))
+    size = " × ".join(str(n) for n in image.values.shape)
+    steps = " × ".join(f"{s:.3g}" for s in spacing)
+    low = np.asarray(image.lowest, dtype=np.float64)
+    box = np.stack([low, low + spacing * (np.array(image.values.shape) - 1)])
+    return ImageFind(
+        label,
+        role,
+        path,
+        read.modality,
+        (float(image.values.min()), float(image.values.max())),
+        f"{size} voxels of {steps} mm",
+        box,
+        findings=read.findings,
+    )
+
+
+def landmark_find(path: Path, label: str) -> LandmarkFind:
+    """A file of landmarks, read.
+
+    Raises
+    ------
+    LandmarkError
+        (also `ValueError`) As `read_landmarks`.
+    """
+    name = path.name.partition(".")[0]
+    return LandmarkFind(label, name_role(name), path, read_landmark_file(path))

@@ -1,0 +1,206 @@
+"""Everything in a folder, or in the scene of 3D Slicer that it holds, read once."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.io.slicer_bundles import unpack_bundle
+from cmfsim.io.slicer_scenes import read_slicer_scene
+from cmfsim.pipeline.drafting.finds import (
+    ImageFind,
+    LandmarkFind,
+    Listing,
+    OtherFind,
+    SurfaceFind,
+    TransformFind,
+    image_find,
+    landmark_find,
+    listing,
+    surface_find,
+)
+from cmfsim.pipeline.drafting.roles import name_role
+from cmfsim.pipeline.drafting.scene_finds import LooseMotion, scene_finds
+from cmfsim.pipeline.drafting.segment_finds import segment_finds
+
+__all__ = ["Gathered", "gather"]
+
+# Images that are read to see which is the CT.
+MAX_IMAGES = 6
+# Bytes of a header in which Slicer states itself, or the frame.
+HEADER = 1024
+BY_SLICER = (b"3D Slicer output", b"SPACE=LPS", b"SPACE=RAS", b"Segmentation_")
+
+Found = TypeVar("Found")
+
+
+@dataclass
+class Gathered:
+    """What was found, by kind.
+
+    Attributes
+    ----------
+    scene : str
+        The label of the scene that was read; empty if there is none.
+    by_slicer : bool
+        Whether 3D Slicer saved any of the files.
+    """
+
+    folder: Path
+    scene: str = ""
+    by_slicer: bool = False
+    surfaces: list[SurfaceFind] = field(default_factory=list)
+    images: list[ImageFind] = field(default_factory=list)
+    landmarks: list[LandmarkFind] = field(default_factory=list)
+    transforms: list[TransformFind] = field(default_factory=list)
+    loose: list[LooseMotion] = field(default_factory=list)
+    others: list[OtherFind] = field(default_factory=list)
+
+    def shown(self, path: Path) -> str:
+        """A path as the case file will have it."""
+        return path.relative_to(self.folder).as_posix()
+
+
+def gather(
+    folder: Path, scene: Path | None, unpacked: Path, progress: Callable[[str], None]
+) -> Gathered:
+    """What a folder holds.
+
+    Parameters
+    ----------
+    folder : Path
+    scene : Path or None
+        The scene that is meant; else the only one of the folder.
+    unpacked : Path
+        An empty folder for the files of a bundle.
+    progress : callable
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Several scenes; a scene that is damaged or hostile; a transform of a
+        scene that is not rigid.
+    """
+    found = Gathered(folder)
+    paths = listing(folder)
+    named_by_scene = _gather_scene(found, paths, scene, unpacked, progress)
+
+    def rest(of: list[Path]) -> list[Path]:
+        return [path for path in of if path.resolve() not in named_by_scene]
+
+    if found.scene:
+        for path in (*rest(paths.surfaces), *rest(paths.labels)):
+            role = name_role(path.name)
+            if role.is_after and path in paths.surfaces:
+                progress(f"reading {found.shown(path)}")
+                _read(found, path, surface_find, found.surfaces)
+            else:
+                why = f"the scene {found.scene} does not have it"
+                found.others.append(OtherFind(found.shown(path), why))
+        found.others += [
+            OtherFind(found.shown(path), f"the scene {found.scene} does not have it")
+            for path in rest(paths.transforms)
+            if path.suffix.lower() != ".txt"
+        ]
+    else:
+        _gather_files(found, paths, progress)
+    for path in rest(paths.markups):
+        _read(found, path, landmark_find, found.landmarks)
+    has_ct = any(not image.role.is_after and not image.error for image in found.images)
+    images = [p for p in (*rest(paths.images), *paths.dicom) if p != folder] + [
+        p for p in paths.dicom if p == folder
+    ]
+    for path in images:
+        label = found.shown(path)
+        if has_ct and not name_role(path.name).is_after:
+            found.others.append(OtherFind(label, f"the scene {found.scene} has another CT"))
+        elif len(found.images) >= MAX_IMAGES:
+            found.others.append(OtherFind(label, f"more than {MAX_IMAGES} images: not looked at"))
+        else:
+            progress(f"reading {label}")
+            found.images.append(image_find(path, label))
+    found.by_slicer = bool(found.scene) or any(
+        _by_slicer(path) for path in (*paths.surfaces, *paths.labels)
+    )
+    return found
+
+
+def _gather_scene(
+    found: Gathered,
+    paths: Listing,
+    scene: Path | None,
+    unpacked: Path,
+    progress: Callable[[str], None],
+) -> set[Path]:
+    """The files that the scene of the folder names, after what it has was added."""
+    if scene is None and len(paths.scenes) > 1:
+        names = ", ".join(found.shown(path) for path in paths.scenes)
+        raise CaseInputError(
+            f"{found.folder}: holds {len(paths.scenes)} scenes of 3D Slicer ({names}): name the "
+            f"one that is meant, such as cmfsim init {paths.scenes[0]}"
+        )
+    if scene is None:
+        scene = next(iter(paths.scenes), None)
+    if scene is None:
+        return set()
+    found.scene = found.shown(scene)
+    progress(f"reading {found.scene}")
+    bundled = scene.suffix.lower() == ".mrb"
+    file = unpack_bundle(scene, unpacked) if bundled else scene
+    read = scene_finds(read_slicer_scene(file), found.scene)
+    found.surfaces += read.surfaces
+    found.images += read.images
+    found.landmarks += read.landmarks
+    found.loose += read.loose
+    found.others += read.others
+    return read.files
+
+
+def _gather_files(found: Gathered, paths: Listing, progress: Callable[[str], None]) -> None:
+    for path in paths.surfaces:
+        progress(f"reading {found.shown(path)}")
+        _read(found, path, surface_find, found.surfaces)
+    for path in paths.labels:
+        label = found.shown(path)
+        progress(f"reading {label}")
+        try:
+            found.surfaces += segment_finds(path, label)
+        except (CmfsimError, OSError) as error:
+            found.others.append(OtherFind(label, str(error)))
+    for path in paths.transforms:
+        label = found.shown(path)
+        role = name_role(path.name[: -len(path.suffix)])
+        if path.suffix.lower() == ".txt" and not _is_matrix(path):
+            continue
+        found.transforms.append(TransformFind(label, role, path))
+
+
+def _read(
+    found: Gathered, path: Path, read: Callable[[Path, str], Found], into: list[Found]
+) -> None:
+    label = found.shown(path)
+    try:
+        into.append(read(path, label))
+    except (CmfsimError, OSError) as error:
+        found.others.append(OtherFind(label, f"cannot be read: {error}"))
+
+
+def _is_matrix(path: Path) -> bool:
+    """Whether a text holds a transform, and is not somebody's notes."""
+    with path.open("rb") as file:
+        begin = file.read(HEADER)
+    if begin.startswith(b"#Insight Transform File"):
+        return True
+    lines = [line.partition(b"#")[0] for line in begin.splitlines()]
+    words = b" ".join(lines).replace(b",", b" ").split()
+    try:
+        return len([float(word) for word in words]) == 16
+    except ValueError:
+        return False
+
+
+def _by_slicer(path: Path) -> bool:
+    with path.open("rb") as file:
+        begin = file.read(HEADER)
+    return any(mark in begin for mark in BY_SLICER)

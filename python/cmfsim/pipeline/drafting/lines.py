@@ -1,0 +1,120 @@
+"""Lines of a case file with their reasons, and questions where nobody but a person can decide."""
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+__all__ = ["Taken", "Text", "clean", "quoted"]
+
+# Characters of a line before its comment goes to lines of its own.
+WIDTH = 100
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What a file, or a node of a scene, was taken for.
+
+    Attributes
+    ----------
+    label : str
+        Its path, or its scene and node.
+    taken_for : str
+        Such as "skin" or "motion of maxilla"; "not used"; empty where that is the question.
+    why : str
+    unit, frame : str
+        Where they have a meaning.
+    question : bool
+        Whether a person has to decide something about it.
+    """
+
+    label: str
+    taken_for: str
+    why: str
+    unit: str = ""
+    frame: str = ""
+    question: bool = False
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values, ready for JSON."""
+        return {
+            "file": self.label,
+            "taken_for": self.taken_for,
+            "unit": self.unit,
+            "frame": self.frame,
+            "why": self.why,
+            "question": self.question,
+        }
+
+
+def clean(text: str) -> str:
+    """A text from a file on one line, without what ends a comment or commands a terminal."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+def quoted(text: str) -> str:
+    """A TOML string."""
+    return json.dumps(text, ensure_ascii=any(not c.isprintable() for c in text))
+
+
+@dataclass
+class Text:
+    """A case file as it is written, line by line, and the questions in it.
+
+    Attributes
+    ----------
+    lines : list of str
+    questions : list of str
+        The key and the question of each line that a person has to decide.
+    """
+
+    lines: list[str] = field(default_factory=list)
+    questions: list[str] = field(default_factory=list)
+    _table: str = ""
+
+    def comment(self, text: str = "") -> None:
+        """A line that is a comment."""
+        self.lines.append(f"# {clean(text)}".rstrip())
+
+    def table(self, name: str, why: str = "") -> None:
+        """The head of a table."""
+        self._table = name.strip("[]")
+        head = f"[{name}]"
+        self.lines += ["", f"{head}  # {clean(why)}" if why else head]
+
+    def value(self, key: str, value: str, why: str = "", more: Iterable[str] = ()) -> None:
+        """A key with its value in TOML, and the reason for it."""
+        line = f"{key} = {value}"
+        reason = clean(why)
+        if reason and len(line) + len(reason) + 4 > WIDTH:
+            self.comment(reason)
+            reason = ""
+        self.lines.append(f"{line}  # {reason}" if reason else line)
+        for entry in more:
+            self.comment(f" {entry}")
+
+    def ask(self, key: str, question: str, choices: Sequence[str], value: str = '"?"') -> None:
+        """A key that a person decides: `doctor` refuses the file and repeats question and choices.
+
+        Parameters
+        ----------
+        key : str
+        question : str
+        choices : sequence of str
+            What may be written instead.
+        value : str
+            TOML that holds "?".
+        """
+        place = f"{self._table}.{key}".lstrip(".")
+        self.questions.append(f"{place}: {question}")
+        self.lines.append(f"{key} = {value}  # {clean(question)}")
+        self.lines += [f"#   {clean(choice)}" for choice in choices]
+
+    def matrix(self, rows: Sequence[Sequence[float]], lead: str = "") -> None:
+        """A 4 × 4 matrix with every digit; `lead` makes it a comment."""
+        self.lines.append(f"{lead}matrix = [")
+        self.lines += [f"{lead}  [{', '.join(repr(float(v)) for v in row)}]," for row in rows]
+        self.lines.append(f"{lead}]")
+
+    def __str__(self) -> str:
+        """The text of the file."""
+        return "\n".join(self.lines) + "\n"

@@ -1,0 +1,121 @@
+"""What a scene of 3D Slicer holds, each thing with what its transforms apply to it."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from cmfsim.checks import Floats
+from cmfsim.errors import CmfsimError
+from cmfsim.io.slicer_scenes import SceneNode, SlicerScene
+from cmfsim.pipeline.drafting.finds import (
+    ImageFind,
+    LandmarkFind,
+    OtherFind,
+    SurfaceFind,
+    image_find,
+    landmark_find,
+    surface_find,
+)
+from cmfsim.pipeline.drafting.roles import NameRole, name_role
+from cmfsim.pipeline.drafting.segment_finds import segment_finds
+
+__all__ = ["LooseMotion", "SceneFinds", "scene_finds"]
+
+# Slicer's own planes in the 3-D view are models, too.
+SLICE_MODELS = "Volume Slice"
+
+
+@dataclass(frozen=True, eq=False)
+class LooseMotion:
+    """A transform of a scene that is applied to nothing: hardened, or never used.
+
+    Attributes
+    ----------
+    label : str
+    role : NameRole
+    matrix : (4, 4) float64, mm, LPS
+    """
+
+    label: str
+    role: NameRole
+    matrix: Floats
+
+
+@dataclass
+class SceneFinds:
+    """What was found in a scene, by kind, and the files that it names."""
+
+    surfaces: list[SurfaceFind] = field(default_factory=list)
+    images: list[ImageFind] = field(default_factory=list)
+    landmarks: list[LandmarkFind] = field(default_factory=list)
+    loose: list[LooseMotion] = field(default_factory=list)
+    others: list[OtherFind] = field(default_factory=list)
+    files: set[Path] = field(default_factory=set)
+
+
+def scene_finds(scene: SlicerScene, label: str) -> SceneFinds:
+    """The models, segments, volumes, markups and transforms of a scene.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) What a case would be made of lies under a transform that is not rigid,
+        or that cannot be read.
+    """
+    found = SceneFinds()
+    for node in scene.nodes.values():
+        if node.file is not None:
+            found.files.add(node.file.resolve())
+        if node.kind == "transform" or node.name.endswith(SLICE_MODELS):
+            continue
+        shown = f"{label}: {node.name}"
+        if node.file is None or node.missing:
+            why = node.missing or "the scene names no file for it: save the scene with its data"
+            found.others.append(OtherFind(shown, why))
+            continue
+        try:
+            _add(found, scene, node, shown)
+        except (CmfsimError, OSError) as error:
+            if node.kind == "model" and name_role(node.name).part not in {"", "other"}:
+                raise
+            found.others.append(OtherFind(shown, str(error)))
+    _add_loose(found, scene, label)
+    return found
+
+
+def _add(found: SceneFinds, scene: SlicerScene, node: SceneNode, shown: str) -> None:
+    if node.file is None:  # asked before
+        raise AssertionError(node.name)
+    chain = tuple(above.name for above in scene.chain(node))
+    matrix, role = scene.to_world(node), name_role(node.name)
+    if node.kind == "model":
+        read = surface_find(node.file, shown)
+        stated = read.stated or node.frame or "LPS"
+        found.surfaces.append(
+            replace(read, role=role, stated=stated, to_world=matrix, chain=chain, in_scene=True)
+        )
+    elif node.kind == "segmentation":
+        for segment in segment_finds(node.file, shown):
+            found.surfaces.append(replace(segment, to_world=matrix, chain=chain, in_scene=True))
+    elif node.kind == "volume":
+        image = image_find(node.file, shown)
+        found.images.append(replace(image, role=role, to_world=matrix, chain=chain, in_scene=True))
+    else:
+        points = landmark_find(node.file, shown)
+        found.landmarks.append(
+            replace(points, role=role, to_world=matrix, chain=chain, in_scene=True)
+        )
+
+
+def _add_loose(found: SceneFinds, scene: SlicerScene, label: str) -> None:
+    """Adds the transforms that nothing lies under."""
+    used = {node.parent for node in scene.nodes.values()}
+    for node in scene.of("transform"):
+        if node.id in used:
+            continue
+        shown = f"{label}: {node.name}"
+        try:
+            matrix = scene.to_parent(node)
+        except CmfsimError as error:
+            found.others.append(OtherFind(shown, str(error)))
+            continue
+        found.loose.append(LooseMotion(shown, name_role(node.name), matrix))

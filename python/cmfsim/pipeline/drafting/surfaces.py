@@ -1,0 +1,400 @@
+"""Which surfaces a case is made of, their unit and their frame, with the reasons."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cmfsim._core import Surface
+from cmfsim.checks import Floats
+from cmfsim.pipeline.drafting.finds import SurfaceFind
+from cmfsim.pipeline.drafting.lines import Taken
+from cmfsim.pipeline.drafting.roles import MOVING, safe_key
+
+__all__ = ["Anatomy", "Question", "choose_surfaces"]
+
+# Longest extent of a skin from a face mask to a head with neck, and of bones, mm.
+SKIN_EXTENT, BONE_EXTENT = (110.0, 420.0), (15.0, 320.0)
+# Lengths of other units that numbers may be in, mm.
+UNITS: Mapping[str, float] = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "inch": 25.4, "um": 0.001}
+# Vertices at which it is asked whether one surface holds another.
+SAMPLES = 300
+# Share of a piece in a bone from which on it is part of it, and distance that counts as in it, mm.
+PART_SHARE, NEAR = 0.8, 0.6
+# The jaw's middle lies so far in front of the cranium's, mm, for this to tell the frame.
+IN_FRONT = 5.0
+FLIP = np.array([-1.0, -1.0, 1.0])
+PIECES_OF = {
+    "mandible": ("mandible_body", "ramus_left", "ramus_right", "chin"),
+    "cranium": ("maxilla", "midface"),
+}
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a person has to decide about a key: the question, and what may be written."""
+
+    key: str
+    text: str
+    choices: tuple[str, ...]
+
+
+@dataclass
+class Anatomy:
+    """The surfaces of a case.
+
+    Attributes
+    ----------
+    skin : SurfaceFind or None
+    bones : dict of str to SurfaceFind
+        By the name that the case gives them.
+    units : str
+    frame : str or None
+        What the case states; None where every file states its own, or nothing needs to be stated.
+    frame_why, units_why : str
+    questions : list of Question
+        Keys "skin", "units", "frame" of [surfaces], or "bones.NAME".
+    after_skin, after_bones
+        The same after the operation.
+    taken : list of Taken
+    """
+
+    skin: SurfaceFind | None = None
+    bones: dict[str, SurfaceFind] = field(default_factory=dict)
+    units: str = "mm"
+    units_why: str = ""
+    frame: str | None = None
+    frame_why: str = ""
+    questions: list[Question] = field(default_factory=list)
+    after_skin: SurfaceFind | None = None
+    after_bones: dict[str, SurfaceFind] = field(default_factory=dict)
+    taken: list[Taken] = field(default_factory=list)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether there is a skin, or a question about it, and a bone."""
+        asked = {question.key.partition(".")[0] for question in self.questions}
+        return (self.skin is not None or "skin" in asked) and (bool(self.bones) or "bones" in asked)
+
+    @property
+    def chosen(self) -> list[SurfaceFind]:
+        """Skin and bones before the operation."""
+        return [*([self.skin] if self.skin else []), *self.bones.values()]
+
+    def asks(self, key: str) -> Question | None:
+        """The question about a key, where there is one."""
+        return next((question for question in self.questions if question.key == key), None)
+
+    def placed(self, find: SurfaceFind) -> Floats:
+        """The vertices of a surface in LPS mm, as far as unit and frame are known, (v, 3)."""
+        frame = find.stated or self.frame or "LPS"
+        scale = UNITS.get(self.units, 1.0) * (FLIP if frame == "RAS" else np.ones(3))
+        return np.asarray(find.surface.vertices) * scale
+
+
+def choose_surfaces(
+    found: Sequence[SurfaceFind], boxes: Sequence[tuple[str, Floats]] = ()
+) -> Anatomy:
+    """Skin and bones among surfaces; what is not clear becomes a question.
+
+    Parameters
+    ----------
+    found : sequence of SurfaceFind
+    boxes : sequence of (str, (2, 3) float64)
+        What lies in LPS mm for certain, by name, with its lowest and highest corner.
+    """
+    anatomy = Anatomy()
+    before = [find for find in found if not find.role.is_after]
+    parts = _by_part(anatomy, before)
+    _choose_skin(anatomy, parts)
+    _choose_bones(anatomy, parts)
+    _check_pieces(anatomy)
+    _choose_units(anatomy)
+    _choose_frame(anatomy, boxes)
+    _choose_after(anatomy, [find for find in found if find.role.is_after])
+    _report(anatomy)
+    return anatomy
+
+
+def _by_part(anatomy: Anatomy, found: Iterable[SurfaceFind]) -> dict[str, list[SurfaceFind]]:
+    parts: dict[str, list[SurfaceFind]] = {}
+    for find in found:
+        if find.role.part == "other":
+            why = f"its name says {find.role.word!r}, which is no bone of a case"
+            anatomy.taken.append(Taken(find.label, "not used", why))
+        else:
+            parts.setdefault(find.role.part, []).append(find)
+    return parts
+
+
+def _choose_skin(anatomy: Anatomy, parts: dict[str, list[SurfaceFind]]) -> None:
+    named = parts.pop("skin", [])
+    if not named:
+        unnamed = parts.get("", [])
+        others = [find for finds in parts.values() for find in finds]
+        around = [find for find in unnamed if len(others) > 1 and _encloses(find, others)]
+        if len(around) == 1:
+            unnamed.remove(around[0])
+            anatomy.skin = around[0]
+            anatomy.taken.append(
+                Taken(around[0].label, "skin", "it encloses every other surface", "", "")
+            )
+            return
+    if len(named) == 1:
+        anatomy.skin = named[0]
+    elif named:
+        _ask_which(anatomy, "skin", named)
+
+
+def _encloses(outer: SurfaceFind, others: Sequence[SurfaceFind]) -> bool:
+    """Whether the box of a surface holds the boxes of all others."""
+    points = np.asarray(outer.surface.vertices)
+    low, high = points.min(axis=0), points.max(axis=0)
+    for find in others:
+        inner = np.asarray(find.surface.vertices)
+        if find is not outer and ((inner.min(axis=0) < low) | (inner.max(axis=0) > high)).any():
+            return False
+    return True
+
+
+def _choose_bones(anatomy: Anatomy, parts: dict[str, list[SurfaceFind]]) -> None:
+    whole = parts.pop("bone", [])
+    unnamed = parts.pop("", [])
+    if whole and "cranium" not in parts:
+        parts["cranium"] = whole
+        whole = []
+    for find in whole:
+        why = "the bones are given one by one; this is all of them in one surface"
+        anatomy.taken.append(Taken(find.label, "not used", why))
+    for part in ("cranium", *MOVING):
+        named = _moved_alone(anatomy, parts.get(part, []))
+        if len(named) == 1:
+            anatomy.bones[part] = named[0]
+        elif named:
+            _ask_which(anatomy, f"bones.{part}", named)
+    for find in unnamed:
+        key = safe_key(find.label.rpartition("/")[2].rpartition(": ")[2].partition(".")[0])
+        text = f"{_said(find)}: which bone is it?"
+        known = ", ".join(("cranium", *MOVING))
+        choices = (
+            f"its name says nothing that is known; rename the key to one of {known},",
+            f"or another name of your own, and write {_written(find)}; or remove the line",
+        )
+        anatomy.questions.append(Question(f"bones.{key}", text, choices))
+        anatomy.taken.append(Taken(find.label, "", f"{text} {' '.join(choices)}", question=True))
+
+
+def _moved_alone(anatomy: Anatomy, named: Sequence[SurfaceFind]) -> Sequence[SurfaceFind]:
+    """Of several surfaces of a part, the only one that its scene moves, if there is one."""
+    moved = [find for find in named if find.is_moved]
+    if len(named) < 2 or len(moved) != 1 or any(find.chain for find in named if not find.is_moved):
+        return named
+    for find in named:
+        if find is not moved[0]:
+            why = f"the scene moves {moved[0].label}, which is the same part, and not this one"
+            anatomy.taken.append(Taken(find.label, "not used", why))
+    return moved
+
+
+def _ask_which(anatomy: Anatomy, key: str, finds: Sequence[SurfaceFind]) -> None:
+    part = key.rpartition(".")[2]
+    names = " or ".join(find.label for find in finds)
+    choices = tuple(f"{_written(find)}: {_shape(find)}" for find in finds)
+    anatomy.questions.append(Question(key, f"{names}: which one is it?", choices))
+    for find in finds:
+        why = f"{len(finds)} surfaces are called {part}; this one is {_shape(find)}"
+        anatomy.taken.append(Taken(find.label, "", why, question=True))
+
+
+def _check_pieces(anatomy: Anatomy) -> None:
+    """Asks about a bone that is there twice: whole, and as the piece that was cut from it."""
+    for whole_name, names in PIECES_OF.items():
+        whole = anatomy.bones.get(whole_name)
+        pieces = {n: anatomy.bones[n] for n in names if n in anatomy.bones}
+        if whole is None or not pieces:
+            continue
+        inside = {n: share for n, p in pieces.items() if (share := _share(p, whole)) > PART_SHARE}
+        if not inside:
+            continue
+        rami = {"ramus_left", "ramus_right"} & set(inside)
+        if whole_name == "mandible" and "mandible_body" in inside and rami and not whole.is_moved:
+            del anatomy.bones[whole_name]
+            why = f"it is the bone before it was cut: {', '.join(inside)} lie in it"
+            anatomy.taken.append(Taken(whole.label, "not used", why))
+            continue
+        name, share = max(inside.items(), key=lambda entry: entry[1])
+        piece = anatomy.bones.pop(name)
+        text = (
+            f"{piece.label} lies in {whole.label} ({share:.0%} of it): the bone would be there "
+            "twice. Which is right?"
+        )
+        cut = {"maxilla": "le_fort_1", "midface": "le_fort_3", "chin": "genioplasty"}
+        procedure = cut.get(name, "bsso")
+        choices = (
+            f"{_written(piece)}, if {whole_name} is replaced by the bone without it; or remove",
+            f'this line and add [[osteotomies]] with procedure = "{procedure}": cmfsim cuts it',
+        )
+        anatomy.questions.append(Question(f"bones.{name}", text, choices))
+        anatomy.taken.append(Taken(piece.label, "", text, question=True))
+
+
+def _share(piece: SurfaceFind, whole: SurfaceFind) -> float:
+    """The share of a piece's vertices that lie in or on a bone."""
+    if (piece.stated or "LPS") != (whole.stated or "LPS"):
+        return 0.0
+    points = np.asarray(piece.surface.vertices)
+    points = np.ascontiguousarray(points[:: max(1, len(points) // SAMPLES)], dtype=np.float64)
+    index = Surface(
+        np.ascontiguousarray(whole.surface.vertices, dtype=np.float64),
+        np.ascontiguousarray(whole.surface.triangles, dtype=np.uint32),
+    )
+    closest, _, _ = index.closest(points)
+    near = np.linalg.norm(closest - points, axis=1) < NEAR * whole.extent.max() / 150.0
+    inside = index.winding_number(points) > 0.5
+    return float((near | inside).mean())
+
+
+def _choose_units(anatomy: Anatomy) -> None:
+    """The unit by the size of the skin, or of the largest bone."""
+    if not anatomy.chosen:
+        return
+    judged = anatomy.skin or max(anatomy.bones.values(), key=lambda find: find.extent.max())
+    low, high = SKIN_EXTENT if judged is anatomy.skin else BONE_EXTENT
+    size = float(judged.extent.max())
+    long = f"{judged.label} is {size:.4g} long"
+    if low <= size <= high:
+        what = "a skin has" if judged is anatomy.skin else "bones have"
+        anatomy.units_why = f"{long}, as {what} it in mm"
+        return
+    fitting = [unit for unit, length in UNITS.items() if low <= size * length <= high]
+    choices = tuple(f'"{unit}": then it is {size * UNITS[unit]:.0f} mm long' for unit in fitting)
+    anatomy.questions.append(
+        Question(
+            "units",
+            f"{long}, and in mm {low:.0f} to {high:.0f} is usual: which unit is it?",
+            choices or ("none of mm, cm, m, um and inch fits: export the surfaces in mm",),
+        )
+    )
+    if len(fitting) == 1:
+        # To go on with: distances and directions are in mm from here on.
+        anatomy.units = fitting[0]
+
+
+def _choose_frame(anatomy: Anatomy, boxes: Sequence[tuple[str, Floats]]) -> None:
+    """The frame of the files: as they state it, else as what lies in them shows it."""
+    chosen = anatomy.chosen
+    silent = [find for find in chosen if find.stated is None]
+    stated = sorted({find.stated for find in chosen if find.stated is not None})
+    if not silent:
+        anatomy.frame_why = f"stated by the header of each file: {' and '.join(stated)}"
+        return
+    names = ", ".join(find.label for find in silent[:4]) + (", …" if len(silent) > 4 else "")
+    frame, why = _shown_frame(anatomy, silent, boxes)
+    if frame is None or (frame == "RAS" and "LPS" in stated):
+        anatomy.questions.append(
+            Question(
+                "frame",
+                f"{names}: states no frame{why and f', and {why}'}. Is x to the left or the right?",
+                (
+                    '"LPS": x to the patient\'s left, y to the back (3D Slicer since 2020, ITK)',
+                    '"RAS": x to the patient\'s right, y to the front (older Slicer, FreeSurfer)',
+                ),
+            )
+        )
+        return
+    anatomy.frame = None if frame == "LPS" and stated else frame
+    anatomy.frame_why = f"{names}: states none; {why}"
+
+
+def _shown_frame(
+    anatomy: Anatomy, silent: Sequence[SurfaceFind], boxes: Sequence[tuple[str, Floats]]
+) -> tuple[str | None, str]:
+    """The frame that the places of things show, and how; None where they show none."""
+    unit = UNITS[anatomy.units]
+    points = np.concatenate([np.asarray(find.surface.vertices) for find in silent]) * unit
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    others = [
+        (find.label, np.asarray(find.surface.vertices) * unit * (FLIP if f == "RAS" else 1.0))
+        for find in anatomy.chosen
+        if (f := find.stated) is not None
+    ]
+    certain = [*boxes, *((name, np.stack([p.min(axis=0), p.max(axis=0)])) for name, p in others)]
+    for name, box in certain:
+        fits = {
+            frame: bool(((middle * signs >= box[0]) & (middle * signs <= box[1])).all())
+            for frame, signs in (("LPS", np.ones(3)), ("RAS", FLIP))
+        }
+        if fits["LPS"] != fits["RAS"]:
+            frame = "LPS" if fits["LPS"] else "RAS"
+            return frame, f"read as {frame} they lie where {name} lies, and otherwise elsewhere"
+    cranium = anatomy.bones.get("cranium")
+    for name in ("mandible", "mandible_body", "maxilla", "chin"):
+        jaw = anatomy.bones.get(name)
+        if cranium in silent and jaw in silent and cranium is not None and jaw is not None:
+            ahead = unit * float(_middle(jaw)[1] - _middle(cranium)[1])
+            if abs(ahead) > IN_FRONT:
+                frame = "LPS" if ahead < 0.0 else "RAS"
+                return frame, (
+                    f"read as {frame} {name} lies {abs(ahead):.0f} mm in front of the cranium's "
+                    "middle, and otherwise behind it"
+                )
+    return None, "nothing that lies in them shows it"
+
+
+def _middle(find: SurfaceFind) -> Floats:
+    return np.asarray(np.asarray(find.surface.vertices).mean(axis=0), dtype=np.float64)
+
+
+def _choose_after(anatomy: Anatomy, found: Sequence[SurfaceFind]) -> None:
+    for find in found:
+        part = find.role.part
+        if part == "skin" and anatomy.after_skin is None:
+            anatomy.after_skin = find
+        elif part in ("cranium", *MOVING) and part not in anatomy.after_bones:
+            anatomy.after_bones[part] = find
+        elif part == "" and anatomy.after_skin is None and anatomy.skin is not None:
+            ratio = float(find.extent.max() / anatomy.skin.extent.max())
+            if 0.5 < ratio < 2.0:
+                anatomy.after_skin = find
+                continue
+            anatomy.taken.append(Taken(find.label, "not used", "after the operation; which part?"))
+        else:
+            why = "after the operation, and it is not clear which part it is"
+            anatomy.taken.append(Taken(find.label, "not used", why))
+
+
+def _report(anatomy: Anatomy) -> None:
+    """What each surface that is used was taken for."""
+    used = {"skin": anatomy.skin, **anatomy.bones}
+    done = {taken.label for taken in anatomy.taken}
+    for part, find in used.items():
+        if find is None or find.label in done:
+            continue
+        frame = find.stated or anatomy.frame or "LPS"
+        why = f"its name says {find.role.word!r}; {_shape(find)}"
+        if find.role.part == "bone":
+            why += "; a jaw that is part of it cannot move by itself"
+        asked = anatomy.asks("frame") is not None and find.stated is None
+        unit = "" if anatomy.asks("units") else anatomy.units
+        anatomy.taken.append(Taken(find.label, part, why, unit, "" if asked else frame))
+    after = {"skin": anatomy.after_skin, **anatomy.after_bones}
+    for part, find in after.items():
+        if find is not None:
+            why = f"its name says {find.role.word or 'after'!r}, after the operation"
+            anatomy.taken.append(
+                Taken(find.label, f"{part} after the operation", why, "mm", find.stated or "LPS")
+            )
+
+
+def _shape(find: SurfaceFind) -> str:
+    size = " × ".join(f"{length:.3g}" for length in find.extent)
+    closed = "closed" if find.is_closed else "open"
+    return f"{size} in its own unit, {len(np.asarray(find.surface.triangles))} triangles, {closed}"
+
+
+def _said(find: SurfaceFind) -> str:
+    return f"{find.label} ({_shape(find)})"
+
+
+def _written(find: SurfaceFind) -> str:
+    return f'"{find.label}"' if not find.in_scene else f'the file made of "{find.label}"'
