@@ -232,6 +232,9 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     # For a study's own processes: they end when what started them does.
     for command in (predict, evaluate):
         command.add_argument("--no-report", action="store_true", help="make no report.html")
+        command.add_argument(
+            "--slicer", action="store_true", help="write prediction.mrb for 3D Slicer as well"
+        )
     evaluate.set_defaults(run=study_commands.evaluate)
 
     sensitivity = commands.add_parser(

@@ -61,6 +61,7 @@ def predict(options: argparse.Namespace) -> int:
             len(models),
             stage=progress.stage,
             with_report=not options.no_report,
+            slicer=options.slicer,
         )
     if options.json:
         entries = [_figures(entry, case.output) for entry in written.predictions]
@@ -116,6 +117,7 @@ def evaluate(options: argparse.Namespace) -> int:
             stage=progress.stage,
             evaluation=lambda: found,
             with_report=not options.no_report,
+            slicer=options.slicer,
         )
     values = found.as_dict()
     code = FAILED if found.failed else DONE

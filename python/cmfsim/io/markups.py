@@ -23,6 +23,7 @@ __all__ = [
     "markup_of",
     "markup_text",
     "markups_of",
+    "markups_text",
     "write_markups",
 ]
 
@@ -129,9 +130,14 @@ def markup_of(kind: str, points: Iterable[tuple[str, Floats]]) -> dict[str, Any]
 
 def write_markups(path: Path, markups: Sequence[Mapping[str, Any]]) -> None:
     """Replaces a `.mrk.json` file in one step."""
-    text = json.dumps({"@schema": SCHEMA, "markups": markups}, indent=1, allow_nan=False)
+    text = markups_text(markups)
     with replacing(path) as file:
         file.write(text.encode())
+
+
+def markups_text(markups: Sequence[Mapping[str, Any]]) -> str:
+    """The text of a `.mrk.json` file."""
+    return json.dumps({"@schema": SCHEMA, "markups": markups}, indent=1, allow_nan=False)
 
 
 def as_position(number: int, position: object) -> Floats:

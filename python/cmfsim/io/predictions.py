@@ -58,7 +58,7 @@ __all__ = [
 PREDICTION_FILE = "prediction.json"
 AGAIN = "run cmfsim predict again"
 PREDICTION_FILES = re.compile(
-    r"prediction\.(vtp|stl|vtu|npz|png|json)|face\.(vtp|stl)|(bones|muscles)\.vtp"
+    r"prediction\.(vtp|stl|vtu|npz|png|json|mrb)|face\.(vtp|stl)|(bones|muscles)\.vtp"
     r"|(plan|muscles)\.png|timings\.json"
 )
 

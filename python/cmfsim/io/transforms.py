@@ -28,6 +28,7 @@ __all__ = [
     "motion_in_lps",
     "read_transform",
     "read_transform_file",
+    "transform_text",
     "write_transform",
 ]
 
@@ -244,8 +245,6 @@ def write_transform(
     if direction is not None:
         check_one_of("direction", direction, DIRECTIONS)
     m = rigid_matrix(as_floats("matrix", matrix))
-    if direction == "from-parent":
-        m = _inverse(m)
     if path.suffix.lower() == ".tfm":
         if frame != "LPS":
             raise CaseInputError(f"{path.name}: {ITK_IS_LPS}")
@@ -254,24 +253,31 @@ def write_transform(
                 f'{path.name}: state direction = "from-parent" for 3D Slicer, which shows the '
                 'inverse of the file as the motion, or "to-parent" to write the motion itself'
             )
-        lines: tuple[str, ...] = (
-            f"{ITK_HEADER} V1.0",
-            f"# mm, LPS, {direction}",
-            "#Transform 0",
-            "Transform: AffineTransform_double_3_3",
-            f"Parameters: {_numbers(np.concatenate([m[:3, :3].ravel(), m[:3, 3]]))}",
-            "FixedParameters: 0 0 0",
-        )
+        text = transform_text(m, direction=direction)
     elif path.suffix.lower() == ".txt":
-        m = motion_in_lps(m, frame)
+        m = motion_in_lps(_inverse(m) if direction == "from-parent" else m, frame)
         header = f"# 4 x 4, mm, {frame}, {direction or DEFAULT_DIRECTION}"
-        lines = (header, *(_numbers(row) for row in m))
+        text = "\n".join((header, *(_numbers(row) for row in m))) + "\n"
     else:
         raise CaseInputError(
             f"{path.name}: a transform is written as .tfm or .txt, not {path.suffix!r}"
         )
     with replacing(path) as file:
-        file.write(("\n".join(lines) + "\n").encode())
+        file.write(text.encode())
+
+
+def transform_text(matrix: Floats, *, direction: str) -> str:
+    """A rigid motion of LPS points as ITK text, (4, 4), or its inverse for "from-parent"."""
+    m = _inverse(matrix) if direction == "from-parent" else matrix
+    lines = (
+        f"{ITK_HEADER} V1.0",
+        f"# mm, LPS, {direction}",
+        "#Transform 0",
+        "Transform: AffineTransform_double_3_3",
+        f"Parameters: {_numbers(np.concatenate([m[:3, :3].ravel(), m[:3, 3]]))}",
+        "FixedParameters: 0 0 0",
+    )
+    return "\n".join(lines) + "\n"
 
 
 def _stated(text: str) -> tuple[str | None, str | None]:

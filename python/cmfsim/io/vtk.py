@@ -71,14 +71,28 @@ def write_triangles(
     vertices: ArrayLike,
     triangles: ArrayLike,
     point_data: Mapping[str, NDArray[Any]],
+    *,
+    vectors: str = "",
+    frame: str = "",
 ) -> None:
-    """Writes triangles as a `.vtp` file with named arrays on vertices."""
+    """Writes triangles as a `.vtp` file with named arrays on vertices.
+
+    `vectors` names the array that turns with the surface; `frame` is stated as 3D Slicer does.
+    """
     points, polys = np.asarray(vertices), np.asarray(triangles)
+    turning = f' Vectors="{vectors}"' if vectors else ""
+    codes = " ".join(str(ord(letter)) for letter in frame)
+    stated = (
+        '<FieldData><Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">'
+        f"{codes} 0</Array></FieldData>"
+        if frame
+        else ""
+    )
     body = (
-        f'<Piece NumberOfPoints="{len(points)}" NumberOfVerts="0" NumberOfLines="0" '
+        f'{stated}<Piece NumberOfPoints="{len(points)}" NumberOfVerts="0" NumberOfLines="0" '
         f'NumberOfStrips="0" NumberOfPolys="{len(polys)}">'
         f"<Points>{data_array('points', points)}</Points>"
-        f"<PointData>{_arrays(point_data)}</PointData>"
+        f"<PointData{turning}>{_arrays(point_data)}</PointData>"
         f"<Polys>{data_array('connectivity', polys.reshape(-1).astype(np.int32))}"
         f"{data_array('offsets', 3 * np.arange(1, len(polys) + 1, dtype=np.int32))}</Polys></Piece>"
     )

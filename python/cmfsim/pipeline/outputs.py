@@ -32,6 +32,7 @@ from cmfsim.io.predictions import (
     read_prediction_picture,
     stale_results,
 )
+from cmfsim.io.slicer_output import SLICER_FILE, write_slicer_bundle
 from cmfsim.io.summaries import write_summary
 from cmfsim.muscles.template import joined_surface
 from cmfsim.pictures import (
@@ -105,6 +106,7 @@ def write_results(
     evaluation: Callable[[], CaseEvaluation] | None = None,
     with_report: bool = True,
     pictures: Callable[[str], bool] = lambda _: True,
+    slicer: bool = False,
 ) -> WrittenResults:
     """What was written of predictions, their comparison and the report of both.
 
@@ -123,6 +125,8 @@ def write_results(
     with_report : bool
     pictures : callable
         Whether those of a model are drawn, by its name.
+    slicer : bool
+        Whether each prediction is written as a bundle for 3D Slicer as well, `prediction.mrb`.
 
     Raises
     ------
@@ -136,8 +140,10 @@ def write_results(
             stage(f"writing {prediction.model}")
             place = "" if n_models == 1 else prediction.model
             (fresh / place).mkdir(exist_ok=True)
-            draw = partial(_draw, prediction) if pictures(prediction.model) else None
-            names = fill_prediction(fresh / place, prediction, draw)
+            more = partial(
+                _more_files, prediction, pictures=pictures(prediction.model), slicer=slicer
+            )
+            names = fill_prediction(fresh / place, prediction, more)
             written.predictions.append(WrittenPrediction(place, names, prediction.summary))
         key = written.predictions[0].summary["case_key"]
         compared = None
@@ -194,6 +200,15 @@ def _statements(names: Iterable[str]) -> list[str]:
     """The files among some that state what the others are."""
     names = list(names)
     return [name for name in names if name.endswith((".json", ".html"))] or names
+
+
+def _more_files(prediction: Prediction, folder: Path, *, pictures: bool, slicer: bool) -> list[str]:
+    """The names of the files of a prediction that were asked for beside those of each."""
+    names = _draw(prediction, folder) if pictures else []
+    if slicer:
+        write_slicer_bundle(folder / SLICER_FILE, prediction)
+        names.append(SLICER_FILE)
+    return names
 
 
 def _draw(prediction: Prediction, folder: Path) -> list[str]:

@@ -17,7 +17,7 @@ from cmfsim.pipeline.drafting.gathering import Gathered
 from cmfsim.pipeline.drafting.lines import Taken, Text, quoted
 from cmfsim.pipeline.drafting.motions import DraftMotion, Plan, file_motions, scene_motions
 from cmfsim.pipeline.drafting.roles import MOVING, safe_key
-from cmfsim.pipeline.drafting.surfaces import Anatomy, choose_surfaces
+from cmfsim.pipeline.drafting.surfaces import Anatomy, Question, choose_surfaces
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.surface_data import SurfaceData
 
@@ -237,17 +237,17 @@ def _write_surfaces(draft: _Draft, lead: str = "") -> None:
     text, anatomy = Text(), draft.anatomy
     text.table("surfaces")
     if (asked := anatomy.asks("skin")) is not None:
-        text.ask("skin", asked.text, asked.choices)
+        text.ask("skin", asked.text, _choices(draft, asked))
     elif anatomy.skin is not None:
         text.value("skin", quoted(_surface_path(draft, anatomy.skin, "skin")))
     else:
         text.ask("skin", "no surface that was found is a skin: which file is it?", ())
     if (asked := anatomy.asks("units")) is not None:
-        text.ask("units", asked.text, asked.choices)
+        text.ask("units", asked.text, _choices(draft, asked))
     else:
         text.value("units", '"mm"', anatomy.units_why)
     if (asked := anatomy.asks("frame")) is not None:
-        text.ask("frame", asked.text, asked.choices)
+        text.ask("frame", asked.text, _choices(draft, asked))
     elif anatomy.frame is not None:
         text.value("frame", quoted(anatomy.frame), anatomy.frame_why)
     elif anatomy.frame_why:
@@ -258,10 +258,24 @@ def _write_surfaces(draft: _Draft, lead: str = "") -> None:
     for question in anatomy.questions:
         part, _, name = question.key.partition(".")
         if part == "bones":
-            text.ask(name, question.text, question.choices)
+            text.ask(name, question.text, _choices(draft, question))
     draft.text.lines += [f"{lead}{line}".rstrip() for line in text.lines]
     if not lead:
         draft.text.questions += text.questions
+
+
+def _choices(draft: _Draft, question: Question) -> list[str]:
+    """What may be written for a question; a surface of a scene gets a file, so that it can be."""
+    return [
+        words if find is None else f"{quoted(_candidate_path(draft, find))}: {words}"
+        for find, words in question.choices
+    ]
+
+
+def _candidate_path(draft: _Draft, find: SurfaceFind) -> str:
+    name = safe_key(find.label.rpartition(": ")[2].rpartition(" / ")[2])
+    taken = {path for path in draft.files if path.startswith(f"{EXTRACTED}/{name}")}
+    return _surface_path(draft, find, f"{name}_{len(taken) + 1}" if taken else name)
 
 
 def _has_copy(draft: _Draft, find: SurfaceFind) -> bool:

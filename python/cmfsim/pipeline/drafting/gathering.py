@@ -105,7 +105,12 @@ def gather(
         ]
     else:
         _gather_files(found, paths, progress)
+    has_marks = bool(found.landmarks)
     for path in rest(paths.markups):
+        if has_marks and not name_role(path.name).is_after:
+            why = f"the scene {found.scene} has landmarks of its own"
+            found.others.append(OtherFind(found.shown(path), why))
+            continue
         _read(found, path, landmark_find, found.landmarks)
     has_ct = any(not image.role.is_after and not image.error for image in found.images)
     images = [p for p in (*rest(paths.images), *paths.dicom) if p != folder] + [

@@ -10,7 +10,7 @@ __all__ = ["MOVING", "NameRole", "name_role", "safe_key"]
 NO_BONE = frozenset(
     ("teeth", "tooth", "canal", "airway", "sinus", "tongue", "muscle", "muscles", "plate", "plates")
     + ("screw", "screws", "splint", "guide", "plane", "planes", "eye", "eyes", "brain", "vertebra")
-    + ("vertebrae", "spine", "cartilage", "implant", "couch")
+    + ("vertebrae", "spine", "cartilage", "implant", "couch", "predicted")
 )
 AFTER = frozenset(
     ("post", "postop", "postoperative", "after", "achieved", "postsurgery", "postsurgical")

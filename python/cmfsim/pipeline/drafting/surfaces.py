@@ -32,11 +32,21 @@ PIECES_OF = {
 
 @dataclass(frozen=True)
 class Question:
-    """What a person has to decide about a key: the question, and what may be written."""
+    """What a person has to decide about a key.
+
+    Attributes
+    ----------
+    key : str
+        Below [surfaces].
+    text : str
+        The question.
+    choices : tuple of (SurfaceFind or None, str)
+        What may be written: the file of a surface, or none, and words about it.
+    """
 
     key: str
     text: str
-    choices: tuple[str, ...]
+    choices: tuple[tuple[SurfaceFind | None, str], ...]
 
 
 @dataclass
@@ -177,11 +187,11 @@ def _choose_bones(anatomy: Anatomy, parts: dict[str, list[SurfaceFind]]) -> None
         text = f"{_said(find)}: which bone is it?"
         known = ", ".join(("cranium", *MOVING))
         choices = (
-            f"its name says nothing that is known; rename the key to one of {known},",
-            f"or another name of your own, and write {_written(find)}; or remove the line",
+            (find, "if it is a bone of the case: rename the key, too,"),
+            (None, f"to one of {known}, or to a name of your own; or remove the line"),
         )
         anatomy.questions.append(Question(f"bones.{key}", text, choices))
-        anatomy.taken.append(Taken(find.label, "", f"{text} {' '.join(choices)}", question=True))
+        anatomy.taken.append(Taken(find.label, "", text, question=True))
 
 
 def _moved_alone(anatomy: Anatomy, named: Sequence[SurfaceFind]) -> Sequence[SurfaceFind]:
@@ -199,7 +209,7 @@ def _moved_alone(anatomy: Anatomy, named: Sequence[SurfaceFind]) -> Sequence[Sur
 def _ask_which(anatomy: Anatomy, key: str, finds: Sequence[SurfaceFind]) -> None:
     part = key.rpartition(".")[2]
     names = " or ".join(find.label for find in finds)
-    choices = tuple(f"{_written(find)}: {_shape(find)}" for find in finds)
+    choices = tuple((find, _shape(find)) for find in finds)
     anatomy.questions.append(Question(key, f"{names}: which one is it?", choices))
     for find in finds:
         why = f"{len(finds)} surfaces are called {part}; this one is {_shape(find)}"
@@ -231,8 +241,8 @@ def _check_pieces(anatomy: Anatomy) -> None:
         cut = {"maxilla": "le_fort_1", "midface": "le_fort_3", "chin": "genioplasty"}
         procedure = cut.get(name, "bsso")
         choices = (
-            f"{_written(piece)}, if {whole_name} is replaced by the bone without it; or remove",
-            f'this line and add [[osteotomies]] with procedure = "{procedure}": cmfsim cuts it',
+            (piece, f"if {whole_name} is replaced by the bone without it; or remove this line"),
+            (None, f'and add [[osteotomies]] with procedure = "{procedure}": cmfsim cuts it'),
         )
         anatomy.questions.append(Question(f"bones.{name}", text, choices))
         anatomy.taken.append(Taken(piece.label, "", text, question=True))
@@ -267,12 +277,14 @@ def _choose_units(anatomy: Anatomy) -> None:
         anatomy.units_why = f"{long}, as {what} it in mm"
         return
     fitting = [unit for unit, length in UNITS.items() if low <= size * length <= high]
-    choices = tuple(f'"{unit}": then it is {size * UNITS[unit]:.0f} mm long' for unit in fitting)
+    choices = tuple(
+        (None, f'"{unit}": then it is {size * UNITS[unit]:.0f} mm long') for unit in fitting
+    )
     anatomy.questions.append(
         Question(
             "units",
             f"{long}, and in mm {low:.0f} to {high:.0f} is usual: which unit is it?",
-            choices or ("none of mm, cm, m, um and inch fits: export the surfaces in mm",),
+            choices or ((None, "none of mm, cm, m, um and inch fits: export the surfaces in mm"),),
         )
     )
     if len(fitting) == 1:
@@ -294,16 +306,16 @@ def _choose_frame(anatomy: Anatomy, boxes: Sequence[tuple[str, Floats]]) -> None
         anatomy.questions.append(
             Question(
                 "frame",
-                f"{names}: states no frame{why and f', and {why}'}. Is x to the left or the right?",
+                f"{names}: no frame is stated, and {why}. Is x to the left or to the right?",
                 (
-                    '"LPS": x to the patient\'s left, y to the back (3D Slicer since 2020, ITK)',
-                    '"RAS": x to the patient\'s right, y to the front (older Slicer, FreeSurfer)',
+                    (None, '"LPS": x to the left, y to the back (3D Slicer since 2020, ITK)'),
+                    (None, '"RAS": x to the right, y to the front (older Slicer, FreeSurfer)'),
                 ),
             )
         )
         return
     anatomy.frame = None if frame == "LPS" and stated else frame
-    anatomy.frame_why = f"{names}: states none; {why}"
+    anatomy.frame_why = f"{names}: none is stated; {why}"
 
 
 def _shown_frame(
@@ -394,7 +406,3 @@ def _shape(find: SurfaceFind) -> str:
 
 def _said(find: SurfaceFind) -> str:
     return f"{find.label} ({_shape(find)})"
-
-
-def _written(find: SurfaceFind) -> str:
-    return f'"{find.label}"' if not find.in_scene else f'the file made of "{find.label}"'
