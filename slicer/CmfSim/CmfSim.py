@@ -1,0 +1,287 @@
+"""CmfSim: choose a volume or models, move segments by transforms, and see the face follow.
+
+A thin widget. What it does with what was chosen is in CmfSimLib, which knows no Slicer; the
+prediction itself runs in a process of its own.
+"""
+
+import importlib.util
+import shutil
+import tempfile
+from pathlib import Path
+
+import ctk
+import qt
+import slicer
+import vtk
+from CmfSimLib.case_folder import BONES, MODELS, Choice, ChoiceError, Segment, face_of, write_case
+from CmfSimLib.running import Run, command, words_of
+from slicer.ScriptedLoadableModule import (
+    ScriptedLoadableModule,
+    ScriptedLoadableModuleLogic,
+    ScriptedLoadableModuleTest,
+    ScriptedLoadableModuleWidget,
+)
+
+ACTIVE = "displacement_length_mm"
+COLOURS = "vtkMRMLColorTableNodeFileViridis.txt"
+# How often a running prediction is asked for its progress, ms.
+INTERVAL = 300
+
+
+class CmfSim(ScriptedLoadableModule):
+    """The module as Slicer lists it."""
+
+    def __init__(self, parent):
+        super().__init__(parent)
+        parent.title = "CmfSim"
+        parent.categories = ["Planning"]
+        parent.dependencies = []
+        parent.contributors = ["The cmfsim maintainers"]
+        parent.helpText = (
+            "Predicts the face after jaw surgery. Choose a CT volume, or models of skin and bones; "
+            "apply a linear transform to each segment that moves; run. Research software, not a "
+            "medical device."
+        )
+        parent.acknowledgementText = (
+            "The method follows Kim, Juergens, Weber, Nolte, Reyes: Progress in Biophysics and "
+            "Molecular Biology 103 (2010) 284."
+        )
+
+
+class CmfSimWidget(ScriptedLoadableModuleWidget):
+    """Choosers, a table of segments, a button, a bar."""
+
+    def setup(self):
+        """Builds the panel; nothing is installed and nothing is imported of cmfsim here."""
+        super().setup()
+        self.logic = CmfSimLogic()
+        self.run = None
+        self.timer = qt.QTimer()
+        self.timer.setInterval(INTERVAL)
+        self.timer.connect("timeout()", self.onTimer)
+        self._addInputs()
+        self._addSegments()
+        self._addRun()
+        self.layout.addStretch(1)
+
+    def cleanup(self):
+        """Ends a prediction that still runs when the module is closed."""
+        self.timer.stop()
+        if self.run is not None:
+            self.run.close()
+
+    def _section(self, title):
+        box = ctk.ctkCollapsibleButton()
+        box.text = title
+        self.layout.addWidget(box)
+        return qt.QFormLayout(box)
+
+    def _chooser(self, form, label, classes, tip):
+        chooser = slicer.qMRMLNodeComboBox()
+        chooser.nodeTypes = classes
+        chooser.noneEnabled = True
+        chooser.addEnabled = chooser.removeEnabled = False
+        chooser.setMRMLScene(slicer.mrmlScene)
+        chooser.setCurrentNode(None)
+        chooser.toolTip = tip
+        form.addRow(label, chooser)
+        return chooser
+
+    def _addInputs(self):
+        form = self._section("Head before the operation")
+        model, points = ["vtkMRMLModelNode"], ["vtkMRMLMarkupsFiducialNode"]
+        self.volume = self._chooser(
+            form, "CT volume:", ["vtkMRMLScalarVolumeNode"], "In HU; or leave it and choose a skin"
+        )
+        self.skin = self._chooser(form, "Skin model:", model, "Where no CT is chosen")
+        self.skull = self._chooser(form, "Skull landmarks:", points, "Needed for muscles and cuts")
+        self.marks = self._chooser(form, "Skin landmarks:", points, "Optional")
+
+    def _addSegments(self):
+        form = self._section("Bones, and the transform that moves each")
+        self.table = qt.QTableWidget(0, 3)
+        self.table.setHorizontalHeaderLabels(["Bone", "Model", "Moved by"])
+        self.table.horizontalHeader().setSectionResizeMode(qt.QHeaderView.Stretch)
+        form.addRow(self.table)
+        add = qt.QPushButton("Add a bone")
+        add.connect("clicked()", self.onAddBone)
+        form.addRow(add)
+
+    def onAddBone(self):
+        """Adds a row: the bone's name, its model, its transform."""
+        row = self.table.rowCount
+        self.table.insertRow(row)
+        names = qt.QComboBox()
+        names.addItems(list(BONES))
+        names.editable = True
+        self.table.setCellWidget(row, 0, names)
+        for column, cls in ((1, "vtkMRMLModelNode"), (2, "vtkMRMLLinearTransformNode")):
+            chooser = slicer.qMRMLNodeComboBox()
+            chooser.nodeTypes = [cls]
+            chooser.noneEnabled = True
+            chooser.addEnabled = chooser.removeEnabled = False
+            chooser.setMRMLScene(slicer.mrmlScene)
+            chooser.setCurrentNode(None)
+            self.table.setCellWidget(row, column, chooser)
+
+    def _addRun(self):
+        form = self._section("Prediction")
+        self.model = qt.QComboBox()
+        self.model.addItems(list(MODELS))
+        self.model.currentText = "M+S"
+        form.addRow("Model:", self.model)
+        self.edge = ctk.ctkDoubleSpinBox()
+        self.edge.minimum, self.edge.maximum, self.edge.value = 1.0, 30.0, 6.0
+        self.edge.suffix = " mm"
+        form.addRow("Edge length:", self.edge)
+        self.button = qt.QPushButton("Predict the face")
+        self.button.connect("clicked()", self.onButton)
+        form.addRow(self.button)
+        self.bar = qt.QProgressBar()
+        self.bar.visible = False
+        form.addRow(self.bar)
+        self.status = qt.QLabel()
+        self.status.wordWrap = True
+        form.addRow(self.status)
+
+    def _rows(self):
+        for row in range(self.table.rowCount):
+            name, model, transform = (self.table.cellWidget(row, column) for column in range(3))
+            yield name.currentText.strip(), model.currentNode(), transform.currentNode()
+
+    def onButton(self):
+        """Starts a prediction, or stops the one that runs."""
+        if self.run is not None:
+            self.run.stop()
+            return
+        try:
+            self.logic.ensureCmfsim()
+            chosen = self.logic.choice(
+                self.volume.currentNode(),
+                self.skin.currentNode(),
+                list(self._rows()),
+                (self.skull.currentNode(), self.marks.currentNode()),
+                (self.edge.value, self.model.currentText),
+            )
+            self.case = write_case(self.logic.folder, chosen)
+        except (ChoiceError, RuntimeError) as error:
+            slicer.util.errorDisplay(str(error), windowTitle="CmfSim")
+            return
+        self.run = Run(command(self.case, chosen.model, python=self.logic.python()))
+        self.button.text = "Stop"
+        self.bar.visible = True
+        self.bar.value = 0
+        self.timer.start()
+
+    def onTimer(self):
+        """Shows how far the prediction is, and its face when it is done."""
+        for line in self.run.poll():
+            self.status.text = line.text
+            if line.share is not None:
+                self.bar.value = int(100 * line.share)
+        code = self.run.code
+        if code is None:
+            return
+        self.timer.stop()
+        run, self.run = self.run, None
+        self.button.text = "Predict the face"
+        self.bar.visible = False
+        answer = run.answer()
+        run.close()
+        if code == 0:
+            head = self.volume.currentNode() or self.skin.currentNode()
+            self.logic.showFace(Path(self.case).parent / "out" / "prediction.mrb", head)
+            self.status.text = "The face is coloured by its displacement in mm."
+            return
+        text = words_of(answer)
+        self.status.text = text
+        slicer.util.errorDisplay(text, windowTitle="CmfSim")
+
+
+class CmfSimLogic(ScriptedLoadableModuleLogic):
+    """What needs Slicer: saving nodes, matrices of transforms, showing the face."""
+
+    def __init__(self):
+        super().__init__()
+        self.folder = None
+
+    def ensureCmfsim(self):
+        """Installs cmfsim into Slicer's Python when it is first needed, after asking."""
+        requirements = str(Path(__file__).parent / "Resources" / "requirements.txt")
+        try:
+            from slicer.packaging import load_requirements, pip_ensure
+        except ImportError:
+            # Slicer 5.10 and earlier.
+            if importlib.util.find_spec("cmfsim") is None:
+                text = "CmfSim needs the Python package cmfsim. Install it?"
+                if not slicer.util.confirmOkCancelDisplay(text, windowTitle="CmfSim"):
+                    raise RuntimeError("cmfsim is not installed.") from None
+                slicer.util.pip_install(f'-r "{requirements}"')
+            return
+        pip_ensure(load_requirements(requirements), requester="CmfSim")
+
+    def python(self):
+        """Slicer's own interpreter, which runs without its window."""
+        found = shutil.which("PythonSlicer")
+        if found is None:
+            raise RuntimeError("PythonSlicer, Slicer's own Python, is not on the path.")
+        return found
+
+    def choice(self, volume, skin, rows, marks, settings):
+        """What was chosen, with every node saved into a new folder."""
+        self.folder = Path(tempfile.mkdtemp(prefix="CmfSim-", dir=slicer.app.temporaryPath))
+        edge, model = settings
+        made = Choice(edge_length=edge, model=model)
+        if volume is not None:
+            made.volume = self._saved(volume, "ct.nrrd")
+        elif skin is not None:
+            made.skin = self._saved(skin, "skin.vtp")
+        for name, bone, transform in rows:
+            file = self._saved(bone, f"{name}.vtp") if bone is not None and volume is None else None
+            made.segments.append(Segment(name, file, self._matrix(transform)))
+        for key, node in zip(("skull_landmarks", "skin_landmarks"), marks, strict=True):
+            if node is not None:
+                setattr(made, key, self._saved(node, f"{key}.mrk.json"))
+        return made
+
+    def _saved(self, node, name):
+        path = self.folder / name
+        if not slicer.util.saveNode(node, str(path), {"useCompression": False}):
+            raise ChoiceError(f"{node.GetName()} could not be saved.")
+        return path
+
+    def _matrix(self, transform):
+        """What a transform does on its own: the rest of the head lies under its parent, too."""
+        if transform is None:
+            return None
+        matrix = vtk.vtkMatrix4x4()
+        transform.GetMatrixTransformToParent(matrix)
+        return tuple(tuple(matrix.GetElement(i, k) for k in range(4)) for i in range(4))
+
+    def showFace(self, bundle, head):
+        """Loads the predicted face, coloured by its displacement, to where the head is shown."""
+        node = slicer.util.loadModel(str(face_of(bundle, self.folder)))
+        node.SetName("face predicted")
+        display = node.GetDisplayNode()
+        display.SetActiveScalar(ACTIVE, vtk.vtkAssignAttribute.POINT_DATA)
+        display.SetAndObserveColorNodeID(COLOURS)
+        display.SetScalarVisibility(True)
+        if head is not None and head.GetParentTransformNode() is not None:
+            node.SetAndObserveTransformNodeID(head.GetParentTransformNode().GetID())
+        return node
+
+
+class CmfSimTest(ScriptedLoadableModuleTest):
+    """Run by Slicer: Reload and Test, or --testing."""
+
+    def runTest(self):
+        """The panel and a choice that is not complete; the rest is tested without Slicer."""
+        self.setUp()
+        self.test_a_choice_without_a_head_is_refused()
+
+    def test_a_choice_without_a_head_is_refused(self):
+        """The error is a sentence, and no process is started."""
+        logic = CmfSimLogic()
+        made = logic.choice(None, None, [], (None, None), (6.0, "H"))
+        with self.assertRaises(ChoiceError):
+            write_case(logic.folder, made)

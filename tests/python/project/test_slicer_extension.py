@@ -1,0 +1,211 @@
+"""The extension for 3D Slicer: its logic without Slicer, its descriptions, a run of its own."""
+
+import ast
+import json
+import re
+import subprocess
+import sys
+import time
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cmfsim
+import head_case
+
+ROOT = Path(__file__).parents[3] / "slicer"
+if not ROOT.is_dir():
+    pytest.skip("the extension is not part of an installed package", allow_module_level=True)
+sys.path.insert(0, str(ROOT / "CmfSim"))
+
+from CmfSimLib import case_folder, running  # noqa: E402 (its folder is no package of the path)
+
+FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
+MOTION = cmfsim.rigid_motion((0.0, 4.0, 1.0), angle=2.0, axis=(1, 0, 0), centre=(-3, 128, 1445))
+
+
+def chosen(folder, **more):
+    """What a person chose: skin, cranium that stays, mandible under a transform."""
+    case = head_case.HeadCase()
+    for name, surface in case.surfaces.items():
+        cmfsim.write_surface(folder / f"{name}.vtp", surface)
+    cmfsim.write_landmarks(folder / "skull_landmarks.mrk.json", case.skull)
+    segments = [
+        case_folder.Segment("cranium", folder / "cranium.vtp"),
+        case_folder.Segment("mandible", folder / "mandible.vtp", MOTION.tolist()),
+    ]
+    given = {
+        "skin": folder / "skin.vtp",
+        "segments": segments,
+        "skull_landmarks": folder / "skull_landmarks.mrk.json",
+        "edge_length": 20.0,
+        "model": "H",
+    }
+    return case_folder.Choice(**{**given, **more})
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory):
+    """A case of the module, predicted in a process of its own: folder, lines, answer."""
+    folder = tmp_path_factory.mktemp("chosen")
+    path = case_folder.write_case(folder, chosen(folder))
+    run = running.Run(running.command(path, "H", python=sys.executable))
+    lines = []
+    while run.code is None:
+        lines += run.poll()
+        time.sleep(0.05)
+    lines += run.poll()
+    code, answer = run.code, run.answer()
+    run.close()
+    assert code == 0, answer
+    return folder, lines, answer
+
+
+def test_the_choice_becomes_the_plan_of_the_case(tmp_path):
+    """Slicer's matrix is RAS; the motion of the case is the same one on LPS points."""
+    case = cmfsim.Case.load(case_folder.write_case(tmp_path, chosen(tmp_path)))
+    assert list(case.plan) == ["mandible"]
+    wanted = FLIP @ MOTION @ FLIP
+    assert np.abs(np.asarray(case.plan["mandible"].matrix) - wanted).max() < 1e-12
+    assert not [f for f in cmfsim.diagnose(case, ["H"]) if f.severity == "error"]
+
+
+def test_a_volume_is_cut_by_the_procedures_that_the_segments_need(tmp_path):
+    text = case_folder.case_text(
+        case_folder.Choice(
+            volume=tmp_path / "ct.nrrd",
+            segments=[
+                case_folder.Segment("maxilla", None, MOTION.tolist()),
+                case_folder.Segment("mandible_body", None, MOTION.tolist()),
+                case_folder.Segment("chin"),
+            ],
+            model="H+S",
+        )
+    )
+    (tmp_path / "case.toml").write_text(text, encoding="utf-8")
+    case = cmfsim.Case.load(tmp_path)
+    assert [cut.procedure for cut in case.osteotomies] == ["le_fort_1", "bsso"]
+    assert case.image is not None
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"skin": None}, "Choose a CT volume"),
+        ({"segments": []}, "at least one model of a bone"),
+        ({"skull_landmarks": None, "model": "M+S"}, "skull landmarks"),
+        ({"model": "X"}, "one of H, M"),
+        ({"segments": [case_folder.Segment("a b", Path("a.vtp"), MOTION.tolist())]}, "no name"),
+        ({"segments": [case_folder.Segment("cranium", Path("a.vtp"))]}, "No segment moves"),
+        ({"segments": 2 * [case_folder.Segment("chin", Path("a.vtp"))]}, "Two bones"),
+    ],
+)
+def test_a_choice_that_makes_no_case_is_refused_in_a_sentence(tmp_path, change, words):
+    with pytest.raises(case_folder.ChoiceError, match=words):
+        case_folder.case_text(chosen(tmp_path, **change))
+
+
+def test_a_run_tells_its_progress_and_gives_the_face(ran, tmp_path):
+    folder, lines, answer = ran
+    shares = [line.share for line in lines if line.share is not None]
+    assert len(shares) > 4
+    assert shares == sorted(shares)
+    assert answer["predictions"][0]["model"] == "H"
+    face = cmfsim.read_surface(case_folder.face_of(folder / "out" / "prediction.mrb", tmp_path))
+    plain = cmfsim.read_surface(folder / "out" / "face.stl")
+    assert len(face.vertices) == len(plain.vertices)
+    assert np.abs(np.asarray(face.vertices) - plain.vertices).max() < 1e-3
+
+
+def test_a_failed_run_gives_the_words_of_the_doctor(tmp_path):
+    """No bone: the case file itself is refused."""
+    (tmp_path / "case.toml").write_text('format = "cmfsim-case"\nversion = 1\n', encoding="utf-8")
+    run = running.Run(running.command(tmp_path, "H", python=sys.executable))
+    while run.code is None:
+        time.sleep(0.05)
+    code, answer = run.code, run.answer()
+    run.close()
+    assert code == 2
+    assert "lacks [image] or [surfaces]" in running.words_of(answer)
+
+
+def test_stages_are_those_that_cmfsim_prints(ran):
+    """Every stage of the bar that this case has is among the lines."""
+    _, lines, _ = ran
+    texts = [line.text for line in lines]
+    for start in ("checking", "reading", "meshing", "classifying", "solving", "writing"):
+        assert any(text.startswith(start) for text in texts), (start, texts)
+
+
+def test_the_command_line_module_predicts_and_states_progress(ran, tmp_path):
+    """As Slicer calls it: positional case and face, flags of the XML."""
+    folder, _, _ = ran
+    script = ROOT / "CmfSimPredict" / "CmfSimPredict.py"
+    words = [sys.executable, str(script), str(folder), str(tmp_path / "face.vtp"), "--model", "H"]
+    ended = subprocess.run(
+        [*words, "--edge-length", "22"], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+    shares = [float(s) for s in re.findall(r"<filter-progress>([^<]*)<", ended.stdout)]
+    assert shares == sorted(shares)
+    assert ended.stdout.count("<filter-end>") == 1
+    assert len(cmfsim.read_surface(tmp_path / "face.vtp").vertices) > 100
+
+
+def test_the_command_line_module_describes_itself():
+    """The XML has the channels and flags that the script takes."""
+    script = ROOT / "CmfSimPredict" / "CmfSimPredict.py"
+    ended = subprocess.run(
+        [sys.executable, str(script), "--xml"], capture_output=True, text=True, check=True
+    )
+    root = ET.fromstring(ended.stdout)  # noqa: S314 (our own file)
+    assert root.tag == "executable"
+    indices = {
+        e.findtext("name"): e.findtext("index") for e in root.iter() if e.find("index") is not None
+    }
+    assert indices == {"case": "0", "face": "1"}
+    flags = {e.findtext("longflag") for e in root.iter() if e.find("longflag") is not None}
+    source = script.read_text(encoding="utf-8")
+    assert all(f'"--{flag}"' in source for flag in flags)
+    models = [e.text for e in root.iter("element")]
+    assert models == list(case_folder.MODELS) == ["H", "M", "H+S", "M+S"]
+
+
+def test_the_logic_knows_no_slicer():
+    """CmfSimLib runs outside of Slicer; the widget imports cmfsim nowhere."""
+    for path in sorted((ROOT / "CmfSim").rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        names = {
+            name.split(".")[0]
+            for node in ast.walk(tree)
+            for name in (
+                [alias.name for alias in node.names]
+                if isinstance(node, ast.Import)
+                else [node.module or ""]
+                if isinstance(node, ast.ImportFrom)
+                else []
+            )
+        }
+        assert "cmfsim" not in names
+        if path.parent.name == "CmfSimLib":
+            assert not names & {"slicer", "qt", "ctk", "vtk"}, path
+
+
+def test_descriptions_agree():
+    """What the index of extensions reads is what CMake and the files have."""
+    cmake = (ROOT / "CMakeLists.txt").read_text(encoding="utf-8")
+    entry = json.loads((ROOT / "CmfSim.json").read_text(encoding="utf-8"))
+    settings = dict(re.findall(r'set\(EXTENSION_(\w+) "([^"]*)"\)', cmake))
+    assert entry["scm_url"].removesuffix(".git") == settings["HOMEPAGE"]
+    assert settings["DEPENDS"] == "NA"
+    assert entry["build_dependencies"] == []
+    assert entry["tier"] == 1
+    for name in re.findall(r"add_subdirectory\((\w+)\)", cmake):
+        listed = (ROOT / name / "CMakeLists.txt").read_text(encoding="utf-8")
+        assert f"NAME {name}" in listed or "NAME ${MODULE_NAME}" in listed
+        for file in re.findall(r"^  (CmfSimLib/\S+|Resources/\S+)$", listed, re.MULTILINE):
+            assert (ROOT / name / file.replace("${MODULE_NAME}", name)).is_file()
+    for key in ("ICONURL", "SCREENSHOTURLS"):
+        assert (ROOT / settings[key].partition("/slicer/")[2]).is_file()
