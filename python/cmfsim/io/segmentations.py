@@ -20,6 +20,8 @@ from cmfsim.values.finding import Finding
 __all__ = ["Segment", "Segmentation", "read_segmentation"]
 
 MAX_SEGMENTS = 200
+# Voxels of all layers, bytes in memory: those of a head CT in eight layers.
+MAX_VOXELS = 2**31
 LABEL_TYPES: Mapping[int, str] = {1: "u1", 2: "u2", 4: "u4"}
 # What Slicer states of each segment, one line each.
 ABOUT = re.compile(rb"^Segment(\d{1,4})_(Name|LabelValue|Layer):=([^\r\n]*)", re.MULTILINE)
@@ -79,7 +81,12 @@ def read_segmentation(path: Path) -> Segmentation:
         sizes = [1, *sizes]
     if len(sizes) != 4:
         raise ImageInputError(f"{path.name}: has {len(sizes)} axes: three, or four with layers")
-    check_shape(path.name, sizes[1:], sizes[0])
+    check_shape(path.name, sizes[1:])
+    if not 1 <= sizes[0] <= MAX_SEGMENTS or math.prod(sizes) > MAX_VOXELS:
+        raise ImageInputError(
+            f"{path.name}: has {sizes[0]} layers of {math.prod(sizes[1:])} voxels: at most "
+            f"{MAX_SEGMENTS} layers and {MAX_VOXELS} voxels are read"
+        )
     width = BYTES.get(fields.get("type", "").lower(), 0)
     if width not in LABEL_TYPES or fields["type"].lower() in {"float", "double"}:
         raise ImageInputError(f"{path.name}: type is {fields.get('type')!r}: labels are needed")
