@@ -93,6 +93,7 @@ from cmfsim.io import write_plan as write_plan
 from cmfsim.io import write_prediction as write_prediction
 from cmfsim.io import write_result as write_result
 from cmfsim.io import write_scene as write_scene
+from cmfsim.io import write_slicer_bundle as write_slicer_bundle
 from cmfsim.io import write_surface as write_surface
 from cmfsim.io import write_transform as write_transform
 from cmfsim.lips import LipSeam as LipSeam
@@ -135,6 +136,9 @@ from cmfsim.phantom.case_files import write_phantom_case as write_phantom_case
 from cmfsim.pipeline.building import build_case as build_case
 from cmfsim.pipeline.building import build_model as build_model
 from cmfsim.pipeline.building import with_muscles as with_muscles
+from cmfsim.pipeline.drafting import CaseDraft as CaseDraft
+from cmfsim.pipeline.drafting import Taken as Taken
+from cmfsim.pipeline.drafting import init_case as init_case
 from cmfsim.pipeline.evaluating import CaseEvaluation as CaseEvaluation
 from cmfsim.pipeline.evaluating import evaluate as evaluate
 from cmfsim.pipeline.predicting import predict as predict

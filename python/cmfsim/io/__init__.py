@@ -13,6 +13,7 @@ from cmfsim.io.plans import write_plan
 from cmfsim.io.predictions import read_parts, write_prediction
 from cmfsim.io.results import read_result, result_suffixes, write_result
 from cmfsim.io.scenes import read_plan, read_scene, write_scene
+from cmfsim.io.slicer_output import write_slicer_bundle
 from cmfsim.io.surfaces import read_moved_surface, read_surface, write_surface
 from cmfsim.io.transforms import read_transform, write_transform
 
@@ -45,6 +46,7 @@ __all__ = [
     "write_prediction",
     "write_result",
     "write_scene",
+    "write_slicer_bundle",
     "write_surface",
     "write_transform",
 ]

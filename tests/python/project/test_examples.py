@@ -23,6 +23,7 @@ MADE_BY_STAGES = {
     "Anatomy",
     "BoneSegment",
     "BoneSite",
+    "CaseDraft",
     "CaseEvaluation",
     "DistanceStatistics",
     "ErrorTable",
@@ -52,6 +53,7 @@ MADE_BY_STAGES = {
     "SensitivityReport",
     "SkinComparison",
     "StudyReport",
+    "Taken",
     "TissueMesh",
     "VolumeAlignment",
 }

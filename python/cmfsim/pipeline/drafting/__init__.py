@@ -51,6 +51,13 @@ def init_case(
     CaseError
         (also `ValueError`) A case file is there; nothing in the folder makes a case; several
         scenes; a scene that is damaged, or whose transforms are not rigid.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> draft = cmfsim.init_case("planning.mrb")  # doctest: +SKIP
+    >>> for taken in draft.taken:  # doctest: +SKIP
+    ...     print(taken.label, taken.taken_for, taken.why)
     """
     path = Path(path)
     if not path.exists():
