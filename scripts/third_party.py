@@ -71,6 +71,7 @@ PYTHON: Mapping[str, str] = {
     "starlette": "BSD-3-Clause",
     "uvicorn": "BSD-3-Clause",
     "playwright": "Apache-2.0",
+    "slicer-core": "Apache-2.0",
     "pytest": "MIT",
     "pytest-xdist": "MIT",
     "hypothesis": "MPL-2.0",
