@@ -90,7 +90,7 @@ def test_a_slicer_transform_is_inverted_and_stated_in_words(head):
         case.plan["mandible"].transform, direction=case.plan["mandible"].direction
     )
     assert np.abs(motion - FORWARDS).max() < 1e-12
-    text = text_of(head)
+    text = text_of(head).replace("\n# ", " ")
     assert "It moves the mandible 4.0 mm forwards, 1.0 mm up" in text
     assert "4.0 mm backwards, 1.0 mm down" in text
 

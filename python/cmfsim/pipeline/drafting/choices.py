@@ -107,7 +107,8 @@ def _check_values(images: Images, find: ImageFind) -> None:
 def _said(find: ImageFind) -> str:
     low, high = find.values
     modality = f"{find.modality}, " if find.modality else ""
-    return f"{modality}{find.words}, values {low:g} to {high:g}"
+    noticed = "".join(f"; {f.severity}: {f.what}" for f in find.findings if f.severity != "note")
+    return f"{modality}{find.words}, values {low:g} to {high:g}{noticed}"
 
 
 @dataclass

@@ -24,6 +24,8 @@ from cmfsim.values.surface_data import SurfaceData
 __all__ = ["CaseDraft", "draft_case"]
 
 SAME = 1e-9
+# Middles of the skins before and after that are farther apart are those of two scans, mm.
+APART = 20.0
 EXAMPLE = """# No plan was found. To move a segment, state how it moves, such as:
 # [plan.maxilla]
 # translation = [0, -5, 0]          # mm, LPS: -y is forwards
@@ -101,7 +103,7 @@ def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
     text.comment()
     for entry in taken:
         mark = "?" if entry.question or not entry.taken_for else entry.taken_for
-        text.comment(f"{entry.label}: {mark} ({entry.why})")
+        text.comment(f"{entry.label}: {mark} ({entry.why})", hang=4)
     text.lines += ["", 'format = "cmfsim-case"', "version = 1", f"name = {quoted(name)}"]
     achieved = not draft.plan.motions and _has_after(draft)
     if achieved:
@@ -354,6 +356,8 @@ def _write_plan(draft: _Draft) -> None:
     for procedure, name in needed.items():
         text.table("[osteotomies]")
         text.value("procedure", quoted(procedure), f"the plan moves {name}, which it cuts")
+        if draft.found.scene:
+            text.comment("It cuts by landmarks, and not where the scene's pieces were cut.")
     if not plan.motions:
         text.lines += ["", *EXAMPLE.splitlines()]
     for name, motion in plan.motions.items():
@@ -364,8 +368,8 @@ def _write_motion(text: Text, name: str, motion: DraftMotion) -> None:
     text.table(f"plan.{name}")
     if motion.words:
         text.comment(f"It {motion.words}.")
-    for line in motion.source:
-        text.comment(line)
+    if motion.source:
+        text.comment(" ".join(motion.source))
     if motion.question:
         key, value = ("transform", motion.transform) if motion.transform else ("matrix", '"?"')
         text.ask(key, motion.question, motion.choices, value)
@@ -385,6 +389,22 @@ def _write_muscles(draft: _Draft) -> None:
     text.table("muscles", "the package's own template, carried over by the skull landmarks")
 
 
+def _write_aligned(draft: _Draft) -> None:
+    """Whether what is after the operation lies where the head was, by the middles of the skins."""
+    before, after = draft.anatomy.skin, draft.anatomy.after_skin
+    if before is None or after is None or draft.anatomy.asks("units") is not None:
+        draft.text.value("aligned", "true", "it lies where the head was before: if not, false")
+        return
+    middles = [
+        0.5 * (points.min(axis=0) + points.max(axis=0))
+        for points in (draft.anatomy.placed(find) for find in (before, after))
+    ]
+    away = float(np.linalg.norm(middles[1] - middles[0]))
+    aligned = away < APART
+    why = f"the middles of the skins before and after are {away:.0f} mm apart"
+    draft.text.value("aligned", "true" if aligned else "false", why)
+
+
 def _write_after(draft: _Draft) -> None:
     text, anatomy, images = draft.text, draft.anatomy, draft.images
     if anatomy.after_skin is None and not anatomy.after_bones and images.after is None:
@@ -396,7 +416,7 @@ def _write_after(draft: _Draft) -> None:
         text.value("skin", quoted(draft.found.shown(anatomy.after_skin.path)))
     if draft.marks.after is not None:
         text.value("landmarks", quoted(draft.found.shown(draft.marks.after.path)))
-    text.value("aligned", "true", "it lies in the frame of the data before: if not, write false")
+    _write_aligned(draft)
     if anatomy.after_bones and (images.after is None or anatomy.after_skin is not None):
         text.table("postoperative.bones")
         for name, find in anatomy.after_bones.items():

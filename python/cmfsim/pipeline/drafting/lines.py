@@ -1,7 +1,8 @@
 """Lines of a case file with their reasons, and questions where nobody but a person can decide."""
 
 import json
-from collections.abc import Iterable, Sequence
+import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 __all__ = ["Taken", "Text", "clean", "quoted"]
@@ -71,9 +72,16 @@ class Text:
     questions: list[str] = field(default_factory=list)
     _table: str = ""
 
-    def comment(self, text: str = "") -> None:
-        """A line that is a comment."""
-        self.lines.append(f"# {clean(text)}".rstrip())
+    def comment(self, text: str = "", hang: int = 0) -> None:
+        """A comment, wrapped; lines after the first begin farther right by `hang`."""
+        lines = textwrap.wrap(
+            clean(text),
+            WIDTH - 2,
+            subsequent_indent=" " * hang,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        self.lines += [f"# {line}".rstrip() for line in lines or [""]]
 
     def table(self, name: str, why: str = "") -> None:
         """The head of a table."""
@@ -81,7 +89,7 @@ class Text:
         head = f"[{name}]"
         self.lines += ["", f"{head}  # {clean(why)}" if why else head]
 
-    def value(self, key: str, value: str, why: str = "", more: Iterable[str] = ()) -> None:
+    def value(self, key: str, value: str, why: str = "") -> None:
         """A key with its value in TOML, and the reason for it."""
         line = f"{key} = {value}"
         reason = clean(why)
@@ -89,8 +97,6 @@ class Text:
             self.comment(reason)
             reason = ""
         self.lines.append(f"{line}  # {reason}" if reason else line)
-        for entry in more:
-            self.comment(f" {entry}")
 
     def ask(self, key: str, question: str, choices: Sequence[str], value: str = '"?"') -> None:
         """A key that a person decides: `doctor` refuses the file and repeats question and choices.

@@ -11,7 +11,7 @@ from cmfsim.errors import CmfsimError
 from cmfsim.io.transforms import is_itk_file, motion_in_lps, read_transform_file
 from cmfsim.pipeline.drafting.finds import OtherFind, SurfaceFind, TransformFind
 from cmfsim.pipeline.drafting.lines import Taken, quoted
-from cmfsim.pipeline.drafting.roles import MOVING
+from cmfsim.pipeline.drafting.roles import MOVING, safe_key
 from cmfsim.pipeline.drafting.scene_finds import LooseMotion
 from cmfsim.pipeline.drafting.surfaces import Anatomy
 from cmfsim.values.clinical_motion import clinical_motion
@@ -100,7 +100,10 @@ def scene_motions(
         Whether the case is in the coordinates of its image, rather than in those of the world.
     """
     back = np.linalg.inv(reference)
-    for name, find in moved.items():
+    asked = _asked(plan.anatomy)
+    # A piece that has a segment's name moves by it, wherever its surface comes from.
+    known = {n: finds[0] for n, finds in asked.items() if n in MOVING and len(finds) == 1}
+    for name, find in {**moved, **known}.items():
         matrix = back @ find.to_world if in_image else find.to_world @ back
         if np.abs(matrix - np.eye(4)).max() <= NOTHING:
             continue
@@ -116,8 +119,45 @@ def scene_motions(
         plan.taken.append(
             Taken(", ".join(find.chain) or find.label, f"motion of {name}", why, "mm", "LPS")
         )
+    for name, finds in asked.items():
+        if name not in known:
+            motions = [back @ f.to_world if in_image else f.to_world @ back for f in finds]
+            _ask_whose(plan, name, finds, motions)
     for motion in loose:
         _add_loose(plan, motion)
+
+
+def _asked(anatomy: Anatomy) -> dict[str, list[SurfaceFind]]:
+    """The surfaces about which there are questions, by the bone's name."""
+    found: dict[str, list[SurfaceFind]] = {}
+    for question in anatomy.questions:
+        part, _, name = question.key.partition(".")
+        finds = [find for find, _ in question.choices if find is not None]
+        if part == "bones" and finds:
+            found[name] = finds
+    return found
+
+
+def _ask_whose(
+    plan: Plan, name: str, finds: Sequence[SurfaceFind], motions: Sequence[Floats]
+) -> None:
+    """Asks about the motion of a bone of which it is not clear which surface, or bone, it is."""
+    moved = [
+        (find, matrix)
+        for find, matrix in zip(finds, motions, strict=True)
+        if np.abs(matrix - np.eye(4)).max() > NOTHING
+    ]
+    if not moved:
+        return
+    choices = [f"{find.label} {plan.words(name, matrix)}" for find, matrix in moved]
+    if len(moved) == 1:
+        choices.append("if it is: write the matrix below, under the name of the bone")
+    question = f"is this the motion of {name}? See [surfaces.bones]"
+    plan.motions[name] = DraftMotion(
+        "", (), moved[0][1] if len(moved) == 1 else None, "", question, tuple(choices)
+    )
+    label = ", ".join(dict.fromkeys(link for find, _ in moved for link in find.chain))
+    plan.taken.append(Taken(label, f"motion of {name}", question, "mm", "LPS", question=True))
 
 
 def _unusual(name: str, find: SurfaceFind, words: str) -> tuple[str, tuple[str, ...]]:
@@ -168,11 +208,11 @@ def file_motions(plan: Plan, found: Sequence[TransformFind], *, by_slicer: bool)
         part = find.role.part
         if part in MOVING and not find.role.registers:
             by_part.setdefault(part, []).append(find)
+        elif find.role.registers:
+            why = "its name says a registration, not a plan"
+            plan.taken.append(Taken(find.label, "not used", why))
         else:
-            why = "its name says no segment" if not find.role.registers else "a registration"
-            plan.taken.append(
-                Taken(find.label, "not used", f"{why}: name it in the plan if it is one")
-            )
+            _ask_segment(plan, find)
     for name, finds in by_part.items():
         if len(finds) > 1:
             _ask_which(plan, name, finds)
@@ -189,6 +229,18 @@ def file_motions(plan: Plan, found: Sequence[TransformFind], *, by_slicer: bool)
         asked = bool(motion.question)
         why = motion.question or f"{motion.source[0]}: {motion.words}"
         plan.taken.append(Taken(find.label, f"motion of {name}", why, "mm", "", question=asked))
+
+
+def _ask_segment(plan: Plan, find: TransformFind) -> None:
+    """Asks what a transform moves whose name does not say it."""
+    text = f"{find.label}: its name says no segment. Which one does it move?"
+    choices = (
+        f"{quoted(find.label)}, and rename this table to [plan.NAME] of one of",
+        f"{', '.join(MOVING)}; or remove the table",
+    )
+    name = safe_key(find.label.rpartition("/")[2].partition(".")[0])
+    plan.motions[name] = DraftMotion("", (), None, '"?"', text, choices)
+    plan.taken.append(Taken(find.label, "", text, question=True))
 
 
 def _ask_which(plan: Plan, name: str, finds: Sequence[TransformFind]) -> None:

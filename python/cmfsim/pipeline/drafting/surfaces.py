@@ -383,11 +383,11 @@ def _report(anatomy: Anatomy) -> None:
         if find is None or find.label in done:
             continue
         frame = find.stated or anatomy.frame or "LPS"
-        why = f"its name says {find.role.word!r}; {_shape(find)}"
+        unit = "" if anatomy.asks("units") else anatomy.units
+        why = f"its name says {find.role.word!r}; {_shape(find, unit)}"
         if find.role.part == "bone":
             why += "; a jaw that is part of it cannot move by itself"
         asked = anatomy.asks("frame") is not None and find.stated is None
-        unit = "" if anatomy.asks("units") else anatomy.units
         anatomy.taken.append(Taken(find.label, part, why, unit, "" if asked else frame))
     after = {"skin": anatomy.after_skin, **anatomy.after_bones}
     for part, find in after.items():
@@ -398,10 +398,11 @@ def _report(anatomy: Anatomy) -> None:
             )
 
 
-def _shape(find: SurfaceFind) -> str:
+def _shape(find: SurfaceFind, unit: str = "") -> str:
     size = " × ".join(f"{length:.3g}" for length in find.extent)
     closed = "closed" if find.is_closed else "open"
-    return f"{size} in its own unit, {len(np.asarray(find.surface.triangles))} triangles, {closed}"
+    count = len(np.asarray(find.surface.triangles))
+    return f"{size} {unit or 'in its own unit'}, {count} triangles, {closed}"
 
 
 def _said(find: SurfaceFind) -> str:
