@@ -13,6 +13,8 @@ import os
 import re
 import shutil
 import struct
+import tempfile
+import zipfile
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,6 +27,9 @@ import cmfsim
 import oracles
 from cmfsim.io.curves import read_curves, write_curves
 from cmfsim.io.meshes import read_mesh
+from cmfsim.io.segmentations import read_segmentation
+from cmfsim.io.slicer_bundles import unpack_bundle
+from cmfsim.io.slicer_scenes import read_slicer_scene
 from cmfsim.io.vtk import write_tets
 
 __all__ = ["READERS", "Reader", "changed_in_silence", "plain"]
@@ -414,6 +419,55 @@ def _markups(kind: str) -> Callable[[Path, int], bool]:
         return True
 
     return make
+
+
+SLICER_SCENE = """<?xml version="1.0" encoding="UTF-8"?>
+<MRML version="Slicer5">
+ <Model id="m" name="Mandible" references="storage:s;transform:t;"></Model>
+ <ModelStorage id="s" fileName="Data/it.stl" coordinateSystem="LPS"></ModelStorage>
+ <LinearTransform id="t" name="Move" references="transform:h;"
+  matrixTransformToParent="1 0 0 1  0 0.8 -0.6 4  0 0.6 0.8 1  0 0 0 1"></LinearTransform>
+ <LinearTransform id="h" name="Head" matrixTransformToParent="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"/>
+</MRML>
+"""
+
+
+def _slicer_nodes(path: Path) -> Any:
+    """The nodes of a scene and where each lies; files that are not there are stated."""
+    scene = read_slicer_scene(path)
+    return [(node.kind, node.id, node.name, scene.to_world(node)) for node in scene.nodes.values()]
+
+
+def _slicer_bundle(folder: Path, number: int) -> bool:
+    if number:
+        return False
+    with zipfile.ZipFile(folder / "it.mrb", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("it/it.mrml", SLICER_SCENE)
+        archive.writestr("it/Data/it.stl", b"x" * 500)
+    return True
+
+
+def _read_bundle(path: Path) -> Any:
+    with tempfile.TemporaryDirectory() as folder:
+        return _slicer_nodes(unpack_bundle(path, Path(folder)))
+
+
+def _segments() -> bytes:
+    labels = np.zeros((2, 6, 5, 4), np.uint8)
+    labels[:, 2:4, 2:4, 1:3] = 1
+    head = (
+        "NRRD0004\ntype: unsigned char\ndimension: 4\nspace: left-posterior-superior\n"
+        "sizes: 2 6 5 4\nspace directions: none (2,0,0) (0,1,0) (0,0,3)\n"
+        "kinds: list domain domain domain\nendian: little\nencoding: gzip\n"
+        "space origin: (10,-20,30)\nSegment0_Name:=Mandible\nSegment0_LabelValue:=1\n"
+        "Segment0_Layer:=0\nSegment1_Name:=Skin\nSegment1_LabelValue:=1\nSegment1_Layer:=1\n\n"
+    )
+    return head.encode() + gzip.compress(labels.tobytes(order="F"), mtime=0)
+
+
+def _read_segments(path: Path) -> Any:
+    found = read_segmentation(path)
+    return [(s.name, found.affine, found.mask(s)) for s in found.segments]
 
 
 def _fcsv() -> bytes:
@@ -961,6 +1015,11 @@ READERS: tuple[Reader, ...] = (
     Reader("transform .tfm", "it.tfm", _transform(".tfm"), _read_transform),
     Reader("transform .txt", "it.txt", _transform(".txt"), _read_transform),
     Reader("transform .h5", "it.h5", _h5, _read_transform),
+    Reader("Slicer scene .mrml", "it.mrml", _texts("it.mrml", SLICER_SCENE.encode), _slicer_nodes),
+    Reader("Slicer bundle .mrb", "it.mrb", _slicer_bundle, _read_bundle, inside=True),
+    Reader(
+        "segmentation .seg.nrrd", "it.seg.nrrd", _texts("it.seg.nrrd", _segments), _read_segments
+    ),
     Reader("case.toml", "case.toml", _texts("case.toml", CASE.encode), cmfsim.Case.load),
     Reader("cohort.toml", "cohort.toml", _texts("cohort.toml", COHORT.encode), cmfsim.Cohort.load),
     Reader("scene .npz", "it.npz", _scene_npz, _read_scene, inside=True, sealed=True),

@@ -25,6 +25,7 @@ MAX_VOXELS = 2**31
 LABEL_TYPES: Mapping[int, str] = {1: "u1", 2: "u2", 4: "u4"}
 # What Slicer states of each segment, one line each.
 ABOUT = re.compile(rb"^Segment(\d{1,4})_(Name|LabelValue|Layer):=([^\r\n]*)", re.MULTILINE)
+LAYER = re.compile(r"[0-9]{1,4}", re.ASCII)
 # zlib's number for a gzip stream.
 GZIP = 31
 
@@ -113,14 +114,25 @@ def _voxels(path: Path, fields: Mapping[str, str], begin: int, needed: int) -> b
         file.seek(begin)
         raw = file.read()
     if packing != "raw":
-        try:
-            raw = zlib.decompressobj(GZIP).decompress(raw, needed + 1)
-        except zlib.error as error:
-            raise ImageInputError(f"{path.name}: is damaged ({error}): copy it again") from error
+        raw = _unpacked(path, raw, needed)
     if len(raw) != needed:
         what = "is cut short" if len(raw) < needed else "is longer than its header states"
         raise ImageInputError(f"{path.name}: {what}: {len(raw)} of {needed} bytes of voxels")
     return raw
+
+
+def _unpacked(path: Path, raw: bytes, needed: int) -> bytes:
+    """The voxels of a gzip stream, whose checksum stands at its end."""
+    unpacker = zlib.decompressobj(GZIP)
+    try:
+        voxels = unpacker.decompress(raw, needed + 1)
+        if len(voxels) == needed and not unpacker.eof:
+            voxels += unpacker.decompress(unpacker.unconsumed_tail, 1)
+    except zlib.error as error:
+        raise ImageInputError(f"{path.name}: is damaged ({error}): copy it again") from error
+    if len(voxels) == needed and not unpacker.eof:
+        raise ImageInputError(f"{path.name}: is cut short: its packed voxels do not end")
+    return voxels
 
 
 def _segments(path: Path, head: bytes, labels: NDArray[Any]) -> tuple[Segment, ...]:
@@ -138,7 +150,8 @@ def _segments(path: Path, head: bytes, labels: NDArray[Any]) -> tuple[Segment, .
     found = []
     for number, said in sorted(about.items()):
         label = whole(path, f"Segment{number}_LabelValue", said.get(b"LabelValue", str(number + 1)))
-        layer = int(said.get(b"Layer", "0")) if said.get(b"Layer", "0").isdigit() else -1
+        text = said.get(b"Layer", "0")
+        layer = int(text) if LAYER.fullmatch(text) else -1
         if not 0 <= layer < len(labels):
             raise ImageInputError(
                 f"{path.name}: Segment{number}_Layer is {said.get(b'Layer')!r}: there are "

@@ -4,8 +4,7 @@ import re
 import shutil
 import stat
 import zipfile
-import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 from cmfsim.errors import CaseInputError
@@ -22,6 +21,8 @@ CHUNK = 2**20
 ENCRYPTED = 0x1
 DRIVE = re.compile(r"^[A-Za-z]:")
 MAX_PATH = 500
+# Bytes of a name that every system takes.
+MAX_NAME = 200
 
 
 def unpack_bundle(path: Path, folder: Path) -> Path:
@@ -45,12 +46,14 @@ def unpack_bundle(path: Path, folder: Path) -> Path:
     check_readable(path)
     with named(path):
         try:
-            with zipfile.ZipFile(path) as archive:
-                scenes = _unpack(archive, path.stat().st_size, folder)
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
+            archive = zipfile.ZipFile(path)
+        # Damaged archives raise whatever zipfile, zlib and struct raise.
+        except Exception as error:
             raise CaseInputError(
                 f"is no bundle of 3D Slicer, or is damaged ({error}): save it again"
             ) from error
+        with archive:
+            scenes = _unpack(archive, path.stat().st_size, folder)
         if len(scenes) != 1:
             raise CaseInputError(f"holds {len(scenes)} scenes (.mrml): one is needed")
         return scenes[0]
@@ -77,21 +80,37 @@ def _unpack(archive: zipfile.ZipFile, packed: int, folder: Path) -> list[Path]:
             target.mkdir(parents=True, exist_ok=True)
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
-        with archive.open(member) as source, target.open("xb") as file:
-            shutil.copyfileobj(source, file, CHUNK)
+        with target.open("xb") as file:
+            for block in _blocks(archive, member):
+                file.write(block)
         if target.suffix.lower() == ".mrml":
             scenes.append(target)
     return scenes
 
 
+def _blocks(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Iterator[bytes]:
+    """The content of a member, no more than its header states."""
+    try:
+        # zipfile reads no more than the header states, and compares the checksum.
+        with archive.open(member) as source:
+            while block := source.read(CHUNK):
+                yield block
+    except Exception as error:
+        raise CaseInputError(
+            f"{member.filename[:80]!r} in it is damaged ({error}): save the bundle again"
+        ) from error
+
+
 def _check_names(members: Sequence[zipfile.ZipInfo]) -> None:
     seen: set[str] = set()
+    files: set[str] = set()
     for member in members:
         name = member.filename
         shown = name[:80]
         place = PurePosixPath(name)
         leads_out = place.is_absolute() or ".." in place.parts or DRIVE.match(name)
-        if leads_out or any(c in name for c in "\\\0") or len(name) > MAX_PATH:
+        too_long = len(name) > MAX_PATH or any(len(p.encode()) > MAX_NAME for p in place.parts)
+        if leads_out or not place.parts or too_long or any(c in name for c in "\\\0"):
             raise CaseInputError(f"names the file {shown!r}, which would lie outside: not unpacked")
         if stat.S_ISLNK(member.external_attr >> 16):
             raise CaseInputError(f"holds the link {shown!r}: links are not unpacked")
@@ -101,3 +120,9 @@ def _check_names(members: Sequence[zipfile.ZipInfo]) -> None:
         if key in seen:
             raise CaseInputError(f"holds {shown!r} twice")
         seen.add(key)
+        if not name.endswith("/"):
+            files.add(key)
+    for key in seen:
+        above = next((str(p) for p in PurePosixPath(key).parents if str(p) in files), None)
+        if above is not None:
+            raise CaseInputError(f"holds {above[:80]!r} as a file and as a folder")

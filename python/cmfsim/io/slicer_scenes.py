@@ -17,7 +17,7 @@ import numpy as np
 
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io.files import check_readable, is_below, named
+from cmfsim.io.files import check_readable, is_below, is_there, named
 from cmfsim.io.transforms import motion_in_lps, read_transform_file
 from cmfsim.values.motion import rigid_matrix
 
@@ -235,9 +235,11 @@ def _file(name: str, folder: Path) -> tuple[Path | None, str]:
             f"{shown}: lies outside the folder of the scene, and is not opened: save the scene as "
             "an .mrb, or copy the file to the scene's folder and save the scene there"
         )
-    if not path.is_file():
-        return path, f"{shown}: the scene names this file, and it is not there"
-    return path, ""
+    try:
+        is_file = is_there(path) and path.is_file()
+    except CaseInputError as error:
+        return path, str(error)
+    return path, "" if is_file else f"{shown}: the scene names this file, and it is not there"
 
 
 def _elements(text: bytes) -> list[tuple[str, dict[str, str]]]:
