@@ -109,6 +109,8 @@ def make(folder):
         ending = entry["ending"]
         kind = "Json" if ending == "mrk.json" else "Fiducial"
         store(scene, node, f"vtkMRMLMarkups{kind}StorageNode", data / f"{entry['file']}.{ending}")
+    if "segments" in asked:
+        add_segments(scene, asked["segments"], data / "Segmentation.seg.nrrd")
     scene.SetRootDirectory(str(folder))
     scene.SetURL(str(folder / "scene.mrml"))
     scene.Commit()
@@ -123,6 +125,27 @@ def make(folder):
     shutil.rmtree(bundle.parent)
     # As Slicer reads it again: files of single precision hold other numbers than its memory.
     look(folder / "scene.mrml", folder / "shown.npz")
+
+
+def add_segments(scene, segments, path):
+    """A segmentation of ellipsoids on one grid of left-handed axes, as Slicer writes it."""
+    node = scene.AddNewNodeByClass("vtkMRMLSegmentationNode", "Segmentation")
+    for entry in segments:
+        steps = np.array([-entry["step"], -entry["step"], entry["step"]])
+        first = np.array(entry["first"]) * FLIP
+        places = np.indices(entry["size"]).reshape(3, -1).T * steps + first
+        ratio = (places - np.array(entry["centre"]) * FLIP) / entry["axes"]
+        inside = ((ratio**2).sum(axis=1) < 1.0).reshape(entry["size"])
+        image = slicer.vtkOrientedImageData()
+        image.SetDimensions(*entry["size"])
+        values = numpy_to_vtk(inside.astype(np.uint8).ravel(order="F"), deep=True)
+        image.GetPointData().SetScalars(values)
+        rows = np.eye(4)
+        rows[:3, :3], rows[:3, 3] = np.diag(steps), first
+        image.SetGeometryFromImageToWorldMatrix(matrix_of(rows))
+        if not node.AddSegmentFromBinaryLabelmapRepresentation(image, entry["name"], [1, 0, 0]):
+            raise SystemExit(f"Slicer takes no segment {entry['name']}")
+    store(scene, node, "vtkMRMLSegmentationStorageNode", path)
 
 
 def shown(scene):

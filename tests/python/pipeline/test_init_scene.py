@@ -131,6 +131,28 @@ def test_of_two_models_of_a_part_the_one_that_moves_is_taken(tmp_path):
     assert left.taken_for == "not used"
 
 
+def test_a_scene_with_a_ct_and_a_moved_piece_has_the_plan_of_the_piece(tmp_path):
+    """Without a skin the CT is the head; cuts are cmfsim's, which the case says."""
+    pytest.importorskip("SimpleITK")
+    values = np.full((30, 40, 50), -1000, dtype=np.int16)
+    values[5:25, 5:35, 5:45] = 40
+    cmfsim.write_image(
+        cmfsim.ImageData(values, (5.0, 5.0, 5.0), (-77.0, -200.0, 1380.0)), tmp_path / "ct.nrrd"
+    )
+    volume = (
+        '<VolumeArchetypeStorage id="sv" fileName="ct.nrrd"/>'
+        '<Volume id="v" name="CT" references="storage:sv;"/>'
+    )
+    write_scene(tmp_path, volume, FORWARDS, model("Maxilla", "mandible.ply", "Move"))
+    draft = init_case(tmp_path)
+    assert not draft.questions
+    case = cmfsim.Case.load(tmp_path)
+    assert case.image.file.name == "ct.nrrd"
+    assert [cut.procedure for cut in case.osteotomies] == ["le_fort_1"]
+    assert np.array_equal(plan_of(tmp_path, "maxilla")[:3, 3], [0.0, -4.0, 1.0])
+    assert "not where the scene's pieces were cut" in text_of(tmp_path)
+
+
 def test_two_scenes_are_an_error_that_names_both(tmp_path):
     write_scene(tmp_path, *HEAD)
     (tmp_path / "other.mrml").write_text("<MRML></MRML>", encoding="utf-8")

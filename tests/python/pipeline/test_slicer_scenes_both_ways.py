@@ -25,6 +25,8 @@ POSTURE = cmfsim.rigid_motion((3.0, -2.0, 5.0), angle=4.0, axis=(1, 0.2, 0), cen
 # The mandible: 4 mm forwards and 1 mm up in RAS, with a turn about a point of its own.
 FORWARDS = cmfsim.rigid_motion((0.0, 4.0, 1.0), angle=3.0, axis=(1, 0, 0.1), centre=(-3, 128, 1445))
 WITHIN = 1e-6
+# Of the grid of the segmentation, mm.
+STEP = 3.0
 # Surfaces' ending and frame, and transforms' ending.
 FORMATS = (
     ("vtk", "RAS", "tfm"),
@@ -94,6 +96,18 @@ def scenes(tmp_path_factory):
     asked = {"nested": scene_of()}
     for ending, space, transform in FORMATS:
         asked[ending] = scene_of(posture=False, ending=ending, space=space, transform=transform)
+    first, size = [-81.0, -204.0, 1372.0], [56, 70, 86]
+    asked["segments"] = {
+        "surfaces": {},
+        "transforms": [],
+        "models": [],
+        "markups": [],
+        "segments": [
+            {"name": name.title(), "centre": centre, "axes": axes, "first": first, "size": size}
+            | {"step": STEP}
+            for name, (centre, axes) in head_case.ELLIPSOIDS.items()
+        ],
+    }
     folders = {name: tmp_path_factory.mktemp(name) for name in asked}
     shown = in_slicer.make_scenes({folders[name]: scene for name, scene in asked.items()})
     return {name: (folder, shown[folder]) for name, folder in folders.items()}
@@ -199,6 +213,20 @@ def test_a_bundle_gives_the_case_of_its_scene(nested, tmp_path):
     plan = np.asarray(case.plan["mandible"].matrix)
     mandible = np.asarray(cmfsim.read_surface(case.surfaces.bones["mandible"]).vertices)
     assert farthest(mandible @ plan[:3, :3].T + plan[:3, 3], shown["Mandible.points"]) < WITHIN
+
+
+def test_segments_lie_where_slicer_has_them(scenes):
+    """Skin and bones of one segmentation, in layers, half a voxel and its smoothing apart."""
+    folder, _ = scenes["segments"]
+    draft = init_case(folder / "scene.mrml")
+    assert not draft.questions
+    case = cmfsim.Case.load(folder)
+    found = {"skin": case.surfaces.skin, **case.surfaces.bones}
+    for name, (centre, axes) in head_case.ELLIPSOIDS.items():
+        vertices = np.asarray(cmfsim.read_surface(found[name]).vertices)
+        middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+        assert np.abs(middle - centre).max() < 0.5 * STEP, name
+        assert np.abs(np.ptp(vertices, axis=0) / 2.0 - axes).max() < STEP, name
 
 
 def test_init_prints_what_it_found_as_json(nested, tmp_path, capsys):
