@@ -22,7 +22,7 @@ DOCS_STAMP := $(VENV)/.cmfsim-docs
 DEVELOP := VIRTUAL_ENV="$(VENV_PATH)" "$(BIN)/maturin" develop --release $(CARGO_FLAGS)
 RUST_SOURCES := Cargo.toml Cargo.lock \
   $(shell find crates -name '*.rs' -o -name 'Cargo.toml' -o -name '*.[ch]')
-PYTHON_DIRS := python tests/python scripts examples benches fuzz
+PYTHON_DIRS := python tests/python scripts examples benches fuzz slicer
 CORE_FEATURES := --features mtm-core/metis
 
 .DEFAULT_GOAL := help

@@ -13,14 +13,15 @@ import ctk
 import qt
 import slicer
 import vtk
-from CmfSimLib.case_folder import BONES, MODELS, Choice, ChoiceError, Segment, face_of, write_case
-from CmfSimLib.running import Run, command, words_of
 from slicer.ScriptedLoadableModule import (
     ScriptedLoadableModule,
     ScriptedLoadableModuleLogic,
     ScriptedLoadableModuleTest,
     ScriptedLoadableModuleWidget,
 )
+
+from CmfSimLib.case_folder import BONES, MODELS, Choice, ChoiceError, Segment, face_of, write_case
+from CmfSimLib.running import Run, command, words_of
 
 ACTIVE = "displacement_length_mm"
 COLOURS = "vtkMRMLColorTableNodeFileViridis.txt"

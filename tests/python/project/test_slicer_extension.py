@@ -1,6 +1,7 @@
 """The extension for 3D Slicer: its logic without Slicer, its descriptions, a run of its own."""
 
 import ast
+import importlib
 import json
 import re
 import subprocess
@@ -8,6 +9,8 @@ import sys
 import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -191,6 +194,78 @@ def test_the_logic_knows_no_slicer():
         assert "cmfsim" not in names
         if path.parent.name == "CmfSimLib":
             assert not names & {"slicer", "qt", "ctk", "vtk"}, path
+
+
+class _Widget:
+    """In the place of Slicer's own class of panels."""
+
+    def setup(self):
+        self.layout = MagicMock()
+
+
+@pytest.fixture
+def panel(monkeypatch, tmp_path):
+    """The panel's own code with stand-ins for Slicer, Qt and CTK, and nothing chosen in it."""
+    stand_in = MagicMock()
+    stand_in.app.temporaryPath = str(tmp_path)
+    classes = SimpleNamespace(
+        ScriptedLoadableModule=object,
+        ScriptedLoadableModuleLogic=object,
+        ScriptedLoadableModuleTest=object,
+        ScriptedLoadableModuleWidget=_Widget,
+    )
+    modules = {
+        "slicer": stand_in,
+        "slicer.ScriptedLoadableModule": classes,
+        "slicer.packaging": stand_in.packaging,
+        "qt": MagicMock(),
+        "ctk": MagicMock(),
+        "vtk": MagicMock(),
+    }
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.delitem(sys.modules, "CmfSim", raising=False)
+    widget = importlib.import_module("CmfSim").CmfSimWidget()
+    widget.setup()
+    widget.table.rowCount = 0
+    for chooser in ("volume", "skin", "skull", "marks"):
+        setattr(widget, chooser, MagicMock())
+        getattr(widget, chooser).currentNode.return_value = None
+    widget.model.currentText, widget.edge.value = "H", 6.0
+    yield widget, stand_in
+    sys.modules.pop("CmfSim", None)
+
+
+def test_the_panel_refuses_an_empty_choice_and_starts_nothing(panel):
+    widget, slicer = panel
+    widget.onAddBone()
+    widget.onButton()
+    text = slicer.util.errorDisplay.call_args[0][0]
+    assert "Choose a CT volume" in text
+    assert widget.run is None
+    slicer.packaging.pip_ensure.assert_called_once()
+
+
+def test_the_panel_shows_progress_and_then_the_face(panel, monkeypatch):
+    """The timer's turns with a run that ends: bar, face, colours."""
+    widget, slicer = panel
+    run = MagicMock(code=None)
+    run.poll.return_value = [running.Line("solving H", 0.65)]
+    widget.run, widget.case = run, Path("case.toml")
+    widget.onTimer()
+    assert widget.bar.value == 65
+    assert widget.run is run
+    run.code = 0
+    shown = MagicMock()
+    monkeypatch.setattr(widget.logic, "showFace", shown)
+    widget.onTimer()
+    assert widget.run is None
+    run.close.assert_called_once()
+    assert shown.call_args[0][0] == Path("out/prediction.mrb")
+    run.code, widget.run = 2, run
+    run.answer.return_value = {"error": {"kind": "CaseError", "text": "no bone"}}
+    widget.onTimer()
+    assert slicer.util.errorDisplay.call_args[0][0] == "no bone"
 
 
 def test_descriptions_agree():
