@@ -223,6 +223,26 @@ def test_faces_after_the_operation_go_to_their_own_table(head):
     assert set(case.postoperative.bones) == {"mandible"}
 
 
+def test_faces_after_in_the_other_frame_are_noticed_by_their_place(head):
+    """A skin in RAS lies 200 mm away, unless its frame is stated."""
+    skin = cmfsim.read_surface(head / "skin.ply")
+    turned = np.asarray(skin.vertices) * [-1.0, -1.0, 1.0]
+    vtp_without_frame(head, "skin_postop", cmfsim.SurfaceData(turned, skin.triangles))
+    init_case(head)
+    after = cmfsim.Case.load(head).postoperative
+    assert after.frame == "RAS"
+    assert after.aligned
+    assert "0 mm apart" in text_of(head)
+
+
+def test_a_face_of_another_scan_is_not_aligned(head):
+    skin = cmfsim.read_surface(head / "skin.ply")
+    moved = np.asarray(skin.vertices) + [0.0, 60.0, 0.0]
+    cmfsim.write_surface(head / "skin_postop.ply", cmfsim.SurfaceData(moved, skin.triangles))
+    init_case(head)
+    assert not cmfsim.Case.load(head).postoperative.aligned
+
+
 def test_a_ct_is_taken_before_its_surfaces_which_stay_as_a_comment(head):
     image(head / "ct.nrrd", -1000.0)
     init_case(head)

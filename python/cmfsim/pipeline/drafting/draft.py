@@ -389,20 +389,37 @@ def _write_muscles(draft: _Draft) -> None:
     text.table("muscles", "the package's own template, carried over by the skull landmarks")
 
 
-def _write_aligned(draft: _Draft) -> None:
-    """Whether what is after the operation lies where the head was, by the middles of the skins."""
-    before, after = draft.anatomy.skin, draft.anatomy.after_skin
-    if before is None or after is None or draft.anatomy.asks("units") is not None:
-        draft.text.value("aligned", "true", "it lies where the head was before: if not, false")
+def _write_place_after(draft: _Draft) -> None:
+    """Unit and frame of surfaces after the operation, and whether they lie where the head was."""
+    text, anatomy = draft.text, draft.anatomy
+    silent = [find for find in anatomy.after if find.stated is None]
+    if (asked := anatomy.asks("units")) is not None and anatomy.after:
+        text.ask("units", asked.text, _choices(draft, asked))
+    frame = anatomy.frame
+    if silent and (asked := anatomy.asks("frame")) is not None:
+        text.ask("frame", asked.text, _choices(draft, asked))
+    elif silent and _distance_after(draft, frame or "LPS") >= APART:
+        other = "LPS" if frame == "RAS" else "RAS"
+        frame = other if _distance_after(draft, other) < APART else frame
+    if silent and anatomy.asks("frame") is None and frame is not None:
+        text.value("frame", quoted(frame), "so that they lie where the skin before lies")
+    away = _distance_after(draft, frame or "LPS")
+    if not np.isfinite(away):
+        text.value("aligned", "true", "it lies where the head was before: if not, write false")
         return
-    middles = [
-        0.5 * (points.min(axis=0) + points.max(axis=0))
-        for points in (draft.anatomy.placed(find) for find in (before, after))
-    ]
-    away = float(np.linalg.norm(middles[1] - middles[0]))
-    aligned = away < APART
     why = f"the middles of the skins before and after are {away:.0f} mm apart"
-    draft.text.value("aligned", "true" if aligned else "false", why)
+    text.value("aligned", "true" if away < APART else "false", why)
+
+
+def _distance_after(draft: _Draft, frame: str) -> float:
+    """How far the middles of the skins before and after are apart, mm; infinite if not known."""
+    anatomy = draft.anatomy
+    if anatomy.skin is None or anatomy.after_skin is None or anatomy.asks("units") is not None:
+        return float("inf")
+    before = anatomy.placed(anatomy.skin)
+    after = replace(anatomy, frame=frame).placed(anatomy.after_skin)
+    middles = [0.5 * (points.min(axis=0) + points.max(axis=0)) for points in (before, after)]
+    return float(np.linalg.norm(middles[1] - middles[0]))
 
 
 def _write_after(draft: _Draft) -> None:
@@ -416,7 +433,7 @@ def _write_after(draft: _Draft) -> None:
         text.value("skin", quoted(draft.found.shown(anatomy.after_skin.path)))
     if draft.marks.after is not None:
         text.value("landmarks", quoted(draft.found.shown(draft.marks.after.path)))
-    _write_aligned(draft)
+    _write_place_after(draft)
     if anatomy.after_bones and (images.after is None or anatomy.after_skin is not None):
         text.table("postoperative.bones")
         for name, find in anatomy.after_bones.items():

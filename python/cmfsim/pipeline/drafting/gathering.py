@@ -105,18 +105,32 @@ def gather(
         ]
     else:
         _gather_files(found, paths, progress)
+    _gather_landmarks(found, rest(paths.markups))
+    # A folder of DICOM is named last where it is the case's own: it holds all else as well.
+    inside = [path for path in paths.dicom if path != folder]
+    own = [path for path in paths.dicom if path == folder]
+    _gather_images(found, [*rest(paths.images), *inside, *own], progress)
+    found.by_slicer = bool(found.scene) or any(
+        _by_slicer(path) for path in (*paths.surfaces, *paths.labels)
+    )
+    return found
+
+
+def _gather_landmarks(found: Gathered, paths: list[Path]) -> None:
+    """Adds the landmarks of files; those of a scene come before them."""
     has_marks = bool(found.landmarks)
-    for path in rest(paths.markups):
+    for path in paths:
         if has_marks and not name_role(path.name).is_after:
             why = f"the scene {found.scene} has landmarks of its own"
             found.others.append(OtherFind(found.shown(path), why))
-            continue
-        _read(found, path, landmark_find, found.landmarks)
+        else:
+            _read(found, path, landmark_find, found.landmarks)
+
+
+def _gather_images(found: Gathered, paths: list[Path], progress: Callable[[str], None]) -> None:
+    """Adds the images of files and folders; the CT of a scene comes before them."""
     has_ct = any(not image.role.is_after and not image.error for image in found.images)
-    images = [p for p in (*rest(paths.images), *paths.dicom) if p != folder] + [
-        p for p in paths.dicom if p == folder
-    ]
-    for path in images:
+    for path in paths:
         label = found.shown(path)
         if has_ct and not name_role(path.name).is_after:
             found.others.append(OtherFind(label, f"the scene {found.scene} has another CT"))
@@ -125,10 +139,6 @@ def gather(
         else:
             progress(f"reading {label}")
             found.images.append(image_find(path, label))
-    found.by_slicer = bool(found.scene) or any(
-        _by_slicer(path) for path in (*paths.surfaces, *paths.labels)
-    )
-    return found
 
 
 def _gather_scene(

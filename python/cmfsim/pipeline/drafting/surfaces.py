@@ -91,6 +91,11 @@ class Anatomy:
         """Skin and bones before the operation."""
         return [*([self.skin] if self.skin else []), *self.bones.values()]
 
+    @property
+    def after(self) -> list[SurfaceFind]:
+        """Skin and bones after the operation."""
+        return [*([self.after_skin] if self.after_skin else []), *self.after_bones.values()]
+
     def asks(self, key: str) -> Question | None:
         """The question about a key, where there is one."""
         return next((question for question in self.questions if question.key == key), None)
@@ -174,7 +179,7 @@ def _choose_bones(anatomy: Anatomy, parts: dict[str, list[SurfaceFind]]) -> None
         parts["cranium"] = whole
         whole = []
     for find in whole:
-        why = "the bones are given one by one; this is all of them in one surface"
+        why = "the bones are given one by one; its name says all of them in one"
         anatomy.taken.append(Taken(find.label, "not used", why))
     for part in ("cranium", *MOVING):
         named = _moved_alone(anatomy, parts.get(part, []))
