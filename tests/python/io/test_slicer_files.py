@@ -119,7 +119,9 @@ def storage(name, number=1, cls="Model"):
     return f'<{cls}Storage id="s{number}" fileName="{name}" coordinateSystem="LPS"></{cls}Storage>'
 
 
-@pytest.mark.parametrize("name", ["../a.stl", "/etc/passwd", "..%2Fa.stl", "C:/a.stl", "gone.stl"])
+@pytest.mark.parametrize(
+    "name", ["../a.stl", "/etc/passwd", "..%2Fa.stl", "C:/a.stl", "gone.stl", 1000 * "x" + ".stl"]
+)
 def test_files_outside_of_the_folder_are_not_opened(tmp_path, name):
     folder = tmp_path / "in"
     folder.mkdir()
@@ -192,6 +194,8 @@ EMPTY = f"{HEAD}<MRML></MRML>"
         ({"a/one.mrml": EMPTY, "a/two.mrml": EMPTY}, "2 scenes"),
         ({"a/Data/x.stl": "x"}, "0 scenes"),
         ({"a/s.mrml": EMPTY, "a/S.MRML": EMPTY}, "twice"),
+        ({"a": "x", "a/s.mrml": EMPTY}, "as a file and as a folder"),
+        ({"b/" + 300 * "x": "x", "a/s.mrml": EMPTY}, "not unpacked"),
         ({"a/s.mrml": EMPTY, "a/zeros": bytes(600 * 2**20)}, "unpacks to"),
     ],
 )
@@ -282,6 +286,7 @@ def test_a_segmentation_becomes_closed_outward_surfaces_where_its_voxels_lie(tmp
         (lambda data: data[:-40], "cut short|damaged"),
         (lambda data: data.replace(b"unsigned char", b"double"), "labels are needed"),
         (lambda data: data.replace(b"Segment1_Layer:=1", b"Segment1_Layer:=7"), "layers"),
+        (lambda data: data.replace(b"Segment1_Layer:=1", b"Segment1_Layer:=" + 5000 * b"9"), "lay"),
         (lambda data: data.replace(b"encoding: gzip", b"encoding: hex"), "packed as"),
         (lambda data: data.replace(b"NRRD0004", b"NOPE0004"), "no NRRD"),
     ],
