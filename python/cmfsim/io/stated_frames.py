@@ -5,10 +5,11 @@ reads it there; files of this package state `LPS mm`. Other programs state nothi
 """
 
 import re
+from pathlib import Path
 
 from cmfsim.errors import CaseInputError
 
-__all__ = ["stated_frame", "stated_in_field"]
+__all__ = ["is_own_file", "stated_frame", "stated_in_field"]
 
 # As 3D Slicer writes it; and the words of this package's own files.
 SLICER = re.compile(rb"\bSPACE=([A-Za-z]+)")
@@ -38,9 +39,16 @@ def stated_frame(data: bytes, suffix: str) -> str | None:
     if len(found) > 1:
         names = " and ".join(sorted(name.decode() for name in found))
         raise CaseInputError(f"its header states two frames, {names}: export it again")
-    if found:
-        return stated_in_field(found.pop())
-    return "LPS" if OWN.search(head) else None
+    return stated_in_field(found.pop()) if found else None
+
+
+def is_own_file(path: Path) -> bool:
+    """Whether a surface states "LPS mm" as this package writes it.
+
+    Where a case states another frame, that is used: the writer cannot know what it was given.
+    """
+    with path.open("rb") as file:
+        return OWN.search(_header(file.read(MOST_HEADER), path.suffix.lower())) is not None
 
 
 def stated_in_field(name: bytes) -> str:

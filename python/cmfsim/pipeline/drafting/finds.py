@@ -12,6 +12,7 @@ from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.files import is_below
 from cmfsim.io.images import read_image_file
 from cmfsim.io.landmarks import LandmarkFile, read_landmark_file
+from cmfsim.io.stated_frames import is_own_file
 from cmfsim.io.surfaces import surface_as_stored
 from cmfsim.pipeline.drafting.roles import NameRole, name_role
 from cmfsim.surfaces.topology import edges_of
@@ -245,6 +246,8 @@ def surface_find(path: Path, label: str) -> SurfaceFind:
         (also `ValueError`) As `read_surface`.
     """
     surface, stated = surface_as_stored(path)
+    if stated is None and is_own_file(path):
+        stated = "LPS"
     name = path.name[: -len(path.suffix)]
     return SurfaceFind(label, name_role(name), path, surface, stated, is_closed(surface))
 
