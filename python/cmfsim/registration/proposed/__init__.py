@@ -1,0 +1,5 @@
+"""Landmarks found without a person: each site where its own definition holds, with a confidence."""
+
+from cmfsim.registration.proposed.template_head import TemplateHead
+
+__all__ = ["TemplateHead"]

@@ -1,0 +1,91 @@
+"""The sites of one head by their definitions, and what templates say of the definitions' bias."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cmfsim._core import Surface
+from cmfsim.checks import Floats
+from cmfsim.registration.proposed.depth_maps import depth_map
+from cmfsim.registration.proposed.pose import Pose, surface_samples
+from cmfsim.registration.proposed.skin_sites import find_skin_sites
+from cmfsim.registration.proposed.skull_sites import FRONT_REACH, find_skull_sites, skull_views
+from cmfsim.registration.proposed.template_head import TemplateHead
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = ["Detected", "biases", "detect", "joined"]
+
+# Points on a surface per mm² for depth maps: some four in a cell.
+DENSITY = 6.0
+MOST_POINTS = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Detected:
+    """Sites of a head, (3,) each, in the frame and size of the average head.
+
+    Names of the skull that begin with "_" are no landmarks, but what others are found from.
+    """
+
+    skull: Mapping[str, Floats]
+    skin: Mapping[str, Floats]
+
+
+def joined(surfaces: list[SurfaceData]) -> SurfaceData:
+    """Several surfaces as one."""
+    starts = np.cumsum([0, *(len(np.asarray(s.vertices)) for s in surfaces)])[:-1]
+    return SurfaceData(
+        np.concatenate([np.asarray(s.vertices) for s in surfaces]),
+        np.concatenate(
+            [
+                np.asarray(s.triangles).astype(np.int64) + start
+                for s, start in zip(surfaces, starts, strict=True)
+            ]
+        ),
+    )
+
+
+def detect(bones: Mapping[str, SurfaceData], skin: SurfaceData | None, pose: Pose) -> Detected:
+    """The sites of a head that lies in a known pose."""
+    upper = joined([bone for name, bone in bones.items() if not is_lower(name)])
+    lower = [bone for name, bone in bones.items() if is_lower(name)]
+    cranium = _points(upper, pose)
+    # Where the jaw is not known apart, it is the lower part of the skull.
+    jaw = _points(joined(lower), pose) if lower else cranium
+    skull = find_skull_sites(skull_views(cranium, jaw))
+    if skin is None:
+        return Detected(skull, {})
+    front = depth_map(_points(skin, pose), (0, 2, 1), 1.0, FRONT_REACH)
+    return Detected(skull, find_skin_sites(front, skull))
+
+
+def is_lower(name: str) -> bool:
+    """Whether a bone of this name moves with the lower jaw."""
+    words = name.casefold()
+    return any(word in words for word in ("mandible", "lower", "ramus", "chin"))
+
+
+def _points(surface: SurfaceData, pose: Pose) -> Floats:
+    area = Surface(np.asarray(surface.vertices), np.asarray(surface.triangles)).area
+    count = min(MOST_POINTS, int(DENSITY * float(area)))
+    points, _ = surface_samples(surface, max(count, 1000))
+    return pose.into(points) / pose.size
+
+
+def biases(template: TemplateHead, pose: Pose) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """How far the landmarks of a template lie from where its sites are found, (3,) each.
+
+    Of skull and skin, in the frame and size of the average head.
+    """
+    found = detect(template.bones, template.skin, pose)
+    pairs = ((found.skull, template.skull), (found.skin, template.skin_landmarks))
+    skull, skin = (
+        {
+            name: pose.into(np.asarray(true[name])[None])[0] / pose.size - place
+            for name, place in sites.items()
+            if name in true
+        }
+        for sites, true in pairs
+    )
+    return skull, skin
