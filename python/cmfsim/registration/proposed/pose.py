@@ -1,26 +1,34 @@
 """The pose of a head of unknown place: its plane of symmetry, and the frame of an average head."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim._core import Surface, icp, rigid_fit
+from cmfsim._core import Surface, icp
 from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError, RegistrationError
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Pose", "find_pose", "surface_samples"]
+__all__ = ["Pose", "find_pose", "levelled", "surface_samples"]
 
 # Points of a surface that poses are fitted with.
 SAMPLES = 4000
 # Share of the worst pairs that fits leave out: spine, couch and what the other head lacks.
 MIRROR_TRIM, POSE_TRIM = 0.3, 0.35
 # Heads are offered to the fit nodding this far either way, degrees, and in these sizes.
-PITCHES = (-24.0, -12.0, 0.0, 12.0, 24.0)
-SIZES = (0.72, 0.82, 0.92, 1.02, 1.12)
+PITCHES = (-20.0, 0.0, 20.0)
+SIZES = (0.72, 0.86, 1.0, 1.14)
 # Rounds of pairs and similarity fits of a candidate, and of the best.
-ROUGH_ROUNDS, FINE_ROUNDS = 12, 40
+FIRST_ROUNDS, ROUGH_ROUNDS, FINE_ROUNDS = 4, 15, 40
+# Starts that are followed up.
+MOST_STARTS = 10
+# How much of the vertex may be missing, mm.
+VERTEX_CUT = (0.0, 30.0, 60.0)
+# Damping of a step, as a share of the pairs.
+DAMPING = 1e-3
+# Cosine between the normals of a pair at least; farthest distance that counts, mm; fewest pairs.
+LEAST_AGREEMENT, MOST_GAP, LEAST_PAIRS = 0.5, 30.0, 50
 # A pose whose kept points lie farther from the average head than this is none, mm.
 WORST_FIT = 6.0
 
@@ -80,14 +88,14 @@ def surface_samples(surface: SurfaceData, count: int, seed: int = 0) -> tuple[Fl
 
 
 def find_pose(
-    bones: Mapping[str, SurfaceData], average: SurfaceData, average_size: float = 1.0
+    bones: SurfaceData, average: SurfaceData, average_size: float = 1.0
 ) -> Pose:
     """The pose of a head by its bones: the plane of symmetry, then the fit of an average cranium.
 
     Parameters
     ----------
-    bones : mapping of str to SurfaceData
-        Of the patient, roughly upright in LPS (within about 30°); parts may be missing.
+    bones : SurfaceData
+        Cranium of the patient, roughly upright in LPS (within about 30°); parts may be missing.
     average : SurfaceData
         Cranium of a whole head in its own frame: x = 0 its plane of symmetry.
     average_size : float
@@ -102,21 +110,9 @@ def find_pose(
     LandmarkError
         (also `ValueError`) The bones look like no head.
     """
-    fixed_bones = [s for n, s in bones.items() if n != "mandible"] or list(bones.values())
-    joined = _joined(fixed_bones)
-    points, normals = surface_samples(joined, SAMPLES)
-    symmetry, centre = _symmetry(joined, points, normals)
+    points, normals = surface_samples(bones, SAMPLES)
+    symmetry, centre = _symmetry(bones, points, normals)
     return _fitted(points, normals, symmetry, centre, average, average_size)
-
-
-def _joined(surfaces: list[SurfaceData]) -> SurfaceData:
-    counts = np.cumsum([0, *(len(np.asarray(s.vertices)) for s in surfaces)])
-    return SurfaceData(
-        np.concatenate([np.asarray(s.vertices) for s in surfaces]),
-        np.concatenate(
-            [np.asarray(s.triangles).astype(np.int64) + n for s, n in zip(surfaces, counts)]  # noqa: B905
-        ),
-    )
 
 
 def _symmetry(whole: SurfaceData, points: Floats, normals: Floats) -> tuple[Floats, Floats]:
@@ -134,7 +130,7 @@ def _symmetry(whole: SurfaceData, points: Floats, normals: Floats) -> tuple[Floa
             keep_border=False,
             trim=MIRROR_TRIM,
             method="plane",
-            max_iterations=80,
+            max_iterations=300,
             tolerance=1e-5,
             max_angle=np.radians(45.0),
             normals=normals * flip,
@@ -170,37 +166,22 @@ def _fitted(
     up = np.array([0.0, 0.0, 1.0]) - left * left[2]
     up /= np.linalg.norm(up)
     upright = np.stack([left, np.cross(up, left), up])
-    # The tips of the head are in front and above in any scan of a face; ends behind may be cut.
-    target = np.asarray(average.vertices)
-    begin = (points - centre) @ upright.T
-    start_from = np.array([0.0, *begin[:, 1:].mean(axis=0)])
-    best: tuple[float, Floats, Floats, float] | None = None
-    few = slice(None, None, 4)
-    for pitch in np.radians(PITCHES):
-        c, s = np.cos(pitch), np.sin(pitch)
-        turn = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-        for size in SIZES:
-            scale = average_size / size
-            moved = scale * (begin - start_from) @ turn.T
-            # Foreheads and faces together: the front of the points on the front of the head.
-            shift = np.array(
-                [
-                    0.0,
-                    np.quantile(target[:, 1], 0.02) - np.quantile(moved[:, 1], 0.02),
-                    np.quantile(target[:, 2], 0.98) - np.quantile(moved[:, 2], 0.98),
-                ]
-            )
-            result = _similarity(
-                begin[few], normals[few] @ upright.T, surface, scale * turn,
-                shift - scale * turn @ start_from, ROUGH_ROUNDS,
-            )
-            if best is None or result[0] < best[0]:
-                best = result
-    if best is None:
-        raise AssertionError("no pose was tried")
-    rms, linear, offset, _ = _similarity(
-        begin, normals @ upright.T, surface, best[1], best[2], FINE_ROUNDS
+    begin, turned = (points - centre) @ upright.T, normals @ upright.T
+    starts = _starts(begin, np.asarray(average.vertices), average_size)
+    few = slice(None, None, 6)
+    tried = [
+        _similarity(begin[few], turned[few], surface, linear, offset, FIRST_ROUNDS)
+        for linear, offset in starts
+    ]
+    tried.sort(key=lambda result: result[0])
+    best = min(
+        (
+            _similarity(begin[few], turned[few], surface, linear, offset, ROUGH_ROUNDS)
+            for _, linear, offset in tried[:MOST_STARTS]
+        ),
+        key=lambda result: result[0],
     )
+    rms, linear, offset = _similarity(begin, turned, surface, best[1], best[2], FINE_ROUNDS)
     scale = float(np.cbrt(np.linalg.det(linear)))
     residual = rms
     if residual > WORST_FIT:
@@ -214,6 +195,88 @@ def _fitted(
     return Pose(origin, axes, average_size / scale, residual)
 
 
+# Sites of the cranium that show how it nods, and the distance at which one counts half, mm.
+LEVEL_SITES = (
+    "nasion",
+    "glabella",
+    "rhinion",
+    "mid_philtrum",
+    "supradentale",
+    *(
+        f"{pair}_{letter}"
+        for pair in ("supraorbital", "suborbital", "zygomatic_arch", "supraglenoid")
+        for letter in "LR"
+    ),
+)
+LEVEL_DISTANCE, LEVEL_ROUNDS, LEAST_LEVEL_SITES = 5.0, 20, 6
+
+
+def levelled(pose: Pose, found: Mapping[str, Floats], average: Mapping[str, Floats]) -> Pose:
+    """The pose with nod, size and place by sites of the cranium instead of its whole surface.
+
+    Skulls differ more in the vault than in how the face lies below it. The plane of symmetry stays.
+
+    Parameters
+    ----------
+    pose : Pose
+    found, average : mapping of str to (3,) float64
+        Sites as found in that pose, average-head mm, and those of the average head.
+    """
+    names = [name for name in LEVEL_SITES if name in found and name in average]
+    if len(names) < LEAST_LEVEL_SITES:
+        return pose
+    source = np.array([found[name] for name in names])
+    target = np.array([average[name] for name in names])
+    linear, offset = np.eye(3), np.zeros(3)
+    for _ in range(LEVEL_ROUNDS):
+        gap = np.linalg.norm((source @ linear.T + offset - target)[:, 1:], axis=1)
+        weight = 1.0 / (1.0 + (gap / LEVEL_DISTANCE) ** 2)
+        linear, offset = _planar_fit(source, target, weight)
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    # The point that goes to the origin of the average head.
+    origin = pose.out(-np.linalg.solve(linear, offset)[None] * pose.size)[0]
+    return Pose(origin, linear / scale @ pose.axes, pose.size / scale, pose.residual)
+
+
+def _planar_fit(source: Floats, target: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """The similarity along y and z alone that brings points to others: scale, nod and shift."""
+    share = weight / weight.sum()
+    a, b = share @ source, share @ target
+    a[0] = b[0] = 0.0
+    p, q = (source - a)[:, 1:], (target - b)[:, 1:]
+    dot = float(share @ (p * q).sum(axis=1))
+    cross = float(share @ (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]))
+    angle = np.arctan2(cross, dot)
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    scale = float(np.hypot(dot, cross) / (share @ (p**2).sum(axis=1)))
+    linear = scale * turn
+    return linear, b - linear @ a
+
+
+def _starts(
+    points: Floats, target: Floats, average_size: float
+) -> Iterator[tuple[Floats, Floats]]:
+    """Similarities to begin with: nods, sizes, and heads whose vertex is cut off."""
+    middle = np.array([0.0, *points[:, 1:].mean(axis=0)])
+    for pitch in np.radians(PITCHES):
+        c, s = np.cos(pitch), np.sin(pitch)
+        turn = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+        for size in SIZES:
+            linear = average_size / size * turn
+            moved = (points - middle) @ linear.T
+            for cut in VERTEX_CUT:
+                # The front of the bones on the front of the head, their top on its top.
+                shift = np.array(
+                    [
+                        0.0,
+                        np.quantile(target[:, 1], 0.02) - np.quantile(moved[:, 1], 0.02),
+                        np.quantile(target[:, 2], 0.98) - cut - np.quantile(moved[:, 2], 0.98),
+                    ]
+                )
+                yield linear, shift - linear @ middle
+
+
 def _similarity(
     points: Floats,
     normals: Floats,
@@ -221,49 +284,52 @@ def _similarity(
     linear: Floats,
     offset: Floats,
     rounds: int,
-) -> tuple[float, Floats, Floats, float]:
+) -> tuple[float, Floats, Floats]:
     """Distance in the patient's mm, and the similarity in the plane x = 0 that fits best."""
-    kept_rms = np.inf
-    share = 1.0
+    kept_rms, share = np.inf, 1.0
+    face_normals = _face_normals(surface)
     for _ in range(rounds):
         scale = float(np.cbrt(np.linalg.det(linear)))
         moved = points @ linear.T + offset
         near, _, triangles = surface.closest(moved)
         gaps = np.linalg.norm(near - moved, axis=1)
         turned = normals @ linear.T / scale
-        agree = (turned * _face_normals(surface)[triangles]).sum(axis=1) > 0.5
-        limit = np.quantile(gaps, 1.0 - POSE_TRIM)
-        kept = (gaps <= limit) & agree
-        share = float(kept.mean())
-        kept_rms = float(np.sqrt((np.minimum(gaps, 30.0)[gaps <= limit] ** 2).mean())) / scale
-        if kept.sum() < 50:
-            return np.inf, linear, offset, share
-        linear, offset = _planar_fit(points[kept], near[kept])
-    return kept_rms / max(share, 0.1), linear, offset, share
-
-
-_NORMALS: dict[int, Floats] = {}
+        agree = (turned * face_normals[triangles]).sum(axis=1) > LEAST_AGREEMENT
+        close = gaps <= np.quantile(gaps, 1.0 - POSE_TRIM)
+        kept = close & agree
+        share = float(kept.sum() / close.sum())
+        kept_rms = float(np.sqrt((np.minimum(gaps, MOST_GAP)[close] ** 2).mean())) / scale
+        if kept.sum() < LEAST_PAIRS:
+            return np.inf, linear, offset
+        step, move = _step_to_planes(moved[kept], near[kept], face_normals[triangles[kept]])
+        linear, offset = step @ linear, step @ offset + move
+    return kept_rms / max(share, 0.1), linear, offset
 
 
 def _face_normals(surface: Surface) -> Floats:
-    key = id(surface)
-    if key not in _NORMALS:
-        corners = np.asarray(surface.vertices)[np.asarray(surface.triangles).astype(np.int64)]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        _NORMALS[key] = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
-    return _NORMALS[key]
+    corners = np.asarray(surface.vertices)[np.asarray(surface.triangles).astype(np.int64)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None])
 
 
-def _planar_fit(source: Floats, target: Floats) -> tuple[Floats, Floats]:
-    """The similarity that keeps x = 0 in its place: scale, pitch and shift along y and z."""
-    a, b = source.mean(axis=0), target.mean(axis=0)
-    a[0] = b[0] = 0.0
-    p, q = source - a, target - b
-    dot = float((p[:, 1:] * q[:, 1:]).sum())
-    cross = float((p[:, 1] * q[:, 2] - p[:, 2] * q[:, 1]).sum())
-    angle = np.arctan2(cross, dot)
-    c, s = np.cos(angle), np.sin(angle)
-    turn = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-    scale = float((q * (p @ turn.T)).sum() / (p**2).sum())
-    linear = scale * turn
-    return linear, b - linear @ a
+def _step_to_planes(points: Floats, near: Floats, normals: Floats) -> tuple[Floats, Floats]:
+    """The small similarity that keeps x = 0 in its place and brings points to tangent planes.
+
+    Minimises the sum of (n·(p + a p + b e_x × p + t − q))² over scale a, nod b and t = (0, t_y,
+    t_z), after Chen & Medioni (1992).
+    """
+    middle = np.array([0.0, *points[:, 1:].mean(axis=0)])
+    p = points - middle
+    turned = np.column_stack([np.zeros(len(p)), -p[:, 2], p[:, 1]])
+    columns = np.column_stack(
+        [(normals * p).sum(axis=1), (normals * turned).sum(axis=1), normals[:, 1], normals[:, 2]]
+    )
+    gap = (normals * (near - points)).sum(axis=1)
+    # Scale and nod act over some 100 mm: in those units all four are lengths.
+    units = np.array([100.0, 100.0, 1.0, 1.0])
+    scaled = columns / units
+    normal_matrix = scaled.T @ scaled + DAMPING * len(p) * np.eye(4)
+    grow, nod, t_y, t_z = np.linalg.solve(normal_matrix, scaled.T @ gap) / units
+    c, s = np.cos(nod), np.sin(nod)
+    step = np.exp(grow) * np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    return step, middle + [0.0, t_y, t_z] - step @ middle

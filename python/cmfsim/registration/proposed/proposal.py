@@ -9,7 +9,7 @@ import numpy as np
 from cmfsim._core import Surface
 from cmfsim.checks import Floats
 from cmfsim.registration.proposed.detection import Detected, biases, detect, is_lower, joined
-from cmfsim.registration.proposed.pose import Pose, find_pose
+from cmfsim.registration.proposed.pose import Pose, find_pose, levelled
 from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.surface_data import SurfaceData
 
@@ -27,7 +27,10 @@ def propose(
     templates: Sequence[TemplateHead],
 ) -> tuple[dict[str, Floats], dict[str, Floats], Pose]:
     average = templates[0]
-    pose = find_pose(bones, average.bones["cranium"])
+    upper = joined([b for n, b in bones.items() if not is_lower(n)] or list(bones.values()))
+    pose = find_pose(upper, average.bones["cranium"])
+    for _ in range(2):
+        pose = levelled(pose, detect(bones, None, pose).skull, average.skull)
     found = detect(bones, skin, pose)
     skull, skin_sites = _corrected(found, [(average, pose.residual / pose.size)])
     skull = {name: place for name, place in skull.items() if not name.startswith("_")}
@@ -76,7 +79,10 @@ def _corrected(
 
 @lru_cache(maxsize=4)
 def _average_biases(template: TemplateHead) -> tuple[dict[str, Floats], dict[str, Floats]]:
-    return biases(template, Pose(np.zeros(3), np.eye(3), 1.0, 0.0))
+    pose = Pose(np.zeros(3), np.eye(3), 1.0, 0.0)
+    for _ in range(2):
+        pose = levelled(pose, detect(template.bones, None, pose).skull, template.skull)
+    return biases(template, pose)
 
 
 def _evened(sites: Mapping[str, Floats]) -> dict[str, Floats]:

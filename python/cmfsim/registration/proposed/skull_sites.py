@@ -98,7 +98,7 @@ FACE_AT, FACE_SLOPE, HOLLOW = -87.0, 0.45, 9.0
 ORBIT_X, ORBIT_Z = (12.0, 54.0), (-16.0, 52.0)
 LEAST_ORBIT = 300.0
 # The lateral rim slopes back: the hollow ends before it, and its middle is so far out, mm.
-LATERAL_RIM = 0.8
+LATERAL_RIM = 0.5
 
 
 def _orbit(front: DepthMap, side: float) -> _Orbit | None:
@@ -253,7 +253,7 @@ def _jaw_profile(views: SkullViews, found: Sites) -> None:
 
 
 # The lower border of the cheekbone is looked for so far out, as a factor on the orbit's middle.
-MALAR_OUT = 1.07
+MALAR_OUT = 1.04
 
 
 def _about_orbit(
@@ -287,7 +287,7 @@ def _about_orbit(
 
 
 # The cheekbone beside the orbit lies so far behind and above its lower rim, mm.
-LATERAL_BEHIND, LATERAL_ABOVE = 13.0, 4.5
+LATERAL_BEHIND, LATERAL_ABOVE = 12.0, 4.5
 
 
 def _lateral_orbit(
