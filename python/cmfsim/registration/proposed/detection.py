@@ -14,7 +14,7 @@ from cmfsim.registration.proposed.skull_sites import FRONT_REACH, find_skull_sit
 from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Detected", "biases", "detect", "joined"]
+__all__ = ["Detected", "biases", "detect", "is_lower", "joined"]
 
 # Points on a surface per mm² for depth maps: some four in a cell.
 DENSITY = 6.0
@@ -46,14 +46,12 @@ def joined(surfaces: list[SurfaceData]) -> SurfaceData:
     )
 
 
-def detect(bones: Mapping[str, SurfaceData], skin: SurfaceData | None, pose: Pose) -> Detected:
-    """The sites of a head that lies in a known pose."""
-    upper = joined([bone for name, bone in bones.items() if not is_lower(name)])
-    lower = [bone for name, bone in bones.items() if is_lower(name)]
-    cranium = _points(upper, pose)
-    # Where the jaw is not known apart, it is the lower part of the skull.
-    jaw = _points(joined(lower), pose) if lower else cranium
-    skull = find_skull_sites(skull_views(cranium, jaw))
+def detect(
+    upper: SurfaceData, lower: SurfaceData | None, skin: SurfaceData | None, pose: Pose
+) -> Detected:
+    """The sites of a head that lies in a known pose: of cranium, mandible and skin."""
+    jaw = np.zeros((0, 3)) if lower is None else _points(lower, pose)
+    skull = find_skull_sites(skull_views(_points(upper, pose), jaw))
     if skin is None:
         return Detected(skull, {})
     front = depth_map(_points(skin, pose), (0, 2, 1), 1.0, FRONT_REACH)
@@ -73,12 +71,14 @@ def _points(surface: SurfaceData, pose: Pose) -> Floats:
     return pose.into(points) / pose.size
 
 
-def biases(template: TemplateHead, pose: Pose) -> tuple[dict[str, Floats], dict[str, Floats]]:
+def biases(
+    template: TemplateHead, upper: SurfaceData, lower: SurfaceData | None, pose: Pose
+) -> tuple[dict[str, Floats], dict[str, Floats]]:
     """How far the landmarks of a template lie from where its sites are found, (3,) each.
 
     Of skull and skin, in the frame and size of the average head.
     """
-    found = detect(template.bones, template.skin, pose)
+    found = detect(upper, lower, template.skin, pose)
     pairs = ((found.skull, template.skull), (found.skin, template.skin_landmarks))
     skull, skin = (
         {

@@ -10,7 +10,7 @@ from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError, RegistrationError
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Pose", "find_pose", "levelled", "surface_samples"]
+__all__ = ["Pose", "distance_from", "find_pose", "levelled", "surface_samples"]
 
 # Points of a surface that poses are fitted with.
 SAMPLES = 4000
@@ -252,6 +252,12 @@ def _planar_fit(source: Floats, target: Floats, weight: Floats) -> tuple[Floats,
     scale = float(np.hypot(dot, cross) / (share @ (p**2).sum(axis=1)))
     linear = scale * turn
     return linear, b - linear @ a
+
+
+def distance_from(points: Floats, normals: Floats, template: SurfaceData) -> float:
+    """How far points of a head lie from a template's bone after the best small similarity, mm."""
+    surface = Surface(np.asarray(template.vertices), np.asarray(template.triangles))
+    return _similarity(points, normals, surface, np.eye(3), np.zeros(3), FINE_ROUNDS)[0]
 
 
 def _starts(

@@ -8,81 +8,174 @@ import numpy as np
 
 from cmfsim._core import Surface
 from cmfsim.checks import Floats
+from cmfsim.errors import LandmarkInputError
 from cmfsim.registration.proposed.detection import Detected, biases, detect, is_lower, joined
-from cmfsim.registration.proposed.pose import Pose, find_pose, levelled
+from cmfsim.registration.proposed.judgement import judged, missing_sites
+from cmfsim.registration.proposed.limits import cut_planes
+from cmfsim.registration.proposed.pose import (
+    Pose,
+    distance_from,
+    find_pose,
+    levelled,
+    surface_samples,
+)
+from cmfsim.registration.proposed.proposed_landmarks import ProposedLandmarks
 from cmfsim.registration.proposed.template_head import TemplateHead
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["propose"]
+__all__ = ["landmarks_from"]
 
 # Distance of a head from a template at which the template's bias counts half, average-head mm.
 LIKENESS = 0.8
 # Share by which a pair moves towards its mirror image.
 MIRRORED = 0.3
+# Rounds of finding sites and levelling the head by them.
+LEVEL_ROUNDS = 2
+# Sites of the lower jaw.
+JAW = ("infradentale", "supramentale", "pogonion", "menton", "gonion", "occlusal_line", "sub_m2")
+# Sites of the cranium without which what was found is no head.
+LEAST_SITES = 12
 
 
-def propose(
+@dataclass(frozen=True, eq=False)
+class _Bones:
+    """The bones of a head as two surfaces; without a mandible the skull is one."""
+
+    upper: SurfaceData
+    lower: SurfaceData | None
+
+
+def landmarks_from(
     bones: Mapping[str, SurfaceData],
     skin: SurfaceData | None,
     templates: Sequence[TemplateHead],
-) -> tuple[dict[str, Floats], dict[str, Floats], Pose]:
+) -> ProposedLandmarks:
+    """The landmarks of a head, each where its definition holds, with what is doubtful about it.
+
+    The plane of symmetry and the fit of the first template's cranium give the pose; sites are found
+    in views from front and side; what a template's own sites are off from its landmarks corrects
+    them, the more the head is like it.
+
+    Parameters
+    ----------
+    bones : mapping of str to SurfaceData
+        Of the patient, LPS mm, upright within about 30°; what is called "mandible" or the like is
+        the lower jaw.
+    skin : SurfaceData or None
+        Without it no landmark of the skin is found.
+    templates : sequence of TemplateHead
+        The first is the average head, in its own frame; at least one.
+
+    Returns
+    -------
+    ProposedLandmarks
+
+    Raises
+    ------
+    LandmarkError
+        (also `ValueError`) The bones show no head, or one that lies otherwise.
+    """
+    if not bones or not templates:
+        raise LandmarkInputError(
+            f"{len(bones)} bones and {len(templates)} template heads are given: landmarks are "
+            "found on at least one bone with at least one template"
+        )
+    parts = _parts(bones)
     average = templates[0]
-    upper = joined([b for n, b in bones.items() if not is_lower(n)] or list(bones.values()))
-    pose = find_pose(upper, average.bones["cranium"])
-    for _ in range(2):
-        pose = levelled(pose, detect(bones, None, pose).skull, average.skull)
-    found = detect(bones, skin, pose)
-    skull, skin_sites = _corrected(found, [(average, pose.residual / pose.size)])
-    skull = {name: place for name, place in skull.items() if not name.startswith("_")}
-    skull = _evened(skull)
-    skin_sites = _evened(skin_sites)
-    upper = joined([b for n, b in bones.items() if not is_lower(n)])
-    lower = [b for n, b in bones.items() if is_lower(n)]
-    onto = {False: upper, True: joined(lower) if lower else upper}
-    return (
-        _on_surface(skull, pose, onto),
-        {} if skin is None else _on_surface(skin_sites, pose, {False: skin, True: skin}),
-        pose,
+    pose = find_pose(parts.upper, average.bones["cranium"])
+    for _ in range(LEVEL_ROUNDS):
+        pose = levelled(pose, detect(parts.upper, parts.lower, None, pose).skull, average.skull)
+    found = detect(parts.upper, parts.lower, skin, pose)
+    likeness = [_likeness(template, parts.upper, pose, templates) for template in templates]
+    found = _corrected(found, templates, likeness)
+    skull = _evened({name: p for name, p in found.skull.items() if not name.startswith("_")})
+    _check_head(skull)
+    surface = {False: parts.upper, True: parts.lower or parts.upper}
+    placed = _on_surface(skull, pose, surface)
+    on_skin = (
+        {} if skin is None else _on_surface(_evened(found.skin), pose, {False: skin, True: skin})
+    )
+    cuts = cut_planes([*([] if skin is None else [skin]), parts.upper])
+    gone = missing_sites(placed, on_skin, cuts, pose, has_jaw=parts.lower is not None)
+    placed = {name: placed[name] for name in SKULL_LANDMARKS if name in placed.keys() - gone.skull}
+    on_skin = {name: on_skin[name] for name in SKIN_LANDMARKS if name in on_skin.keys() - gone.skin}
+    return ProposedLandmarks(
+        judged("skull", placed, pose, max(likeness)),
+        judged("skin", on_skin, pose, max(likeness)),
+        gone.skull,
+        gone.skin if skin is not None else dict.fromkeys(SKIN_LANDMARKS, "no skin is given"),
     )
 
 
-JAW = ("infradentale", "supramentale", "pogonion", "menton", "gonion", "occlusal_line", "sub_m2")
+def _parts(bones: Mapping[str, SurfaceData]) -> _Bones:
+    upper = [bone for name, bone in bones.items() if not is_lower(name)]
+    lower = [bone for name, bone in bones.items() if is_lower(name)]
+    if not upper:
+        raise LandmarkInputError(
+            f"the bones are {', '.join(bones)}: landmarks are found from the cranium, add it"
+        )
+    return _Bones(joined(upper), joined(lower) if lower else None)
 
 
-def _on_surface(
-    sites: Mapping[str, Floats], pose: Pose, surfaces: Mapping[bool, SurfaceData]
-) -> dict[str, Floats]:
-    placed: dict[str, Floats] = {}
-    for lower, surface in surfaces.items():
-        names = [n for n in sites if n.startswith(JAW) == lower]
-        if not names:
-            continue
-        points = pose.out(np.array([sites[n] for n in names]) * pose.size)
-        whole = Surface(np.asarray(surface.vertices), np.asarray(surface.triangles))
-        near, _, _ = whole.closest(points)
-        placed.update(zip(names, near, strict=True))
-    return placed
+def _check_head(skull: Mapping[str, Floats]) -> None:
+    """Refuses what has no orbits, or too few sites of a cranium."""
+    cranial = [name for name in skull if not name.startswith(JAW)]
+    if len(cranial) < LEAST_SITES or not any(n.startswith("suborbital") for n in cranial):
+        raise LandmarkInputError(
+            f"{len(cranial)} sites of the cranium were found, {LEAST_SITES} and an orbit are "
+            "needed: the bones show no face, or lie otherwise than LPS says; place the landmarks "
+            "by hand"
+        )
+
+
+def _likeness(
+    template: TemplateHead, upper: SurfaceData, pose: Pose, templates: Sequence[TemplateHead]
+) -> float:
+    """How much a template's bias counts: 1 for a head of its own shape, near 0 for another."""
+    if template is templates[0]:
+        distance = pose.residual / pose.size
+    else:
+        other = _template_pose(template, templates[0])
+        points, normals = surface_samples(upper, 2000)
+        shape = _parts(template.bones).upper
+        moved = SurfaceData(other.into(np.asarray(shape.vertices)) / other.size, shape.triangles)
+        distance = distance_from(pose.into(points) / pose.size, normals @ pose.axes.T, moved)
+    return 1.0 / (1.0 + (distance / LIKENESS) ** 2)
+
+
+@lru_cache(maxsize=8)
+def _template_pose(template: TemplateHead, average: TemplateHead) -> Pose:
+    parts = _parts(template.bones)
+    if template is average:
+        pose = Pose(np.zeros(3), np.eye(3), 1.0, 0.0)
+    else:
+        pose = find_pose(parts.upper, average.bones["cranium"])
+    for _ in range(LEVEL_ROUNDS):
+        pose = levelled(pose, detect(parts.upper, parts.lower, None, pose).skull, average.skull)
+    return pose
+
+
+@lru_cache(maxsize=8)
+def _template_biases(
+    template: TemplateHead, average: TemplateHead
+) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    parts = _parts(template.bones)
+    return biases(template, parts.upper, parts.lower, _template_pose(template, average))
 
 
 def _corrected(
-    found: Detected, templates: Sequence[tuple[TemplateHead, float]]
-) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    found: Detected, templates: Sequence[TemplateHead], likeness: Sequence[float]
+) -> Detected:
     """The sites moved by the biases of templates, as far as the head is like them."""
     results: list[dict[str, Floats]] = [dict(found.skull), dict(found.skin)]
-    for template, distance in templates:
-        weight = 1.0 / (1.0 + (distance / LIKENESS) ** 2)
-        for sites, bias in zip(results, _average_biases(template), strict=True):
+    total = max(1.0, float(sum(likeness)))
+    for template, weight in zip(templates, likeness, strict=True):
+        shares = _template_biases(template, templates[0])
+        for sites, bias in zip(results, shares, strict=True):
             for name in sites.keys() & bias.keys():
-                sites[name] = sites[name] + weight * bias[name]
-    return results[0], results[1]
-
-
-@lru_cache(maxsize=4)
-def _average_biases(template: TemplateHead) -> tuple[dict[str, Floats], dict[str, Floats]]:
-    pose = Pose(np.zeros(3), np.eye(3), 1.0, 0.0)
-    for _ in range(2):
-        pose = levelled(pose, detect(template.bones, None, pose).skull, template.skull)
-    return biases(template, pose)
+                sites[name] = sites[name] + weight / total * bias[name]
+    return Detected(results[0], results[1])
 
 
 def _evened(sites: Mapping[str, Floats]) -> dict[str, Floats]:
@@ -97,3 +190,19 @@ def _evened(sites: Mapping[str, Floats]) -> dict[str, Floats]:
             mirrored = even * [side, 1.0, 1.0] + [middle, 0.0, 0.0]
             result[f"{pair}_{letter}"] = own + MIRRORED * (mirrored - own)
     return result
+
+
+def _on_surface(
+    sites: Mapping[str, Floats], pose: Pose, surfaces: Mapping[bool, SurfaceData]
+) -> dict[str, Floats]:
+    """The sites moved to the closest points of their surfaces, in the patient's frame."""
+    placed: dict[str, Floats] = {}
+    for lower, surface in surfaces.items():
+        names = [name for name in sites if name.startswith(JAW) == lower]
+        if not names:
+            continue
+        points = pose.out(np.array([sites[name] for name in names]) * pose.size)
+        whole = Surface(np.asarray(surface.vertices), np.asarray(surface.triangles))
+        near, _, _ = whole.closest(points)
+        placed.update(zip(names, near, strict=True))
+    return placed

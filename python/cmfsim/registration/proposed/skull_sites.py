@@ -141,7 +141,11 @@ def _midface(views: SkullViews, orbits: list[_Orbit | None], found: Sites) -> No
             # The suture is at the upper end of a flat hollow, where the brow begins.
             deepest = upper_end(z, top, (z[rhinion], high), deepest, FLAT)
             found["nasion"] = np.array([0.0, top[deepest], z[deepest]])
-            brow = farthest_from_chord(z, top, (z[deepest], z[deepest] + 32.0), 1.0)
+            # A forehead that is cut off shows the glabella as long as it goes on above it.
+            end = min(z[deepest] + 32.0, float(z[np.isfinite(top)].max()) - 1.0)
+            brow = None
+            if end > z[deepest] + LEAST_FOREHEAD:
+                brow = farthest_from_chord(z, top, (z[deepest], end), 1.0)
             if brow is not None:
                 found["glabella"] = np.array([0.0, top[brow], z[brow]])
                 above = int(np.argmin(np.abs(z - z[brow] - 15.0)))
@@ -150,6 +154,8 @@ def _midface(views: SkullViews, orbits: list[_Orbit | None], found: Sites) -> No
     _upper_alveolus(views, found)
 
 
+# Bone above the nasion from which the glabella can be told, mm.
+LEAST_FOREHEAD = 24.0
 # How much the bottom of the hollow of the nasion may rise and still count as flat, mm.
 FLAT = 0.5
 # The bony nose ends where the profile falls back by so much within the step below, mm.
@@ -216,9 +222,15 @@ def _run_end(known: Floats, start: int) -> int:
 def _jaw_profile(views: SkullViews, found: Sites) -> None:
     front = views.mandible_front
     z = front.columns
-    lean = local_midline(front, (-64.0, -44.0))
-    chin_lean = local_midline(front, (-95.0, -62.0), 0.0 if lean is None else lean)
+    if not len(views.mandible):
+        return
+    whole = front.column(0.0, 6.0)
+    heights = z[np.isfinite(whole) & (whole < -35.0)]
+    if not len(heights):
+        return
+    lean = local_midline(front, (heights.max() - 20.0, heights.max() - 2.0))
     lean = 0.0 if lean is None else lean
+    chin_lean = local_midline(front, (heights.min() - 2.0, heights.min() + 18.0), lean)
     chin_lean = lean if chin_lean is None else chin_lean
     line = smoothed(front.column(lean, 2.2), 0.8)
     known = np.isfinite(line) & (line < -35.0)

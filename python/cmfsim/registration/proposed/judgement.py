@@ -1,0 +1,164 @@
+"""How far a proposed landmark may be off, what speaks against it, and what the image leaves out."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from cmfsim.checks import Floats
+from cmfsim.errors import LandmarkError, RegistrationError
+from cmfsim.registration.agreement import leave_one_out
+from cmfsim.registration.proposed.limits import CutPlane
+from cmfsim.registration.proposed.pose import Pose
+from cmfsim.registration.proposed.proposed_landmarks import ProposedSite
+from cmfsim.registration.reference import REFERENCE_PLACES
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
+
+__all__ = ["MissingSites", "judged", "missing_sites"]
+
+# Expected error of a site on a head unlike any template, mm: what docs/landmarks.md reports of two
+# real heads, rounded up; sites not named, and heads like a template.
+_ERRORS: Mapping[str, float] = MappingProxyType(
+    {
+        "frontal_eminence": 6.0,
+        "lateral_orbit": 5.0,
+        "inferior_malar": 4.0,
+        "supra_m2": 3.5,
+        "sub_m2": 3.0,
+        "supraglabella": 3.5,
+        "glabella": 3.0,
+        "supraorbital": 3.0,
+        "subnasale": 2.5,
+        "alare": 2.5,
+        "exocanthion": 3.0,
+        "endocanthion": 2.5,
+        "rhinion": 2.5,
+    }
+)
+USUAL_ERROR, ALIKE_ERROR = 2.0, 1.0
+# Left and right differ by so much in few faces, mm of the average head.
+MOST_UNEVEN = 6.0
+# A point so near to where the image ends may lie on the cut instead of on bone, and one a little
+# farther away is doubtful, mm.
+AT_CUT, NEAR_CUT = 3.0, 8.0
+# The jaw below the lower incisors must be there as far down as this for its profile to be read,
+# average-head mm: to the deepest point, and to the foremost one of the chin.
+TO_FOLD, TO_CHIN = 18.0, 27.0
+# Heads differ so much from the average one at a site, mm of the average head, and robust standard
+# deviations of the set: more is no variety.
+FAR_FROM_AVERAGE, FAR_SCORE = 14.0, 4.5
+
+
+@dataclass(frozen=True)
+class MissingSites:
+    """Sites that were not found, with the reason."""
+
+    skull: Mapping[str, str]
+    skin: Mapping[str, str]
+
+
+def missing_sites(
+    skull: Mapping[str, Floats],
+    skin: Mapping[str, Floats],
+    cuts: Sequence[CutPlane],
+    pose: Pose,
+    *,
+    has_jaw: bool,
+) -> MissingSites:
+    """The sites that are absent, or that lie where the image ends."""
+    gone: dict[str, str] = {}
+    for name in SKULL_LANDMARKS:
+        if name not in skull:
+            gone[name] = (
+                "the bone that it lies on was not recognised"
+                if has_jaw
+                else "upper and lower jaw are one surface"
+            )
+        else:
+            cut = _cut_at(skull[name], cuts, AT_CUT)
+            if cut is not None:
+                gone[name] = f"the image ends there ({cut.name} border)"
+    _below_a_cut_chin(skull, cuts, pose, gone)
+    lost: dict[str, str] = {}
+    for name in SKIN_LANDMARKS:
+        if name not in skin:
+            lost[name] = "the skin around it was not recognised"
+        elif (cut := _cut_at(skin[name], cuts, AT_CUT)) is not None:
+            lost[name] = f"the image ends there ({cut.name} border)"
+        elif name == "pogonion" and "pogonion" in gone:
+            lost[name] = gone["pogonion"]
+    return MissingSites(gone, lost)
+
+
+def _below_a_cut_chin(
+    skull: Mapping[str, Floats], cuts: Sequence[CutPlane], pose: Pose, gone: dict[str, str]
+) -> None:
+    """The profile of the chin is read from its lower end: without it, only where enough is left."""
+    bottom = [cut for cut in cuts if cut.name == "bottom"]
+    if "infradentale" not in skull or not bottom:
+        return
+    left = bottom[0].inside(skull["infradentale"]) / pose.size
+    for name, least in (("supramentale", TO_FOLD), ("pogonion", TO_CHIN), ("menton", TO_CHIN)):
+        if left < least:
+            gone.setdefault(name, "the image ends there (bottom border)")
+
+
+def _cut_at(point: Floats, cuts: Sequence[CutPlane], depth: float) -> CutPlane | None:
+    return next((cut for cut in cuts if cut.inside(point) < depth), None)
+
+
+def judged(
+    kind: str, points: Mapping[str, Floats], pose: Pose, likeness: float
+) -> dict[str, ProposedSite]:
+    """The sites with their expected errors, and what speaks against the doubtful ones."""
+    own = {name: pose.into(point[None])[0] / pose.size for name, point in points.items()}
+    uneven = _unevenness(own)
+    odd = _odd(kind, own)
+    sites = {}
+    for name, point in points.items():
+        base = name[:-2] if name.endswith(("_L", "_R")) else name
+        usual = _ERRORS.get(base, USUAL_ERROR)
+        gap = uneven.get(base, 0.0)
+        error = likeness * ALIKE_ERROR + (1.0 - likeness) * usual
+        error = pose.size * float(np.hypot(error, 0.5 * max(gap - 1.0, 0.0)))
+        doubts = []
+        if gap > MOST_UNEVEN:
+            doubts.append(f"left and right differ by {pose.size * gap:.1f} mm")
+        if name in odd:
+            doubts.append(
+                f"the others put it {pose.size * odd[name]:.1f} mm away in an average head"
+            )
+            error = max(error, 0.5 * pose.size * odd[name])
+        sites[name] = ProposedSite(point, error, "; ".join(doubts))
+    return sites
+
+
+def _unevenness(own: Mapping[str, Floats]) -> dict[str, float]:
+    """How far the two of each pair are from mirror images, average-head mm.
+
+    Across, pairs may share a lean of the jaw: the middle of their own midlines is taken off.
+    """
+    pairs = [n[:-2] for n in own if n.endswith("_L") and f"{n[:-2]}_R" in own]
+    gaps = {p: own[f"{p}_L"] * [-1.0, 1.0, 1.0] - own[f"{p}_R"] for p in pairs}
+    result = {}
+    for pair, gap in gaps.items():
+        height = own[f"{pair}_L"][2]
+        near = [abs(own[f"{p}_L"][2] - height) < 30.0 for p in pairs]
+        lean = float(np.median([gaps[p][0] for p, is_near in zip(pairs, near, strict=True) if is_near]))
+        result[pair] = float(np.linalg.norm(gap - [lean, 0.0, 0.0]))
+    return result
+
+
+def _odd(kind: str, own: Mapping[str, Floats]) -> dict[str, float]:
+    """The sites that the others, carried from an average head, put far away, with the distance."""
+    reference = REFERENCE_PLACES[kind]
+    names = [name for name in reference if name in own]
+    try:
+        agreement = leave_one_out(
+            [reference[name] for name in names], [own[name] for name in names], names
+        )
+    except (LandmarkError, RegistrationError):
+        return {}
+    rows = zip(agreement.names, agreement.distances, agreement.scores, strict=True)
+    return {n: float(d) for n, d, s in rows if d > FAR_FROM_AVERAGE and s > FAR_SCORE}

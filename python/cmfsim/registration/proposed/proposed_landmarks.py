@@ -1,0 +1,102 @@
+"""What landmarks were proposed for a head, how far each may be off, and which are missing."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from cmfsim.checks import Floats
+from cmfsim.values.finding import Finding
+
+__all__ = ["ProposedLandmarks", "ProposedSite"]
+
+
+@dataclass(frozen=True, eq=False)
+class ProposedSite:
+    """A proposed landmark.
+
+    Attributes
+    ----------
+    point : (3,) float64, mm
+        On the surface of the bone or skin, in the frame of the head.
+    error : float, mm
+        How far it is expected to lie from where a person would place it.
+    doubt : str
+        Why it should be looked at first; empty where nothing speaks against it.
+    """
+
+    point: Floats
+    error: float
+    doubt: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ProposedLandmarks:
+    """Landmarks that were found without a person.
+
+    Attributes
+    ----------
+    skull, skin : mapping of str to ProposedSite
+        By label, in the order of `SKULL_LANDMARKS` and `SKIN_LANDMARKS`; sites that were not found
+        are absent.
+    missing_skull, missing_skin : mapping of str to str
+        The sites that were not found, with the reason.
+    """
+
+    skull: Mapping[str, ProposedSite]
+    skin: Mapping[str, ProposedSite]
+    missing_skull: Mapping[str, str] = field(default_factory=dict)
+    missing_skin: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("skull", "skin", "missing_skull", "missing_skin"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    @property
+    def points(self) -> dict[str, Mapping[str, Floats]]:
+        """The places alone, under "skull" and "skin" where there are any."""
+        kinds = (("skull", self.skull), ("skin", self.skin))
+        return {
+            kind: MappingProxyType({name: site.point for name, site in sites.items()})
+            for kind, sites in kinds
+            if sites
+        }
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """A note of what was done, a warning for each doubtful site and one for missing ones."""
+        return tuple(self._findings())
+
+    def _findings(self) -> Iterator[Finding]:
+        count = len(self.skull) + len(self.skin)
+        typical = sorted(s.error for s in (*self.skull.values(), *self.skin.values()))
+        yield Finding.note(
+            "landmarks-proposed",
+            f"{count} landmarks were found automatically, none was placed by a person; expected "
+            f"error {typical[len(typical) // 2]:.1f} mm (median), {typical[-1]:.1f} mm (largest)",
+            where="landmarks",
+            why="cuts, muscles, the region and the lips are placed from them",
+            fix='"cmfsim landmarks case.toml" writes them with a picture: check them in 3D Slicer '
+            "and name the files under [landmarks]",
+        )
+        for kind, sites in (("skull", self.skull), ("skin", self.skin)):
+            for name, site in sites.items():
+                if site.doubt:
+                    x, y, z = site.point
+                    yield Finding.warning(
+                        "landmark-doubtful",
+                        f"{name} ({kind}) at ({x:.1f}, {y:.1f}, {z:.1f}) is doubtful: {site.doubt}",
+                        where=f"landmarks.{kind}",
+                        why="it was proposed, and what is placed from it follows its error",
+                        fix='look at it in the picture of "cmfsim landmarks", and place it by hand '
+                        "where it is wrong",
+                    )
+        for kind, missing in (("skull", self.missing_skull), ("skin", self.missing_skin)):
+            for reason in dict.fromkeys(missing.values()):
+                names = [name for name, why in missing.items() if why == reason]
+                yield Finding.warning(
+                    "landmarks-missing",
+                    f"{len(names)} {kind} landmarks were not found: {', '.join(names)}: {reason}",
+                    where=f"landmarks.{kind}",
+                    why="they are left out rather than guessed; what needs them is refused",
+                    fix="place them by hand if the image shows them",
+                )
