@@ -168,6 +168,7 @@ from cmfsim.planning.replanning import corrected_planning as corrected_planning
 from cmfsim.planning.replanning import expected_error as expected_error
 from cmfsim.planning.replanning import planning_model as planning_model
 from cmfsim.planning.server import serve_planning as serve_planning
+from cmfsim.pipeline.proposing import propose_landmarks as propose_landmarks
 from cmfsim.registration import FoldReport as FoldReport
 from cmfsim.registration import LandmarkAgreement as LandmarkAgreement
 from cmfsim.registration import LandmarkMatch as LandmarkMatch

@@ -11,6 +11,7 @@ from cmfsim.cli import (
     case_commands,
     demo_command,
     init_command,
+    landmarks_command,
     phantom_command,
     plan_command,
     scene_commands,
@@ -111,6 +112,8 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         epilog="Exit codes: 0 no errors found, 2 errors found or the case file cannot be read.",
     )
     doctor.set_defaults(run=case_commands.doctor)
+
+    _add_landmarks(commands, named)
 
     changed = argparse.ArgumentParser(add_help=False, parents=[named])
     changed.add_argument(
@@ -296,6 +299,26 @@ def _add_scene_commands(commands: Any, common: argparse.ArgumentParser) -> None:
 
     info = commands.add_parser("info", parents=[common], help="say what a scene holds")
     info.set_defaults(run=scene_commands.info)
+
+
+def _add_landmarks(commands: Any, named: argparse.ArgumentParser) -> None:
+    landmarks = commands.add_parser(
+        "landmarks",
+        parents=[named],
+        help="find the landmarks of skull and skin, and draw them to be confirmed",
+    )
+    landmarks.add_argument(
+        "-o", "--output", metavar="OUT", type=Path, help="folder instead of the case's own"
+    )
+    landmarks.add_argument(
+        "--template",
+        metavar="FOLDER",
+        type=Path,
+        action="append",
+        help="a head whose landmarks are known (cranium, mandible, skull_landmarks.mrk.json); "
+        "may be repeated",
+    )
+    landmarks.set_defaults(run=landmarks_command.landmarks)
 
 
 def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> None:

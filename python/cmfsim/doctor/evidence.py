@@ -188,7 +188,8 @@ def gather(case: Case) -> Evidence:
         if matrix is not None:
             motions[name] = matrix
     try:
-        case.region.plane(skull, 0.0, 0.0)
+        if not case.landmarks.proposed:
+            case.region.plane(skull, 0.0, 0.0)
     except CaseError as error:
         findings.append(
             Finding.error(

@@ -59,6 +59,9 @@ def _check_procedure(evidence: Evidence, cut: CaseOsteotomy, where: str) -> Iter
     """Whether a standard procedure can be placed from the landmarks that are there."""
     if cut.procedure is None:
         return
+    if evidence.case.landmarks.proposed:
+        # Placed from landmarks that are found when the case is built.
+        return
     try:
         yield from place_procedure(cut.procedure, evidence.skull_landmarks, cut.options).findings
     except LandmarkError as error:

@@ -393,12 +393,24 @@ def _name(table: Table, key: str, name: str) -> str:
 
 
 def _landmarks(table: Table, folder: Path) -> CaseLandmarks:
-    table.only("skull", "skin", "frame")
+    table.only("skull", "skin", "frame", "automatic", "templates")
     return CaseLandmarks(
         _file_or_none(table, "skull", folder),
         _file_or_none(table, "skin", folder),
         _frame(table),
+        table.flag("automatic", default=True),
+        _template_folders(table, folder),
     )
+
+
+def _template_folders(table: Table, folder: Path) -> tuple[Path, ...]:
+    """The folders of heads whose landmarks are known."""
+    if "templates" not in table:
+        return ()
+    given = table.plain("templates")
+    if not isinstance(given, list) or not all(isinstance(n, str) and n.strip() for n in given):
+        table.fail("templates", f'is {given!r}: a list of folders, such as ["heads/a", "heads/b"]')
+    return tuple(folder / name for name in given)
 
 
 def _plane(table: Table, key: str) -> Plane:

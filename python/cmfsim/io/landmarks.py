@@ -165,7 +165,12 @@ def _read(path: str | os.PathLike[str], frame: str | None) -> LandmarkFile:
         raise LandmarkInputError(f"{path.name}: {error}") from error
 
 
-def write_landmarks(path: str | os.PathLike[str], landmarks: Mapping[str, ArrayLike]) -> None:
+def write_landmarks(
+    path: str | os.PathLike[str],
+    landmarks: Mapping[str, ArrayLike],
+    *,
+    descriptions: Mapping[str, str] | None = None,
+) -> None:
     """Writes landmarks as a `.mrk.json` file of 3D Slicer, LPS mm.
 
     An existing file is replaced in one step; `read_landmarks` gives the same numbers back.
@@ -175,6 +180,8 @@ def write_landmarks(path: str | os.PathLike[str], landmarks: Mapping[str, ArrayL
     path : path
         Ends in `.mrk.json`.
     landmarks : mapping of str to (3,) float64, mm
+    descriptions : mapping of str to str, optional
+        What 3D Slicer shows with a point, by label.
 
     Raises
     ------
@@ -199,7 +206,7 @@ def write_landmarks(path: str | os.PathLike[str], landmarks: Mapping[str, ArrayL
             for number, (label, value) in enumerate(landmarks.items(), start=1)
         ]
     )
-    write_markups(path, [markup_of("Fiducial", points.items())])
+    write_markups(path, [markup_of("Fiducial", points.items(), descriptions)])
 
 
 def _from_json(text: str, path: Path, frame: str | None) -> LandmarkFile:

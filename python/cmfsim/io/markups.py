@@ -110,8 +110,13 @@ def markups_of(text: str, unstated: str) -> list[Markup]:
     return found
 
 
-def markup_of(kind: str, points: Iterable[tuple[str, Floats]]) -> dict[str, Any]:
-    """A markup as Slicer writes it, LPS mm."""
+def markup_of(
+    kind: str,
+    points: Iterable[tuple[str, Floats]],
+    descriptions: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """A markup as Slicer writes it, LPS mm, with what is said of points by label."""
+    said = descriptions or {}
     return {
         "type": kind,
         "coordinateSystem": "LPS",
@@ -120,6 +125,7 @@ def markup_of(kind: str, points: Iterable[tuple[str, Floats]]) -> dict[str, Any]
             {
                 "id": str(number),
                 "label": label,
+                **({"description": said[label]} if label in said else {}),
                 "position": position.tolist(),
                 "positionStatus": "defined",
             }

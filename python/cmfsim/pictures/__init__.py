@@ -12,6 +12,7 @@ from cmfsim.pictures.anatomy import (
 from cmfsim.pictures.charts import MODEL_COLOURS, chart_errors
 from cmfsim.pictures.distances import DISTANCE_LIMIT, distance_colour, picture_distances
 from cmfsim.pictures.faces import picture_plan, picture_prediction
+from cmfsim.pictures.landmarks import picture_landmarks
 from cmfsim.pictures.muscles import picture_muscles
 from cmfsim.pictures.window import ViewPart, has_screen, view_parts
 
@@ -27,6 +28,7 @@ __all__ = [
     "has_screen",
     "picture_anatomy",
     "picture_distances",
+    "picture_landmarks",
     "picture_muscles",
     "picture_node_kinds",
     "picture_plan",

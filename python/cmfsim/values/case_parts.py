@@ -175,11 +175,22 @@ class CaseLandmarks:
     skull, skin : Path or None
     frame : str or None
         The frame of files that do not state theirs.
+    automatic : bool
+        Whether landmarks are found automatically where neither file is given.
+    templates : tuple of Path
+        Folders of heads whose landmarks are known, for finding them; see docs/landmarks.md.
     """
 
     skull: Path | None = None
     skin: Path | None = None
     frame: str | None = None
+    automatic: bool = True
+    templates: tuple[Path, ...] = ()
+
+    @property
+    def proposed(self) -> bool:
+        """Whether landmarks are to be found automatically: none are given."""
+        return self.automatic and self.skull is None and self.skin is None
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,7 @@ from cmfsim.pipeline.building.inputs import (
     read_anatomy,
     read_case_landmarks,
 )
+from cmfsim.pipeline.building.landmarks import found_landmarks, landmark_summary
 from cmfsim.pipeline.building.lips import (
     CaseLipContact,
     find_seam,
@@ -68,6 +69,7 @@ from cmfsim.pipeline.building.skin_part import on_skin
 from cmfsim.pipeline.building.stages import BuildOptions, Stages
 from cmfsim.pipeline.building.tissue_mesh import end_planes, region_of, tissue_mesh
 from cmfsim.progress import Progress, no_progress
+from cmfsim.registration.proposed import ProposedLandmarks
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding, OnFindings
@@ -200,7 +202,11 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
     if anatomy is None:
         anatomy, noticed = read_anatomy(case, landmarks.get("skull", {}), stages.begin)
         stages.add(noticed)
-    head = _Head(case, landmarks, anatomy)
+    proposed = None
+    if case.landmarks.proposed and not landmarks:
+        proposed = found_landmarks(case, anatomy, stages)
+        landmarks = {} if proposed is None else proposed.points
+    head = _Head(case, landmarks, anatomy, proposed)
     bones, procedures = _bones(head, stages, options.after)
     tissue = _tissue(head, stages, bones, kinds)
     nodes = _nodes(head, stages, bones, tissue, kinds)
@@ -221,6 +227,7 @@ class _Head:
     case: Case
     landmarks: Mapping[str, Mapping[str, Floats]]
     anatomy: Anatomy
+    proposed: ProposedLandmarks | None = None
 
     @property
     def skull(self) -> Mapping[str, Floats]:
@@ -487,6 +494,7 @@ def _summary(
             "origin": grid.lowest.tolist(),
         },
         "bones": list(head.anatomy.bones),
+        **({} if head.proposed is None else {"landmarks": landmark_summary(head.proposed)}),
         "osteotomies": [
             {"procedure": placed.kind, "options": dict(placed.options)} for placed in procedures
         ],

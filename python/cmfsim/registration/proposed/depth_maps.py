@@ -51,7 +51,9 @@ class DepthMap:
         """The values along the second coordinate at a place of the first, (k,): medians."""
         return _medians(self.values[np.abs(self.rows - u) <= half], 0)
 
-    def window(self, u: tuple[float, float], v: tuple[float, float]) -> tuple[Floats, Floats, Floats]:
+    def window(
+        self, u: tuple[float, float], v: tuple[float, float]
+    ) -> tuple[Floats, Floats, Floats]:
         """First and second coordinate and value of the cells of a window that have one, (n,)."""
         rows = (self.rows >= u[0]) & (self.rows <= u[1])
         columns = (self.columns >= v[0]) & (self.columns <= v[1])
@@ -70,7 +72,10 @@ def _medians(values: Floats, axis: int) -> Floats:
 
 
 def depth_map(
-    points: Floats, view: tuple[int, int, int], sign: float, reach: tuple[float, float, float, float]
+    points: Floats,
+    view: tuple[int, int, int],
+    sign: float,
+    reach: tuple[float, float, float, float],
 ) -> DepthMap:
     """The depth map of points that lie densely on a surface.
 

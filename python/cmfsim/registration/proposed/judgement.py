@@ -145,7 +145,9 @@ def _unevenness(own: Mapping[str, Floats]) -> dict[str, float]:
     for pair, gap in gaps.items():
         height = own[f"{pair}_L"][2]
         near = [abs(own[f"{p}_L"][2] - height) < 30.0 for p in pairs]
-        lean = float(np.median([gaps[p][0] for p, is_near in zip(pairs, near, strict=True) if is_near]))
+        lean = float(
+            np.median([gaps[p][0] for p, is_near in zip(pairs, near, strict=True) if is_near])
+        )
         result[pair] = float(np.linalg.norm(gap - [lean, 0.0, 0.0]))
     return result
 

@@ -87,9 +87,7 @@ def surface_samples(surface: SurfaceData, count: int, seed: int = 0) -> tuple[Fl
     return points, normals[chosen] / doubled[chosen][:, None]
 
 
-def find_pose(
-    bones: SurfaceData, average: SurfaceData, average_size: float = 1.0
-) -> Pose:
+def find_pose(bones: SurfaceData, average: SurfaceData, average_size: float = 1.0) -> Pose:
     """The pose of a head by its bones: the plane of symmetry, then the fit of an average cranium.
 
     Parameters
@@ -260,9 +258,7 @@ def distance_from(points: Floats, normals: Floats, template: SurfaceData) -> flo
     return _similarity(points, normals, surface, np.eye(3), np.zeros(3), FINE_ROUNDS)[0]
 
 
-def _starts(
-    points: Floats, target: Floats, average_size: float
-) -> Iterator[tuple[Floats, Floats]]:
+def _starts(points: Floats, target: Floats, average_size: float) -> Iterator[tuple[Floats, Floats]]:
     """Similarities to begin with: nods, sizes, and heads whose vertex is cut off."""
     middle = np.array([0.0, *points[:, 1:].mean(axis=0)])
     for pitch in np.radians(PITCHES):

@@ -67,9 +67,7 @@ def _tip(front: DepthMap, skull: Mapping[str, Floats]) -> Floats | None:
     return np.array([x[near].mean(), y.min(), z[near].mean()])
 
 
-def _below_nose(
-    front: DepthMap, tip: Floats, skull: Mapping[str, Floats], found: Sites
-) -> None:
+def _below_nose(front: DepthMap, tip: Floats, skull: Mapping[str, Floats], found: Sites) -> None:
     middle = local_midline(front, (tip[2] - 42.0, tip[2] - 14.0))
     lean = float(tip[0]) if middle is None else middle
     z = front.columns
@@ -105,9 +103,7 @@ def _bulge(z: Floats, line: Floats, low: float, high: float, outwards: float) ->
     return int(inside[np.argmax(outwards * (chord - line[inside]))])
 
 
-def _lips(
-    z: Floats, line: Floats, lean: float, corner: int, chin_z: float, found: Sites
-) -> None:
+def _lips(z: Floats, line: Floats, lean: float, corner: int, chin_z: float, found: Sites) -> None:
     """The lips stand out from the chord between nose and chin, with a dent between them."""
     inside = np.flatnonzero((z >= chin_z) & (z <= z[corner]) & np.isfinite(line))[::-1]
     if len(inside) < 20:

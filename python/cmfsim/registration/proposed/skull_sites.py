@@ -199,9 +199,12 @@ def _upper_alveolus(views: SkullViews, found: Sites) -> None:
     found["supradentale"] = np.array([lean, line[neck], z[neck]])
     found["_upper_edge"] = np.array([lean, line[edge], z[edge]])
     spine = neck
-    while spine + 1 < len(z) and np.isfinite(line[spine + 1]) and (
-        line[spine + 1] - line[neck] < 14.0 and line[spine + 1] - line[spine] < 2.5
-    ) and z[spine + 1] < z[neck] + 24.0:
+    while (
+        spine + 1 < len(z)
+        and np.isfinite(line[spine + 1])
+        and (line[spine + 1] - line[neck] < 14.0 and line[spine + 1] - line[spine] < 2.5)
+        and z[spine + 1] < z[neck] + 24.0
+    ):
         spine += 1
     half = z[neck] + 0.38 * (z[spine] - z[neck])
     at = int(np.argmin(np.abs(z - half)))
@@ -242,7 +245,8 @@ def _jaw_profile(views: SkullViews, found: Sites) -> None:
     found["infradentale"] = np.array([lean, line[neck], z[neck]])
     chin = smoothed(front.column(chin_lean, 2.2), 0.8)
     low = views.mandible[
-        (np.abs(views.mandible[:, 0] - chin_lean) < 1.5) & (views.mandible[:, 1] < line[bottom] + 25.0)
+        (np.abs(views.mandible[:, 0] - chin_lean) < 1.5)
+        & (views.mandible[:, 1] < line[bottom] + 25.0)
     ]
     if len(low) < 20:
         return
@@ -268,9 +272,7 @@ def _jaw_profile(views: SkullViews, found: Sites) -> None:
 MALAR_OUT = 1.04
 
 
-def _about_orbit(
-    views: SkullViews, orbit: _Orbit, side: float, letter: str, found: Sites
-) -> None:
+def _about_orbit(views: SkullViews, orbit: _Orbit, side: float, letter: str, found: Sites) -> None:
     front = views.cranium_front
     z = front.columns
     line = smoothed(front.column(side * orbit.x, 1.6), 0.8)
@@ -302,9 +304,7 @@ def _about_orbit(
 LATERAL_BEHIND, LATERAL_ABOVE = 12.0, 4.5
 
 
-def _lateral_orbit(
-    views: SkullViews, rim: Floats, side: float, letter: str, found: Sites
-) -> None:
+def _lateral_orbit(views: SkullViews, rim: Floats, side: float, letter: str, found: Sites) -> None:
     outer = views.cranium_sides[0 if side > 0.0 else 1]
     y, z = rim[1] + LATERAL_BEHIND, rim[2] + LATERAL_ABOVE
     across = -outer.at(y, z)
