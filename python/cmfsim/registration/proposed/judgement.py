@@ -7,12 +7,10 @@ from types import MappingProxyType
 import numpy as np
 
 from cmfsim.checks import Floats
-from cmfsim.errors import LandmarkError, RegistrationError
-from cmfsim.registration.agreement import leave_one_out
+from cmfsim.registration.proposed.groups import misfits
 from cmfsim.registration.proposed.limits import CutPlane
 from cmfsim.registration.proposed.pose import Pose
 from cmfsim.registration.proposed.proposed_landmarks import ProposedSite
-from cmfsim.registration.reference import REFERENCE_PLACES
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 
 __all__ = ["MissingSites", "judged", "missing_sites"]
@@ -45,9 +43,23 @@ AT_CUT, NEAR_CUT = 3.0, 8.0
 # The jaw below the lower incisors must be there as far down as this for its profile to be read,
 # average-head mm: to the deepest point, and to the foremost one of the chin.
 TO_FOLD, TO_CHIN = 18.0, 27.0
-# Heads differ so much from the average one at a site, mm of the average head, and robust standard
-# deviations of the set: more is no variety.
-FAR_FROM_AVERAGE, FAR_SCORE = 14.0, 4.5
+# Correct sites of two real heads lie within 12 mm of where the others of their group put them in an
+# average head, wrong ones 15 mm and more: mm of the average head.
+STRANGE, IMPOSSIBLE = 9.5, 14.0
+
+
+# Sites of the skin that are found from those of the skull, and are gone with them.
+SUPPORT: Mapping[str, str] = MappingProxyType(
+    {
+        "pogonion": "pogonion",
+        "nasion": "nasion",
+        **{
+            f"{corner}canthion_{letter}": f"supraorbital_{letter}"
+            for corner in ("endo", "exo")
+            for letter in "LR"
+        },
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -80,15 +92,30 @@ def missing_sites(
             if cut is not None:
                 gone[name] = f"the image ends there ({cut.name} border)"
     _below_a_cut_chin(skull, cuts, pose, gone)
+    there = {name: place for name, place in skull.items() if name not in gone}
+    off = misfits(_own(there, pose), _own(skin, pose))
+    _impossible(off["skull"], gone)
     lost: dict[str, str] = {}
     for name in SKIN_LANDMARKS:
         if name not in skin:
             lost[name] = "the skin around it was not recognised"
         elif (cut := _cut_at(skin[name], cuts, AT_CUT)) is not None:
             lost[name] = f"the image ends there ({cut.name} border)"
-        elif name == "pogonion" and "pogonion" in gone:
-            lost[name] = gone["pogonion"]
+        elif SUPPORT.get(name) in gone:
+            lost[name] = gone[SUPPORT[name]]
+    _impossible(off["skin"], lost)
     return MissingSites(gone, lost)
+
+
+def _own(points: Mapping[str, Floats], pose: Pose) -> dict[str, Floats]:
+    """Points in the frame and size of the average head."""
+    return {name: pose.into(point[None])[0] / pose.size for name, point in points.items()}
+
+
+def _impossible(off: Mapping[str, float], gone: dict[str, str]) -> None:
+    for name, distance in off.items():
+        if distance > IMPOSSIBLE:
+            gone.setdefault(name, "what was found there does not fit the other sites of any head")
 
 
 def _below_a_cut_chin(
@@ -112,9 +139,10 @@ def judged(
     kind: str, points: Mapping[str, Floats], pose: Pose, likeness: float
 ) -> dict[str, ProposedSite]:
     """The sites with their expected errors, and what speaks against the doubtful ones."""
-    own = {name: pose.into(point[None])[0] / pose.size for name, point in points.items()}
+    own = _own(points, pose)
     uneven = _unevenness(own)
-    odd = _odd(kind, own)
+    off = misfits(own, {}) if kind == "skull" else misfits({}, own)
+    odd = {name: distance for name, distance in off[kind].items() if distance > STRANGE}
     sites = {}
     for name, point in points.items():
         base = name[:-2] if name.endswith(("_L", "_R")) else name
@@ -150,17 +178,3 @@ def _unevenness(own: Mapping[str, Floats]) -> dict[str, float]:
         )
         result[pair] = float(np.linalg.norm(gap - [lean, 0.0, 0.0]))
     return result
-
-
-def _odd(kind: str, own: Mapping[str, Floats]) -> dict[str, float]:
-    """The sites that the others, carried from an average head, put far away, with the distance."""
-    reference = REFERENCE_PLACES[kind]
-    names = [name for name in reference if name in own]
-    try:
-        agreement = leave_one_out(
-            [reference[name] for name in names], [own[name] for name in names], names
-        )
-    except (LandmarkError, RegistrationError):
-        return {}
-    rows = zip(agreement.names, agreement.distances, agreement.scores, strict=True)
-    return {n: float(d) for n, d, s in rows if d > FAR_FROM_AVERAGE and s > FAR_SCORE}

@@ -207,6 +207,9 @@ LEVEL_SITES = (
     ),
 )
 LEVEL_DISTANCE, LEVEL_ROUNDS, LEAST_LEVEL_SITES = 5.0, 20, 6
+# A levelling that turns the head by more, degrees, or moves or scales it by more (mm, share) rests
+# on sites that were found wrongly.
+MOST_LEVEL_TURN, MOST_LEVEL_SHIFT, MOST_LEVEL_SCALE = 12.0, 12.0, 0.12
 
 
 def levelled(pose: Pose, found: Mapping[str, Floats], average: Mapping[str, Floats]) -> Pose:
@@ -231,6 +234,11 @@ def levelled(pose: Pose, found: Mapping[str, Floats], average: Mapping[str, Floa
         weight = 1.0 / (1.0 + (gap / LEVEL_DISTANCE) ** 2)
         linear, offset = _planar_fit(source, target, weight)
     scale = float(np.cbrt(np.linalg.det(linear)))
+    turn = np.degrees(np.arccos(np.clip(linear[1, 1] / scale, -1.0, 1.0)))
+    moved = float(np.linalg.norm((source @ linear.T + offset - source).mean(axis=0)))
+    if turn > MOST_LEVEL_TURN or moved > MOST_LEVEL_SHIFT or abs(scale - 1.0) > MOST_LEVEL_SCALE:
+        # Sites that were found wrongly would turn the whole head over.
+        return pose
     # The point that goes to the origin of the average head.
     origin = pose.out(-np.linalg.solve(linear, offset)[None] * pose.size)[0]
     return Pose(origin, linear / scale @ pose.axes, pose.size / scale, pose.residual)

@@ -10,6 +10,7 @@ from cmfsim._core import Surface
 from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
 from cmfsim.registration.proposed.detection import Detected, biases, detect, is_lower, joined
+from cmfsim.registration.proposed.groups import JAW_SITES
 from cmfsim.registration.proposed.judgement import judged, missing_sites
 from cmfsim.registration.proposed.limits import cut_planes
 from cmfsim.registration.proposed.pose import (
@@ -32,8 +33,6 @@ LIKENESS = 0.8
 MIRRORED = 0.3
 # Rounds of finding sites and levelling the head by them.
 LEVEL_ROUNDS = 2
-# Sites of the lower jaw.
-JAW = ("infradentale", "supramentale", "pogonion", "menton", "gonion", "occlusal_line", "sub_m2")
 # Sites of the cranium without which what was found is no head.
 LEAST_SITES = 12
 
@@ -120,7 +119,7 @@ def _parts(bones: Mapping[str, SurfaceData]) -> _Bones:
 
 def _check_head(skull: Mapping[str, Floats]) -> None:
     """Refuses what has no orbits, or too few sites of a cranium."""
-    cranial = [name for name in skull if not name.startswith(JAW)]
+    cranial = [name for name in skull if not name.startswith(JAW_SITES)]
     if len(cranial) < LEAST_SITES or not any(n.startswith("suborbital") for n in cranial):
         raise LandmarkInputError(
             f"{len(cranial)} sites of the cranium were found, {LEAST_SITES} and an orbit are "
@@ -198,7 +197,7 @@ def _on_surface(
     """The sites moved to the closest points of their surfaces, in the patient's frame."""
     placed: dict[str, Floats] = {}
     for lower, surface in surfaces.items():
-        names = [name for name in sites if name.startswith(JAW) == lower]
+        names = [name for name in sites if name.startswith(JAW_SITES) == lower]
         if not names:
             continue
         points = pose.out(np.array([sites[name] for name in names]) * pose.size)

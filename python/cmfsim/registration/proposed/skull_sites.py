@@ -269,7 +269,7 @@ def _jaw_profile(views: SkullViews, found: Sites) -> None:
 
 
 # The lower border of the cheekbone is looked for so far out, as a factor on the orbit's middle.
-MALAR_OUT = 1.04
+MALAR_OUT = 1.055
 
 
 def _about_orbit(views: SkullViews, orbit: _Orbit, side: float, letter: str, found: Sites) -> None:
@@ -312,6 +312,11 @@ def _lateral_orbit(views: SkullViews, rim: Floats, side: float, letter: str, fou
         found[f"lateral_orbit_{letter}"] = np.array([side * across, y, z])
 
 
+# Where the condyle of an average head, levelled, can lie, mm, how high its top must reach there, and
+# how many points it must have.
+CONDYLE_Y, CONDYLE_Z, LEAST_TOP, LEAST_CONDYLE = (-30.0, 10.0), (-30.0, 18.0), -10.0, 100
+
+
 def _beside(views: SkullViews, side: float, letter: str, found: Sites) -> None:
     k = 0 if side > 0.0 else 1
     outer, jaw = views.cranium_sides[k], views.mandible_sides[k]
@@ -319,15 +324,25 @@ def _beside(views: SkullViews, side: float, letter: str, found: Sites) -> None:
     half = mandible[mandible[:, 0] > 10.0]
     if not len(half):
         return
-    # The condyle: the highest point of the hind part of the ramus.
-    hind = half[half[:, 1] > np.quantile(half[:, 1], 0.80)]
-    top = float(hind[:, 2].max())
-    head = hind[hind[:, 2] > top - 14.0]
-    pole = head[head[:, 0] > head[:, 0].max() - 1.0].mean(axis=0)
-    condyle = np.array([pole[0], pole[1], top])
-    _arch(outer, condyle, side, letter, found)
-    _jaw_angle(half, jaw, side, letter, found)
+    condyle = _condyle(half)
+    if condyle is not None:
+        _arch(outer, condyle, side, letter, found)
+    _jaw_angle(half, side, letter, found)
     _teeth_line(outer, jaw, mandible, side, letter, found)
+
+
+def _condyle(half: Floats) -> Floats | None:
+    """The lateral pole of the condyle at the height of its top; None where the jaw has none."""
+    y, z = half[:, 1], half[:, 2]
+    near = half[(y > CONDYLE_Y[0]) & (y < CONDYLE_Y[1]) & (z > CONDYLE_Z[0]) & (z < CONDYLE_Z[1])]
+    if len(near) < LEAST_CONDYLE:
+        return None
+    top = float(near[:, 2].max())
+    if top < LEAST_TOP:
+        return None
+    head = near[near[:, 2] > top - 14.0]
+    pole = head[head[:, 0] > head[:, 0].max() - 1.0].mean(axis=0)
+    return np.array([pole[0], pole[1], top])
 
 
 def _ridge(outer: DepthMap, y: float, z: float, reach: float) -> Floats | None:
@@ -349,7 +364,7 @@ def _arch(outer: DepthMap, condyle: Floats, side: float, letter: str, found: Sit
             found[f"zygomatic_arch_{letter}"] = middle * flip
 
 
-def _jaw_angle(half: Floats, jaw: DepthMap, side: float, letter: str, found: Sites) -> None:
+def _jaw_angle(half: Floats, side: float, letter: str, found: Sites) -> None:
     """The gonion: the point of the outline farthest from the line of condyle and menton."""
     menton = found.get("menton")
     if menton is None:
