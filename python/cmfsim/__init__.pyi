@@ -143,6 +143,7 @@ from cmfsim.pipeline.evaluating import CaseEvaluation as CaseEvaluation
 from cmfsim.pipeline.evaluating import evaluate as evaluate
 from cmfsim.pipeline.predicting import predict as predict
 from cmfsim.pipeline.predicting import predict_models as predict_models
+from cmfsim.pipeline.proposing import propose_landmarks as propose_landmarks
 from cmfsim.planning.face_measures import MEASURES as MEASURES
 from cmfsim.planning.face_measures import BoneSite as BoneSite
 from cmfsim.planning.face_measures import FaceSites as FaceSites
@@ -168,7 +169,6 @@ from cmfsim.planning.replanning import corrected_planning as corrected_planning
 from cmfsim.planning.replanning import expected_error as expected_error
 from cmfsim.planning.replanning import planning_model as planning_model
 from cmfsim.planning.server import serve_planning as serve_planning
-from cmfsim.pipeline.proposing import propose_landmarks as propose_landmarks
 from cmfsim.registration import FoldReport as FoldReport
 from cmfsim.registration import LandmarkAgreement as LandmarkAgreement
 from cmfsim.registration import LandmarkMatch as LandmarkMatch

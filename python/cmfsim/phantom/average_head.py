@@ -55,7 +55,7 @@ def write_average_head(path: Path) -> None:
             raise AssertionError(name)
         packed[f"{name}_vertices"] = np.round(np.asarray(surface.vertices) / GRAIN).astype(np.int16)
         packed[f"{name}_triangles"] = np.asarray(surface.triangles).astype(np.uint16)
-    np.savez_compressed(path, **packed)
+    np.savez_compressed(path, allow_pickle=False, **packed)
 
 
 def _unpacked(stored: "np.lib.npyio.NpzFile", name: str) -> SurfaceData:

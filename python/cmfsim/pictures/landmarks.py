@@ -25,7 +25,7 @@ ROOM, LIFT = 22.0, 2.5
 VIEWS = (("front", (0.0, -1.0, 0.0)), ("left", (1.0, 0.0, 0.0)), ("right", (-1.0, 0.0, 0.0)))
 
 
-def picture_landmarks(  # noqa: PLR0913 (options by name)
+def picture_landmarks(
     path: str | os.PathLike[str],
     bones: Mapping[str, SurfaceData],
     skin: SurfaceData | None,

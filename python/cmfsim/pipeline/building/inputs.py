@@ -282,8 +282,7 @@ def _files(case: Case) -> Iterator[Path]:
     optional = [case.landmarks.skull, case.landmarks.skin, case.mesh.parting, case.mesh.file]
     if isinstance(case.lips.seam, Path):
         optional.append(case.lips.seam)
-    for folder in case.landmarks.templates:
-        optional.append(folder)
+    optional.extend(case.landmarks.templates)
     if case.muscles is not None and isinstance(case.muscles.template, Path):
         optional.append(case.muscles.template)
     after = case.postoperative

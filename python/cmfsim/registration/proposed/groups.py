@@ -1,4 +1,4 @@
-"""Whether sites lie among one another as those of an average head do: cranium, jaw and skin apart."""
+"""Whether sites lie among one another as in an average head: cranium, jaw and skin separately."""
 
 from collections.abc import Mapping
 

@@ -33,6 +33,10 @@ LEAST_AGREEMENT, MOST_GAP, LEAST_PAIRS = 0.5, 30.0, 50
 WORST_FIT = 6.0
 
 
+# Points of a surface and their outward unit normals, (n, 3) each.
+Samples = tuple[Floats, Floats]
+
+
 @dataclass(frozen=True, eq=False)
 class Pose:
     """How a head lies: p' = axes (p − origin), in mm, with x' to the left, y' back, z' up.
@@ -110,7 +114,7 @@ def find_pose(bones: SurfaceData, average: SurfaceData, average_size: float = 1.
     """
     points, normals = surface_samples(bones, SAMPLES)
     symmetry, centre = _symmetry(bones, points, normals)
-    return _fitted(points, normals, symmetry, centre, average, average_size)
+    return _fitted((points, normals), (symmetry, centre), average, average_size)
 
 
 def _symmetry(whole: SurfaceData, points: Floats, normals: Floats) -> tuple[Floats, Floats]:
@@ -153,13 +157,10 @@ def _symmetry(whole: SurfaceData, points: Floats, normals: Floats) -> tuple[Floa
 
 
 def _fitted(
-    points: Floats,
-    normals: Floats,
-    left: Floats,
-    centre: Floats,
-    average: SurfaceData,
-    average_size: float,
+    samples: Samples, plane: tuple[Floats, Floats], average: SurfaceData, average_size: float
 ) -> Pose:
+    """The pose of points whose plane of symmetry is known by its normal and a point."""
+    (points, normals), (left, centre) = samples, plane
     surface = Surface(np.asarray(average.vertices), np.asarray(average.triangles))
     up = np.array([0.0, 0.0, 1.0]) - left * left[2]
     up /= np.linalg.norm(up)
@@ -168,18 +169,17 @@ def _fitted(
     starts = _starts(begin, np.asarray(average.vertices), average_size)
     few = slice(None, None, 6)
     tried = [
-        _similarity(begin[few], turned[few], surface, linear, offset, FIRST_ROUNDS)
-        for linear, offset in starts
+        _similarity((begin[few], turned[few]), surface, start, FIRST_ROUNDS) for start in starts
     ]
     tried.sort(key=lambda result: result[0])
     best = min(
         (
-            _similarity(begin[few], turned[few], surface, linear, offset, ROUGH_ROUNDS)
+            _similarity((begin[few], turned[few]), surface, (linear, offset), ROUGH_ROUNDS)
             for _, linear, offset in tried[:MOST_STARTS]
         ),
         key=lambda result: result[0],
     )
-    rms, linear, offset = _similarity(begin, turned, surface, best[1], best[2], FINE_ROUNDS)
+    rms, linear, offset = _similarity((begin, turned), surface, best[1:], FINE_ROUNDS)
     scale = float(np.cbrt(np.linalg.det(linear)))
     residual = rms
     if residual > WORST_FIT:
@@ -240,7 +240,8 @@ def levelled(pose: Pose, found: Mapping[str, Floats], average: Mapping[str, Floa
         # Sites that were found wrongly would turn the whole head over.
         return pose
     # The point that goes to the origin of the average head.
-    origin = pose.out(-np.linalg.solve(linear, offset)[None] * pose.size)[0]
+    start = np.asarray(-np.linalg.solve(linear, offset) * pose.size, dtype=np.float64)
+    origin = pose.out(start[None])[0]
     return Pose(origin, linear / scale @ pose.axes, pose.size / scale, pose.residual)
 
 
@@ -263,7 +264,7 @@ def _planar_fit(source: Floats, target: Floats, weight: Floats) -> tuple[Floats,
 def distance_from(points: Floats, normals: Floats, template: SurfaceData) -> float:
     """How far points of a head lie from a template's bone after the best small similarity, mm."""
     surface = Surface(np.asarray(template.vertices), np.asarray(template.triangles))
-    return _similarity(points, normals, surface, np.eye(3), np.zeros(3), FINE_ROUNDS)[0]
+    return _similarity((points, normals), surface, (np.eye(3), np.zeros(3)), FINE_ROUNDS)[0]
 
 
 def _starts(points: Floats, target: Floats, average_size: float) -> Iterator[tuple[Floats, Floats]]:
@@ -288,14 +289,10 @@ def _starts(points: Floats, target: Floats, average_size: float) -> Iterator[tup
 
 
 def _similarity(
-    points: Floats,
-    normals: Floats,
-    surface: Surface,
-    linear: Floats,
-    offset: Floats,
-    rounds: int,
+    samples: Samples, surface: Surface, start: tuple[Floats, Floats], rounds: int
 ) -> tuple[float, Floats, Floats]:
     """Distance in the patient's mm, and the similarity in the plane x = 0 that fits best."""
+    (points, normals), (linear, offset) = samples, start
     kept_rms, share = np.inf, 1.0
     face_normals = _face_normals(surface)
     for _ in range(rounds):

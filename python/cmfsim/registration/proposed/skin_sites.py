@@ -50,7 +50,7 @@ def find_skin_sites(front: DepthMap, skull: Mapping[str, Floats]) -> Sites:
 
 def _put(front: DepthMap, name: str, x: float, z: float, found: Sites) -> None:
     """The point of the skin that a ray from in front meets."""
-    u, v, y = front.window((x - 1.2, x + 1.2), (z - 1.2, z + 1.2))
+    _, _, y = front.window((x - 1.2, x + 1.2), (z - 1.2, z + 1.2))
     if len(y) > 3:
         found[name] = np.array([x, float(np.median(y)), z])
 
@@ -87,7 +87,7 @@ def _below_nose(front: DepthMap, tip: Floats, skull: Mapping[str, Floats], found
         return
     found["subnasale"] = np.array([lean, line[corner], z[corner]])
     _wings(front, tip, float(z[corner]), found)
-    _lips(z, line, lean, corner, chin_z, found)
+    _lips(front, lean, (chin_z, float(z[corner])), found)
     if "labiale_superius" in found and "labiale_inferius" in found:
         height = 0.5 * (found["labiale_superius"][2] + found["labiale_inferius"][2])
         for side, letter in ((1.0, "L"), (-1.0, "R")):
@@ -103,9 +103,10 @@ def _bulge(z: Floats, line: Floats, low: float, high: float, outwards: float) ->
     return int(inside[np.argmax(outwards * (chord - line[inside]))])
 
 
-def _lips(z: Floats, line: Floats, lean: float, corner: int, chin_z: float, found: Sites) -> None:
-    """The lips stand out from the chord between nose and chin, with a dent between them."""
-    inside = np.flatnonzero((z >= chin_z) & (z <= z[corner]) & np.isfinite(line))[::-1]
+def _lips(front: DepthMap, lean: float, ends: tuple[float, float], found: Sites) -> None:
+    """The lips stand out from the chord between chin and nose, with a dent between them."""
+    z, line = front.columns, smoothed(front.column(lean, 1.2), 0.8)
+    inside = np.flatnonzero((z >= ends[0]) & (z <= ends[1]) & np.isfinite(line))[::-1]
     if len(inside) < 20:
         return
     a, b = inside[0], inside[-1]

@@ -1,12 +1,11 @@
 """Each landmark of the skull where its own definition holds, in the frame of an average head."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmfsim.checks import Floats
-from cmfsim.extras import third_party
 from cmfsim.registration.proposed.depth_maps import STEP, DepthMap, depth_map
 from cmfsim.registration.proposed.profile import (
     farthest_from_chord,
@@ -14,6 +13,7 @@ from cmfsim.registration.proposed.profile import (
     smoothed,
     upper_end,
 )
+from cmfsim.registration.proposed.side_sites import SideView, Sites, find_orbit, find_side_sites
 
 __all__ = ["SkullViews", "find_skull_sites", "skull_views"]
 
@@ -65,72 +65,34 @@ def skull_views(cranium: Floats, mandible: Floats) -> SkullViews:
     )
 
 
-Sites = dict[str, Floats]
-
-
 def find_skull_sites(views: SkullViews) -> Sites:
     """The sites that are found, (3,) each, average-head mm."""
     found: Sites = {}
-    orbits = [_orbit(views.cranium_front, side) for side in (1.0, -1.0)]
-    _midface(views, orbits, found)
+    sides = [
+        SideView(
+            letter=letter,
+            side=side,
+            front=views.cranium_front,
+            outer=outer,
+            jaw=jaw,
+            mandible=views.mandible * [side, 1.0, 1.0],
+        )
+        for letter, side, outer, jaw in zip(
+            "LR", (1.0, -1.0), views.cranium_sides, views.mandible_sides, strict=True
+        )
+    ]
+    orbits = [find_orbit(view) for view in sides]
+    _midface(views, [orbit.z for orbit in orbits if orbit is not None], found)
     _jaw_profile(views, found)
-    for orbit, side, letter in zip(orbits, (1.0, -1.0), "LR", strict=True):
-        if orbit is not None:
-            _about_orbit(views, orbit, side, letter, found)
-    for side, letter in ((1.0, "L"), (-1.0, "R")):
-        _beside(views, side, letter, found)
+    for view, orbit in zip(sides, orbits, strict=True):
+        find_side_sites(view, orbit, found)
     return found
 
 
-@dataclass(frozen=True)
-class _Orbit:
-    """The opening of an orbit in the front view."""
-
-    x: float
-    z: float
-    low: float
-    high: float
-
-
-# The front of the face beside the nose, as a line over the distance from the midline, mm, and how
-# far behind it the orbit's floor begins.
-FACE_AT, FACE_SLOPE, HOLLOW = -87.0, 0.45, 9.0
-ORBIT_X, ORBIT_Z = (12.0, 54.0), (-16.0, 52.0)
-LEAST_ORBIT = 300.0
-# The lateral rim slopes back: the hollow ends before it, and its middle is so far out, mm.
-LATERAL_RIM = 0.5
-
-
-def _orbit(front: DepthMap, side: float) -> _Orbit | None:
-    ndimage = third_party("scipy.ndimage", "landmarks are proposed", "imaging")
-    x = side * front.rows
-    room = ((x > ORBIT_X[0]) & (x < ORBIT_X[1]))[:, None] & (
-        (front.columns > ORBIT_Z[0]) & (front.columns < ORBIT_Z[1])
-    )[None]
-    face = FACE_AT + FACE_SLOPE * np.maximum(x - 15.0, 0.0)[:, None]
-    depth = np.where(np.isfinite(front.values), front.values, 60.0)
-    hollow = room & (depth > face + HOLLOW)
-    labels, count = ndimage.label(ndimage.binary_opening(hollow, iterations=3))
-    if count == 0:
-        return None
-    sizes = ndimage.sum_labels(np.ones(labels.shape), labels, range(1, count + 1))
-    largest = int(np.argmax(sizes)) + 1
-    if sizes[largest - 1] * STEP * STEP < LEAST_ORBIT:
-        return None
-    i, j = np.nonzero(labels == largest)
-    across, height = x[i], front.columns[j]
-    xs = np.quantile(across, [0.02, 0.98])
-    zs = np.quantile(height, [0.02, 0.98])
-    middle = float(xs.mean()) + LATERAL_RIM
-    near = np.abs(across - middle) < 3.0
-    return _Orbit(middle, float(zs.mean()), float(height[near].min()), float(height[near].max()))
-
-
-def _midface(views: SkullViews, orbits: list[_Orbit | None], found: Sites) -> None:
+def _midface(views: SkullViews, eyes: list[float], found: Sites) -> None:
     front = views.cranium_front
     z = front.columns
-    eye = [o.z for o in orbits if o is not None]
-    centre = float(np.mean(eye)) if eye else 20.0
+    centre = float(np.mean(eyes)) if eyes else 20.0
     top = smoothed(front.column(0.0, 1.6), 1.0)
     rhinion = _nasal_end(z, top, centre)
     if rhinion is not None:
@@ -212,7 +174,7 @@ def _upper_alveolus(views: SkullViews, found: Sites) -> None:
     found["mid_philtrum"] = np.array([lean, line[at], z[at]])
 
 
-def _run_end(known: Floats, start: int) -> int:
+def _run_end(known: NDArray[np.bool_], start: int) -> int:
     """The last index of a run of true cells downwards, over gaps of two cells."""
     k = start
     while k > 3 and known[k - 3 : k].any():
@@ -266,158 +228,3 @@ def _jaw_profile(views: SkullViews, found: Sites) -> None:
     across = chin_lean + share * (lean - chin_lean)
     found["supramentale"] = np.array([across, chin[fold], z[fold]])
     found["pogonion"] = np.array([chin_lean, chin[chin_at], z[chin_at]])
-
-
-# The lower border of the cheekbone is looked for so far out, as a factor on the orbit's middle.
-MALAR_OUT = 1.055
-
-
-def _about_orbit(views: SkullViews, orbit: _Orbit, side: float, letter: str, found: Sites) -> None:
-    front = views.cranium_front
-    z = front.columns
-    line = smoothed(front.column(side * orbit.x, 1.6), 0.8)
-
-    def point(index: int) -> Floats:
-        return np.array([side * orbit.x, line[index], z[index]])
-
-    above = np.flatnonzero((z >= orbit.high - 1.0) & (z <= orbit.high + 12.0) & np.isfinite(line))
-    if len(above):
-        upper = above[np.argmax(-line[above] - 0.8 * z[above])]
-        found[f"supraorbital_{letter}"] = point(upper)
-        bulge = int(np.argmin(np.abs(z - z[upper] - 32.5)))
-        if np.isfinite(line[bulge]):
-            found[f"frontal_eminence_{letter}"] = point(bulge)
-    below = np.flatnonzero((z <= orbit.low + 1.0) & (z >= orbit.low - 10.0) & np.isfinite(line))
-    if len(below):
-        lower = below[np.argmax(-line[below] + 0.7 * z[below])]
-        found[f"suborbital_{letter}"] = point(lower)
-        malar = int(np.argmin(np.abs(z - z[lower] + 18.5)))
-        depth = front.at(MALAR_OUT * side * orbit.x, z[malar])
-        if np.isfinite(depth):
-            found[f"inferior_malar_{letter}"] = np.array(
-                [MALAR_OUT * side * orbit.x, depth, z[malar]]
-            )
-        _lateral_orbit(views, found[f"suborbital_{letter}"], side, letter, found)
-
-
-# The cheekbone beside the orbit lies so far behind and above its lower rim, mm.
-LATERAL_BEHIND, LATERAL_ABOVE = 12.0, 4.5
-
-
-def _lateral_orbit(views: SkullViews, rim: Floats, side: float, letter: str, found: Sites) -> None:
-    outer = views.cranium_sides[0 if side > 0.0 else 1]
-    y, z = rim[1] + LATERAL_BEHIND, rim[2] + LATERAL_ABOVE
-    across = -outer.at(y, z)
-    if np.isfinite(across):
-        found[f"lateral_orbit_{letter}"] = np.array([side * across, y, z])
-
-
-# Where the condyle of an average head, levelled, can lie, mm, how high its top must reach there, and
-# how many points it must have.
-CONDYLE_Y, CONDYLE_Z, LEAST_TOP, LEAST_CONDYLE = (-30.0, 10.0), (-30.0, 18.0), -10.0, 100
-
-
-def _beside(views: SkullViews, side: float, letter: str, found: Sites) -> None:
-    k = 0 if side > 0.0 else 1
-    outer, jaw = views.cranium_sides[k], views.mandible_sides[k]
-    mandible = views.mandible * [side, 1.0, 1.0]
-    half = mandible[mandible[:, 0] > 10.0]
-    if not len(half):
-        return
-    condyle = _condyle(half)
-    if condyle is not None:
-        _arch(outer, condyle, side, letter, found)
-    _jaw_angle(half, side, letter, found)
-    _teeth_line(outer, jaw, mandible, side, letter, found)
-
-
-def _condyle(half: Floats) -> Floats | None:
-    """The lateral pole of the condyle at the height of its top; None where the jaw has none."""
-    y, z = half[:, 1], half[:, 2]
-    near = half[(y > CONDYLE_Y[0]) & (y < CONDYLE_Y[1]) & (z > CONDYLE_Z[0]) & (z < CONDYLE_Z[1])]
-    if len(near) < LEAST_CONDYLE:
-        return None
-    top = float(near[:, 2].max())
-    if top < LEAST_TOP:
-        return None
-    head = near[near[:, 2] > top - 14.0]
-    pole = head[head[:, 0] > head[:, 0].max() - 1.0].mean(axis=0)
-    return np.array([pole[0], pole[1], top])
-
-
-def _ridge(outer: DepthMap, y: float, z: float, reach: float) -> Floats | None:
-    """The outermost point over height near a place, (3,) with x positive."""
-    v, w, depth = outer.window((y - 1.0, y + 1.0), (z - reach, z + reach))
-    if not len(depth):
-        return None
-    best = int(np.argmin(depth + 0.15 * np.abs(w - z)))
-    return np.array([-depth[best], v[best], w[best]])
-
-
-def _arch(outer: DepthMap, condyle: Floats, side: float, letter: str, found: Sites) -> None:
-    flip = np.array([side, 1.0, 1.0])
-    root = _ridge(outer, condyle[1], condyle[2] + 6.0, 5.0)
-    if root is not None:
-        found[f"supraglenoid_{letter}"] = root * flip
-        middle = _ridge(outer, root[1] - 19.5, root[2] - 1.5, 7.0)
-        if middle is not None:
-            found[f"zygomatic_arch_{letter}"] = middle * flip
-
-
-def _jaw_angle(half: Floats, side: float, letter: str, found: Sites) -> None:
-    """The gonion: the point of the outline farthest from the line of condyle and menton."""
-    menton = found.get("menton")
-    if menton is None:
-        return
-    condyle = half[np.argmax(half[:, 1] + 0.3 * half[:, 2])]
-    along = menton[1:] - condyle[1:]
-    along = along / np.linalg.norm(along)
-    away = np.array([-along[1], along[0]])
-    away = away if away[0] > 0.0 else -away
-    reach = (half[:, 1:] - condyle[1:]) @ away
-    tip = half[reach > reach.max() - 0.8]
-    at = tip.mean(axis=0)
-    lateral = tip[:, 0].max()
-    found[f"gonion_{letter}"] = np.array([side * 0.5 * (at[0] + lateral), at[1], at[2]])
-
-
-def _teeth_line(
-    outer: DepthMap, jaw: DepthMap, mandible: Floats, side: float, letter: str, found: Sites
-) -> None:
-    """Sites beside the second molars, and on the ramus at the height of the teeth."""
-    flip = np.array([side, 1.0, 1.0])
-    upper, lower = found.get("_upper_edge"), found.get("_lower_edge")
-    neck, low = found.get("supradentale"), found.get("infradentale")
-    if upper is None or lower is None or neck is None or low is None:
-        return
-    level = lower[2] + 4.0
-    for _ in range(3):
-        border = _ramus_front(jaw, level)
-        if border is None:
-            return
-        molar = neck[1] + 0.815 * (border - neck[1])
-        row = mandible[
-            (np.abs(mandible[:, 1] - molar) < 4.0)
-            & (np.abs(mandible[:, 0]) > 12.0)
-            & (np.abs(mandible[:, 0]) < 32.0)
-        ]
-        if len(row) < 10:
-            return
-        level = float(np.quantile(row[:, 2], 0.995)) - 0.8
-    found[f"occlusal_line_{letter}"] = np.array([-jaw.at(border, level), border, level]) * flip
-    for name, view, y, z in (
-        ("supra_m2", outer, molar, level + 13.0),
-        ("sub_m2", jaw, molar + 4.5, level - 19.5),
-    ):
-        across = -view.at(y, z)
-        if np.isfinite(across):
-            found[f"{name}_{letter}"] = np.array([across, y, z]) * flip
-
-
-def _ramus_front(jaw: DepthMap, level: float) -> float | None:
-    """Where the outer face of the ramus begins at a height, 2.5 mm behind its front border."""
-    y, _, depth = jaw.window((-80.0, 5.0), (level - 1.0, level + 1.0))
-    if not len(depth):
-        return None
-    outside = -depth > np.quantile(-depth, 0.9) - 8.0
-    return float(y[outside].min()) + 2.5
