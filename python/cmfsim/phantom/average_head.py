@@ -27,7 +27,7 @@ def average_head() -> TemplateHead:
     """The ordinary synthetic head: cranium and mandible with their teeth, skin, all landmarks.
 
     Its frame is that of `make_head`. The surfaces come with the package
-    (`scripts/make_average_head.py` makes them anew), the landmarks from the head itself.
+    (`scripts/make_average_head.py` makes them again), the landmarks from the head itself.
     """
     head = make_head()
     with np.load(Path(__file__).with_name(FILE), allow_pickle=False) as stored:

@@ -18,8 +18,10 @@ __all__ = ["picture_landmarks"]
 LANDMARK_SIZE = (2100, 1500)
 SURE_COLOUR, DOUBTFUL_COLOUR = "#1f4fd8", "#d62728"
 # Radius of a point, mm; a doubtful one is a cube of that half edge.
-RADIUS = 1.6
+RADIUS = 2.0
 LABEL_SIZE = 13
+# From a point to its name, mm.
+LABEL_GAP = 3.0
 # What is drawn about the points, mm, and how far points stand in front of the surface.
 ROOM, LIFT = 22.0, 2.5
 VIEWS = (("front", (0.0, -1.0, 0.0)), ("left", (1.0, 0.0, 0.0)), ("right", (-1.0, 0.0, 0.0)))
@@ -83,8 +85,11 @@ def picture_landmarks(
         _add_points(plotter, view, points[kind], wrong[kind])
 
     views = [View(name, f"{kind}, {name}") for kind in points for name, _ in VIEWS]
-    legend = [("landmark", SURE_COLOUR), ("doubtful", DOUBTFUL_COLOUR)]
-    draw(path, views, corners, size, paint, legend=legend, columns=len(VIEWS))
+    count = sum(len(names) for names in wrong.values())
+    words = [
+        f"Blue balls: landmarks. Red cubes with red names: doubtful ones ({count}) to look at."
+    ]
+    draw(path, views, corners, size, paint, columns=len(VIEWS), words=words)
 
 
 def _add(plotter: Any, surface: SurfaceData, colour: str) -> None:
@@ -108,7 +113,8 @@ def _add_points(plotter: Any, view: View, points: Mapping[str, Floats], doubtful
         (DOUBTFUL_COLOUR, [n for n in shown if n in doubtful]),
     ):
         if names:
-            places = np.array([shown[n] for n in names]) + 10.0 * LIFT * toward
+            beside = LABEL_GAP * np.cross((0.0, 0.0, 1.0), toward)
+            places = np.array([shown[n] for n in names]) + 10.0 * LIFT * toward + beside
             plotter.add_point_labels(
                 places,
                 names,

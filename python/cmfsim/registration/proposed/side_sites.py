@@ -205,7 +205,9 @@ MOLAR_SHARE = 0.815
 OVER_MOLARS, UNDER_MOLARS, LOWER_BEHIND = 13.0, 19.5, 3.8
 # How far upper and lower incisors are apart in a closed mouth at most, mm, and how much of an
 # opening beyond it there is at the molars.
-CLOSED, MOLAR_OPENING = 1.5, 0.6
+CLOSED, MOLAR_OPENING = 2.0, 0.6
+# From the upper incisors back to the second molar on average, mm.
+TO_MOLAR = 41.7
 # Where molars stand across, mm.
 MOLAR_ROW = (12.0, 32.0)
 
@@ -231,9 +233,11 @@ def _teeth_line(view: SideView, found: Sites) -> None:
             return
         level = float(np.quantile(row[:, 2], 0.995)) - 0.8
     view.put(found, "occlusal_line", np.array([-view.jaw.at(border, level), border, level]))
-    opening = MOLAR_OPENING * max(float(upper[2] - lower[2]) - CLOSED, 0.0)
-    high = level + opening + OVER_MOLARS
-    view.put(found, "supra_m2", np.array([-view.outer.at(molar, high), molar, high]))
+    opening = max(float(upper[2] - lower[2]) - CLOSED, 0.0)
+    high = level + MOLAR_OPENING * opening + OVER_MOLARS
+    # The ramus of an open mouth does not show how far back the upper teeth go.
+    above = molar if opening == 0.0 else float(neck[1]) + TO_MOLAR
+    view.put(found, "supra_m2", np.array([-view.outer.at(above, high), above, high]))
     back, low = molar + LOWER_BEHIND, level - UNDER_MOLARS
     view.put(found, "sub_m2", np.array([-view.jaw.at(back, low), back, low]))
 
