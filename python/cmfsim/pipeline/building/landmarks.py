@@ -5,7 +5,6 @@ from typing import Any
 from cmfsim.errors import LandmarkError
 from cmfsim.io import Case
 from cmfsim.pipeline.building.stages import Stages
-from cmfsim.pipeline.proposing import proposed_for_case
 from cmfsim.registration.proposed import ProposedLandmarks
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding
@@ -18,6 +17,9 @@ def found_landmarks(case: Case, anatomy: Anatomy, stages: Stages) -> ProposedLan
 
     What cannot do without landmarks (muscles, standard procedures) is refused where it is reached.
     """
+    # A case with landmarks loads nothing of the synthetic heads that others are compared with.
+    from cmfsim.pipeline.proposing import proposed_for_case  # noqa: PLC0415
+
     stages.begin("finding the landmarks")
     try:
         found = proposed_for_case(case, anatomy)
