@@ -691,7 +691,7 @@ impl PySolution {
         self.core.touching.rounds
     }
 
-    /// Whether what touches is at rest within 0.05 mm and no node went through; False where it is within 0.25 mm alone.
+    /// Whether what touches is at rest within 0.05 mm and no node went through; False where it is within 0.5 mm alone.
     #[getter]
     fn touching_converged(&self) -> bool {
         self.core.touching.converged || self.core.touching.rounds == 0

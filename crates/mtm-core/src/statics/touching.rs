@@ -32,10 +32,10 @@ const SHORTEST_STEP: f64 = 1.0 / 512.0;
 /// small.
 const CLOSE: f64 = 0.01;
 const CLOSE_SHARE: f64 = 4e-5;
-/// Multiple of it that is enough on the way, and that may be open in the end, with a warning: a quarter of a
+/// Multiple of it that is enough on the way, and that may be open in the end, with a warning: half a
 /// millimetre, at a node on a fold inside the mouth.
 const LOOSE: f64 = 5.0;
-const SEEN: f64 = 25.0;
+const SEEN: f64 = 50.0;
 /// Multiple of it that a node may lie in a tet of other tissue, where edges meet; from there on it went through.
 const THROUGH: f64 = 15.0;
 /// Rounds of a step on the way, which the next one continues, and of the last one.
