@@ -1,13 +1,13 @@
-//! The smooth distance field of a contact surface: what sliding nodes feel of a triangle surface.
+//! The smooth distance field of a contact surface: the form in which sliding nodes see a triangle surface.
 //!
-//! Soft tissue does not feel facets, nor edges sharper than its own mesh can follow. The signed distance of
-//! the surface, with facets curved by their corner normals, is sampled on a lattice and carried between its
-//! points by cubic B-splines: a field that is twice continuously differentiable, equal to the distance where
-//! this is smooth, and rounded over about the lattice spacing where it is not. Newton's method needs exactly
-//! that: one value, gradient and Hessian which belong together.
+//! Soft tissue cannot follow individual facets, nor edges sharper than its own mesh resolves. The signed
+//! distance to the surface, with facets curved by the normals at their corners, is therefore sampled on a
+//! lattice and interpolated by cubic B-splines. The result is a twice continuously differentiable field that
+//! equals the distance where the distance is smooth, and is rounded over about one lattice spacing where it is
+//! not. This is what Newton's method needs: a value, gradient and Hessian that are consistent with each other.
 //!
-//! Samples are taken where nodes come by, each once: a lattice point's value does not depend on when or by
-//! which thread it was asked for.
+//! Lattice points are sampled on demand, near the nodes, and only once: the value at a lattice point does not
+//! depend on when it was requested, or by which thread.
 
 use std::collections::{HashMap, HashSet};
 use std::hash::BuildHasherDefault;
@@ -19,17 +19,17 @@ use crate::geometry::lattice_hash::KeyHasher;
 use crate::geometry::surface::Surface;
 use crate::vector::{add, dot, scaled, sub};
 
-/// Distance relative to the lattice spacing below which the way to the surface has no direction.
+/// Distance to the surface, relative to the lattice spacing, below which its direction is undefined.
 const ON_SURFACE: f64 = 1e-9;
-/// Share of the projection on the tangent planes at the corners that curves a facet: one half reproduces
+/// Weight of the projection onto the tangent planes at the corners when a facet is curved: one half reproduces
 /// quadratic surfaces.
 const CURVING: f64 = 0.5;
-/// Samples that a thread takes at once.
+/// Samples per parallel task.
 const SAMPLES_PER_TASK: usize = 64;
 
 /// A lattice point, or the lowest corner of a cell.
 type Place = [i32; 3];
-/// Spline coefficients round a cell: those of x first, four along each axis.
+/// Spline coefficients around a cell, four along each axis, those of x first.
 type Cell = [f64; 64];
 type PlaceMap<T> = HashMap<Place, T, BuildHasherDefault<KeyHasher>>;
 type PlaceSet = HashSet<Place, BuildHasherDefault<KeyHasher>>;
@@ -39,7 +39,7 @@ type PlaceSet = HashSet<Place, BuildHasherDefault<KeyHasher>>;
 pub(crate) struct FieldValue {
     /// Distance from the surface, out of the bone, mm.
     pub distance: f64,
-    /// Its gradient; of length one but where the surface is sharper than the lattice resolves.
+    /// Its gradient, of length one except where the surface is sharper than the lattice resolves.
     pub gradient: [f64; 3],
     /// Its Hessian, 1/mm.
     pub hessian: [[f64; 3]; 3],
@@ -56,21 +56,21 @@ pub(crate) struct Field {
     lattice: RwLock<Lattice>,
 }
 
-/// What has been sampled so far.
+/// The samples and coefficients computed so far.
 #[derive(Debug, Default)]
 struct Lattice {
     samples: PlaceMap<f64>,
     cells: PlaceMap<Box<Cell>>,
 }
 
-/// The field, ready at the points it was asked for.
+/// The field, evaluated around the points it was requested for.
 pub(crate) struct ReadyField<'a> {
     field: &'a Field,
     lattice: RwLockReadGuard<'a, Lattice>,
 }
 
 impl Field {
-    /// The field of `surface` on the lattice through `origin` with the spacing given, mm.
+    /// The field of `surface` on the lattice through `origin` with the given spacing, mm.
     pub fn new(surface: Arc<Surface>, origin: [f64; 3], spacing: f64) -> Self {
         Self { surface, origin, spacing, lattice: RwLock::new(Lattice::default()) }
     }
@@ -90,7 +90,7 @@ impl Field {
         self.spacing
     }
 
-    /// The field ready at `points`, mm; parallel, with the same bits for any number of threads.
+    /// The field prepared at `points`, mm; parallel, bitwise identical for any number of threads.
     pub fn at(&self, points: &[[f64; 3]]) -> ReadyField<'_> {
         let mut missing: Vec<Place> = {
             let lattice = self.read();
@@ -139,7 +139,7 @@ impl Field {
         let found = self.surface.closest_one(point);
         let t = found.triangle as usize;
         let away = sub(point, found.point);
-        // Past a border the surface goes on along its tangent plane there.
+        // Beyond a border the surface is extended along its tangent plane there.
         let (distance, outward) = if found.on_border {
             (dot(found.normal, away), found.normal)
         } else if found.distance <= ON_SURFACE * self.spacing {
@@ -170,11 +170,11 @@ impl Field {
 }
 
 impl ReadyField<'_> {
-    /// The field at a point that it was asked for.
+    /// The field at one of the points it was prepared for.
     pub fn value(&self, point: [f64; 3]) -> FieldValue {
         let (place, inner) = self.field.cell_of(point);
         let Some(cell) = self.lattice.cells.get(&place) else {
-            // Only points that were not asked for have no cell.
+            // Only points that the field was not prepared for have no cell.
             return FieldValue {
                 distance: f64::NAN,
                 gradient: [f64::NAN; 3],
@@ -184,7 +184,7 @@ impl ReadyField<'_> {
         let [bx, by, bz] = inner.map(weights);
         let (mut distance, mut gradient, mut hessian) = (0.0, [0.0; 3], [[0.0; 3]; 3]);
         for i in 0..4 {
-            // Sums over y and z of value and derivatives, for one x.
+            // Sums over y and z of the value and its derivatives, for one x.
             let (mut v, mut vy, mut vz) = (0.0, 0.0, 0.0);
             let (mut vyy, mut vzz, mut vyz) = (0.0, 0.0, 0.0);
             for j in 0..4 {
@@ -222,8 +222,8 @@ impl ReadyField<'_> {
     }
 }
 
-/// Cubic B-spline weights of the four knots round a place t, 0 ≤ t < 1, in a cell, with their first and
-/// second derivatives by t.
+/// Cubic B-spline weights of the four knots around a position t, 0 ≤ t < 1, in a cell, with their first and
+/// second derivatives with respect to t.
 fn weights(t: f64) -> [[f64; 4]; 3] {
     let s = 1.0 - t;
     [
@@ -238,7 +238,7 @@ fn weights(t: f64) -> [[f64; 4]; 3] {
     ]
 }
 
-/// The knots whose splines reach into a cell, in the order of [`Cell`].
+/// The knots whose splines are nonzero in a cell, in the order of [`Cell`].
 fn knots(cell: Place) -> impl Iterator<Item = Place> {
     (0..64).map(move |k: i32| [cell[0] - 1 + k / 16, cell[1] - 1 + k / 4 % 4, cell[2] - 1 + k % 4])
 }
@@ -249,8 +249,8 @@ fn star(at: Place) -> [Place; 7] {
     [at, [x - 1, y, z], [x + 1, y, z], [x, y - 1, z], [x, y + 1, z], [x, y, z - 1], [x, y, z + 1]]
 }
 
-/// Coefficients of the splines round a cell: samples less a sixth of their second differences, with which
-/// cubic fields come back exactly (de Boor & Fix 1973).
+/// Coefficients of the splines around a cell: the samples minus a sixth of their second differences, which
+/// reproduces cubic fields exactly (de Boor & Fix 1973).
 fn coefficients(samples: &PlaceMap<f64>, cell: Place) -> Box<Cell> {
     let mut out = Box::new([0.0; 64]);
     for (value, knot) in out.iter_mut().zip(knots(cell)) {
@@ -290,7 +290,7 @@ mod tests {
         field.at(&[at]).value(at)
     }
 
-    /// A plane comes back to rounding, also past its border, where it goes on.
+    /// A plane is reproduced to rounding, also beyond its border, where it is extended.
     #[test]
     fn field_of_a_plane_is_its_height() {
         let plane = relief(3, 6.0, |x, y| 0.3 * x - 0.2 * y);
@@ -306,8 +306,8 @@ mod tests {
         }
     }
 
-    /// On a coarse ball the facets are felt as curved: distance, normal and curvature are those of the ball,
-    /// where the facets themselves lie 20 times as far off.
+    /// On a coarse ball the facets act as if curved: distance, normal and curvature are those of the ball,
+    /// although the facets themselves lie 20 times as far from it.
     #[test]
     fn field_of_a_coarse_bowl_is_that_of_the_sphere() {
         let radius = 20.0_f64;
@@ -333,7 +333,7 @@ mod tests {
         }
     }
 
-    /// Value, gradient and Hessian belong together, on a surface with a crease too.
+    /// Value, gradient and Hessian are consistent with each other, on a surface with a crease too.
     #[test]
     fn derivatives_are_those_of_the_value() {
         let field = Field::new(Arc::new(relief(6, 6.0, |x, _| x.abs())), [0.0; 3], 0.8);
@@ -357,7 +357,7 @@ mod tests {
         }
     }
 
-    /// A field that has been asked elsewhere before, or by other threads, has the same bits.
+    /// A field that was evaluated elsewhere before, or by other threads, is bitwise identical.
     #[test]
     fn samples_do_not_depend_on_their_order() {
         let surface = Arc::new(relief(8, 12.0, |x, y| (0.7 * x).sin() + (0.5 * y).cos()));

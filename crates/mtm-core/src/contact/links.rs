@@ -1,4 +1,4 @@
-//! Springs between rows: what nodes that touch do to each other in a round.
+//! Springs between rows: the interaction of touching nodes in one round.
 
 use crate::vector::{add, dot, scaled};
 
@@ -19,7 +19,7 @@ impl Link {
         self.ends.iter().map(|(row, c)| dot(*c, x[*row as usize])).sum()
     }
 
-    /// k (goal − c·x): the force that it puts on c at x, N.
+    /// k (goal − c·x): the force that the spring exerts along c at x, N.
     pub fn pull(&self, x: &[[f64; 3]]) -> f64 {
         self.stiffness * (self.goal - self.along(x))
     }
@@ -34,12 +34,12 @@ impl Link {
         self.add(self.stiffness * self.goal, b);
     }
 
-    /// Adds k (goal − c·x) c to rows y: the force that it puts on them at x, N.
+    /// Adds k (goal − c·x) c to rows y: the force that the spring exerts on them at x, N.
     pub fn add_force(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
         self.add(self.pull(x), y);
     }
 
-    /// Takes it off again.
+    /// Subtracts the same force again.
     pub fn take_force(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
         self.add(-self.pull(x), y);
     }

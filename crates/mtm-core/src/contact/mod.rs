@@ -1,8 +1,8 @@
-//! Sliding contact: nodes stay on the moved surface of their bone segment and feel no force along it.
+//! Sliding contact: nodes stay on the moved surface of their bone segment, with no force tangential to it.
 //!
-//! A sliding node x keeps its distance from the moved contact surface, φ(x + u) = g, and its force follows
-//! the gradient of φ (Kim et al. 2010, section 2.5 and eq. 2: no force acts in the tangent plane). The
-//! smooth distance φ is in `field`, where each node lies on it in `seat`, the solver in `newton`.
+//! A sliding node x keeps its distance from the moved contact surface, φ(x + u) = g, and its force acts along
+//! the gradient of φ (Kim et al. 2010, section 2.5 and eq. 2: no force acts in the tangent plane). The smooth
+//! distance φ is in `field`, the position of each node on it in `seat`, the solver in `newton`.
 
 mod field;
 pub(crate) mod links;
@@ -20,21 +20,22 @@ use crate::mesh::TetMesh;
 use crate::vector::{add, dot, norm, scaled, sub};
 use field::Field;
 
-/// Share of sliding nodes that may face away from the contact surface before it counts as inverted.
+/// Share of sliding nodes that may face away from the contact surface before the surface counts as inverted.
 const MOSTLY: f64 = 0.5;
-/// Rounding of the area vector round a node, relative to the areas summed: less has no direction.
+/// Rounding error of the area vector around a node, relative to the areas summed: a shorter vector has no
+/// direction.
 const FACING_ROUNDING: f64 = 1e-12;
 
-/// Lattice spacing of a contact field over the mean edge of the tissue at it: what is sharper, the tissue's
-/// nodes cannot follow.
+/// Lattice spacing of a contact field over the mean edge of the adjacent tissue: the nodes of the tissue cannot
+/// follow sharper features.
 const LATTICE_SHARE: f64 = 0.5;
 
 /// Whether nodes may lift off.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ContactMode {
-    /// Nodes stay on the surface, pushed or pulled (the paper).
+    /// Nodes stay on the surface, under pressure or tension (the paper).
     Bilateral,
-    /// Nodes may lift off, never penetrate: pressure is not negative at the end.
+    /// Nodes may lift off but never penetrate: no contact pressure is negative in the result.
     Unilateral,
 }
 
@@ -43,14 +44,14 @@ pub enum ContactMode {
 pub struct ContactOptions {
     /// Whether nodes may lift off.
     pub mode: ContactMode,
-    /// Largest distance of a held node from its surface, mm; a tenth of it is the way that the force along
-    /// the surface may still move any node by itself.
+    /// Largest distance of a held node from its surface, mm. The tangential force remaining at any node must be
+    /// too small to move that node, on its own, by more than a tenth of this.
     pub tolerance: f64,
-    /// Distance that is allowed whatever the tolerance says, mm: for a state that is only a step on the way.
+    /// Distance that is accepted even if the tolerance is smaller, mm: for intermediate states.
     pub allowed: f64,
-    /// Newton steps after which the solver stops.
+    /// Maximum number of Newton steps.
     pub max_iterations: usize,
-    /// How far past the border of an open contact surface a node may end, over the surface's mean edge.
+    /// How far beyond the border of an open contact surface a node may end, over the mean edge of the surface.
     pub border_reach: f64,
 }
 
@@ -84,23 +85,23 @@ pub struct Sliding {
     pub(crate) positions: Vec<[f64; 3]>,
     rest: Vec<Closest>,
     rest_normals: Vec<[f64; 3]>,
-    /// Prescribed distance of each node, mm; none where it keeps its place at rest.
+    /// Prescribed distance of each node, mm; none for a node that keeps its offset at rest.
     gaps: Vec<Option<f64>>,
-    /// Stiffness of each node by itself, N/mm.
+    /// Stiffness of each node on its own, N/mm.
     pub(crate) stiffness: Vec<f64>,
-    /// Contact surface of each segment that has one, as its nodes feel it.
+    /// Distance field of the contact surface of each segment that has one.
     fields: Vec<Option<Field>>,
     pub(crate) names: Vec<String>,
     /// Diagonal of the mesh, mm.
     pub(crate) diagonal: f64,
 }
 
-/// Where the sliding nodes ended.
+/// Final state of the sliding nodes.
 #[derive(Debug, Clone)]
 pub struct ContactState {
     /// Displacement of each sliding node, mm.
     pub displacements: Vec<[f64; 3]>,
-    /// Force that the bone exerts on each, N: along the normal but for what the tolerance leaves.
+    /// Force that the bone exerts on each, N: along the normal, to within the tolerance.
     pub reactions: Vec<[f64; 3]>,
     /// Closest point of the moved surface, mm.
     pub points: Vec<[f64; 3]>,
@@ -110,15 +111,15 @@ pub struct ContactState {
     pub forces: Vec<f64>,
     /// Constraint of each held node.
     pub rows: Vec<ContactRow>,
-    /// How the forces turn as held nodes slide.
+    /// How the forces change direction as held nodes slide.
     pub springs: Vec<Spring>,
-    /// Distance of each node from its surface at the end, out of the bone, mm.
+    /// Final distance of each node from its surface, out of the bone, mm.
     pub gaps: Vec<f64>,
     /// Whether the node is held to the surface.
     pub active: Vec<bool>,
     /// Newton steps done.
     pub iterations: usize,
-    /// Largest way, mm, that the force along the surface would still move a node by itself.
+    /// Largest distance, mm, by which the remaining tangential force would move a node on its own.
     pub unbalanced: f64,
     /// Whether the tolerance was reached.
     pub converged: bool,
@@ -132,10 +133,10 @@ impl ContactState {
     }
 }
 
-/// Sliding nodes to begin a solve from.
+/// State of the sliding nodes that a solve starts from.
 #[derive(Debug, Clone)]
 pub struct ContactStart {
-    /// Place of each sliding node, mm.
+    /// Position of each sliding node, mm.
     pub places: Vec<[f64; 3]>,
     /// Force that the bone exerts on each, N.
     pub reactions: Vec<[f64; 3]>,
@@ -152,20 +153,21 @@ pub struct ContactRow {
     pub point: [f64; 3],
 }
 
-/// Contact conditions linearised about a state: n_r·u_i = offset_r on the sliding nodes that are held.
+/// Contact conditions linearised about a state: n_r·u_i = offset_r at the sliding nodes that are held.
 pub struct Constraints<'a> {
     /// Node and normal of each constraint, nodes ascending.
     pub rows: &'a [ContactRow],
     /// Offset of every row, mm.
     pub offsets: &'a [f64],
-    /// How the contact forces turn as nodes slide, across the normals of their rows.
+    /// How the contact forces change direction as nodes slide, across the normals of their rows.
     pub springs: &'a [Spring],
-    /// Displacements of all sliding nodes that they are linearised about, mm.
+    /// Displacements of all sliding nodes about which the conditions are linearised, mm.
     pub about: &'a [[f64; 3]],
-    /// Share of what the conditions change to which the answer may be off; 0 for one as good as the solver's
-    /// tolerance asks.
+    /// Error that the answer may have, as a share of the change that the conditions cause; 0 for an answer
+    /// within the tolerance of the solver.
     pub share: f64,
-    /// How far, mm, springs that carry nodes on may carry any node from where the body is without them.
+    /// How far, mm, springs of negative stiffness may carry any node from its position in the body without
+    /// them.
     pub reach: f64,
 }
 
@@ -176,51 +178,51 @@ pub struct Spring {
     pub node: usize,
     /// Unit vector.
     pub axis: [f64; 3],
-    /// N/mm; negative where the force carries the node on.
+    /// N/mm; negative where the force drives the node further along the axis.
     pub stiffness: f64,
-    /// Displacement along the axis at which it is slack, mm.
+    /// Displacement along the axis at which the spring exerts no force, mm.
     pub goal: f64,
 }
 
-/// What a body does under linearised contact conditions.
+/// Response of a body to linearised contact conditions.
 pub struct Response {
     /// Displacement of every sliding node, mm.
     pub displacements: Vec<[f64; 3]>,
-    /// Internal force less loads of every sliding node, N: what the bone has to exert.
+    /// Internal force minus loads at every sliding node, N: the force that the bone has to exert.
     pub reactions: Vec<[f64; 3]>,
-    /// Slope of the elastic energy along the step from the state before to this one, at its start and at
-    /// its end, N mm; none where the body does not know it.
+    /// Slope of the elastic energy along the step from the previous state to this one, at its start and at its
+    /// end, N mm; none if the body does not know it.
     pub slopes: Option<(f64, f64)>,
-    /// Whether they are within the tolerance of the solver: contact cannot end before that.
+    /// Whether the displacements are within the tolerance of the solver: contact cannot end before that.
     pub solved: bool,
-    /// Whether springs would have carried nodes on past their reach, or for ever: contact cannot end there.
+    /// Whether springs would have carried nodes beyond their reach, or without limit: contact cannot end there.
     pub is_carried: bool,
 }
 
-/// An elastic body in contact: what the contact solver asks of it.
+/// An elastic body in contact, as the contact solver sees it.
 pub trait Body {
-    /// The body under `conditions`, from its state before.
+    /// The response of the body to `conditions`, starting from its previous state.
     ///
     /// # Errors
-    /// `NotPositiveDefinite` where the springs make it unstable and it does not know how far to go; those of
+    /// `NotPositiveDefinite` if the springs make the body unstable and it does not know how far to go; those of
     /// its solver.
     fn respond(&mut self, conditions: &Constraints<'_>) -> Result<Response>;
 
-    /// Goes back to `share` of the way from the state before to the last one.
+    /// Shortens the last step to `share` of its length.
     fn shorten(&mut self, share: f64);
 
-    /// Forgets the last step: the next one starts where its conditions are linearised about.
+    /// Discards the last step: the next one starts from the state about which its conditions are linearised.
     fn restart(&mut self);
 }
 
 impl Sliding {
-    /// The sliding nodes of `boundary`, or nothing where no node slides.
+    /// The sliding nodes of `boundary`, or nothing if no node slides.
     ///
-    /// `places`: position of each node at rest, those in the middle of edges included. `row_of`: row of
-    /// each node among the unknowns. `stiffness`: of each node by itself, N/mm.
+    /// `places`: position of each node at rest, mid-edge nodes included. `row_of`: row of each node among the
+    /// unknowns. `stiffness`: stiffness of each node on its own, N/mm.
     ///
     /// # Errors
-    /// A contact surface that faces away from the tissue where that matters.
+    /// A contact surface that faces away from the tissue, if the side matters.
     pub fn new(
         boundary: &Boundary,
         mesh: &TetMesh,
@@ -283,7 +285,7 @@ impl Sliding {
         &self.rest_normals
     }
 
-    /// Where the sliding nodes would be if they clung to their segment.
+    /// Positions of the sliding nodes if they were attached to their segment.
     fn clinging(&self, motions: &[&Motion]) -> Vec<[f64; 3]> {
         let mut out = self.positions.clone();
         for (s, motion) in motions.iter().enumerate() {
@@ -302,15 +304,15 @@ impl Sliding {
                         out[i] = add(self.positions[i], u);
                     }
                 }
-                // Refused by `Boundary::motions` for segments with sliding nodes.
+                // `Boundary::motions` rejects this for segments with sliding nodes.
                 Motion::Nodes(_) => {}
             }
         }
         out
     }
 
-    /// The sliding nodes as `state` under `motions` has them, carried back with their segments to where these were
-    /// at rest; none where a segment is deformed.
+    /// The sliding nodes of `state` under `motions`, moved back with their segments to the position at rest;
+    /// none if a segment is deformed.
     pub(crate) fn carried_back(
         &self,
         motions: &[&Motion],
@@ -321,12 +323,14 @@ impl Sliding {
         })
     }
 
-    /// What was carried back, carried with the segments under other `motions`; none where a segment is deformed.
+    /// The result of [`carried_back`](Self::carried_back), moved with the segments under other `motions`; none
+    /// if a segment is deformed.
     pub(crate) fn carried(&self, motions: &[&Motion], rest: &ContactStart) -> Option<ContactStart> {
         self.moved(motions, rest, |rigid, place, force| (rigid.apply(place), rigid.rotate(force)))
     }
 
-    /// Each place and reaction as `way` takes it by the motion of its segment; none where one is not rigid.
+    /// Each position and reaction, transformed by `way` with the motion of its segment; none if a motion is not
+    /// rigid.
     fn moved(
         &self,
         motions: &[&Motion],
@@ -342,13 +346,14 @@ impl Sliding {
         Some(ContactStart { places, reactions })
     }
 
-    /// Where `state` has the sliding nodes.
+    /// The positions of the sliding nodes in `state`, and the forces on them.
     pub(crate) fn start_of(&self, state: &ContactState) -> ContactStart {
         let places = self.positions.iter().zip(&state.displacements).map(|(x, u)| add(*x, *u));
         ContactStart { places: places.collect(), reactions: state.reactions.clone() }
     }
 
-    /// Distance of node `i` from its contact surface at rest, mm; past a border, from the tangent plane there.
+    /// Distance of node `i` from its contact surface at rest, mm; beyond a border, from the tangent plane
+    /// there.
     fn rest_distance(&self, i: usize) -> f64 {
         let rest = &self.rest[i];
         if rest.on_border {
@@ -357,7 +362,7 @@ impl Sliding {
         rest.signed_distance
     }
 
-    /// Largest motion of a sliding node that clings to its segment, mm.
+    /// Largest displacement of a sliding node that is attached to its segment, mm.
     pub(crate) fn farthest(&self, motions: &[&Motion]) -> f64 {
         let clinging = self.clinging(motions);
         let moved = clinging.iter().zip(&self.positions).map(|(c, x)| norm(sub(*c, *x)));
@@ -367,7 +372,7 @@ impl Sliding {
 
 /// A point of the lattice of a contact field, and its spacing, mm.
 ///
-/// The point goes along with the nodes, so that a head elsewhere, or its mirror image, has the same field.
+/// The point moves with the nodes, so that a translated head, or its mirror image, has the same field.
 fn lattice(
     mesh: &TetMesh,
     nodes: &[u32],
@@ -389,8 +394,8 @@ fn lattice(
     (centre, LATTICE_SHARE * edge)
 }
 
-/// Refuses a contact surface that faces away from the tissue, where the side matters: always if nodes
-/// may lift off, and for closed surfaces turned inside out.
+/// Rejects a contact surface that faces away from the tissue if the side matters: always if nodes may lift off,
+/// and for closed surfaces turned inside out.
 fn check_facing(
     mesh: &TetMesh,
     segment: &str,
@@ -409,8 +414,8 @@ fn check_facing(
         .zip(normals)
         .filter(|&(&j, _)| (j as usize) < mesh.n_nodes())
         .filter(|&(&j, &n)| {
-            // Σ_t V_t ∇φ_j = ∫ φ_j dA over the boundary round j: a third of its area vector, out of the
-            // tissue, whatever the shape of the tets; zero but for rounding inside the body.
+            // Σ_t V_t ∇φ_j = ∫ φ_j dA over the boundary around j: a third of its area vector, pointing out of
+            // the tissue, for any shape of the tets; zero up to rounding inside the body.
             let (mut out, mut size) = ([0.0; 3], 0.0);
             for &t in mesh.tets_of_node(j as usize) {
                 let Some(a) = mesh.tets()[t as usize].iter().position(|&v| v == j) else {

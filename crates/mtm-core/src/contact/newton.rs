@@ -1,17 +1,18 @@
-//! The contact problem: least elastic energy among the states whose sliding nodes lie on their surfaces
-//! (bilateral) or on and above them (unilateral), by Newton's method.
+//! The contact problem, solved by Newton's method: minimum elastic energy among the states whose sliding nodes
+//! lie on their surfaces (bilateral), or on or above them (unilateral).
 //!
-//! Each step solves the body under the conditions linearised about the last state, with the curvature of the
-//! surfaces under the contact forces: the Hessian of the Lagrangian, so that steps near the solution converge
-//! quadratically. A step is taken as far as it brings down the augmented Lagrangian E − Σ λ φ + ½ Σ ρ φ²
-//! (Rockafellar 1973; for inequalities the terms of nodes in the air are −λ²/2ρ), whose minimum the solution is
-//! for any large enough ρ; ρ only grows, so that no state comes twice. Which nodes are held follows from force
-//! and gap together (primal-dual active set; Hintermüller, Ito & Kunisch 2002).
+//! Each step solves the body under the conditions linearised about the last state, including the curvature of
+//! the surfaces under the contact forces. This is the Hessian of the Lagrangian, so steps near the solution
+//! converge quadratically. A step is shortened until it decreases the augmented Lagrangian E − Σ λ φ + ½ Σ ρ φ²
+//! (Rockafellar 1973; for inequalities the terms of nodes in the air are −λ²/2ρ), which has its minimum at the
+//! solution for any sufficiently large ρ. ρ only grows, so no state is visited twice. Force and gap together
+//! decide which nodes are held (primal-dual active set; Hintermüller, Ito & Kunisch 2002).
 //!
-//! Contact forces on convex bone carry nodes on as they slide, now and then by more than the tissue holds: a node
-//! slips over an edge. The body then says how far to go, within a carry that grows and shrinks with how far steps could be taken
-//! (a trust region). The first steps of a large plan take nodes far off their surfaces along the tangents at
-//! rest; they are put back on them, and the next step is linearised there.
+//! Contact forces on convex bone drive sliding nodes further along, sometimes by more than the tissue can
+//! resist: a node slips over an edge. The body then decides how far to go, within a limit (the carry) that
+//! grows and shrinks with the length of the accepted steps (a trust region). The first steps of a large plan
+//! take nodes far off their surfaces along the tangents at rest; these nodes are moved back onto their surfaces
+//! before the next linearisation.
 
 use crate::boundary::Motion;
 use crate::contact::seat::{Seats, Touch};
@@ -22,73 +23,75 @@ use crate::contact::{
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::vector::{Vec3, add, between, dot, norm, scaled, sub};
 
-/// Most nodes an error names.
+/// Maximum number of nodes listed in an error.
 const NAMED_NODES: usize = 10;
-/// Share of a node's own stiffness below which the turn of its contact force is left out of a step, and of
-/// what a plan operator keeps.
+/// Share of a node's own stiffness below which a step ignores the change of direction of its contact force;
+/// second, the same for a plan operator.
 const SPRING_SHARE: f64 = 1e-2;
 const FROZEN_SPRING_SHARE: f64 = 1e-3;
-/// How far contact forces may carry nodes on in the first step and in any, over the reach of the surfaces.
+/// How far contact forces may carry nodes in the first step, and in any step, over the reach of the surfaces.
 const FIRST_CARRY: f64 = 1.0;
 const MOST_CARRY: f64 = 4.0;
-/// Share to which a step is solved: what the last one left, over the spacing of the surfaces, within bounds. As
-/// much as that the next conditions differ.
+/// Limits of the relative accuracy of a step, which is what the last step left open, over the spacing of the
+/// surfaces: the next conditions differ by about as much.
 const ROUGH_SHARE: f64 = 0.1;
 const FINE_SHARE: f64 = 1e-4;
-/// Steps at the beginning after which nodes far off their surfaces may be put back on them.
+/// Number of steps at the beginning after which nodes far off their surfaces may be moved back onto them.
 const MOST_APPROACHES: usize = 8;
-/// Times that nodes are moved along their normals to be back on their surfaces.
+/// Maximum number of moves along the normals that bring nodes back onto their surfaces.
 const RETRACTIONS: usize = 8;
-/// Distance from which nodes are put back, over the reach of the surfaces: from farther they may find others.
+/// Distance up to which nodes are moved back, over the reach of the surfaces: from further away they may meet
+/// the wrong surface.
 const MOST_RETRACTION: f64 = 10.0;
-/// Penalty of the merit at the start over the own stiffness of each node.
+/// Initial penalty of the merit function over the own stiffness of each node.
 const FIRST_PENALTY: f64 = 10.0;
-/// Largest penalty over the own stiffness: from there on steps would follow the surface alone.
+/// Largest penalty over the own stiffness: above it, steps would only follow the surface.
 const MOST_PENALTY: f64 = 1e4;
-/// Share of what closing gaps take off the merit that all else may add.
+/// How much all other terms may increase the merit, as a share of the decrease due to closing gaps.
 const CLOSING_SHARE: f64 = 0.5;
-/// Steps in a row that may lead nowhere.
+/// Number of consecutive steps without progress that is tolerated.
 const MOST_STALLS: usize = 3;
-/// Share of its slope by which the merit has to fall (Armijo 1966).
+/// Share of its slope by which the merit must decrease (Armijo 1966).
 const DESCENT: f64 = 1e-4;
-/// Share of its largest gap that a step may leave where that is more than the reach of the surfaces.
+/// Share of its largest gap that a step may leave if the gap exceeds the reach of the surfaces.
 const STEADY_GAP: f64 = 0.6;
 /// Shortest step over the full one.
 const SHORTEST: f64 = 1.0 / 64.0;
-/// Rounding of the merit over the work of all contact forces on the way.
+/// Rounding error of the merit over the work of all contact forces along the step.
 const MERIT_ROUNDING: f64 = 1e-9;
-/// Share of the tolerance that the force along the surface may still move a node by itself.
+/// Share of the tolerance by which the remaining tangential force may move a node on its own.
 const BALANCE_SHARE: f64 = 0.1;
-/// Imbalance over the one allowed from which the next step is solved for good: it is far smaller after it.
+/// Ratio of the imbalance to its limit below which the next step is solved to full accuracy, since it reduces
+/// the imbalance far more.
 const NEAR: f64 = 30.0;
-/// Gap and imbalance, mm, that no face would show, and the same over the diagonal of the mesh: a state
-/// within is handed out though the steps ran out.
+/// Gap and imbalance too small to be visible on a face, in mm and over the diagonal of the mesh: a state within
+/// these limits is returned even if the steps run out.
 const UNSEEN: f64 = 0.02;
 const UNSEEN_SHARE: f64 = 1e-4;
-/// Largest tolerance over the diagonal of the mesh: scenes may be small.
+/// Largest tolerance over the diagonal of the mesh, for small scenes.
 const MOST_TOLERANCE: f64 = 1e-5;
-/// Roundings of a coordinate that a displacement gathers on its way.
+/// Rounding error that a displacement accumulates, in roundings of a coordinate.
 const ROUNDINGS: f64 = 64.0;
 
 /// A state of the sliding nodes.
 struct State {
     displacements: Vec<[f64; 3]>,
     touches: Vec<Touch>,
-    /// Forces of the bone; none before the body has answered.
+    /// Forces of the bone; none before the first response of the body.
     reactions: Vec<[f64; 3]>,
     /// Contact forces along the normals, 0 for nodes in the air.
     forces: Vec<f64>,
 }
 
 impl Sliding {
-    /// The state of contact under `motions` (one per segment) of the body that answers.
+    /// The contact state of `body` under `motions` (one per segment).
     ///
-    /// `begin`: where contact was for motions or a body a little different; from where the nodes would be if
-    /// they clung to their segment if none.
+    /// `begin`: contact state for similar motions or a similar body; if none, the nodes start where they would
+    /// be if they were attached to their segment.
     ///
     /// # Errors
-    /// `ContactNotConverged` where the steps run out far from a solution, `ContactSurface` where a node ends
-    /// past the border of its surface, whatever the body reports.
+    /// `ContactNotConverged` if the steps run out far from a solution, `ContactSurface` if a node ends beyond
+    /// the border of its surface, and any error of the body.
     pub fn solve(
         &self,
         motions: &[&Motion],
@@ -182,10 +185,10 @@ struct Problem<'a> {
     options: &'a ContactOptions,
 }
 
-/// A step of the nodes and its contact forces, before the line search.
+/// A step of the nodes with its contact forces, before the line search.
 struct Way<'a> {
     state: &'a State,
-    /// Which nodes are held in it.
+    /// Which nodes are held during the step.
     active: &'a [bool],
     /// Force on each node at its end, N.
     forces: Vec<f64>,
@@ -202,12 +205,12 @@ impl Problem<'_> {
         self.options.mode == ContactMode::Unilateral
     }
 
-    /// Way by itself, mm, that the force along the surface may leave each node.
+    /// Distance, mm, by which the remaining tangential force may move each node on its own.
     fn balance(&self) -> f64 {
         BALANCE_SHARE * self.sliding.gap_limit(self.options)
     }
 
-    /// Gap and imbalance, mm, that no face would show.
+    /// Gap and imbalance too small to be visible on a face, mm.
     fn unseen(&self) -> f64 {
         UNSEEN.min(UNSEEN_SHARE * self.sliding.diagonal).max(self.options.allowed)
     }
@@ -228,7 +231,7 @@ impl Problem<'_> {
         State { displacements, touches, reactions, forces }
     }
 
-    /// Which nodes are held: all of them, or those that are pressed more than they are apart.
+    /// Which nodes are held: all of them, or those whose pressure outweighs their gap.
     fn held(&self, state: &State, before: Option<&[bool]>) -> Vec<bool> {
         if !self.is_unilateral() {
             return vec![true; self.count()];
@@ -238,7 +241,7 @@ impl Problem<'_> {
             .map(|i| {
                 let (gap, force) = (state.touches[i].gap, state.forces[i]);
                 match before {
-                    // Nothing has pressed yet.
+                    // No contact force is known yet.
                     None => gap <= limit,
                     Some(before) if before[i] => force >= 0.0,
                     Some(_) => gap < -limit,
@@ -247,7 +250,7 @@ impl Problem<'_> {
             .collect()
     }
 
-    /// The body under the conditions linearised about `state`.
+    /// The response of the body to the conditions linearised about `state`.
     fn step(
         &self,
         state: &State,
@@ -275,7 +278,8 @@ impl Problem<'_> {
                 reach,
             };
             match body.respond(&conditions) {
-                // Forces carry their nodes on by more than the body can hold: without that.
+                // The contact forces drive their nodes by more than the body can resist: solve without that
+                // effect.
                 Err(MtmError::NotPositiveDefinite { .. })
                     if springs.iter().any(|s| s.stiffness < 0.0) =>
                 {
@@ -286,7 +290,7 @@ impl Problem<'_> {
         }
     }
 
-    /// Share to which the next step is solved, `left` mm from a solution.
+    /// Relative accuracy of the next step, `left` mm from a solution.
     fn share(&self, left: f64, near: bool) -> f64 {
         if near {
             return 0.0;
@@ -298,8 +302,8 @@ impl Problem<'_> {
         }
     }
 
-    /// The state with nodes that the body took off their surfaces put back on them; none where they are near
-    /// enough, or too far.
+    /// The state with nodes that have left their surfaces moved back onto them; none if they are near enough,
+    /// or too far away.
     fn put_back(&self, response: &Response, active: &[bool]) -> Option<State> {
         let reach = self.seats.reach();
         let mut displacements = response.displacements.clone();
@@ -331,9 +335,9 @@ impl Problem<'_> {
             .collect()
     }
 
-    /// How the contact forces turn as held nodes slide: −f H across the normals.
+    /// How the contact forces change direction as held nodes slide: −f H across the normals.
     ///
-    /// `least`: share of a node's own stiffness below which they are left out.
+    /// `least`: share of a node's own stiffness below which the springs are omitted.
     fn springs(&self, state: &State, active: &[bool], least: f64) -> Vec<Spring> {
         let mut out = Vec::new();
         for i in (0..self.count()).filter(|&i| active[i] && state.forces[i] != 0.0) {
@@ -350,8 +354,8 @@ impl Problem<'_> {
         out
     }
 
-    /// The state at the end of the step to `response`, shortened until the merit falls, and its share; none
-    /// where the merit falls at no length.
+    /// The state at the end of the step to `response`, shortened until the merit decreases, and the accepted
+    /// share; none if the merit decreases for no length.
     fn search(
         &self,
         state: &State,
@@ -369,7 +373,7 @@ impl Problem<'_> {
             ways: ends.map(|(to, from)| sub(*to, *from)).collect(),
         };
         let reach = (STEADY_GAP * farthest(&state.touches, active)).max(self.seats.reach());
-        // Of the last steps the merit shows little but rounding.
+        // For the last steps, changes of the merit are mostly rounding errors.
         let negligible = BALANCE_SHARE * self.sliding.gap_limit(self.options);
         let is_tiny = near || way.ways.iter().all(|way| norm(*way) <= negligible);
         let slope = match response.slopes {
@@ -400,8 +404,8 @@ impl Problem<'_> {
         None
     }
 
-    /// Slope of the merit at the start of a step, negative, with the penalty that makes it so; none where no
-    /// penalty does.
+    /// Slope of the merit at the start of a step, made negative by increasing the penalty; none if no penalty
+    /// achieves that.
     ///
     /// `energy`: the slope of the elastic energy.
     fn slope(&self, way: &Way<'_>, energy: f64, penalty: &mut f64) -> Option<f64> {
@@ -424,7 +428,8 @@ impl Problem<'_> {
             (slope, closing)
         };
         let (slope, closing) = at(*penalty);
-        // What does not depend on the penalty, and what gaps that close take off: the latter is to win clearly.
+        // Terms independent of the penalty, and the decrease due to closing gaps: the latter must clearly
+        // dominate.
         let rest = slope + *penalty * closing;
         if rest <= CLOSING_SHARE * *penalty * closing {
             return Some(slope).filter(|slope| *slope < 0.0);
@@ -437,9 +442,9 @@ impl Problem<'_> {
         Some(at(needed).0).filter(|slope| *slope < 0.0)
     }
 
-    /// How much the merit rises over `share` of a step to where the nodes feel `touches`.
+    /// Increase of the merit over `share` of a step to the state with the contact values `touches`.
     ///
-    /// `slopes`: of the elastic energy, at the start and at the end of the whole step.
+    /// `slopes`: slopes of the elastic energy at the start and at the end of the whole step.
     fn rise(
         &self,
         way: &Way<'_>,
@@ -486,7 +491,7 @@ impl Problem<'_> {
         (0.5 * rho * level - multiplier) * level
     }
 
-    /// Its slopes by level and by multiplier.
+    /// Its derivatives with respect to level and multiplier.
     fn merit_slopes(&self, multiplier: f64, level: f64, rho: f64) -> (f64, f64) {
         if self.is_unilateral() && multiplier < rho * level {
             return (0.0, -multiplier / rho);
@@ -494,7 +499,7 @@ impl Problem<'_> {
         (rho * level - multiplier, -level)
     }
 
-    /// Largest gap of a held node, and largest way, mm, that the force along the surface would move one.
+    /// Largest gap of a held node, and largest distance, mm, by which the tangential force would move a node.
     fn left(&self, state: &State, active: &[bool]) -> (f64, f64) {
         let (mut gap, mut unbalanced) = (0.0_f64, 0.0_f64);
         for (i, &held) in active.iter().enumerate() {
@@ -505,7 +510,7 @@ impl Problem<'_> {
         (gap, unbalanced)
     }
 
-    /// The same of node `i`: a node in the air may be above its surface, and feels no force at all.
+    /// The same for node `i`: a node in the air may be above its surface, and must be free of any force.
     fn left_of(&self, state: &State, i: usize, held: bool) -> (f64, f64) {
         let (touch, reaction) = (&state.touches[i], state.reactions[i]);
         let (gap, left) = if held {
@@ -561,7 +566,7 @@ impl Problem<'_> {
         })
     }
 
-    /// That the steps ran out far from a solution, with the nodes that are farthest.
+    /// The error for steps that ran out far from a solution, with the nodes that are furthest from one.
     fn far(&self, state: &State, active: &[bool], iterations: usize, gap: f64) -> MtmError {
         let badness = |i: usize| {
             let (gap, way) = self.left_of(state, i, active[i]);
@@ -599,9 +604,9 @@ fn curvatures(touch: &Touch) -> [(f64, [f64; 3]); 2] {
     [(mean + half, one.into()), (mean - half, two.into())]
 }
 
-/// Two unit vectors that make an orthonormal basis with the unit vector `n`.
+/// Two unit vectors that form an orthonormal basis with the unit vector `n`.
 fn across(n: &Vec3) -> [Vec3; 2] {
-    // The axis that n is least along keeps the cross product away from zero.
+    // Starting from the axis of the smallest component of n keeps the cross product away from zero.
     let mut axis = Vec3::zeros();
     axis[n.abs().imin()] = 1.0;
     let one = n.cross(&axis).normalize();

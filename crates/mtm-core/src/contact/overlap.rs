@@ -1,7 +1,7 @@
-//! Tissue inside other tissue, found without surfaces: nodes that lie in deformed tets which are not theirs.
+//! Tissue inside other tissue, found without surfaces: nodes inside deformed tets that they do not belong to.
 //!
-//! Closest points tell on which side of a surface a node is, but not whether it has come there round an edge or
-//! through it. A tet that holds a node of another part does.
+//! Closest points show on which side of a surface a node is, but not whether it got there around an edge or
+//! through the surface. A tet that contains a node of another part does show it.
 
 use std::collections::HashMap;
 
@@ -10,16 +10,16 @@ use rayon::prelude::*;
 use crate::mesh::TetMesh;
 use crate::vector::{add, cross, dot, norm, sub};
 
-/// Nodes that should lie in no tet of others.
+/// Nodes that should not lie in any tet of another part.
 #[derive(Debug)]
 pub(crate) struct Overlap {
     nodes: Vec<u32>,
-    /// Edge of a cell of the lattice in which they are looked up, mm.
+    /// Cell size of the lattice used to look up the nodes, mm.
     cell: f64,
 }
 
 impl Overlap {
-    /// Those of `nodes` that lie in no other tet at rest.
+    /// The members of `nodes` that lie in no tet of another part at rest.
     pub fn new(mesh: &TetMesh, mut nodes: Vec<u32>) -> Self {
         nodes.retain(|&j| (j as usize) < mesh.n_nodes());
         nodes.sort_unstable();
@@ -36,8 +36,8 @@ impl Overlap {
         out
     }
 
-    /// Deepest that one of them lies in a tet of others under displacements `u` of all nodes, mm; no deeper than the
-    /// tet's own walls are.
+    /// Largest depth of such a node inside a tet of another part under displacements `u` of all nodes, mm;
+    /// limited by the size of the tet.
     pub fn deepest(&self, mesh: &TetMesh, u: &[[f64; 3]]) -> f64 {
         self.depths(mesh, u).into_iter().fold(0.0, f64::max)
     }
@@ -84,7 +84,7 @@ impl Overlap {
     }
 }
 
-/// Least distance of a point from the faces of a tet around it, mm; not positive outside.
+/// Smallest distance of a point from the faces of the tet that contains it, mm; zero or negative outside.
 fn depth_in(corners: &[[f64; 3]; 4], point: [f64; 3]) -> f64 {
     let face = |k: usize| {
         let [a, b, c] = [1, 2, 3].map(|step| corners[(k + step) % 4]);

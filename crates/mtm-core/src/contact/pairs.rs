@@ -1,16 +1,17 @@
-//! Tissue that may touch what it does not slide on: lip against lip, and each lip against the teeth of both jaws.
+//! Contact between surfaces that do not slide on each other: lip against lip, and each lip against the teeth of
+//! both jaws.
 //!
-//! A node of a pair may not enter the surface that it faces, without friction: g(u) = φ(x + u) − min(φ at rest, 0)
-//! ≥ 0 with φ the signed distance from the surface, which is that of a bone, moved by the plan, or a part of the
-//! boundary of the tissue itself, deformed with it. Solved by the method of multipliers (Hestenes 1969, Powell
-//! 1969; for inequalities Rockafellar 1973; for contact Simo & Laursen 1992): each round takes the least of
-//!
+//! A node of a pair may not enter the surface it faces; there is no friction: g(u) = φ(x + u) − min(φ at rest,
+//! 0) ≥ 0, where φ is the signed distance from the surface. The surface belongs to a bone, moved by the plan,
+//! or is a part of the boundary of the tissue itself, deformed with it. The problem is solved by the method of
+//! multipliers (Hestenes 1969, Powell 1969; for inequalities Rockafellar 1973; for contact Simo & Laursen
+//! 1992). Each round minimises
 //! ```text
 //! E(u) + Σ ½ k (g(u) − λ/k)²     over the nodes with λ − k g > 0,
 //! ```
 //!
-//! g linearised at the last state, and follows it by λ ← max(0, λ − k g). The stiffness k only says how many rounds
-//! it takes: forces and gaps at the end do not depend on it.
+//! with g linearised about the last state, and then updates λ ← max(0, λ − k g). The stiffness k only affects
+//! the number of rounds: the final forces and gaps do not depend on it.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -26,23 +27,24 @@ use crate::geometry::surface::{Closest, Surface};
 use crate::mesh::TetMesh;
 use crate::vector::{add, dot, norm, scaled, sub};
 
-/// Row of a node that is no unknown.
+/// Row of a node that is not an unknown.
 pub(crate) const NO_ROW: u32 = u32::MAX;
-/// Stiffness of a link over that of its node by itself: with more, each round takes more iterations, with less
-/// there are more rounds.
+/// Stiffness of a link over the own stiffness of its node: a larger value makes each round take more
+/// iterations, a smaller one requires more rounds.
 const LINK_STIFFNESS: f64 = 2.0;
-/// Way to the surface, over its mean edge, below which its direction is that of the continuous normal: the way
-/// itself turns from facet to facet, and means nothing at the surface.
+/// Distance to the surface, over its mean edge, below which the continuous normal is used as direction: that to
+/// the closest point jumps from facet to facet, and is undefined at the surface.
 const NEAR_SHARE: f64 = 0.5;
-/// Way past the border of an open surface, over its mean edge, up to which a node may still touch it.
+/// Distance beyond the border of an open surface, over its mean edge, up to which a node may still touch it.
 const BORDER_REACH: f64 = 0.25;
-/// Farthest that a gap shrinks in a round where a node goes through its surface, over the mean edge: bones go no
-/// farther in a step.
+/// Largest decrease of a gap in one round for a node that passes through its surface, over the mean edge: bones
+/// move no further in a step.
 const JUMP_SHARE: f64 = 1.0;
-/// Depth behind a surface, over its mean edge, from which a node that was past its border has come round it.
+/// Depth behind a surface, over its mean edge, from which a node that was beyond its border is taken to have
+/// come around it.
 const ROUND_SHARE: f64 = 0.1;
-/// Depth behind a surface, over its mean edge, from which a node counts as on the far side of it: it is not pushed
-/// back through.
+/// Depth behind a surface, over its mean edge, from which a node counts as being on its far side, and is not
+/// pushed back through it.
 const DEEPEST: f64 = 2.0;
 
 /// A node that may meet a surface.
@@ -51,11 +53,12 @@ struct Candidate {
     node: u32,
     /// Its surface.
     wall: usize,
-    /// Signed distance down to which it may go, mm: 0, or what it has at rest behind the surface.
+    /// Smallest signed distance allowed, mm: 0, or the distance at rest if the node is behind the surface
+    /// there.
     allowed: f64,
     /// Stiffness of its link, N/mm.
     stiffness: f64,
-    /// Gap at rest, mm; none past the border of its surface.
+    /// Gap at rest, mm; none beyond the border of its surface.
     at_rest: Option<f64>,
 }
 
@@ -64,7 +67,7 @@ struct Candidate {
 enum Wall {
     /// A part of the boundary of the tissue, and the node of each vertex.
     Tissue { surface: Surface, nodes: Vec<u32> },
-    /// That of a segment, or of bone that stays where it is.
+    /// The surface of a segment, or of bone that does not move.
     Bone { surface: Arc<Surface>, segment: Option<usize> },
 }
 
@@ -77,7 +80,7 @@ impl Wall {
     }
 }
 
-/// What may touch what in a scene.
+/// The surfaces of a scene that may touch, and the nodes that may touch them.
 #[derive(Debug)]
 pub(crate) struct Pairs {
     candidates: Vec<Candidate>,
@@ -86,26 +89,26 @@ pub(crate) struct Pairs {
     row_of: Vec<u32>,
 }
 
-/// Forces between what touches, from one round to the next.
+/// Contact forces, carried from one round to the next.
 #[derive(Debug, Clone)]
 pub(crate) struct Touching {
     /// λ of each candidate, N.
     multipliers: Vec<f64>,
-    /// Gap of each where it was last, mm; none past the border of its surface.
+    /// Last gap of each candidate, mm; none beyond the border of its surface.
     pub gaps: Vec<Option<f64>>,
 }
 
 /// A round of the method of multipliers.
 pub(crate) struct Round {
-    /// Link of each candidate that presses.
+    /// Link of each candidate under pressure.
     number: Vec<Option<u32>>,
     pub links: Vec<Link>,
 }
 
-/// What a round left.
+/// Residuals of a round.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Left {
-    /// Deepest that a node is behind its surface, mm.
+    /// Largest depth of a node behind its surface, mm.
     pub penetration: f64,
     /// Largest gap under a force, mm.
     pub gap: f64,
@@ -118,27 +121,27 @@ impl Left {
     }
 }
 
-/// A node that met its surface at the end.
+/// A node that touches its surface in the result.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Met {
     /// The node.
     pub node: u32,
-    /// Distance from the surface less what it has behind it at rest, mm; negative where it penetrates.
+    /// Distance from the surface minus any penetration at rest, mm; negative where the node penetrates.
     pub gap: f64,
     /// Unit normal of the surface.
     pub normal: [f64; 3],
-    /// Force along it, N, not negative.
+    /// Force along it, N, zero or positive.
     pub force: f64,
 }
 
 impl Pairs {
-    /// The pairs of `boundary`, or nothing where it has none.
+    /// The pairs of `boundary`, or nothing if it has none.
     ///
-    /// `places`: position of each node at rest. `row_of`: row of each node among the unknowns. `stiffness`: of each
-    /// node by itself, N/mm.
+    /// `places`: position of each node at rest. `row_of`: row of each node among the unknowns. `stiffness`:
+    /// stiffness of each node on its own, N/mm.
     ///
     /// # Errors
-    /// Triangles that are no boundary of the mesh, or face into the tissue; a triangle without area.
+    /// Triangles that are not on the boundary of the mesh, or face into the tissue; a triangle without area.
     pub fn new(
         boundary: &Boundary,
         mesh: &TetMesh,
@@ -212,7 +215,7 @@ impl Pairs {
         }
     }
 
-    /// Mean edge of the surfaces of tissue, mm, or of all where there is none of tissue.
+    /// Mean edge of the tissue surfaces, mm, or of all surfaces if none is of tissue.
     pub fn mean_edge(&self) -> f64 {
         let mean = |walls: Vec<&Wall>| {
             let sum: f64 = walls.iter().map(|w| w.surface().mean_edge_length()).sum();
@@ -223,9 +226,10 @@ impl Pairs {
         if tissue.is_empty() { mean(self.walls.iter().collect()) } else { mean(tissue) }
     }
 
-    /// Where every candidate is under displacements `u` of all nodes; nothing for those past a border, and for those
-    /// that came behind their surface round its border or past an edge of it: farther from their gaps `before` than
-    /// a step takes them, they did not go through it.
+    /// The position of every candidate relative to its surface under displacements `u` of all nodes. Nothing
+    /// for candidates beyond a border, and for those that came behind their surface around its border or past
+    /// one of its edges: they are further from their gaps `before` than one step can take them, so they did not
+    /// pass through the surface.
     ///
     /// # Errors
     /// A triangle of the tissue that has collapsed.
@@ -250,7 +254,7 @@ impl Pairs {
                         let vertices = surface.vertices().iter().zip(way);
                         Moved::Deformed(surface.moved(vertices.map(|(x, w)| add(*x, w)).collect())?)
                     }
-                    // Refused by `Boundary::motions` for segments that nodes may touch.
+                    // `Boundary::motions` rejects this for segments that nodes may touch.
                     Some(Motion::Nodes(_)) => Moved::Rigid(surface, RigidMotion::identity()),
                 },
             });
@@ -264,7 +268,8 @@ impl Pairs {
         Ok(self.candidates.par_iter().zip(before).with_min_len(64).map(meet).collect())
     }
 
-    /// Where candidate `c` at `place` is; nothing past the border of its surface.
+    /// The position of candidate `c` at `place` relative to its surface; nothing beyond the border of the
+    /// surface.
     fn meet(&self, c: &Candidate, wall: &Moved<'_>, place: [f64; 3]) -> Option<Meeting> {
         let (closest, mean_edge) = match wall {
             Moved::Rigid(surface, rigid) => {
@@ -306,8 +311,8 @@ impl Pairs {
         Ok(self.linearised(&meetings, u))
     }
 
-    /// The planes at displacements `u` under motions `from`, carried with the bones to motions `to`: closest points
-    /// tell nothing where a bone has moved into what follows it.
+    /// The planes at displacements `u` under motions `from`, moved with the bones to motions `to`: closest
+    /// points are meaningless where a bone has moved into the tissue that follows it.
     ///
     /// # Errors
     /// A triangle of the tissue that has collapsed.
@@ -335,7 +340,8 @@ impl Pairs {
         Planes { at: self.candidates.iter().zip(meetings).map(plane).collect() }
     }
 
-    /// The round at displacements `u` of all nodes, prescribed ones where they go, with the forces of `touching`.
+    /// The round at displacements `u` of all nodes, prescribed ones at their target, with the forces of
+    /// `touching`.
     pub fn round(&self, planes: &Planes, u: &[[f64; 3]], touching: &Touching) -> Round {
         let (mut links, mut number) = (Vec::new(), vec![None; self.candidates.len()]);
         for (i, c) in self.candidates.iter().enumerate() {
@@ -361,8 +367,8 @@ impl Pairs {
         Round { number, links }
     }
 
-    /// Σ ½ k ⟨λ/k − g⟩₊² over `planes` at displacements `u` of all nodes, N mm: what pressing adds to the elastic
-    /// energy.
+    /// Σ ½ k ⟨λ/k − g⟩₊² over `planes` at displacements `u` of all nodes, N mm: the contribution of contact to
+    /// the energy.
     pub fn energy(&self, planes: &Planes, u: &[[f64; 3]], touching: &Touching) -> f64 {
         let each = self.candidates.iter().zip(&planes.at).zip(&touching.multipliers);
         each.map(|((c, plane), force)| {
@@ -372,7 +378,7 @@ impl Pairs {
         .sum()
     }
 
-    /// What `round` leaves open at displacements `rows` of the unknown nodes, the `gap` of each plane given.
+    /// The residuals of `round` at displacements `rows` of the unknown nodes, given the `gap` of each plane.
     pub fn left(
         &self,
         planes: &Planes,
@@ -392,7 +398,7 @@ impl Pairs {
         left
     }
 
-    /// The nodes that press most, `most` of them.
+    /// The `most` nodes with the largest contact forces.
     pub fn pressed(&self, touching: &Touching, most: usize) -> Vec<usize> {
         let mut order: Vec<usize> = (0..self.candidates.len()).collect();
         let force = |i: usize| touching.multipliers[i];
@@ -400,7 +406,8 @@ impl Pairs {
         order.iter().take(most).map(|&i| self.candidates[i].node as usize).collect()
     }
 
-    /// What met at the end of `round`: at displacements `rows` of the unknown nodes, where `planes` are.
+    /// The nodes that touch at the end of `round`, at displacements `rows` of the unknown nodes about which
+    /// `planes` are linearised.
     pub fn met(&self, planes: &Planes, round: &Round, rows: &[[f64; 3]]) -> Vec<Met> {
         let force = |number: Option<u32>| {
             number.map_or(0.0, |k| round.links[k as usize].pull(rows).max(0.0))
@@ -415,7 +422,8 @@ impl Pairs {
 }
 
 impl Touching {
-    /// Follows `round` by the forces that its links put on the nodes at displacements `rows` of the unknown ones.
+    /// Updates the multipliers after `round` to the forces of its links at displacements `rows` of the unknown
+    /// nodes.
     pub fn follow(&mut self, round: &Round, rows: &[[f64; 3]]) {
         for (force, number) in self.multipliers.iter_mut().zip(&round.number) {
             *force = number.map_or(0.0, |k| round.links[k as usize].pull(rows).max(0.0));
@@ -423,7 +431,7 @@ impl Touching {
     }
 }
 
-/// Signed distance of a point that lies by `way` from its closest point; nothing past the border of the surface.
+/// Signed distance of a point at offset `way` from its closest point; nothing beyond the border of the surface.
 fn over(closest: &Closest, way: [f64; 3], mean_edge: f64) -> Option<f64> {
     if !closest.on_border {
         return Some(closest.signed_distance);
@@ -446,12 +454,12 @@ fn out_of_range(pair: usize, node: u32, count: usize) -> MtmError {
 
 /// A surface under a plan.
 enum Moved<'a> {
-    /// Points are carried back to it.
+    /// Points are moved back to the surface at rest.
     Rigid(&'a Surface, RigidMotion),
     Deformed(Surface),
 }
 
-/// The wall of `triangles` of nodes, its vertices numbered by ascending node.
+/// The wall made of `triangles` of nodes, with vertices numbered in ascending order of node.
 fn tissue_wall(places: &[[f64; 3]], triangles: &[[u32; 3]]) -> Result<Wall> {
     let mut nodes: Vec<u32> = triangles.iter().flatten().copied().collect();
     nodes.sort_unstable();
@@ -462,7 +470,7 @@ fn tissue_wall(places: &[[f64; 3]], triangles: &[[u32; 3]]) -> Result<Wall> {
     Ok(Wall::Tissue { surface: Surface::new(vertices, rows)?, nodes })
 }
 
-/// The boundary triangles of a mesh, however they are turned.
+/// The boundary triangles of a mesh, whatever their orientation.
 struct Outside {
     triangles: HashMap<[u32; 3], [u32; 3]>,
 }
@@ -476,7 +484,7 @@ impl Outside {
         Self { triangles: mesh.boundary_triangles().iter().map(|&t| (sorted(t), t)).collect() }
     }
 
-    /// Refuses triangles of a pair that are no boundary of the tissue, or face into it.
+    /// Rejects triangles of a pair that are not on the boundary of the tissue, or face into it.
     fn check(&self, pair: usize, triangles: &[[u32; 3]]) -> Result<()> {
         for (row, triangle) in triangles.iter().enumerate() {
             let mut key = *triangle;
@@ -495,7 +503,7 @@ impl Outside {
     }
 }
 
-/// Whether two triangles of the same nodes have them in the same cyclic order.
+/// Whether two triangles of the same nodes list them in the same cyclic order.
 fn same_turn(a: &[u32; 3], b: &[u32; 3]) -> bool {
     let at = a.iter().position(|v| *v == b[0]).unwrap_or(0);
     a[(at + 1) % 3] == b[1]

@@ -1,15 +1,15 @@
-//! What nodes that may touch meet about some state, linearised: a tangent plane for each.
+//! The surfaces that candidate nodes may touch, linearised about a state: one tangent plane per node.
 
 use crate::boundary::Motion;
 use crate::vector::{add, dot, norm, scaled, sub};
 
-/// Length of the mean of two unit normals below which they face each other, and have no mean.
+/// Length of the mean of two unit normals below which they are opposed, and have no meaningful mean.
 const LEAST_MEAN: f64 = 0.5;
-/// Factors on the share by which a plane follows its surface, where this swings back and where it does not.
+/// Factors on the share by which a plane follows its surface: if the surface oscillates, and if it does not.
 const STEADIER: f64 = 0.7;
 const FREER: f64 = 1.2;
 
-/// Where a candidate is with respect to its surface.
+/// The position of a candidate relative to its surface.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Meeting {
     /// g, mm.
@@ -18,29 +18,29 @@ pub(crate) struct Meeting {
     pub point: [f64; 3],
     /// Unit vector away from the surface.
     pub normal: [f64; 3],
-    /// Nodes of the triangle that is met, with the weights of the closest point; none on bone.
+    /// Nodes of the closest triangle, with the weights of the closest point; none on bone.
     pub facing: Option<([u32; 3], [f64; 3])>,
 }
 
 /// The gap of a candidate about some state: g(u) = offset + Σ cⱼ·uⱼ.
 #[derive(Debug, Clone)]
 pub(crate) struct Plane {
-    /// Gap where it was linearised, mm.
+    /// Gap at the state of linearisation, mm.
     pub gap: f64,
     /// Unit vector away from the surface.
     pub normal: [f64; 3],
     /// mm.
     pub offset: f64,
-    /// Nodes with the change of the gap by each.
+    /// Nodes with the derivative of the gap with respect to each.
     pub ends: Vec<(u32, [f64; 3])>,
-    /// Share by which it follows the surface; 1 but for one that swings.
+    /// Share by which the plane follows the surface; 1 unless it oscillates.
     turn: f64,
-    /// What of normal and gap, mm, the surface last was ahead of it.
+    /// By how much the normal and the gap, mm, of the surface last differed from those of the plane.
     swing: ([f64; 3], f64),
 }
 
 impl Plane {
-    /// That of candidate `node` which is where `meeting` is under displacements `u` of all nodes.
+    /// The plane of candidate `node`, found at `meeting` under displacements `u` of all nodes.
     pub fn new(node: u32, meeting: &Meeting, u: &[[f64; 3]]) -> Self {
         let Meeting { gap, normal, facing, .. } = *meeting;
         let mut ends = vec![(node, normal)];
@@ -51,7 +51,8 @@ impl Plane {
         Self { gap, normal, offset: gap - here, ends, turn: 1.0, swing: ([0.0; 3], 0.0) }
     }
 
-    /// Turns it to another normal about where nodes are under displacements `u`, with another gap there.
+    /// Rotates the plane to another normal about the node positions under displacements `u`, with another gap
+    /// there.
     fn turn_to(&mut self, normal: [f64; 3], gap: f64, u: &[[f64; 3]]) {
         for (_, c) in &mut self.ends {
             *c = scaled(normal, dot(*c, self.normal));
@@ -67,15 +68,15 @@ impl Plane {
     }
 }
 
-/// What every candidate may meet about some state, each surface as its tangent plane; nothing for those past a border.
+/// The surface of every candidate as its tangent plane at a state; nothing for candidates beyond a border.
 #[derive(Debug)]
 pub(crate) struct Planes {
     pub at: Vec<Option<Plane>>,
 }
 
 impl Meeting {
-    /// Carries the plane of a node at `place` from where motion `from` has its bone to where `to` has it; a deformed
-    /// one stays as it is.
+    /// Moves the plane of a node at `place` from its bone under motion `from` to the bone under motion `to`; a
+    /// plane on a deformed segment stays as it is.
     pub fn carry(&mut self, from: &Motion, to: &Motion, place: [f64; 3]) {
         let (Motion::Rigid(from), Motion::Rigid(to)) = (from, to) else { return };
         let before = dot(self.normal, sub(place, self.point));
@@ -86,13 +87,13 @@ impl Meeting {
 }
 
 impl Planes {
-    /// Deepest that a candidate is behind its surface where the planes are, mm.
+    /// Largest depth of a candidate behind its surface at the state of the planes, mm.
     pub fn deepest(&self) -> f64 {
         self.at.iter().flatten().fold(0.0, |m, p| m.max(-p.gap))
     }
 
-    /// Steadies those that swing: where a surface is now on one side of what the planes `before` foresaw and now on the
-    /// other, they follow it by less of the way. What [`Plane::gap`] has is still the gap that was found.
+    /// Damps planes that oscillate: if a surface lies alternately on either side of what the planes `before`
+    /// predicted, the planes follow it by a smaller share. [`Plane::gap`] remains the gap that was found.
     ///
     /// `u`: displacements of all nodes.
     pub fn steady(&mut self, before: &Self, u: &[[f64; 3]]) {
@@ -112,7 +113,7 @@ impl Planes {
         }
     }
 
-    /// Gap of each candidate where the planes are, mm; none past the border of its surface.
+    /// Gap of each candidate at the state of the planes, mm; none beyond the border of its surface.
     pub fn gaps(&self) -> Vec<Option<f64>> {
         self.at.iter().map(|p| p.as_ref().map(|p| p.gap)).collect()
     }

@@ -1,4 +1,4 @@
-//! Where each sliding node lies on its contact surface under a plan: gap, normal and curvature there.
+//! The position of each sliding node on its contact surface under a plan: gap, normal and curvature there.
 
 use rayon::prelude::*;
 
@@ -10,66 +10,66 @@ use crate::geometry::motion::RigidMotion;
 use crate::geometry::surface::Closest;
 use crate::vector::{add, dot, norm, scaled, sub};
 
-/// Gradient of the distance below which it counts as lost: nodes there lie in the middle of a sheet that is
-/// far thinner than the tissue's mesh resolves.
+/// Length of the gradient of the distance below which the surface counts as lost: such nodes lie in the middle
+/// of a sheet far thinner than the mesh of the tissue resolves.
 const LEAST_SLOPE: f64 = 0.1;
 
-/// Distance from its gap at rest, over the lattice spacing, up to which a node counts as lying at it.
+/// Difference from its gap at rest, over the lattice spacing, up to which a node counts as lying at that gap.
 const AT_REST: f64 = 0.05;
 /// Reach of a surface over the lattice spacing of its field.
 const REACH: f64 = 1.5;
 
-/// The surface that one node slides on: a level of its segment's field, shifted.
+/// The surface that one node slides on: a level set of its segment's field, shifted.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Seat {
     /// Shift from the contact surface, mm.
     pub offset: [f64; 3],
-    /// Level of the field, mm.
+    /// Value of the field on it, mm.
     level: f64,
 }
 
-/// What a node feels of its surface.
+/// The local shape of a surface at a node.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Touch {
     /// Distance of the node from its surface, negative behind it, mm, to first order.
     pub gap: f64,
     /// Unit normal, out of the bone.
     pub normal: [f64; 3],
-    /// Length of the gradient that the gap and the Hessian are relative to.
+    /// Length of the gradient, by which the gap and the Hessian are divided.
     slope: f64,
     /// Hessian of the distance over the slope, 1/mm.
     pub hessian: [[f64; 3]; 3],
 }
 
 impl Touch {
-    /// Distance as the field has it, mm: smooth, where `gap` divides by the slope.
+    /// Distance in terms of the field, mm: smooth, whereas `gap` is divided by the slope.
     pub fn level(&self) -> f64 {
         self.gap * self.slope
     }
 
-    /// Multiplier of the level that is a force along the normal, N.
+    /// Multiplier of the level that corresponds to a force along the normal, N.
     pub fn multiplier(&self, force: f64) -> f64 {
         force / self.slope
     }
 
-    /// How fast the level changes along `way`.
+    /// Rate of change of the level along `way`.
     pub fn level_rate(&self, way: [f64; 3]) -> f64 {
         self.slope * dot(self.normal, way)
     }
 }
 
-/// Contact surfaces under a plan, and where each node lies on them.
+/// Contact surfaces under a plan, and the position of each node on them.
 pub(super) struct Seats<'a> {
     sliding: &'a Sliding,
     surfaces: Vec<Moved<'a>>,
     seats: Vec<Seat>,
-    /// Where the nodes would be if they clung to their segment, mm.
+    /// Positions of the nodes if they were attached to their segment, mm.
     pub clinging: Vec<[f64; 3]>,
 }
 
 /// A contact surface under a plan.
 enum Moved<'a> {
-    /// Points are carried back to the field at rest, whose samples serve every plan.
+    /// Points are moved back to the field at rest, whose samples can be used for every plan.
     Rigid(&'a Field, RigidMotion),
     /// A surface with new vertices.
     Deformed(Field),
@@ -80,9 +80,9 @@ enum Moved<'a> {
 impl<'a> Seats<'a> {
     /// The surfaces of `sliding` moved by `motions`, one per segment.
     ///
-    /// A node without a prescribed gap slides on the contact surface shifted to where it lies itself: by
-    /// its offset at rest, carried with the segment. However far off the contact surface it lies, its own
-    /// surface is as smooth; the surface at its distance may fold.
+    /// A node without a prescribed gap slides on the contact surface shifted through the node, by the node's
+    /// offset at rest, moved with the segment. However far the node is from the contact surface, the shifted
+    /// surface is equally smooth, while the surface at constant distance may fold.
     pub fn new(sliding: &'a Sliding, motions: &[&Motion]) -> Result<Self> {
         let surfaces = sliding
             .fields
@@ -112,7 +112,7 @@ impl<'a> Seats<'a> {
                 None => Seat { offset: sub(out.clinging[i], foot), level: 0.0 },
             };
         }
-        // A node that lies at its gap stays there at rest, whatever the field makes of the surface.
+        // A node that lies at its gap stays there at rest, whatever error the field makes.
         let levels = out.touches(&out.clinging.clone());
         for (i, (touch, gap)) in levels.iter().zip(&sliding.gaps).enumerate() {
             let near = AT_REST * out.spacing(sliding.nodes[i].segment);
@@ -127,7 +127,7 @@ impl<'a> Seats<'a> {
         Ok(out)
     }
 
-    /// Where the closest point of node `i` at rest lies now, mm.
+    /// Current position of the closest point of node `i` at rest, mm.
     fn foot(&self, i: usize) -> [f64; 3] {
         let rest = &self.sliding.rest[i];
         match &self.surfaces[self.sliding.nodes[i].segment] {
@@ -137,10 +137,10 @@ impl<'a> Seats<'a> {
         }
     }
 
-    /// What each node feels at its place of `at`, mm.
+    /// The local surface of each node at its position in `at`, mm.
     pub fn touches(&self, at: &[[f64; 3]]) -> Vec<Touch> {
         let mut out = Vec::with_capacity(at.len());
-        // Nodes stand segment by segment.
+        // Nodes are ordered by segment.
         for chunk in self.sliding.nodes.chunk_by(|a, b| a.segment == b.segment) {
             let first = out.len();
             let seats = &self.seats[first..first + chunk.len()];
@@ -171,8 +171,8 @@ impl<'a> Seats<'a> {
         out
     }
 
-    /// Closest point of the moved triangle surface to node `i` at `at`, and how far past its border it is,
-    /// mm, if it is.
+    /// Closest point of the moved triangle surface to node `i` at `at`, and its distance beyond the border, mm,
+    /// if it is beyond one.
     pub fn closest(&self, i: usize, at: [f64; 3]) -> (Closest, Option<f64>) {
         let own = sub(at, self.seats[i].offset);
         let found = match &self.surfaces[self.sliding.nodes[i].segment] {
@@ -192,8 +192,8 @@ impl<'a> Seats<'a> {
         (found, found.on_border.then_some(past))
     }
 
-    /// How far off their surfaces nodes may be on the way, mm: farther off, and behind thin bone, the nearest
-    /// surface may be another one.
+    /// Largest intermediate distance of nodes from their surfaces, mm: further away, or behind thin bone, the
+    /// nearest surface may be another one.
     pub fn reach(&self) -> f64 {
         let spacings = (0..self.surfaces.len()).map(|s| self.spacing(s));
         REACH * spacings.fold(f64::INFINITY, f64::min)
@@ -218,7 +218,8 @@ impl<'a> Seats<'a> {
     }
 }
 
-/// Adds what nodes at `points` of the field feel; `turn` carries values to where the surface is.
+/// Adds the local surfaces of nodes at `points` of the field; `turn` rotates values to the current orientation
+/// of the surface.
 fn felt(
     field: &Field,
     points: &[[f64; 3]],
@@ -242,7 +243,7 @@ fn felt(
 
 /// R H Rᵀ.
 fn turned(rigid: &RigidMotion, hessian: &[[f64; 3]; 3]) -> [[f64; 3]; 3] {
-    // R H, by the symmetry of H row by row; the same again from the other side.
+    // R H, row by row since H is symmetric; the same again from the other side.
     let half: Vec<[f64; 3]> = hessian.iter().map(|&row| rigid.rotate(row)).collect();
     let column = |c: usize| rigid.rotate([half[0][c], half[1][c], half[2][c]]);
     [column(0), column(1), column(2)]
