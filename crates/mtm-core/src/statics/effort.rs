@@ -1,4 +1,4 @@
-//! What the solves of one plan share: the length that tolerances refer to, the work done, the interrupt.
+//! What the solves of one plan share: the reference length of tolerances, the work done, the interrupt.
 
 use crate::statics::options::Interrupt;
 
@@ -23,14 +23,14 @@ impl Effort {
 
 /// The solve of one plan.
 pub(crate) struct Solve<'a> {
-    /// Length that the tolerance refers to: the largest prescribed displacement, mm.
+    /// Reference length of the tolerance: the largest prescribed displacement, mm.
     pub scale: f64,
     pub interrupted: Interrupt<'a>,
     pub effort: Effort,
 }
 
 impl<'a> Solve<'a> {
-    /// A solve that has done nothing yet.
+    /// The record of a solve that has not started.
     pub fn new(scale: f64, interrupted: Interrupt<'a>) -> Self {
         Self { scale, interrupted, effort: Effort::default() }
     }

@@ -1,10 +1,10 @@
-//! Contact conditions that stay the same for several right-hand sides, as the columns of a plan operator have
-//! them: answered by factors, once the flexibility of the sliding nodes is at hand.
+//! Contact conditions that stay the same for several right-hand sides, as for the columns of a plan operator:
+//! solved by factorisation, provided that the flexibility of the sliding nodes is known.
 //!
-//! Forces λ along the rows N and loads z along the axes A of springs of stiffness −k, which carry nodes on, follow
-//! from Nᵀ F N λ + Nᵀ F A z = g − Nᵀ u and Aᵀ F N λ + (Aᵀ F A − k⁻¹) z = goal − Aᵀ u, F the flexibility and u the
-//! displacements without them: λ is eliminated, and what is left for z is positive definite where the body holds
-//! the springs.
+//! Forces λ along the rows N, and loads z along the axes A of springs of negative stiffness −k, follow from Nᵀ
+//! F N λ + Nᵀ F A z = g − Nᵀ u and Aᵀ F N λ + (Aᵀ F A − k⁻¹) z = goal − Aᵀ u, where F is the flexibility and u
+//! the displacements without them. λ is eliminated; the remaining matrix for z is positive definite if the body
+//! is stable with the springs.
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use rayon::prelude::*;
@@ -15,7 +15,7 @@ use crate::error::Result;
 use crate::statics::reaction::{Rows, singular, unheld};
 use crate::vector::{add, dot, scaled};
 
-/// What answers for conditions that stay the same.
+/// The factors for conditions that stay the same.
 pub(crate) struct FrozenContact {
     rows: Rows,
     normal: NormalFactor,
@@ -30,8 +30,8 @@ impl FrozenContact {
     /// The factors for `rows` and `springs`.
     ///
     /// # Errors
-    /// `NotPositiveDefinite` where the rows are degenerate, or where springs carry nodes on by more than the
-    /// body holds.
+    /// `NotPositiveDefinite` if the rows are degenerate, or if springs drive nodes by more than the body can
+    /// resist.
     pub fn new(tail: &TailFlexibility, rows: &[ContactRow], springs: &[Spring]) -> Result<Self> {
         let offsets = vec![0.0; rows.len()];
         let rows = Rows::new(&Constraints {
@@ -73,8 +73,8 @@ impl FrozenContact {
         Ok(Self { rows, normal, unstable, coupling, held })
     }
 
-    /// Force on each sliding node, N: `free` are their displacements without contact, `offsets` and `goals` what
-    /// the conditions ask of rows and springs, mm.
+    /// Force on each sliding node, N: `free` are the displacements without contact, `offsets` and `goals` the
+    /// values prescribed for rows and springs, mm.
     pub fn forces(&self, free: &[[f64; 3]], c: &Constraints<'_>) -> Vec<[f64; 3]> {
         let goals = Rows::new(c).missing(free);
         let mut along = self.normal.solve(goals);

@@ -1,8 +1,8 @@
 //! The system solved by iteration: conjugate gradients with multigrid, or the sweeps of the literature.
 //!
-//! What an iteration knows of its own error is an estimate. Where stiff and soft tissue are mixed, or the
-//! spectrum is wide, a slow motion may hide from it: there a trial solves for a known field first, and its
-//! true errors say what the estimates are worth (`benches/error_estimate.rs` measures how often they fail).
+//! An iteration can only estimate its own error. If stiff and soft tissue are mixed, or the spectrum is wide,
+//! the estimate may miss a slow motion. In these cases a trial with a known solution is solved first, and its
+//! true errors calibrate the estimates (`benches/error_estimate.rs` measures how often they fail).
 
 use std::sync::OnceLock;
 
@@ -24,27 +24,27 @@ use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Over-relaxation of the node-wise iteration.
 const RELAXATION_FACTOR: f64 = 1.6;
-/// Sweeps after which the node-wise iteration gives up.
+/// Sweeps after which the node-wise iteration stops with an error.
 const MAX_SWEEPS: usize = 200_000;
-/// Share of the tolerance to which the error left by the sweeps is measured.
+/// Accuracy, as a share of the tolerance, to which the error left by the sweeps is measured.
 const MEASURED_SHARE: f64 = 0.1;
-/// λ/μ from which a stronger smoother pays: at ν = 0.499 it takes 113 iterations instead of 186. ν = 0.48.
+/// λ/μ above which a stronger smoother pays: at ν = 0.499 it takes 113 iterations instead of 186. ν = 0.48.
 const NEARLY_INCOMPRESSIBLE: f64 = 24.0;
 
-/// Ratio of the stiffest tissue to the softest above which estimates are not believed without a trial. The
+/// Ratio of the stiffest tissue to the softest above which estimates are not trusted without a trial. The
 /// tissue of a face stays below 300.
 const DOUBTFUL_CONTRAST: f64 = 1e3;
-/// Share of the tolerance to which a trial is solved.
+/// Accuracy, as a share of the tolerance, to which a trial is solved.
 const TRIAL_SHARE: f64 = 0.1;
-/// Multiple of the error of a trial that stands for that of any solution, as for a factor.
+/// Multiple of the error of a trial that is taken as the error of any solution, as for a factorisation.
 const TRIAL_SAFETY: f64 = 10.0;
 
-/// Multiple of the estimate by which an iteration stops that is reported: in `benches/error_estimate.rs` one in
-/// some thousand was up to 2.2 times too small.
+/// Multiple of the estimate at the end of the iteration that is reported: in `benches/error_estimate.rs` about
+/// one estimate in a thousand was up to 2.2 times too small.
 const REPORT_SAFETY: f64 = 4.0;
 
-/// Share of what the body holds along a direction that springs may take off: of those that take more, some are
-/// left out of a step.
+/// Share of the stiffness of the body along a direction that springs may cancel: if they cancel more, some of
+/// them are left out of the step.
 const LEFT_SHARE: f64 = 0.5;
 
 /// Whether estimates for tissue of such `contrast` need a trial.
@@ -52,13 +52,13 @@ pub(crate) fn is_doubtful(contrast: f64) -> bool {
     contrast.is_nan() || contrast > DOUBTFUL_CONTRAST
 }
 
-/// Conjugate gradients with an estimate that a trial has confirmed where that is in doubt.
+/// Conjugate gradients whose estimate is confirmed by a trial if it is in doubt.
 struct Confirmed<'a> {
     a: &'a dyn Operator,
     preconditioner: &'a dyn Preconditioner,
-    /// Where the trial is kept.
+    /// Cache of the trial.
     trial: &'a OnceLock<Trial>,
-    /// Whether there is to be one whatever the spectrum shows.
+    /// Whether a trial is needed whatever the spectrum shows.
     doubtful: bool,
     /// Tolerance over the length of the motion.
     relative: f64,
@@ -66,7 +66,7 @@ struct Confirmed<'a> {
 }
 
 impl Confirmed<'_> {
-    /// The trial, made if need be.
+    /// The trial, run on first use.
     fn trial(&self, options: &PcgOptions) -> Result<&Trial> {
         if let Some(made) = self.trial.get() {
             return Ok(made);
@@ -77,10 +77,10 @@ impl Confirmed<'_> {
         Ok(self.trial.get_or_init(|| made))
     }
 
-    /// The solution of A x = `b`, or with `enough` a step towards it (see [`pcg_near`]).
+    /// The solution of A x = `b`, or, if `enough` is given, a step towards it (see [`pcg_near`]).
     ///
     /// # Errors
-    /// Those of [`pcg_near`]; `NotConverged` where a known solution came back with too large an error.
+    /// Those of [`pcg_near`]; `NotConverged` if the error on a known solution is too large.
     fn solve(
         &self,
         b: &[[f64; 3]],
@@ -108,7 +108,7 @@ impl Confirmed<'_> {
         }
         let mut reached = near(start, seen)?;
         if enough.is_some() && seen.is_wide() {
-            // What is only a step needs no trial, but does not pass for a solution.
+            // An intermediate step needs no trial, but does not count as a solution.
             return Ok(match reached {
                 Reached::Solution(found) => Reached::Step(found),
                 other => other,
@@ -131,7 +131,7 @@ impl Confirmed<'_> {
     }
 }
 
-/// That a known solution came back with an error beyond the tolerance.
+/// The error for a known solution that was recovered with an error above the tolerance.
 fn not_confirmed(trial: &Trial, options: &PcgOptions, relative: f64) -> MtmError {
     MtmError::NotConverged {
         method: "pcg",
@@ -147,52 +147,52 @@ fn not_confirmed(trial: &Trial, options: &PcgOptions, relative: f64) -> MtmError
     }
 }
 
-/// What the solves of one plan leave to the next, whose constraints differ a little.
+/// Results kept between the solves of one plan, whose constraints differ only a little.
 #[derive(Default)]
 pub(crate) struct Trail {
-    /// Displacements of the rows; none before the first solve, unless some are known to be near.
+    /// Displacements of the rows; none before the first solve, unless an approximation is known.
     pub rows: Vec<[f64; 3]>,
-    /// What the solves showed of the spectrum.
+    /// What the solves have revealed of the spectrum.
     seen: Spectrum,
-    /// The trial under the first constraints, once there is one.
+    /// The trial under the first constraints, once it was run.
     trial: OnceLock<Trial>,
-    /// Length that the tolerance refers to, mm; none before the first solve.
+    /// Reference length of the tolerance, mm; none before the first solve.
     reach: Option<f64>,
 }
 
 impl Trail {
-    /// A trail that begins at displacements of the rows, or at none.
+    /// A trail that starts at the given displacements of the rows, or without any.
     pub fn starting(rows: Vec<[f64; 3]>) -> Self {
         Self { rows, ..Self::default() }
     }
 }
 
-/// What a solve under contact conditions may leave to the next one.
+/// What a solve under contact conditions may leave for the next one.
 #[derive(Clone, Copy)]
 pub(crate) struct Leave<'a> {
-    /// How far springs that carry nodes on may carry any of them, mm.
+    /// How far springs of negative stiffness may carry any node, mm.
     pub reach: f64,
-    /// What suffices; none for the tolerance itself.
+    /// The accuracy that suffices; none for the tolerance itself.
     pub enough: Option<Enough>,
     /// Springs between rows.
     pub links: &'a [Link],
 }
 
-/// What rows do under contact conditions.
+/// Response of the rows to contact conditions.
 pub(crate) struct Advance {
     /// Displacements, mm.
     pub rows: Vec<[f64; 3]>,
     /// Whether they are within the tolerance.
     pub solved: bool,
-    /// Whether springs would have carried nodes on for ever.
+    /// Whether springs would have carried nodes without limit.
     pub is_carried: bool,
 }
 
-/// A system without a factor: the matrix and a multigrid hierarchy for it.
+/// A system without a factorisation: the matrix and a multigrid hierarchy for it.
 pub(crate) struct Iterative {
     matrix: BlockMatrix,
     multigrid: Multigrid,
-    /// Whether sweeps solve, and the hierarchy only measures the error they leave.
+    /// Whether sweeps solve the system, and the hierarchy only measures their error.
     sweeps: bool,
     /// Estimated error over the length of the motion.
     tolerance: f64,
@@ -204,9 +204,9 @@ pub(crate) struct Iterative {
 }
 
 impl Iterative {
-    /// The system of `matrix`, to be solved by `method` with the hierarchy for it.
+    /// The system of `matrix`, to be solved by `method`, with a multigrid hierarchy.
     ///
-    /// `tissue`: how extreme the tissue is.
+    /// `tissue`: contrast and compressibility of the tissue.
     pub fn new(
         matrix: BlockMatrix,
         multigrid: Multigrid,
@@ -225,7 +225,7 @@ impl Iterative {
         }
     }
 
-    /// Conjugate gradients with `a`, whose trial is kept in `trial`.
+    /// Conjugate gradients with `a`, whose trial is cached in `trial`.
     fn confirmed<'a>(
         &'a self,
         a: &'a dyn Operator,
@@ -268,8 +268,8 @@ impl Iterative {
         Ok(found.solution)
     }
 
-    /// A⁻¹ b with an error of `allowed`, mm, or of the tolerance over how far one cycle moves the rows, where
-    /// that is more: a step of Newton's method.
+    /// A⁻¹ b with an error of `allowed`, mm, or of the tolerance times the distance that one cycle moves the
+    /// rows, if that is more: a step of Newton's method.
     pub fn step(
         &self,
         b: &[[f64; 3]],
@@ -288,7 +288,7 @@ impl Iterative {
         Ok(self.solution(&confirmed, b, tolerance)?.solution)
     }
 
-    /// The solution for `b` by `confirmed`, begun at rest.
+    /// The solution for `b` by `confirmed`, starting from rest.
     fn solution(
         &self,
         confirmed: &Confirmed<'_>,
@@ -302,12 +302,12 @@ impl Iterative {
 
     /// Components across the normals of w in P A P w = `b`, with springs.
     ///
-    /// `b`: see [`projected_rhs`](crate::algebra::constraints::projected_rhs), with the pull of the springs.
-    /// `leave`: how far springs may carry rows, and what suffices as long as it is more than the tolerance; see
-    /// [`pcg_near`].
+    /// `b`: see [`projected_rhs`](crate::algebra::constraints::projected_rhs), including the forces of the
+    /// springs. `leave`: how far springs may carry rows, and the accuracy that suffices if coarser than the
+    /// tolerance; see [`pcg_near`].
     ///
-    /// Where springs carry nodes on by more than the body holds, those at fault are left out, and the
-    /// solution goes on to their reach along the direction that is not held, downhill.
+    /// If springs drive nodes by more than the body can resist, the springs responsible are left out, and the
+    /// solution is extended downhill, to the reach of the springs, along the unstable direction.
     pub fn solve_projected(
         &self,
         mut b: Vec<[f64; 3]>,
@@ -376,8 +376,8 @@ impl Iterative {
         Ok(Advance { rows, solved, is_carried })
     }
 
-    /// Length that the tolerance refers to, mm. Loads move the body where bone does not: one cycle tells
-    /// how far, to the order of magnitude.
+    /// Reference length of the tolerance, mm. Loads move the body even where bone does not: one cycle gives the
+    /// order of magnitude of that motion.
     fn reach(&self, b: &[[f64; 3]], scale: f64) -> f64 {
         let mut first = vec![[0.0; 3]; b.len()];
         self.multigrid.apply(b, &mut first);
@@ -392,9 +392,10 @@ impl Iterative {
 
     /// Sweeps until the error itself is within `tolerance`, mm.
     ///
-    /// The steps of the sweeps do not tell: where a stiff body hangs on soft tissue they become tiny long
-    /// before it has moved. The error that is left, A⁻¹ (b − A x), is therefore solved for by conjugate
-    /// gradients each time the steps say that the sweeps are done, and measured, not used.
+    /// The length of the sweeps' steps does not show the error: if a stiff body is attached to soft tissue, the
+    /// steps become tiny long before the body has moved all the way. Each time the steps suggest that the
+    /// sweeps are done, the remaining error A⁻¹ (b − A x) is therefore solved for by conjugate gradients; it is
+    /// only measured, not added to the solution.
     fn relax_to_bound(
         &self,
         matrix: &BlockMatrix,
@@ -442,8 +443,8 @@ impl Iterative {
     }
 }
 
-/// The hierarchy for `matrix`, whose rows at `positions` are held along `normals`, of a tissue as extreme as
-/// that.
+/// The hierarchy for `matrix`, whose rows at `positions` are held along `normals`, for tissue with these
+/// extremes.
 pub(crate) fn hierarchy(
     matrix: &BlockMatrix,
     positions: &[[f64; 3]],
@@ -453,7 +454,7 @@ pub(crate) fn hierarchy(
     Multigrid::new(matrix, positions, normals, &multigrid_options(tissue.lame_ratio))
 }
 
-/// How extreme a tissue is.
+/// Extreme material ratios of a tissue.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Extremes {
     /// Largest λ/μ.
@@ -471,11 +472,11 @@ fn multigrid_options(lame_ratio: f64) -> MultigridOptions {
     MultigridOptions { smoother_degree: 2 * defaults.smoother_degree, ..defaults }
 }
 
-/// What to do where sweeps do not end.
+/// Remedy reported if sweeps do not converge.
 const NO_SWEEPS: &str =
     "use method=\"cholesky\" or \"pcg\"; node-wise relaxation is kept for comparison";
 
-/// That the sweeps ended before the error was within the tolerance.
+/// The error for sweeps that ended before the error was within the tolerance.
 fn no_rest(sweeps: usize, error: f64, tolerance: f64) -> MtmError {
     MtmError::NotConverged {
         method: "relaxation",
@@ -490,7 +491,7 @@ fn no_rest(sweeps: usize, error: f64, tolerance: f64) -> MtmError {
     }
 }
 
-/// An error of a step of the relaxation, in the terms that the caller asked in.
+/// An error of a relaxation step, in terms of the caller's tolerance.
 fn gave_up(error: MtmError, sweeps: usize) -> MtmError {
     match error {
         MtmError::NotConverged { shortfall, .. } => MtmError::NotConverged {
@@ -503,8 +504,8 @@ fn gave_up(error: MtmError, sweeps: usize) -> MtmError {
     }
 }
 
-/// Takes out of `springs` those that let the body give way along `direction`: the strongest, until what is left
-/// takes no more than half of what the body holds.
+/// Removes from `springs` those that make the body unstable along `direction`: the strongest first, until the
+/// rest cancel at most half of the stiffness of the body.
 fn at_fault(
     matrix: &BlockMatrix,
     springs: &mut Vec<(usize, Spring)>,
@@ -533,8 +534,8 @@ fn at_fault(
     taken
 }
 
-/// Adds to x as much of each of `directions` as brings ½ xᵀ A x − bᵀ x down, `reach` at most; whether it has no
-/// minimum along one of them.
+/// Adds to x the multiple of each of `directions` that decreases ½ xᵀ A x − bᵀ x the most, moving no node by
+/// more than `reach`; returns whether there is no minimum along one of them.
 fn carry_on(
     a: &dyn Operator,
     b: &[[f64; 3]],
@@ -561,8 +562,8 @@ fn carry_on(
     is_carried
 }
 
-/// How far to go along a direction of an energy with `slope` and `curvature` at its start: to the minimum, or
-/// by `most` downhill where there is none.
+/// How far to go along a direction, given the `slope` and `curvature` of the energy at its start: to the
+/// minimum, or by `most` downhill if there is none.
 fn way_along(slope: f64, curvature: f64, most: f64) -> f64 {
     if curvature > 0.0 {
         return (-slope / curvature).clamp(-most, most);
@@ -570,7 +571,7 @@ fn way_along(slope: f64, curvature: f64, most: f64) -> f64 {
     if slope > 0.0 { -most } else { most }
 }
 
-/// Whether nothing pulls: any iteration would only divide by it.
+/// Whether there is no load at all: any iteration would divide by its norm.
 fn is_zero(b: &[[f64; 3]]) -> bool {
     b.iter().flatten().all(|&v| v == 0.0)
 }
@@ -583,7 +584,7 @@ mod tests {
         (row, Spring { node: row, axis: [1.0, 0.0, 0.0], stiffness, goal: 0.0 })
     }
 
-    /// Three rows that hold themselves by 1 N/mm each.
+    /// Three independent rows, each with a stiffness of 1 N/mm.
     fn unit() -> BlockMatrix {
         let mut matrix = BlockMatrix::from_pattern(vec![0, 1, 2, 3], vec![0, 1, 2]);
         for block in &mut matrix.blocks {
@@ -609,7 +610,7 @@ mod tests {
         let product = ProjectedProduct::new(&matrix, &[], &held);
         assert!(!carry_on(&product, &b, std::slice::from_ref(&along_x), 2.0, &mut x));
         assert!((x[0][0] - 0.5).abs() < 1e-14, "{x:?}");
-        // From beyond the top of a hill the way down is ahead, from before it back.
+        // Beyond the top of a hill, downhill is ahead; before it, downhill is back.
         let unheld = [spring(0, -1.4)];
         let product = ProjectedProduct::new(&matrix, &[], &unheld);
         for (start, end) in [(-0.7, 1.3), (-0.8, -2.8)] {

@@ -1,4 +1,4 @@
-//! Options of a solver: which method, how exact, how contact behaves, how much memory.
+//! Options of a solver: which method, how accurate, how contact behaves, how much memory.
 
 use std::sync::LazyLock;
 
@@ -6,14 +6,14 @@ use crate::contact::ContactOptions;
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::mechanics::kinematics::Kinematics;
 
-/// Asked now and then whether to stop.
+/// Called now and then; true to stop.
 pub type Interrupt<'a> = &'a (dyn Fn() -> bool + Sync);
 
 /// How the linear system is solved.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Method {
-    /// Cholesky up to 100 000 unknowns (some 180 000 tets) if its factor fits into memory, else conjugate
+    /// Cholesky up to 100 000 unknowns (some 180 000 tets) if its factor fits into memory, otherwise conjugate
     /// gradients.
     Auto,
     /// Sparse Cholesky factor, kept for new plans.
@@ -24,11 +24,11 @@ pub enum Method {
     Relaxation,
 }
 
-/// Unknowns up to which [`Method::Auto`] takes the factor.
+/// Unknowns up to which [`Method::Auto`] chooses Cholesky.
 ///
-/// A factor grows like n^1.3 and conjugate gradients like n: for one plan they cost the same near 50 000
-/// unknowns, and at 160 000 the factor costs twice as much, in memory too. It answers the next plan sooner
-/// at any size; up to here that weighs more.
+/// The cost of a factorisation grows like n^1.3, that of conjugate gradients like n: for one plan they cost the
+/// same near 50 000 unknowns, and at 160 000 the factorisation costs twice as much, in memory too. It solves
+/// each further plan faster at any size; up to this limit that matters more.
 const AUTO_DIRECT_UNKNOWNS: usize = 100_000;
 
 /// Names of the methods, for messages.
@@ -41,11 +41,11 @@ pub struct StaticOptions {
     pub method: Method,
     /// Estimated error of the iterative methods over the largest prescribed displacement.
     pub tolerance: f64,
-    /// Most iterations of the iterative methods; their own default if `None`.
+    /// Maximum number of iterations of the iterative methods; their own default if `None`.
     pub max_iterations: Option<usize>,
-    /// The contact loop.
+    /// Options of the contact solver.
     pub contact: ContactOptions,
-    /// Memory that a factor may take, bytes; without limit if `None`.
+    /// Memory that a factor may take, bytes; unlimited if `None`.
     pub memory_limit: Option<usize>,
     /// How strain follows from displacement.
     pub kinematics: Kinematics,
@@ -74,7 +74,7 @@ impl Method {
     /// The method called `name`.
     ///
     /// # Errors
-    /// [`MtmError::UnknownName`] with the names that there are.
+    /// [`MtmError::UnknownName`] with the available names.
     pub fn from_name(name: &str) -> Result<Self> {
         Self::ALL.into_iter().find(|method| method.name() == name).ok_or_else(|| {
             MtmError::UnknownName {
@@ -86,7 +86,7 @@ impl Method {
         })
     }
 
-    /// Whether it solves by a factor; [`Method::Auto`] has to be resolved first.
+    /// Whether it uses a factorisation; [`Method::Auto`] has to be resolved first.
     pub(crate) fn has_factor(self) -> bool {
         match self {
             Self::Cholesky => true,
@@ -94,7 +94,7 @@ impl Method {
         }
     }
 
-    /// Whether it solves by node-wise sweeps.
+    /// Whether it uses node-wise sweeps.
     pub(crate) fn sweeps(self) -> bool {
         match self {
             Self::Relaxation => true,
@@ -102,7 +102,7 @@ impl Method {
         }
     }
 
-    /// The method for a system of so many unknowns: itself, or what [`Method::Auto`] stands for.
+    /// The method for a system of so many unknowns: itself, or the choice of [`Method::Auto`].
     pub fn for_unknowns(self, unknowns: usize) -> Self {
         match self {
             Self::Auto if unknowns > AUTO_DIRECT_UNKNOWNS => Self::Pcg,

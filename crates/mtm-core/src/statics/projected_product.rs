@@ -1,5 +1,5 @@
-//! The system under contact constraints as a product: what conjugate gradients need of P A P, without a
-//! copy of A.
+//! The system under contact constraints as a matrix product: all that conjugate gradients need of P A P,
+//! without a copy of A.
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::constraints::Constraint;
@@ -8,10 +8,10 @@ use crate::contact::Spring;
 use crate::contact::links::Link;
 use crate::vector::{add, dot, norm, scaled, sub};
 
-/// Length, relative to what it was, below which nothing but rounding is left of a projected vector.
+/// Length of a projected vector, relative to the original, below which only rounding errors are left of it.
 const PROJECTION_ROUNDING: f64 = 16.0 * f64::EPSILON;
 
-/// Share of what the body holds along a direction that springs have to leave.
+/// Share of the stiffness of the body along a direction that must remain with the springs.
 const LEAST_HOLD: f64 = 0.05;
 
 /// P (A + Σ k a⊗a + Σ k c⊗c) P on the vectors without a component along the normals of held rows.
@@ -59,7 +59,7 @@ impl Operator for ProjectedProduct<'_> {
         self.project(y);
     }
 
-    /// Springs may take off most of what the body holds, not all.
+    /// Springs may cancel most of the stiffness of the body, but not all of it.
     fn least_curvature(&self, p: &[[f64; 3]]) -> f64 {
         let taken = |(row, s): &(usize, Spring)| -s.stiffness * dot(s.axis, p[*row]).powi(2);
         let unstable = self.springs.iter().filter(|(_, s)| s.stiffness < 0.0);
@@ -73,7 +73,8 @@ impl Operator for ProjectedProduct<'_> {
             for &Constraint { normal, .. } in held {
                 x[row] = sub(x[row], scaled(normal, dot(normal, x[row])));
             }
-            // What rounding leaves points anywhere, and may be all that a held node has.
+            // The rounding errors left by the projection point anywhere, and may be all that is left at a held
+            // node.
             if norm(x[row]) <= least {
                 x[row] = [0.0; 3];
             }

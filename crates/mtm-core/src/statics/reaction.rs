@@ -1,13 +1,15 @@
-//! How sliding nodes answer to constraints where the factor of the body without them is kept.
+//! How sliding nodes respond to constraints if the factorisation of the body without them is available.
 //!
-//! Contact forces λ along the normals N follow from (Nᵀ A⁻¹ N) λ = g − Nᵀ u_free, by conjugate gradients that
-//! the matrix at rest preconditions. Until closest points settle they stop early, and begin where the last
-//! displacements put them: two or three products for each set of normals, rough ones but for two in a plan.
+//! Contact forces λ along the normals N follow from (Nᵀ A⁻¹ N) λ = g − Nᵀ u_free, solved by conjugate gradients
+//! with the matrix at rest as preconditioner. Until the closest points converge, the iterations stop early and
+//! start from the last displacements: two or three products for each set of normals, of which all but two per
+//! plan are approximate.
 //!
-//! Few sliding nodes have their whole flexibility A⁻¹ at hand for the products, and the matrix of other
-//! normals is written down and factored where too many are needed. Where nodes are many, products come from
-//! sweeps through the part of the factor that they reach: less to make and to keep, but springs and second
-//! walls, which the matrix at rest knows nothing of, can take a hundred of them.
+//! If there are few sliding nodes, their whole flexibility A⁻¹ is stored for the products, and the matrix of
+//! new normals is assembled and factorised if too many products would be needed. If there are many, products
+//! are computed by sweeps through the part of the factor that the nodes reach. This takes less time to set up
+//! and less memory, but springs and second walls, which the matrix at rest does not include, can require a
+//! hundred of them.
 
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
@@ -19,29 +21,30 @@ use crate::contact::{Constraints, ContactRow, Sliding, Spring};
 use crate::error::{MtmError, Result, Shortfall};
 use crate::vector::{add, dot, norm, scaled, sub};
 
-/// Steps of sweeps after which contact gives up: ten on smooth bone, a hundred on teeth.
+/// Maximum number of steps with sweeps: ten are needed on smooth bone, a hundred on teeth.
 const MOST_SWEEPS: usize = 1000;
-/// Share of what is left to change that rough products may have left open before one that is exact.
+/// Error that approximate products may accumulate, as a share of the remaining change, before an exact product
+/// is needed.
 const DOUBT_SHARE: f64 = 0.1;
-/// Share of the loads of unstable springs to which they are solved at the least.
+/// Relative accuracy of the loads of unstable springs if no further step corrects them.
 const LOAD_SHARE: f64 = 1e-5;
-/// Steps of conjugate gradients after which the loads stay as they are.
+/// Maximum number of conjugate gradient steps for these loads.
 const MOST_LOAD_STEPS: usize = 60;
-/// Softness of unstable springs above which they are as good as none.
+/// Softness of unstable springs above which they have practically no effect.
 const MOST_SOFTNESS: f64 = 1e6;
-/// Halvings in the search for it.
+/// Number of bisections in the search for the softness.
 const SOFTENINGS: usize = 30;
-/// Share of what a direction moves that may be wrong in a step.
+/// Relative error of the response to a trial direction that is allowed in a step.
 const PROBE_ERROR: f64 = 1e-3;
-/// Loads by which directions are tried, over the contact forces: what they move is far above rounding.
+/// Size of trial loads relative to the contact forces: large enough for their effect to exceed rounding errors
+/// by far.
 const PROBE_SHARE: f64 = 1e-2;
-/// Relative error of contact forces, in the energy norm, at which only rounding is left.
+/// Relative error of contact forces, in the energy norm, at which only rounding errors are left.
 const ROUNDING: f64 = 1e-14;
-/// Share of the contact tolerance that the forces of settled contact may be off, relative to all of them.
+/// Share of the contact tolerance by which the final contact forces may be in error, relative to all of them.
 const EXACT_SHARE: f64 = 1e-2;
 
-/// What is kept for sliding nodes: their flexibility, and the inverse of its part along the normals at
-/// rest.
+/// Data kept for sliding nodes: their flexibility, and the inverse of its part along the normals at rest.
 pub(crate) struct ContactFactor {
     flexibility: Flexibility,
     rest: NormalFactor,
@@ -49,20 +52,20 @@ pub(crate) struct ContactFactor {
 
 /// Displacements of sliding nodes under forces on them.
 enum Flexibility {
-    /// Written down.
+    /// Stored as a matrix.
     Dense(TailFlexibility),
-    /// By sweeps.
+    /// Computed by sweeps.
     Sweeps {
         reach: Reach,
         /// Row of the system of each sliding node.
         rows: Vec<u32>,
-        /// Flexibility of each by itself along its normal at rest, mm/N.
+        /// Flexibility of each on its own along its normal at rest, mm/N.
         own: Vec<f64>,
     },
 }
 
 impl ContactFactor {
-    /// The whole flexibility of the sliding nodes, which the structure keeps last.
+    /// The whole flexibility of the sliding nodes, which are last in the elimination order.
     pub fn dense(factor: &Factor, sliding: &Sliding) -> Result<Self> {
         let tail = factor.tail_flexibility();
         let row = |(node, &normal)| ContactRow { node, normal, point: [0.0; 3] };
@@ -80,7 +83,7 @@ impl ContactFactor {
         Ok(Self { flexibility: Flexibility::Dense(tail), rest })
     }
 
-    /// The flexibility along the normals at rest, and what sweeps need for the rest of it.
+    /// The flexibility along the normals at rest, and the data that sweeps need for the rest of it.
     pub fn by_sweeps(factor: &Factor, sliding: &Sliding) -> Result<Self> {
         let rows: Vec<u32> = sliding.nodes().iter().map(|n| n.row).collect();
         let reach = factor.reach(&rows);
@@ -104,7 +107,7 @@ impl ContactFactor {
         flexibility + self.rest.bytes()
     }
 
-    /// Answers to one plan's constraints, whose forces are `b`.
+    /// The responses to the constraints of one plan, with forces `b`.
     pub fn answers<'a>(&'a self, factor: &'a Factor, b: &[[f64; 3]]) -> Answers<'a> {
         let (free, swept) = match &self.flexibility {
             Flexibility::Dense(tail) => {
@@ -139,7 +142,7 @@ impl ContactFactor {
         }
     }
 
-    /// The whole flexibility of the sliding nodes, where it is written down.
+    /// The whole flexibility of the sliding nodes, if it is stored.
     pub fn tail(&self) -> Option<&TailFlexibility> {
         match &self.flexibility {
             Flexibility::Dense(tail) => Some(tail),
@@ -148,30 +151,30 @@ impl ContactFactor {
     }
 }
 
-/// Answers of the sliding nodes to one plan's constraints, each begun from the one before.
+/// Responses of the sliding nodes to the constraints of one plan, each starting from the previous one.
 pub(crate) struct Answers<'a> {
     contact: &'a ContactFactor,
     factor: &'a Factor,
-    /// The forces after the sweep to the sliding nodes, in elimination order.
+    /// The forces after the forward sweep to the sliding nodes, in elimination order.
     swept: Vec<f64>,
     /// Displacements of the sliding nodes without contact forces, mm.
     free: Vec<[f64; 3]>,
-    /// Forces of the last answer on each.
+    /// Forces on each node in the last response.
     pushed: Vec<[f64; 3]>,
-    /// What they added to the displacements, mm, and how exactly.
+    /// Their contribution to the displacements, mm, and its accuracy.
     moved: Vec<[f64; 3]>,
     precision: Precision,
-    /// What rough products may have left open, in the measure of the preconditioner.
+    /// Error accumulated by approximate products, in the norm of the preconditioner.
     doubt: f64,
-    /// Measure that the last answer had to come within.
+    /// Accuracy required of the last response, in the same norm.
     enough: f64,
     /// Zeros for the sweeps.
     work: Vec<f64>,
-    /// The factor made last in this plan, once the one at rest did not serve.
+    /// The last factorisation made for this plan, if the one at rest was not good enough.
     made: Option<NormalFactor>,
-    /// Rows of the last answer, ascending, with their forces.
+    /// Rows of the last response, ascending, with their forces.
     last: Vec<(RowKey, f64)>,
-    /// Loads that unstable springs bring.
+    /// Loads due to unstable springs.
     carried: Option<Carried>,
 }
 
@@ -179,11 +182,11 @@ pub(crate) struct Answers<'a> {
 struct Carried {
     /// N.
     loads: Vec<[f64; 3]>,
-    /// What they add to the displacements, mm.
+    /// Their contribution to the displacements, mm.
     moved: Vec<[f64; 3]>,
 }
 
-/// What sliding nodes do under contact conditions.
+/// Response of the sliding nodes to contact conditions.
 pub(crate) struct Answer {
     /// Displacement of each, mm.
     pub displacements: Vec<[f64; 3]>,
@@ -191,20 +194,21 @@ pub(crate) struct Answer {
     pub forces: Vec<[f64; 3]>,
     /// Whether they are within the tolerance.
     pub solved: bool,
-    /// Whether unstable springs would have carried nodes past their reach.
+    /// Whether unstable springs would have carried nodes beyond their reach.
     pub is_carried: bool,
 }
 
 impl<'a> Answers<'a> {
-    /// The sliding nodes under conditions `c`, to the share of what these change that they ask for; `tolerance`:
-    /// of contact, over the size of the scene.
+    /// The response of the sliding nodes to conditions `c`, with the relative accuracy that `c` requests;
+    /// `tolerance`: of contact, over the size of the scene.
     ///
-    /// Springs that hold a node back stand among the rows. Those that carry it on, of stiffness −k along the axes
-    /// A, are loads z = k (Aᵀ u − goal): (1/k − Aᵀ F A) z = Aᵀ u₀ − goal with F the flexibility of the body
-    /// under the rows, solved by [`Krylov`], which softens springs that the body does not hold.
+    /// Springs that hold a node back are treated as rows. Those of negative stiffness −k along the axes A,
+    /// which drive nodes further along, become loads z = k (Aᵀ u − goal): (1/k − Aᵀ F A) z = Aᵀ u₀ − goal,
+    /// where F is the flexibility of the body under the rows. The system is solved by [`Krylov`], which softens
+    /// springs that make the body unstable.
     ///
     /// # Errors
-    /// `NotPositiveDefinite` where the body does not hold the loads and their reach has no end.
+    /// `NotPositiveDefinite` if the loads make the body unstable and their reach is unlimited.
     pub fn respond(&mut self, c: &Constraints<'_>, tolerance: f64) -> Result<Answer> {
         let unstable: Vec<Spring> =
             c.springs.iter().filter(|s| s.stiffness < 0.0).copied().collect();
@@ -229,7 +233,7 @@ impl<'a> Answers<'a> {
         Ok(Answer { displacements: self.displacements(), forces, solved: found.solved, is_carried })
     }
 
-    /// Loads along `unstable` springs, N, and whether these had to be softened.
+    /// Loads along `unstable` springs, N, and whether the springs had to be softened.
     fn loads(
         &mut self,
         unstable: &[Spring],
@@ -237,7 +241,7 @@ impl<'a> Answers<'a> {
         rows: &Rows,
         exact: f64,
     ) -> Result<(Vec<f64>, bool)> {
-        // For a step, the next one corrects what is left; an operator has no next one.
+        // In a step, the next step corrects what is left; for an operator there is no next step.
         let is_step = c.reach.is_finite();
         let share = if is_step { c.share.max(PROBE_ERROR) } else { LOAD_SHARE };
         let (aim, precision) = if is_step {
@@ -256,7 +260,7 @@ impl<'a> Answers<'a> {
         let mut next: Vec<f64> = open.iter().map(|v| v / size).collect();
         while size > 0.0 && krylov.basis.len() < MOST_LOAD_STEPS.min(unstable.len()) {
             let q: Vec<f64> = next.iter().zip(&root).map(|(v, r)| v * r).collect();
-            // As large as what is known of the answers to it.
+            // Scaled to the size of the responses known so far.
             let up = PROBE_SHARE * most / length(&q);
             let loads: Vec<f64> = q.iter().map(|q| q * up).collect();
             self.take(base.clone());
@@ -277,7 +281,7 @@ impl<'a> Answers<'a> {
         if c.reach.is_infinite() && (krylov.softness > 0.0 || krylov.left > share * size) {
             return Err(unheld());
         }
-        // Answers add up: from there the last one is near.
+        // Responses are linear: their sum is close to the final one.
         let mut sum = base.clone();
         for (y, (up, pose)) in krylov.solution.iter().zip(&answered) {
             sum.add(y / up, pose, &base);
@@ -293,7 +297,7 @@ impl<'a> Answers<'a> {
         Ok((loads, krylov.softness > 0.0))
     }
 
-    /// Puts loads z along unstable springs on the body.
+    /// Applies loads z along unstable springs to the body.
     fn carry(&mut self, unstable: &[Spring], z: &[f64], precision: Precision) {
         let mut loads = vec![[0.0; 3]; self.free.len()];
         for (s, z) in unstable.iter().zip(z) {
@@ -324,12 +328,12 @@ impl<'a> Answers<'a> {
         }
     }
 
-    /// Displacements after the last answer, mm.
+    /// Displacements after the last response, mm.
     fn displacements(&self) -> Vec<[f64; 3]> {
         self.unpushed().iter().zip(&self.moved).map(|(f, m)| add(*f, *m)).collect()
     }
 
-    /// Contact forces and what they do, to begin from.
+    /// Contact forces and their effect, as a state to start from.
     fn pose(&self) -> Pose {
         Pose { last: self.last.clone(), pushed: self.pushed.clone(), moved: self.moved.clone() }
     }
@@ -338,8 +342,8 @@ impl<'a> Answers<'a> {
         (self.last, self.pushed, self.moved) = (pose.last, pose.pushed, pose.moved);
     }
 
-    /// Contact forces along `rows`, and what they add to the displacements: as near as `aim` says, or to `exact`
-    /// of all.
+    /// Contact forces along `rows`, with their contribution to the displacements: with the accuracy of `aim`,
+    /// or to the share `exact` of the whole.
     fn forces(&mut self, rows: &Rows, aim: Aim, exact: f64) -> Result<NormalForces> {
         let kept = self.made.as_ref().unwrap_or(&self.contact.rest);
         let preconditioner = Preconditioner::new(self.diagonal(rows), &rows.keys, kept);
@@ -347,7 +351,7 @@ impl<'a> Answers<'a> {
             self.last.binary_search_by(|(k, _)| k.cmp(key)).map_or(0.0, |at| self.last[at].1)
         };
         let mut start: Vec<f64> = rows.keys.iter().map(before).collect();
-        // What the last displacements leave open, were its forces not to turn with the normals.
+        // What the last displacements leave open, assuming that the forces do not turn with the normals.
         let goals = rows.missing(&self.unpushed());
         let there = rows.along(&self.moved, &start);
         let open: Vec<f64> = goals.iter().zip(there).map(|(g, v)| g - v).collect();
@@ -365,7 +369,8 @@ impl<'a> Answers<'a> {
                 (self.factor.respond(reach, pushes, work), Precision::Exact)
             }
         };
-        // What is rough of a change is little of the whole, until that little is what is left to change.
+        // The error of an approximate product is a small share of the change, until the remaining change is
+        // just as small.
         let now = pushes(n, &rows.rows, &start);
         let (nodes, precision) = if self.doubt > DOUBT_SHARE * measure {
             self.doubt = 0.0;
@@ -434,7 +439,7 @@ impl<'a> Answers<'a> {
         Ok(found)
     }
 
-    /// Flexibility of each row by itself, mm/N.
+    /// Flexibility of each row on its own, mm/N.
     fn diagonal(&self, rows: &Rows) -> Vec<f64> {
         let own = |r: &ContactRow| match &self.contact.flexibility {
             Flexibility::Dense(tail) => tail.own(r.node, r.normal),
@@ -462,16 +467,16 @@ impl<'a> Answers<'a> {
     }
 }
 
-/// How near forces have to come.
+/// Accuracy required of the forces.
 #[derive(Clone, Copy)]
 enum Aim {
-    /// To a share of what the rows change.
+    /// Relative to the change that the rows cause.
     Share(f64),
-    /// Within so much, in the measure of the preconditioner.
+    /// Absolute, in the norm of the preconditioner.
     Measure(f64),
 }
 
-/// Contact forces of some answer, and what they do.
+/// Contact forces of a response, and their effect.
 #[derive(Clone)]
 struct Pose {
     last: Vec<(RowKey, f64)>,
@@ -480,7 +485,7 @@ struct Pose {
 }
 
 impl Pose {
-    /// Adds `share` of what `to` has more than `from`, for the same rows.
+    /// Adds `share` of the difference between `to` and `from`, for the same rows.
     fn add(&mut self, share: f64, to: &Self, from: &Self) {
         for (own, (to, from)) in self.last.iter_mut().zip(to.last.iter().zip(&from.last)) {
             own.1 += share * (to.1 - from.1);
@@ -495,13 +500,13 @@ impl Pose {
     }
 }
 
-/// Constraint rows, and after them one for each spring: a spring of stiffness k adds a column along its
-/// axis, with 1/k on the diagonal.
+/// Constraint rows, followed by one row for each spring: a spring of stiffness k adds a column along its axis,
+/// with 1/k on the diagonal.
 pub(crate) struct Rows {
     pub rows: Vec<ContactRow>,
-    /// Displacement that each row asks for, mm.
+    /// Prescribed displacement of each row, mm.
     goals: Vec<f64>,
-    /// What is added to the diagonal, mm/N.
+    /// Softness added to the diagonal, mm/N.
     pub softness: Vec<f64>,
     pub keys: Vec<RowKey>,
 }
@@ -525,12 +530,12 @@ impl Rows {
         Self { rows, goals, softness, keys }
     }
 
-    /// What contact forces have to add to displacements `free`, mm.
+    /// Displacements that contact forces have to add to `free`, mm.
     pub fn missing(&self, free: &[[f64; 3]]) -> Vec<f64> {
         self.rows.iter().zip(&self.goals).map(|(r, g)| g - dot(r.normal, free[r.node])).collect()
     }
 
-    /// Displacement along each row where nodes move by `nodes` and the forces along the rows are `forces`.
+    /// Displacement along each row if the nodes move by `nodes` and the forces along the rows are `forces`.
     fn along(&self, nodes: &[[f64; 3]], forces: &[f64]) -> Vec<f64> {
         let along = |((r, s), f): ((&ContactRow, &f64), &f64)| dot(r.normal, nodes[r.node]) + s * f;
         self.rows.iter().zip(&self.softness).zip(forces).map(along).collect()
@@ -554,15 +559,16 @@ impl Rows {
     }
 }
 
-/// Loads y of unstable springs in the space that their products span: ((1 + μ) I − G) y = b, G the flexibility
-/// between the springs, each by the root of its stiffness; μ softens all springs alike, so that the body holds
-/// them and no node goes farther than they reach (a trust region; Gould, Lucidi, Roma & Toint 1999).
+/// Loads y of unstable springs in the space spanned by their products: ((1 + μ) I − G) y = b, where G is the
+/// flexibility between the springs, each scaled by the root of its stiffness. μ softens all springs equally, so
+/// that the body is stable with them and no node moves beyond their reach (a trust region; Gould, Lucidi, Roma
+/// & Toint 1999).
 struct Krylov {
     /// Length of b.
     size: f64,
     /// Orthonormal directions, the first along b.
     basis: Vec<Vec<f64>>,
-    /// What loads along them add to the displacements of the sliding nodes, mm.
+    /// Displacements of the sliding nodes under loads along them, mm.
     moved: Vec<Vec<[f64; 3]>>,
     /// G between them.
     flexibility: DMatrix<f64>,
@@ -590,14 +596,14 @@ impl Krylov {
         }
     }
 
-    /// Adds a direction with its product and what it moves; the next one.
+    /// Adds a direction with its product and the displacements it causes; returns the next direction.
     fn push(&mut self, direction: Vec<f64>, answer: Vec<f64>, moved: Vec<[f64; 3]>) -> Vec<f64> {
         let m = self.basis.len();
         self.basis.push(direction);
         self.moved.push(moved);
         let mut flexibility = std::mem::take(&mut self.flexibility).resize(m + 1, m + 1, 0.0);
         let mut next = answer;
-        // Twice is enough against rounding (Parlett 1980).
+        // Two passes are enough against rounding (Parlett 1980).
         for _ in 0..2 {
             for (k, q) in self.basis.iter().enumerate() {
                 let along: f64 = q.iter().zip(&next).map(|(a, b)| a * b).sum();
@@ -615,7 +621,7 @@ impl Krylov {
         next.iter().map(|v| v / self.rest.max(f64::MIN_POSITIVE)).collect()
     }
 
-    /// The solution with the least softness with which no node goes farther than `reach`, mm.
+    /// The solution with the smallest softness for which no node moves further than `reach`, mm.
     fn soften(&mut self, reach: f64) {
         let m = self.basis.len();
         let eigen = SymmetricEigen::new(self.flexibility.clone());
@@ -635,7 +641,7 @@ impl Krylov {
         self.softness = 0.0;
         self.solution = solution(0.0);
         if most >= 1.0 || farthest(&self.solution) > reach {
-            // From just held on, the way falls as the softness grows.
+            // Above the limit of stability, displacements decrease as the softness grows.
             let least = (most - 1.0).max(0.0);
             let (mut low, mut high) = (least, least + 1.0);
             while farthest(&solution(high)) > reach && high < MOST_SOFTNESS {
@@ -660,7 +666,7 @@ fn length(v: &[f64]) -> f64 {
     v.iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
-/// That contact forces carry nodes on by more than the body holds.
+/// The error for contact forces that drive nodes by more than the body can resist.
 pub(crate) fn unheld() -> MtmError {
     MtmError::NotPositiveDefinite {
         node: 0,
@@ -668,7 +674,7 @@ pub(crate) fn unheld() -> MtmError {
     }
 }
 
-/// That the flexibility has no positive pivot at a row of the system.
+/// The error for a flexibility without a positive pivot at a row of the system.
 pub(crate) fn singular(row: u32) -> MtmError {
     MtmError::NotPositiveDefinite {
         node: row as usize,

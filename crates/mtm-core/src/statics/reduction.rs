@@ -1,4 +1,4 @@
-//! The unknowns of a body: which nodes they are, and rows and matrices of them alone.
+//! The unknowns of a body: their nodes, and the vectors and matrices restricted to them.
 
 use rayon::prelude::*;
 

@@ -1,8 +1,8 @@
-//! Exact re-planning: the answer to any rigid plan from columns solved once.
+//! Exact re-planning: the solution for any rigid plan from columns that are solved once.
 //!
-//! A rigid motion is affine, u_b = (R − I)(x − c) + s, so twelve unit fields per segment span every
-//! finite motion of it: nine for R − I, three for s = t + (R − I) c. With contact normals frozen the
-//! sliding constraints are affine in the same numbers.
+//! A rigid motion is affine, u_b = (R − I)(x − c) + s, so twelve unit fields per segment span all its finite
+//! motions: nine for R − I, three for s = t + (R − I) c. If the contact normals are frozen, the sliding
+//! constraints are affine in the same numbers.
 
 use rayon::prelude::*;
 
@@ -19,9 +19,9 @@ use crate::vector::{add, dot, scaled, sub};
 
 /// Unit fields per segment.
 pub const COLUMNS: usize = 12;
-/// Nodes from which a second core brings more than its wake-up costs.
+/// Number of nodes from which a second core saves more than it costs to wake it up.
 const NODES_FOR_THREADS: usize = 32_768;
-/// Nodes a thread takes at once.
+/// Nodes per parallel task.
 const NODES_PER_TASK: usize = 8192;
 
 /// Linear map from rigid plans to the displacements of chosen nodes.
@@ -33,19 +33,18 @@ pub struct PlanOperator {
     centres: Vec<[f64; 3]>,
     /// Coefficients of the twelve numbers of each segment: component i of the nodes, then segment.
     rows: Vec<[f64; COLUMNS]>,
-    /// Displacement that does not depend on the plan: rest gaps that contact closes.
+    /// Displacement that does not depend on the plan: gaps at rest that contact closes.
     offset: Option<Vec<f64>>,
 }
 
 impl StaticSolver {
     /// The operator for `nodes` (all of them if `None`).
     ///
-    /// Without sliding nodes it equals `solve` for every rigid plan. With them, contact points, normals
-    /// and the set of held nodes are those of `reference` (at rest if `None`).
+    /// Without sliding nodes it equals `solve` for every rigid plan. With them, contact points, normals and the
+    /// set of held nodes are those of the plan `reference` (of the state at rest if `None`).
     ///
     /// # Errors
-    /// Node indices out of range, a reference plan that does not fit or settle, a linear solve that
-    /// fails.
+    /// Node indices out of range, a reference plan that does not fit or converge, a linear solve that fails.
     pub fn plan_operator(
         &self,
         nodes: Option<Vec<u32>>,
@@ -103,7 +102,7 @@ impl StaticSolver {
             })
             .collect();
 
-        // Prescribed fields of every column, and the constant column last if there is contact.
+        // Prescribed fields of all columns, followed by the constant column if there is contact.
         let (mut fields, mut scales) = (Vec::new(), Vec::new());
         for (s, segment) in segments.iter().enumerate() {
             for column in 0..COLUMNS {
@@ -163,7 +162,7 @@ impl StaticSolver {
 }
 
 impl PlanOperator {
-    /// The nodes it answers for.
+    /// The nodes whose displacements it returns.
     pub fn nodes(&self) -> &[u32] {
         &self.nodes
     }
@@ -173,7 +172,7 @@ impl PlanOperator {
         &self.segments
     }
 
-    /// Point of each segment that its columns are taken about, mm.
+    /// Point of each segment about which its columns are defined, mm.
     pub fn centres(&self) -> &[[f64; 3]] {
         &self.centres
     }
@@ -186,7 +185,7 @@ impl PlanOperator {
     /// Displacements of the nodes under a rigid plan, mm.
     ///
     /// # Errors
-    /// A plan that does not name every segment once, or moves one otherwise than rigidly.
+    /// A plan that does not name every segment exactly once, or contains a motion that is not rigid.
     pub fn apply(&self, plan: &Plan) -> Result<Vec<[f64; 3]>> {
         let mut out = vec![[0.0; 3]; self.nodes.len()];
         self.apply_into(plan, &mut out)?;
@@ -208,7 +207,7 @@ impl PlanOperator {
         let names: Vec<&str> = self.segments.iter().map(String::as_str).collect();
         let mut numbers = Vec::with_capacity(names.len());
         for (motion, &centre) in matched(plan, &names)?.into_iter().zip(&self.centres) {
-            // Every other motion was refused above.
+            // Motions that are not rigid were rejected above.
             let Motion::Rigid(rigid) = motion else { continue };
             // (R − I)(x − c) + s with s the displacement of the centre.
             let mut own = [0.0; COLUMNS];
@@ -241,7 +240,7 @@ impl PlanOperator {
     }
 }
 
-/// Contact at the reference plan, to be continued to others.
+/// Contact at the reference plan, about which other plans are linearised.
 struct About<'a> {
     state: &'a ContactState,
     sliding: &'a [SlidingNode],
@@ -249,7 +248,8 @@ struct About<'a> {
     centres: &'a [[f64; 3]],
 }
 
-/// How contact conditions change with the columns of the operator, and what they are without any, last.
+/// Derivatives of the contact conditions with respect to the columns of the operator, followed by their
+/// constant part.
 struct Slopes {
     /// Offset of every row, for each column.
     offsets: Vec<Vec<f64>>,
@@ -258,10 +258,10 @@ struct Slopes {
 }
 
 impl About<'_> {
-    /// First order of the contact conditions about the reference: a row follows its surface along its normal,
-    /// n·u = n·w(p) with w the way of the point p of the segment; the force f n turns with the surface, and as
-    /// the node slides on it: f H (u − w) + f (R − R₀) R₀ᵀ n across the normal. The first part is a spring that
-    /// goes along with the surface, the second a load, which is added to `fields`.
+    /// First-order change of the contact conditions about the reference. A row follows its surface along its
+    /// normal, n·u = n·w(p), where w is the displacement of the point p of the segment. The force f n turns
+    /// with the surface, and as the node slides on it: f H (u − w) + f (R − R₀) R₀ᵀ n across the normal. The
+    /// first term is a spring that moves with the surface, the second a load, which is added to `fields`.
     fn slopes(&self, reference: &Plan, segments: &[&str], fields: &mut [Vec<[f64; 3]>]) -> Slopes {
         let Self { state, sliding, places, centres } = *self;
         let columns = fields.len();
@@ -293,7 +293,8 @@ impl About<'_> {
                 out.goals[COLUMNS * node.segment + column][r] = dot(axis, unit(column));
             }
         }
-        // Turns of the forces with their segments: across the normal, what lies along it is the row's.
+        // Rotation of the forces with their segments, only across the normal: the component along it belongs to
+        // the row.
         for (i, node) in sliding.iter().enumerate().filter(|(i, _)| state.active[*i]) {
             let (normal, force) = (state.normals[i], state.forces[i]);
             let back = motion(node.segment).rotate_inverse(normal);

@@ -1,7 +1,7 @@
-//! Whether the body is held: which parts could move without deforming, and along which rigid modes.
+//! Whether the body is constrained: which parts could move without deforming, and along which rigid modes.
 //!
-//! A stiffness matrix with a free rigid mode or a hinge is singular, but rounding can hide it from the
-//! factorisation. The parts are therefore found from geometry, before any number is factored.
+//! A stiffness matrix with a free rigid mode or a hinge is singular, but rounding can hide this from the
+//! factorisation. The parts are therefore found from the geometry, before anything is factorised.
 
 use nalgebra::{DMatrix, Matrix6, SMatrix, SymmetricEigen, Vector3, Vector6};
 
@@ -9,17 +9,17 @@ use crate::error::{MtmError, Result};
 use crate::mesh::TetMesh;
 use crate::vector::{cross, dot, norm, scaled, sub};
 
-/// Share of the largest eigenvalue of a part's restraint below which a rigid mode counts as free.
+/// Eigenvalue of a part's restraint, relative to the largest, below which a rigid mode counts as free.
 const FREE_MODE: f64 = 1e-10;
-/// Most parts in one chain of touching parts whose joint motion is analysed (six unknowns each).
+/// Maximum number of parts in a chain of touching parts whose joint motion is analysed (six unknowns each).
 const MAX_JOINT_PARTS: usize = 150;
 
-/// How the body is held.
+/// How the body is constrained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Held {
-    /// Fixed and joined nodes suffice: sliding nodes may even be let go.
+    /// Fixed and joined nodes suffice: sliding nodes may even be released.
     ByPrescribed,
-    /// Sliding nodes are needed: without their normal constraint a part would drift.
+    /// Sliding nodes are needed: without their normal constraint a part could drift.
     WithSliding,
 }
 
@@ -30,10 +30,10 @@ struct Part {
     radius: f64,
 }
 
-/// How the body is held by its prescribed nodes and by sliding nodes with their unit normals.
+/// How the prescribed nodes, and the sliding nodes with their unit normals, constrain the body.
 ///
 /// # Errors
-/// `Unconstrained` with the free modes of the first part that is not held.
+/// `Unconstrained` with the free modes of the first part that is not constrained.
 pub fn check(
     mesh: &TetMesh,
     prescribed: impl Fn(usize) -> bool,
@@ -53,7 +53,7 @@ pub fn check(
     Ok(Held::WithSliding)
 }
 
-/// Grounds every node of a tet that has three grounded ones: they are never in line.
+/// Grounds every node of a tet that has three grounded ones: three nodes of a tet are never collinear.
 fn grow(mesh: &TetMesh, grounded: &mut [bool]) {
     let mut count = vec![0_u8; mesh.n_tets()];
     let mut queue: Vec<u32> =
@@ -110,7 +110,7 @@ fn parts(mesh: &TetMesh, grounded: &[bool]) -> Vec<Part> {
     parts
 }
 
-/// Whether all parts are held: each by itself, else those that lean on one another jointly.
+/// Checks that all parts are constrained: each is tested alone, then those that share nodes jointly.
 fn free_parts(
     mesh: &TetMesh,
     parts: &[Part],
@@ -121,7 +121,7 @@ fn free_parts(
     for &(node, n) in sliding {
         normal[node as usize] = Some(n);
     }
-    // A part that is held grounds its nodes, which may hold the next.
+    // A constrained part grounds its nodes, which may constrain the next part.
     let mut open: Vec<usize> = (0..parts.len()).collect();
     loop {
         let before = open.len();
@@ -205,7 +205,7 @@ fn free_modes(gram: &Matrix6<f64>) -> Vec<Vector6<f64>> {
         .collect()
 }
 
-/// The open parts in chains that share nodes, each chain and the parts in it ascending.
+/// The free parts in chains that share nodes; the chains, and the parts in each, in ascending order.
 fn touching(mesh: &TetMesh, parts: &[Part], open: &[usize], grounded: &[bool]) -> Vec<Vec<usize>> {
     let mut chain_of: Vec<usize> = (0..open.len()).collect();
     let mut owner: Vec<Option<usize>> = vec![None; mesh.n_nodes()];
@@ -237,7 +237,7 @@ fn root(chain_of: &mut [usize], mut i: usize) -> usize {
     i
 }
 
-/// Whether parts that share nodes hold one another: six unknowns a part, equal motion at shared nodes.
+/// Whether parts that share nodes constrain each other: six unknowns per part, equal motion at shared nodes.
 fn held_jointly(
     mesh: &TetMesh,
     parts: &[Part],
@@ -322,7 +322,7 @@ fn direction(v: [f64; 3]) -> String {
     format!("({:.3}, {:.3}, {:.3})", shown(unit[0]), shown(unit[1]), shown(unit[2]))
 }
 
-/// `value` without the sign of a zero that rounding left.
+/// `value` without the negative sign of a zero left by rounding.
 fn shown(value: f64) -> f64 {
     if value.abs() < 5e-5 { 0.0 } else { value }
 }

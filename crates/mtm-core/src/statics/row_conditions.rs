@@ -15,7 +15,7 @@ pub(crate) struct RowConditions {
 }
 
 impl RowConditions {
-    /// Those that `c` sets for the sliding nodes.
+    /// The conditions that `c` sets for the sliding nodes.
     pub fn new(sliding: &Sliding, c: &Constraints<'_>) -> Self {
         let row = |node: usize| sliding.nodes()[node].row as usize;
         let rows = c.rows.iter().zip(c.offsets);
@@ -36,7 +36,7 @@ impl RowConditions {
         system
     }
 
-    /// Adds what the springs pull with from rest to the right-hand side `b`, N.
+    /// Adds the forces of the springs at rest to the right-hand side `b`, N.
     pub fn add_pull(&self, b: &mut [[f64; 3]]) {
         for (row, s) in &self.springs {
             b[*row] = add(b[*row], scaled(s.axis, s.stiffness * s.goal));

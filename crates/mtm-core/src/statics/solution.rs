@@ -1,10 +1,10 @@
-//! What a solve returns: displacements, forces, how exact they are and where the time went.
+//! The result of a solve: displacements, forces, their accuracy, and the time spent.
 
 use std::time::Instant;
 
 use crate::contact::ContactStart;
 
-/// Seconds by stage; a stage that the scene does not need stays at exactly zero.
+/// Seconds by stage; exactly zero for a stage that the scene does not need.
 pub type Timings = Vec<(&'static str, f64)>;
 
 /// Contact at the sliding nodes after a solve.
@@ -14,36 +14,37 @@ pub struct ContactResult {
     pub nodes: Vec<u32>,
     /// Closest point of the moved contact surface, mm.
     pub points: Vec<[f64; 3]>,
-    /// Unit normal that the contact force follows, out of the bone.
+    /// Unit normal along which the contact force acts, out of the bone.
     pub normals: Vec<[f64; 3]>,
     /// Contact force along the normal, N; positive pushes the tissue away from the bone.
     pub forces: Vec<f64>,
-    /// Distance from the surface less the prescribed gap, mm; for nodes that keep their offset at rest,
-    /// distance from the surface shifted by it.
+    /// Distance from the surface minus the prescribed gap, mm; for nodes that keep their offset at rest,
+    /// distance from the surface shifted by that offset.
     pub gaps: Vec<f64>,
     /// Whether the node is held to the surface.
     pub active: Vec<bool>,
-    /// Largest way, mm, that the force along the surface would still move a sliding node by itself.
+    /// Largest distance, mm, by which the remaining tangential force would move a sliding node on its own.
     pub unbalanced: f64,
-    /// The nodes carried back with their segments to where these were at rest; none where one is deformed.
+    /// The nodes moved back with their segments to the position at rest; none if a segment is deformed.
     pub at_rest: Option<ContactStart>,
-    /// Whether gaps and forces are within the tolerance. Where they are not, they are so small that no face
-    /// would show it.
+    /// Whether gaps and forces are within the tolerance. If not, they are still too small to be visible on a
+    /// face.
     pub converged: bool,
 }
 
-/// Nodes that met what they may touch, with the forces between them.
+/// Nodes in contact with a surface of their pair, with the contact forces.
 #[derive(Debug, Clone, Default)]
 pub struct TouchResult {
-    /// The nodes, pair by pair; a node may meet several surfaces.
+    /// The nodes, pair by pair; a node may touch several surfaces.
     pub nodes: Vec<u32>,
-    /// Distance from the surface, less what the node has behind it at rest, mm; negative where it penetrates.
+    /// Distance from the surface, minus any penetration at rest, mm; negative where the node penetrates.
     pub gaps: Vec<f64>,
     /// Unit normal of the surface.
     pub normals: Vec<[f64; 3]>,
-    /// Force along it, N, not negative.
+    /// Force along it, N, zero or positive.
     pub forces: Vec<f64>,
-    /// Deepest that one of the nodes lies in a deformed tet of other tissue, mm, no deeper than the walls of that tet.
+    /// Largest depth of one of the nodes inside a deformed tet of other tissue, mm, limited by the size of that
+    /// tet.
     pub overlap: f64,
     /// Rounds of the method of multipliers.
     pub rounds: usize,
@@ -52,14 +53,14 @@ pub struct TouchResult {
 }
 
 impl TouchResult {
-    /// Deepest that a node is behind its surface or in other tissue, mm.
+    /// Largest depth of a node behind its surface or inside other tissue, mm.
     pub fn penetration(&self) -> f64 {
         self.gaps.iter().fold(self.overlap, |m, gap| m.max(-gap))
     }
 }
 
 impl Default for ContactResult {
-    /// No sliding nodes.
+    /// The result without sliding nodes.
     fn default() -> Self {
         Self {
             nodes: Vec::new(),
@@ -80,35 +81,36 @@ impl Default for ContactResult {
 pub struct Solution {
     /// Displacement of every node, mm.
     pub displacements: Vec<[f64; 3]>,
-    /// Internal force K u of every node, N; zero at free nodes, the bone's load at the others.
+    /// Internal force K u of every node, N; zero at free nodes, the load from the bone at the others.
     pub forces: Vec<[f64; 3]>,
-    /// ‖f − loads − contact‖ over the unknown nodes, relative to the forces that the plan brings in: loads,
-    /// those of joined nodes, and of walls both their push and what each node alone would take to follow.
+    /// ‖f − loads − contact‖ over the unknown nodes, relative to the forces that the plan introduces: loads,
+    /// forces of joined nodes, and for walls both the contact force and the force that each node alone would
+    /// need to follow.
     pub residual: f64,
-    /// Estimate of the largest nodal error of the linear solve, mm; no bound. From the residual and the
-    /// spectrum that an iterative method saw, confirmed on a known solution where stiff and soft tissue are
-    /// mixed; for Cholesky a hundred times the error with which the factor recovered a known solution.
-    /// Against the exact solution of K as stored: what rounding K itself costs is not in it, and of what
-    /// contact leaves only ten times the largest gap. `benches/error_estimate.rs` measures how often it is
-    /// too small.
+    /// Estimate of the largest nodal error of the linear solve, mm; not a bound. For iterative methods it
+    /// follows from the residual and the observed spectrum, confirmed on a known solution if stiff and soft
+    /// tissue are mixed; for Cholesky it is a hundred times the error with which the factorisation recovered a
+    /// known solution. It refers to the exact solution of K as stored: the rounding of K itself is not
+    /// included, and the error left by contact only as ten times the largest gap. `benches/error_estimate.rs`
+    /// measures how often it is too small.
     pub error_estimate: f64,
-    /// Iterations of the linear solver (0 for Cholesky), over all contact iterations; with large deformation
-    /// Newton's steps.
+    /// Iterations of the linear solver (0 for Cholesky), summed over all contact iterations; for large
+    /// deformation, the number of Newton steps.
     pub iterations: usize,
     /// Residual measure of each linear iteration.
     pub residual_history: Vec<f64>,
     /// Contact at the sliding nodes.
     pub contact: ContactResult,
-    /// What touches, where the boundary has pairs that may.
+    /// Contact of the pairs, if the boundary has any.
     pub touching: TouchResult,
-    /// Newton steps of the contact solver, over all of Newton's steps.
+    /// Steps of the contact solver, summed over all Newton steps.
     pub contact_iterations: usize,
     /// Seconds by stage.
     pub timings: Timings,
 }
 
 impl Solution {
-    /// Largest |gap| of the held sliding nodes, mm; 0 without any.
+    /// Largest |gap| of the held sliding nodes, mm; 0 if there are none.
     pub fn contact_gap(&self) -> f64 {
         let c = &self.contact;
         c.gaps.iter().zip(&c.active).filter(|(_, a)| **a).fold(0.0, |m, (g, _)| m.max(g.abs()))
@@ -129,7 +131,7 @@ impl Clock {
         Self { begin: now, last: now, laps: Vec::new() }
     }
 
-    /// Books the time since the last lap under `stage`; exactly zero where the stage was not needed.
+    /// Records the time since the last lap under `stage`; exactly zero if the stage was not needed.
     pub fn lap(&mut self, stage: &'static str, needed: bool) {
         let now = Instant::now();
         let seconds = if needed { (now - self.last).as_secs_f64() } else { 0.0 };

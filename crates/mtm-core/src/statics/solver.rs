@@ -1,5 +1,5 @@
-//! `StaticSolver`: eliminates prescribed nodes, keeps all that a new plan does not change, and composes
-//! the solution of each plan.
+//! `StaticSolver`: eliminates prescribed nodes, keeps everything that does not depend on the plan, and
+//! assembles the solution of each plan.
 
 use std::sync::Arc;
 
@@ -23,7 +23,7 @@ use crate::statics::system::{
 use crate::statics::touching::{Path, Prescribes, Touch};
 use crate::vector::{add, dot, norm, scaled, sub};
 
-/// Multiple of the correction of a solution by factor that stands for the error of the corrected one.
+/// Multiple of the correction of a solution by factorisation that is taken as the error of the corrected one.
 const CORRECTION_SAFETY: f64 = 2.0;
 
 /// A patient's tensors and node kinds, ready for any plan.
@@ -34,7 +34,7 @@ pub struct StaticSolver {
     pub(crate) node_kinds: Arc<Boundary>,
     options: StaticOptions,
     method: Method,
-    /// Whether solutions by factor are corrected once.
+    /// Whether solutions by factorisation are corrected once.
     refines: bool,
     pub(crate) reduction: Arc<Reduction>,
     pub(crate) sliding: Option<Sliding>,
@@ -47,7 +47,7 @@ pub struct StaticSolver {
     timings: Timings,
 }
 
-/// How the unknown rows follow from a plan.
+/// How the unknown rows are computed for a plan.
 enum Mechanics {
     /// One linear system for every plan.
     Linear(Box<System>),
@@ -55,9 +55,9 @@ enum Mechanics {
     LargeRotation(Box<Equilibrium>),
 }
 
-/// A plan in the terms of the system.
+/// A plan in terms of the system.
 struct Posed<'a> {
-    /// Forces that joined nodes and loads bring to the rows of the linear system, N.
+    /// Forces from joined nodes and loads on the rows of the linear system, N.
     b: &'a [[f64; 3]],
     /// Displacements of all nodes, those of joined ones filled in, mm.
     u: &'a [[f64; 3]],
@@ -70,8 +70,8 @@ impl StaticSolver {
     /// The solver of `tensors` under `boundary`.
     ///
     /// # Errors
-    /// Options out of range, node indices out of range, a body that is not held (with its free rigid
-    /// modes), an inverted contact surface, a factor that fails or does not fit in memory.
+    /// Options out of range, node indices out of range, a body that is not constrained (with its free rigid
+    /// modes), an inverted contact surface, a factorisation that fails or does not fit in memory.
     pub fn new(
         tensors: Arc<MassTensors>,
         boundary: Arc<Boundary>,
@@ -104,7 +104,7 @@ impl StaticSolver {
             .iter()
             .flat_map(|s| s.nodes().iter().zip(s.rest_normals()))
             .map(|(s, &n)| (s.node, n))
-            // Whole faces join the tets of a part, so its corners say how it is held.
+            // The tets of a part share whole faces, so its corner nodes decide how it is constrained.
             .filter(|(node, _)| (*node as usize) < mesh.n_nodes())
             .collect();
         let held = restraint::check(&mesh, |j| !is_unknown(j), &normals)?;
@@ -191,10 +191,10 @@ impl StaticSolver {
         &self.timings
     }
 
-    /// Displacements under `plan` and nodal `loads` (N, one row per corner, or per node with those in the
-    /// middle of edges).
+    /// Displacements under `plan` and nodal `loads` (N, one row per corner node, or per node including mid-edge
+    /// nodes).
     ///
-    /// Depends on its arguments alone: nothing is left over from earlier plans.
+    /// Depends only on its arguments: earlier plans have no effect.
     ///
     /// # Errors
     /// A plan or loads that do not fit, contact that does not converge, an iteration that does not
@@ -208,12 +208,13 @@ impl StaticSolver {
         self.solve_from(None, plan, loads, interrupted)
     }
 
-    /// As [`solve`](Self::solve), with contact begun where `start`, a solution of this solver for another plan, has
-    /// the nodes on their segments: fewer steps for a plan that differs little. The end is the same within the
-    /// tolerances wherever there is one equilibrium. Large deformation begins at rest whatever the start.
+    /// As [`solve`](Self::solve), but contact starts with the nodes on their segments where `start`, a solution
+    /// of this solver for another plan, has them: a plan that differs little takes fewer steps. The result is
+    /// the same within the tolerances if there is only one equilibrium. Large deformation always starts from
+    /// rest.
     ///
     /// # Errors
-    /// As [`solve`](Self::solve); a start with other nodes.
+    /// As [`solve`](Self::solve); a start with a different number of nodes.
     pub fn solve_from(
         &self,
         start: Option<&Solution>,
@@ -288,8 +289,8 @@ impl StaticSolver {
         }
     }
 
-    /// Adds to `u` what its own forces out of balance still bring, and counts it as error: where stiff and
-    /// soft tissue are mixed, a solution may lose digits that the known one of the factor kept.
+    /// Adds to `u` the correction for its own residual forces, and counts it as error: if stiff and soft tissue
+    /// are mixed, a solution may lose digits that the factorisation's known solution kept.
     fn refine(
         &self,
         u: &mut [[f64; 3]],
@@ -326,7 +327,7 @@ impl StaticSolver {
         Ok(u)
     }
 
-    /// Forces −K_UB u_B that prescribed nodes bring to the unknown rows, N.
+    /// Forces −K_UB u_B exerted by the prescribed nodes on the unknown rows, N.
     pub(crate) fn coupled(&self, u: &[[f64; 3]]) -> Vec<[f64; 3]> {
         let mut b = vec![[0.0; 3]; self.reduction.unknowns.len()];
         for (row, node, k) in &self.couplings {
@@ -339,7 +340,7 @@ impl StaticSolver {
         b
     }
 
-    /// `loads` for every node, those in the middle of edges included.
+    /// `loads` for every node, mid-edge nodes included.
     fn checked_loads(&self, loads: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
         let n = self.tensors.element_nodes().n_nodes();
         let corners = self.tensors.mesh().n_nodes();
@@ -358,7 +359,7 @@ impl StaticSolver {
         Ok(out)
     }
 
-    /// Displacements of the unknown rows with contact settled, and what touches.
+    /// Displacements of the unknown rows at contact equilibrium, and what touches.
     fn solve_rows(&self, posed: &Posed<'_>, solve: &mut Solve<'_>) -> Result<(Solved, Touch)> {
         let &Posed { b, u, loads, motions, start } = posed;
         if let (Mechanics::Linear(system), Some(pairs)) = (&self.mechanics, &self.pairs) {
@@ -397,9 +398,10 @@ impl StaticSolver {
         Ok((found, Touch::default()))
     }
 
-    /// Force out of balance at the unknown nodes over the forces that the plan brings in: those of joined
-    /// nodes and loads on the unknown rows, contact forces, and what each held node alone would take to go
-    /// where its walls ask. Without the last, walls that carry a body about unstrained bring in nothing.
+    /// Residual force at the unknown nodes relative to the forces that the plan introduces: forces of joined
+    /// nodes and loads on the unknown rows, contact forces, and the force that each held node alone would need
+    /// to follow its walls. Without the last term, walls that move a body without straining it would introduce
+    /// no force.
     fn residual(
         &self,
         forces: &[[f64; 3]],
@@ -438,7 +440,7 @@ impl StaticSolver {
         if sum == 0.0 { 0.0 } else { (sum / scale.max(f64::MIN_POSITIVE)).sqrt() }
     }
 
-    /// Refuses a solution of another mesh or boundary to start from.
+    /// Rejects a starting solution of another mesh or boundary.
     fn check_start(&self, start: &Solution) -> Result<()> {
         let n = self.tensors.element_nodes().n_nodes();
         let nodes = self.sliding.as_ref().map_or(0, |s| s.nodes().len());
@@ -478,7 +480,7 @@ impl StaticSolver {
         }
     }
 
-    /// Contact settled for `plan`: where the linear operator of re-planning is frozen.
+    /// Contact at equilibrium for `plan`: the state about which the linear operator of re-planning is frozen.
     pub(crate) fn settled(
         &self,
         plan: &Plan,
@@ -495,7 +497,7 @@ impl StaticSolver {
         Ok(self.solve_rows(&posed, &mut Solve::new(scale, interrupted))?.0.contact)
     }
 
-    /// Unknown rows for several right-hand sides, with contact frozen where there is any.
+    /// Unknown rows for several right-hand sides, with contact frozen if there is any.
     pub(crate) fn solve_columns(
         &self,
         columns: Vec<Vec<[f64; 3]>>,
@@ -522,8 +524,8 @@ impl Prescribes for StaticSolver {
     }
 }
 
-/// The method for a boundary with pairs that may touch: rounds change its matrix, and a factor would have to be
-/// made for each.
+/// The method for a boundary with pairs that may touch: every round changes the matrix, and would need a new
+/// factorisation.
 fn method_for_touching(options: &StaticOptions) -> Result<Method> {
     if options.kinematics != Kinematics::Linear {
         return Err(MtmError::UnknownName {
@@ -539,7 +541,7 @@ fn method_for_touching(options: &StaticOptions) -> Result<Method> {
     }
 }
 
-/// `boundary` with the mid-edge nodes of `tensors`; itself where there are none.
+/// `boundary` with the mid-edge nodes of `tensors`; unchanged if there are none.
 fn with_mid_edges(tensors: &MassTensors, boundary: &Arc<Boundary>) -> Result<Arc<Boundary>> {
     let edges = tensors.element_nodes().mid_edges();
     if edges.is_empty() {
@@ -557,13 +559,13 @@ fn with_mid_edges(tensors: &MassTensors, boundary: &Arc<Boundary>) -> Result<Arc
     Ok(Arc::new(boundary.with_mid_edges(mesh.n_nodes(), edges, on_surface)?))
 }
 
-/// Mean stiffness of node `j` by itself, a third of the trace of K_jj, N/mm.
+/// Mean stiffness of node `j` on its own, a third of the trace of K_jj, N/mm.
 fn own_stiffness(matrix: &BlockMatrix, j: usize) -> f64 {
     let own = matrix.diagonal_block(j);
     (own[0] + own[4] + own[8]) / 3.0
 }
 
-/// Names the node instead of the row of the reduced system.
+/// Replaces the row of the reduced system in an error by its node.
 fn by_node(error: MtmError, unknowns: &[u32]) -> MtmError {
     match error {
         MtmError::NotPositiveDefinite { node, detail } => MtmError::NotPositiveDefinite {

@@ -1,5 +1,5 @@
-//! The reduced linear system: what a method keeps from one plan to the next, and how it solves with
-//! and without contact.
+//! The reduced linear system: what each method keeps from one plan to the next, and how it solves with and
+//! without contact.
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -26,20 +26,21 @@ use crate::statics::row_conditions::RowConditions;
 use crate::statics::solution::Clock;
 use crate::vector::{between, dot, norm, sub};
 
-/// Most sliding nodes whose whole flexibility is kept (three unknowns each, 12 bytes a pair: doubles and
-/// floats): with it a set of normals costs a few dense products, by sweeps a few passes over the factor.
+/// Maximum number of sliding nodes for which the whole flexibility is kept (three unknowns each, 12 bytes a
+/// pair: doubles and floats). A set of normals then costs a few dense products; with sweeps it costs a few
+/// passes over the factor.
 const MAX_DENSE_SLIDING: usize = 2500;
-/// Most sliding nodes of which the flexibility along the normals at rest is kept: 8 bytes a pair.
+/// Maximum number of sliding nodes for which the flexibility along the normals at rest is kept: 8 bytes a pair.
 const MAX_KEPT_SLIDING: usize = 6000;
 
-/// Share of the error allowed to an iterative solve that contact may have as well: it cannot settle nearer
-/// than the solves repeat.
+/// Tolerance of contact as a share of the error allowed in an iterative solve: contact cannot converge further
+/// than successive solves agree.
 const CONTACT_SHARE: f64 = 0.1;
-/// Multiple of a factor's trial error that stands for the error of any solution by it. Ten of them were too
-/// few for one solution in 300 of `benches/error_estimate.rs`, most of them with contact.
+/// Multiple of a factorisation's trial error that is taken as the error of any solution by it. A factor of ten
+/// was too small for one solution in 300 of `benches/error_estimate.rs`, most of them with contact.
 const TRIAL_SAFETY: f64 = 100.0;
 
-/// Multiple of the largest gap that contact leaves which stands for the error of a solution with it.
+/// Multiple of the largest remaining contact gap that is taken as the error of a solution with contact.
 const GAP_SAFETY: f64 = 10.0;
 
 /// One row of three for each unknown node.
@@ -47,17 +48,17 @@ type Rows = Vec<[f64; 3]>;
 
 /// What is kept from one plan to the next.
 enum Kept {
-    /// The factor of a body without sliding nodes.
+    /// The factorisation of a body without sliding nodes.
     Factor(Factor),
-    /// The factor, and what answers for the sliding nodes.
+    /// The factorisation, and the data for solving contact at the sliding nodes.
     Flexible { factor: Factor, contact: ContactFactor },
-    /// The matrix: sliding nodes are constrained in it.
+    /// The matrix, in which sliding nodes are constrained.
     Matrix(Unfactored),
 }
 
-/// The matrix of a system that is solved again under each set of constraints.
+/// The matrix of a system that is solved again for each set of constraints.
 enum Unfactored {
-    /// By a factor whose values change with the contact normals.
+    /// By factorisations with the same structure, whose values change with the contact normals.
     Refactored { symbolic: Arc<Symbolic>, matrix: BlockMatrix },
     /// By iteration.
     Iterative(Box<Iterative>),
@@ -68,50 +69,50 @@ pub(crate) struct System {
     kept: Kept,
 }
 
-/// The body whose rows make a system.
+/// The rows of a body that form a system.
 pub(crate) struct BodyRows<'a> {
     /// Coordinates of the rows, mm.
     pub positions: &'a [[f64; 3]],
     pub sliding: Option<&'a Sliding>,
     pub held: Held,
-    /// How extreme the tissue is.
+    /// Contrast and compressibility of the tissue.
     pub tissue: Extremes,
 }
 
-/// What contact is settled for.
+/// Input of a contact solve.
 pub(crate) struct Settle<'a> {
     pub sliding: &'a Sliding,
-    /// One of each segment.
+    /// One motion per segment.
     pub motions: &'a [&'a Motion],
     pub begin: Option<Begin<'a>>,
     pub options: &'a StaticOptions,
     pub linked: Linked<'a>,
 }
 
-/// Links between rows: what touches.
+/// Links between the rows of touching nodes.
 #[derive(Clone, Copy, Default)]
 pub(crate) struct Linked<'a> {
     pub links: &'a [Link],
-    /// Share of what they change, in the energy norm, to which the answer may be off; none for one as exact as the
-    /// tolerance asks.
+    /// Error allowed relative to the change that the links cause, in the energy norm; none for an answer within
+    /// the tolerance.
     pub share: Option<f64>,
 }
 
-/// Displacements of the rows with contact settled.
+/// Displacements of the rows at contact equilibrium.
 pub(crate) struct Settled {
     /// mm.
     pub rows: Vec<[f64; 3]>,
     pub contact: ContactState,
-    /// Seconds that contact took.
+    /// Time that contact took, s.
     pub contact_seconds: f64,
 }
 
-/// Displacements of the rows after a solve, with contact where nodes slide.
+/// Displacements of the rows after a solve, with contact if nodes slide.
 pub(crate) struct Solved {
     /// mm.
     pub rows: Vec<[f64; 3]>,
     pub contact: Option<ContactState>,
-    /// Seconds that contact took.
+    /// Time that contact took, s.
     pub contact_seconds: f64,
 }
 
@@ -129,20 +130,20 @@ impl From<Settled> for Solved {
     }
 }
 
-/// Where a solve with contact starts: the end of one for a plan or a body a little different.
+/// Starting state of a solve with contact: the end of a solve for a similar plan or body.
 pub(crate) struct Begin<'a> {
     /// Displacements of the rows.
     pub rows: &'a [[f64; 3]],
     pub contact: ContactStart,
 }
 
-/// Contact constraints that do not change, for several right-hand sides.
+/// Contact constraints that stay the same for several right-hand sides.
 pub(crate) struct Frozen<'a> {
     /// Sliding node and normal of each constraint.
     pub rows: &'a [ContactRow],
     /// Offset of every row, for each right-hand side.
     pub offsets: &'a [Vec<f64>],
-    /// How the contact forces turn as nodes slide.
+    /// How the contact forces change direction as nodes slide.
     pub springs: &'a [Spring],
     /// Goal of every spring, for each right-hand side.
     pub goals: &'a [Vec<f64>],
@@ -157,7 +158,7 @@ impl Frozen<'_> {
 }
 
 impl Linked<'_> {
-    /// `b` with the forces of the links where rows stand at their constraints.
+    /// `b` with the forces of the links, where rows satisfy their constraints.
     fn pulled<'b>(&self, b: &'b [[f64; 3]], constraints: &[Constraint]) -> Cow<'b, [[f64; 3]]> {
         if self.links.is_empty() {
             return Cow::Borrowed(b);
@@ -174,7 +175,7 @@ impl Linked<'_> {
 impl System {
     /// The system of `matrix`, with what the method of `options` keeps, and the method used.
     ///
-    /// Errors name rows.
+    /// Errors refer to rows.
     pub fn new(
         matrix: BlockMatrix,
         body: &BodyRows<'_>,
@@ -187,7 +188,7 @@ impl System {
         if method.has_factor() {
             let slide_rows: Vec<u32> =
                 body.sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
-            // Where sliding nodes alone hold a part, there is no flexibility without them.
+            // If a part is constrained by sliding nodes alone, there is no flexibility without them.
             let kept = !slide_rows.is_empty()
                 && body.held == Held::ByPrescribed
                 && slide_rows.len() <= MAX_KEPT_SLIDING;
@@ -261,7 +262,7 @@ impl System {
         }
     }
 
-    /// Displacements of the rows with contact settled.
+    /// Displacements of the rows at contact equilibrium.
     pub fn solve_with_contact(
         &self,
         b: &[[f64; 3]],
@@ -283,17 +284,17 @@ impl System {
         }
     }
 
-    /// Forces out of balance of the rows at displacements `x`, A x − b, N; nothing where the matrix is not kept.
+    /// Residual forces of the rows at displacements `x`, A x − b, N; nothing if the matrix is not kept.
     pub fn out_of_balance(&self, x: &[[f64; 3]], b: &[[f64; 3]]) -> Option<Rows> {
         let Kept::Matrix(system) = &self.kept else { return None };
         let product = system.matrix().multiply(x);
         Some(product.iter().zip(b).map(|(f, b)| sub(*f, *b)).collect())
     }
 
-    /// Rows under links where no node slides, begun from displacements `start`.
+    /// Rows under links if no node slides, starting from displacements `start`.
     ///
     /// # Errors
-    /// Any method but conjugate gradients; those of its solve.
+    /// Any method except conjugate gradients; those of its solve.
     pub fn solve_linked(
         &self,
         b: &[[f64; 3]],
@@ -318,7 +319,7 @@ impl System {
         Ok(iterative.solve_projected(b, conditions, leave, &mut trail, solve)?.rows)
     }
 
-    /// Rows for several right-hand sides; `scales` is the length of each one's prescribed field, mm.
+    /// Rows for several right-hand sides; `scales` are the lengths of their prescribed fields, mm.
     pub fn solve_columns(
         &self,
         mut columns: Vec<Vec<[f64; 3]>>,
@@ -394,7 +395,7 @@ impl Unfactored {
         }
     }
 
-    /// Displacements of the rows with contact settled.
+    /// Displacements of the rows at contact equilibrium.
     fn settled(
         &self,
         b: &[[f64; 3]],
@@ -415,7 +416,7 @@ impl Unfactored {
         let linked = *linked;
         let mut body = Projected { system: self, b, linked, sliding, trail, solve, last: None };
         let state = sliding.solve(motions, first, &contact, interrupted, &mut body)?;
-        // No state without a step.
+        // At least one step is always made, so there is a state.
         let rows = body.last.map_or_else(Vec::new, |last| last.to);
         let effort = &mut body.solve.effort;
         effort.error_estimate = effort.error_estimate.max(left_by(&state));
@@ -474,7 +475,7 @@ fn multigrid(matrix: &BlockMatrix, body: &BodyRows<'_>) -> Result<Multigrid> {
     hierarchy(held_matrix.as_ref().unwrap_or(matrix), body.positions, &normals, body.tissue)
 }
 
-/// Displacements of the rows with contact settled by what its sliding nodes do to one another.
+/// Displacements of the rows at contact equilibrium, found from the flexibility of the sliding nodes.
 fn settled_by_flexibility(
     factor: &Factor,
     contact: &ContactFactor,
@@ -485,8 +486,8 @@ fn settled_by_flexibility(
     let clock = Clock::new();
     let Settle { sliding, motions, begin, options, .. } = settle;
     let first = begin.as_ref().map(|b| &b.contact);
-    // Each on a thread of the pool, so that loops inside begin without a hand-over; not all at once:
-    // interrupts are of the calling thread.
+    // Run on a thread of the pool, so that inner loops start without a hand-over; but one at a time, since
+    // interrupts must be checked on the calling thread.
     let answers = in_pool(|| contact.answers(factor, b));
     let tolerance = sliding.gap_limit(&options.contact) / sliding.diagonal;
     let mut body = Flexible { answers, tolerance, last: None, is_known: false };
@@ -497,7 +498,7 @@ fn settled_by_flexibility(
     Ok(Settled { rows, contact: state, contact_seconds })
 }
 
-/// The body by what its sliding nodes do to one another: every other node follows them exactly.
+/// The body reduced to its sliding nodes: every other node follows them exactly.
 struct Flexible<'a> {
     answers: Answers<'a>,
     tolerance: f64,
@@ -506,7 +507,7 @@ struct Flexible<'a> {
     is_known: bool,
 }
 
-/// A step of some rows with the forces out of balance at its ends, N.
+/// A step of some rows with the residual forces at its ends, N.
 struct Step {
     from: Vec<[f64; 3]>,
     to: Vec<[f64; 3]>,
@@ -527,7 +528,7 @@ impl Step {
         (first, last)
     }
 
-    /// The step to `share` of the way; energy is quadratic, forces are linear.
+    /// Shortens the step to `share` of its length; the energy is quadratic, the forces are linear.
     fn shorten(&mut self, share: f64) {
         self.to = between(&self.from, &self.to, share);
         self.forces_to = between(&self.forces_from, &self.forces_to, share);
@@ -550,7 +551,7 @@ impl Body for Flexible<'_> {
 
     fn shorten(&mut self, share: f64) {
         if !self.is_known {
-            // What a share of the way takes depends on the forces at its start.
+            // The response after a shortened step depends on the forces at its start.
             self.last = None;
         } else if let Some(step) = &mut self.last {
             step.shorten(share);
@@ -562,7 +563,7 @@ impl Body for Flexible<'_> {
     }
 }
 
-/// The body by all its rows, those of held nodes projected.
+/// The body with all its rows, those of held nodes projected.
 struct Projected<'a, 'i> {
     system: &'a Unfactored,
     b: &'a [[f64; 3]],
@@ -574,7 +575,7 @@ struct Projected<'a, 'i> {
 }
 
 impl Projected<'_, '_> {
-    /// Forces out of balance of all rows, A x − b less those of the links.
+    /// Residual forces of all rows, A x − b minus those of the links.
     fn forces(&self, x: &[[f64; 3]]) -> Vec<[f64; 3]> {
         let mut out = self.system.matrix().multiply(x);
         for (f, b) in out.iter_mut().zip(self.b) {
@@ -620,7 +621,7 @@ impl Body for Projected<'_, '_> {
         let step = Step { from, to: x, forces_from, forces_to: forces };
         let slopes = Some(step.slopes());
         self.last = Some(step);
-        // A rough round is as good as it was asked to be.
+        // An approximate round is solved once it is as accurate as requested.
         let solved = solved || self.linked.share.is_some();
         Ok(Response { displacements, reactions, slopes, solved, is_carried })
     }
@@ -638,7 +639,7 @@ impl Body for Projected<'_, '_> {
     }
 }
 
-/// That a method cannot solve for parts that touch.
+/// The error for a method that cannot solve for parts that touch.
 pub(crate) fn touching_needs_pcg(method: Method) -> MtmError {
     MtmError::UnknownName {
         what: "method for a boundary with touching pairs",
@@ -648,12 +649,12 @@ pub(crate) fn touching_needs_pcg(method: Method) -> MtmError {
     }
 }
 
-/// What contact leaves of error, mm.
+/// Error left by contact, mm.
 fn left_by(state: &ContactState) -> f64 {
     GAP_SAFETY * state.largest_gap().max(state.unbalanced)
 }
 
-/// Estimate of the largest nodal error of a solution by factor, mm.
+/// Estimate of the largest nodal error of a solution by factorisation, mm.
 fn direct_error(factor: &Factor, x: &[[f64; 3]]) -> f64 {
     TRIAL_SAFETY * factor.trial_error() * x.iter().fold(0.0_f64, |m, v| m.max(norm(*v)))
 }

@@ -1,9 +1,11 @@
-//! Plans of bodies with parts that may touch: rounds of the method of multipliers, along the plan in steps.
+//! Plans of bodies with parts that may touch: rounds of the method of multipliers, with the plan applied in
+//! steps.
 //!
-//! What touches is found by closest points, so no step of the plan may take one part through another: bones move by
-//! a quarter of an edge of the tissue at a time. Each step first follows the tangent planes of its start, which move with
-//! the bones and have no far side, and then what is met where the nodes are. On the way there are few rounds, and
-//! rough ones; at the end of the plan they go on until nothing penetrates and nothing changes.
+//! Contact is detected by closest points, so no step of the plan may take one part through another: bones move
+//! by a quarter of a tissue edge at a time. Each step first uses the tangent planes at its start, which move
+//! with the bones and have no far side, and then the surfaces actually met by the nodes. Intermediate steps do
+//! few, approximate rounds; at the end of the plan the rounds continue until nothing penetrates and nothing
+//! changes.
 
 use std::sync::Arc;
 
@@ -22,48 +24,51 @@ use crate::statics::solution::{Clock, TouchResult};
 use crate::statics::system::{Begin, Linked, Settle, Settled, Solved, System};
 use crate::vector::{add, between, dot, norm, scaled, sub};
 
-/// Way of the bones in one step, over the mean edge of the tissue that may be touched.
+/// Motion of the bones in one step, over the mean edge of the tissue that may be touched.
 const STEP_EDGES: f64 = 0.25;
-/// Depth, over the same, to which a step may take a node; half the step where it goes deeper.
+/// Depth, over the same edge, that a node may reach in a step; if it goes deeper, the step is halved.
 const DEEP_EDGES: f64 = 0.5;
 /// Shortest step, as a share of the plan.
 const SHORTEST_STEP: f64 = 1.0 / 512.0;
-/// Distance that a node may have from what it presses on, mm, and over the diagonal of the mesh: scenes may be
-/// small.
+/// Largest accepted distance between a node and the surface that it presses on, mm, and the same over the
+/// diagonal of the mesh, for small scenes.
 const CLOSE: f64 = 0.01;
 const CLOSE_SHARE: f64 = 4e-5;
-/// Multiple of it that is enough on the way, and that may be open in the end, with a warning: half a
-/// millimetre, at a node on a fold inside the mouth.
+/// Multiples of that distance which are accepted in intermediate steps, and at the end with a warning: the
+/// latter is half a millimetre, at a node on a fold inside the mouth.
 const LOOSE: f64 = 5.0;
 const SEEN: f64 = 50.0;
-/// Multiple of it that a node may lie in a tet of other tissue, where edges meet; from there on it went through.
+/// Multiple of that distance by which a node may lie inside a tet of other tissue, where edges meet; beyond it,
+/// the node has passed through the surface.
 const THROUGH: f64 = 15.0;
-/// Rounds of a step on the way, which the next one continues, and of the last one.
+/// Maximum number of rounds of an intermediate step, which the next step continues, and of the last step.
 const MOST_ROUNDS_ON_THE_WAY: usize = 2;
 const MOST_ROUNDS: usize = 60;
-/// Rounds before those run out that are solved to the tolerance.
+/// Number of rounds, at the end of the maximum, that are solved to the tolerance.
 const LAST_ROUNDS: usize = 5;
-/// Change of a node in a round, over the distance that counts as touching, up to which it is still.
+/// Change of a node in a round, over the distance that counts as touching, up to which the node counts as
+/// still.
 const STILL: f64 = 4.0;
-/// Rounds of a step with the normals as they are found, before those that swing are steadied.
+/// Rounds of a step that use the normals as they are found; after that, oscillating normals are damped.
 const SHARP_ROUNDS: usize = 6;
-/// Share of its slope by which the energy has to fall, and shortest share of a round.
+/// Share of its slope by which the energy has to decrease, and smallest share of a round.
 const DESCENT: f64 = 1e-4;
 const SHORTEST_SHARE: f64 = 1.0 / 32.0;
-/// Rounds of a step with the planes of its start, and the depth behind them, over the mean edge, that ends them.
+/// Rounds of a step with the planes at its start, and the depth behind them, over the mean edge, at which they
+/// end.
 const MOST_ROUNDS_AHEAD: usize = 8;
 const AHEAD_EDGES: f64 = 0.05;
-/// Share of what a round changes, in the energy norm, to which it is solved until the last ones.
+/// Relative accuracy of a round, in the energy norm, before the last ones.
 const ROUGH_SHARE: f64 = 0.1;
-/// Most nodes that an error names.
+/// Maximum number of nodes listed in an error.
 const NAMED_NODES: usize = 10;
 
-/// The body with what touches, after some share of the plan.
+/// The body and its contact after some share of the plan.
 #[derive(Clone)]
 struct Pose {
     /// Displacement of every node, mm.
     u: Vec<[f64; 3]>,
-    /// Those of the unknown rows.
+    /// Displacements of the unknown rows.
     rows: Vec<[f64; 3]>,
     contact: Option<ContactState>,
     touching: Touching,
@@ -73,7 +78,7 @@ struct Pose {
 #[derive(Default)]
 pub(super) struct Touch {
     pub result: TouchResult,
-    /// Force on each row by what it touches, N; empty where nothing may.
+    /// Contact force on each row, N; empty if nothing may touch.
     pub forces: Vec<[f64; 3]>,
 }
 
@@ -85,7 +90,7 @@ pub(super) trait Prescribes {
     /// Those of the motions.
     fn prescribed(&self, motions: &[&Motion]) -> Result<Vec<[f64; 3]>>;
 
-    /// Forces that prescribed nodes bring to the unknown rows, N.
+    /// Forces exerted by the prescribed nodes on the unknown rows, N.
     fn coupled(&self, u: &[[f64; 3]]) -> Vec<[f64; 3]>;
 }
 
@@ -98,13 +103,13 @@ pub(super) struct Path<'a> {
     pub options: &'a StaticOptions,
     pub system: &'a System,
     pub pairs: &'a Pairs,
-    /// One for each segment.
+    /// One motion per segment.
     pub motions: &'a [&'a Motion],
-    /// Of every node, N.
+    /// Load on every node, N.
     pub loads: Option<&'a [[f64; 3]]>,
 }
 
-/// Where a step of the plan leads.
+/// The target of a step of the plan.
 struct Goal<'a> {
     motions: &'a [&'a Motion],
     /// Displacements of all nodes with the prescribed ones filled in, mm.
@@ -119,7 +124,7 @@ struct Done {
     round: Round,
     left: Left,
     rounds: usize,
-    /// Largest change of a node in the last one, mm.
+    /// Largest change of a node in the last round, mm.
     change: f64,
     converged: bool,
 }
@@ -128,8 +133,8 @@ impl Path<'_> {
     /// The body at the end of the plan.
     ///
     /// # Errors
-    /// `ContactNotConverged` where the rounds run out with a gap or penetration that a face would show, or where a
-    /// step penetrates however short it is; those of the solves.
+    /// `ContactNotConverged` if the rounds run out with a gap or penetration that would be visible on a face,
+    /// or if a step penetrates however short it is; those of the solves.
     pub fn solve(&self, solve: &mut Solve<'_>) -> Result<(Solved, Touch)> {
         let clock = Clock::new();
         let sliding = self.sliding;
@@ -169,7 +174,7 @@ impl Path<'_> {
         CLOSE.min(CLOSE_SHARE * self.mesh.diagonal())
     }
 
-    /// `pose`, reached at the share `from` of the plan, carried on to the share `to`; nothing where the step is too
+    /// `pose`, reached at the share `from` of the plan, advanced to the share `to`; nothing if the step is too
     /// large for closest points.
     fn advance(
         &self,
@@ -193,8 +198,8 @@ impl Path<'_> {
         self.rounds(pose, planes, &goal, (rounds, to == 1.0), solve).map(Some)
     }
 
-    /// `pose` with the bones where the `goal` has them, against the planes that were found `ahead` of their motion;
-    /// and the rounds that took. Planes are without end: nothing falls through them.
+    /// `pose` with the bones at their position in the `goal`, solved against the planes that were found `ahead`
+    /// of their motion, and the number of rounds. Planes are infinite, so nodes cannot pass around them.
     fn go_ahead(
         &self,
         pose: &Pose,
@@ -203,7 +208,7 @@ impl Path<'_> {
         goal: &Goal<'_>,
         solve: &mut Solve<'_>,
     ) -> Result<(Pose, usize)> {
-        // Where prescribed nodes go is known before anything is solved.
+        // The targets of prescribed nodes are known before anything is solved.
         let u = self.reduction.filled(goal.prescribed, &pose.rows);
         let mut pose = Pose { u, ..pose.clone() };
         let deep = AHEAD_EDGES * self.pairs.mean_edge();
@@ -211,7 +216,7 @@ impl Path<'_> {
         for round in 1..=MOST_ROUNDS_AHEAD {
             let links = self.pairs.round(ahead, &pose.u, &pose.touching);
             let (rows, found) = self.linked(&links, (&pose, contact), goal, Some(close), solve)?;
-            // The first round takes the sliding nodes along with their bones.
+            // The first round moves the sliding nodes with their bones.
             let share =
                 if round == 1 { 1.0 } else { self.share(&pose, (ahead, &links), &rows, goal) };
             pose = self.moved(&pose, &rows, found, share, goal);
@@ -226,11 +231,11 @@ impl Path<'_> {
         Ok((pose, MOST_ROUNDS_AHEAD))
     }
 
-    /// Rounds from `pose` under the motions of the `goal`, `planes` there, until nothing is open; `before` were done
-    /// already.
+    /// Rounds from `pose` under the motions of the `goal`, starting with `planes`, until nothing is open;
+    /// `before` rounds were already done.
     ///
-    /// A node on an edge of what it touches would meet now one facet and now the other, for ever: normals that swing
-    /// turn less and less.
+    /// A node on an edge of the surface that it touches would alternate between two facets for ever: normals
+    /// that oscillate are therefore allowed to turn less and less.
     fn rounds(
         &self,
         mut pose: Pose,
@@ -276,12 +281,12 @@ impl Path<'_> {
         }
     }
 
-    /// What `round` leaves open in `pose`, by the planes.
+    /// The residuals of `round` in `pose`, with respect to the planes.
     fn left(&self, planes: &Planes, round: &Round, pose: &Pose) -> Left {
         self.pairs.left(planes, round, &pose.rows, |plane| plane.at(&pose.u))
     }
 
-    /// `pose` by `share` of its way to `rows`.
+    /// `pose` moved by `share` of the way to `rows`.
     fn moved(
         &self,
         pose: &Pose,
@@ -295,8 +300,8 @@ impl Path<'_> {
         Pose { u, rows, contact, touching: pose.touching.clone() }
     }
 
-    /// How far to go from `pose` to the solution `rows` of a round: halves of the way until elastic energy and
-    /// pressing against the planes together fall (Armijo 1966).
+    /// How far to go from `pose` towards the solution `rows` of a round: the step is halved until the sum of
+    /// elastic energy and contact energy against the planes decreases (Armijo 1966).
     fn share(
         &self,
         pose: &Pose,
@@ -313,7 +318,7 @@ impl Path<'_> {
         let mut way: Vec<[f64; 3]> =
             rows.iter().zip(&pose.rows).map(|(to, from)| sub(*to, *from)).collect();
         let pressing: f64 = round.links.iter().map(|l| l.pull(&pose.rows) * l.along(&way)).sum();
-        // Contact forces of sliding nodes do no work along their surfaces.
+        // The contact forces of sliding nodes do no work along their surfaces.
         for node in self.sliding.iter().flat_map(|s| s.nodes()) {
             way[node.row as usize] = [0.0; 3];
         }
@@ -334,7 +339,7 @@ impl Path<'_> {
         share
     }
 
-    /// Where sliding nodes are in `pose`.
+    /// Positions of the sliding nodes in `pose`.
     fn begun(&self, pose: &Pose) -> Option<ContactStart> {
         let (sliding, state) = (self.sliding?, pose.contact.as_ref()?);
         let at = |node: &SlidingNode, place: &[f64; 3]| add(*place, pose.rows[node.row as usize]);
@@ -342,9 +347,10 @@ impl Path<'_> {
         Some(ContactStart { places: places.collect(), reactions: state.reactions.clone() })
     }
 
-    /// The body under the links of a `round` from `pose`: displacements of the rows, and contact where nodes slide.
+    /// The body under the links of a `round` from `pose`: displacements of the rows, and contact if nodes
+    /// slide.
     ///
-    /// `rough`: gap of sliding nodes, mm, that is enough for a round on the way.
+    /// `rough`: gap of sliding nodes, mm, that is accepted in an intermediate round.
     fn linked(
         &self,
         round: &Round,
@@ -368,7 +374,7 @@ impl Path<'_> {
         Ok((rows, Some(contact)))
     }
 
-    /// Each motion as far as it has come at `share` of the plan.
+    /// Each motion at `share` of the plan.
     fn partial(&self, share: f64) -> Result<Vec<Motion>> {
         if share == 1.0 {
             return Ok(self.motions.iter().map(|&m| m.clone()).collect());
@@ -402,14 +408,14 @@ impl Path<'_> {
         b
     }
 
-    /// Sliding nodes carried with their segments from where `pose` has them.
+    /// Sliding nodes moved with their segments from their positions in `pose`.
     fn carried(&self, pose: &Pose, from: &[&Motion], to: &[&Motion]) -> Option<ContactStart> {
         let sliding = self.sliding?;
         let rest = sliding.carried_back(from, pose.contact.as_ref()?)?;
         sliding.carried(to, &rest)
     }
 
-    /// The answer, or an error where a face would show what is left.
+    /// The answer, or an error if what is left open would be visible on a face.
     fn end(
         &self,
         pose: Pose,
@@ -421,7 +427,8 @@ impl Path<'_> {
         if !done.converged && open > SEEN * self.close() {
             return Err(self.lost(&pose, rounds, open));
         }
-        // What a node still moved by may be its own way between two facets, and is no less than its error.
+        // The motion remaining in the last round may be a node's alternation between two facets, and is at
+        // least its error.
         let error = open.max(done.change);
         solve.effort.error_estimate = solve.effort.error_estimate.max(error);
         let met = self.pairs.met(&done.planes, &done.round, &pose.rows);
@@ -444,7 +451,7 @@ impl Path<'_> {
         Ok((Solved { rows, contact, contact_seconds: 0.0 }, Touch { result, forces }))
     }
 
-    /// That parts which touch found no equilibrium, with the nodes that press most.
+    /// The error for touching parts without equilibrium, with the nodes that carry the largest forces.
     fn lost(&self, pose: &Pose, rounds: usize, gap: f64) -> MtmError {
         let nodes = self.pairs.pressed(&pose.touching, NAMED_NODES);
         MtmError::ContactNotConverged { iterations: rounds, nodes, gap }

@@ -1,8 +1,8 @@
-//! Equilibrium of a body that rotates and stretches: Newton's method on its energy, with line search.
+//! Equilibrium of a body that rotates and stretches: Newton's method on its energy, with a line search.
 //!
-//! Each step solves with the exact tangent, or, where that is not positive definite, with the tangent
-//! whose points have lost their negative curvature; so every step goes downhill. Sliding constraints n·u = g
-//! are kept by projection, as in the linear system.
+//! Each step solves with the exact tangent or, if that is not positive definite, with a tangent from which the
+//! negative curvature at each integration point has been removed, so that every step goes downhill. Sliding
+//! constraints n·u = g are enforced by projection, as in the linear system.
 
 mod sliding;
 
@@ -31,25 +31,25 @@ pub(crate) use sliding::Slide;
 const MAX_STEPS: usize = 40;
 /// Smallest share of the plan that is tried.
 const LEAST_SHARE: f64 = 1.0 / 64.0;
-/// Share of the slope that a step must bring the energy down by (Armijo 1966).
+/// Share of the slope by which a step must decrease the energy (Armijo 1966).
 const DESCENT: f64 = 1e-4;
-/// Shortest step of the line search over the full one.
+/// Shortest step of the line search relative to the full one.
 const SHORTEST: f64 = 1.0 / 1024.0;
-/// Rounding of the energy over its parts, which a descent below it does not show through.
+/// Rounding error of the energy relative to its parts: a smaller decrease cannot be detected.
 const ENERGY_ROUNDING: f64 = 1e-12;
-/// Error that conjugate gradients may leave in a step, over the tolerance of the solution.
+/// Error that conjugate gradients may leave in a step, relative to the tolerance of the solution.
 const STEP_TOLERANCE: f64 = 0.1;
-/// The same over the length of the step before, which its own error outweighs until the last steps
-/// (Dembo, Eisenstat & Steihaug 1982).
+/// The same relative to the length of the previous step, whose own error is larger until the last steps (Dembo,
+/// Eisenstat & Steihaug 1982).
 const STEP_SHARE: f64 = 1e-3;
 
-/// Longest step of the search over the full one.
+/// Longest step of the search relative to the full one.
 const LONGEST: f64 = 16.0;
-/// Length of a step, over that at which the exact tangent was not positive definite, from which it is tried
-/// again.
+/// Length of a step, relative to the length at which the exact tangent was not positive definite, below which
+/// it is tried again.
 const RETRY_EXACT: f64 = 0.5;
-/// Length of a step over all displacements, from which conjugate gradients take the exact tangent: at rest
-/// it is positive definite, and on the way they would notice only by chance where it is not.
+/// Length of a step over all displacements, below which conjugate gradients use the exact tangent: at rest it
+/// is positive definite, and further away they would detect indefiniteness only by chance.
 const NEAR_REST: f64 = 0.1;
 
 /// How tangent systems are solved.
@@ -68,7 +68,7 @@ pub(crate) struct Equilibrium {
     tissue: Extremes,
 }
 
-/// A body of large deformation that follows contact conditions, each to its equilibrium.
+/// A body under large deformation that follows contact conditions, reaching equilibrium under each set.
 struct Followed<'a, 'i> {
     equilibrium: &'a Equilibrium,
     target: Target<'a>,
@@ -103,25 +103,25 @@ impl Body for Followed<'_, '_> {
     fn restart(&mut self) {}
 }
 
-/// What the boundary asks for.
+/// The conditions at the boundary.
 struct Target<'a> {
     /// Displacement of every node; those of unknowns are not read.
     prescribed: &'a [[f64; 3]],
     /// Forces on every node, N.
     loads: Option<&'a [[f64; 3]]>,
     conditions: RowConditions,
-    /// Length that the tolerance refers to, mm.
+    /// Reference length of the tolerance, mm.
     scale: f64,
 }
 
-/// A state with what the next step starts from.
+/// A state, with the data from which the next step starts.
 struct Pose {
     u: Vec<[f64; 3]>,
-    /// Energy less the work of loads, with springs, N mm.
+    /// Energy minus the work of loads, with springs, N mm.
     merit: f64,
-    /// Sum of the sizes of its parts.
+    /// Sum of the absolute values of its parts.
     size: f64,
-    /// Its slope by each row.
+    /// Its derivative with respect to each row.
     slope: Vec<[f64; 3]>,
 }
 
@@ -130,15 +130,15 @@ struct Step {
     rows: Vec<[f64; 3]>,
     /// Slope of the merit along it.
     slope: f64,
-    /// What the merit may rise by all the same, N mm.
+    /// Increase of the merit that is accepted, N mm.
     slack: f64,
 }
 
 /// How the boundary moves in a step.
 struct Moves<'a> {
-    /// How far each constrained row goes along its normal.
+    /// Displacement of each constrained row along its normal.
     constraints: &'a [Constraint],
-    /// How far the nodes go that are no unknowns; none where they stay.
+    /// Displacements of the nodes that are not unknowns; none if they do not move.
     change: Option<&'a [[f64; 3]]>,
 }
 
@@ -152,7 +152,7 @@ impl Step {
 impl Equilibrium {
     /// The body of `tensors` with the unknowns of `reduction`, and the method used.
     ///
-    /// `matrix`: the reduced stiffness at rest. Errors name rows.
+    /// `matrix`: the reduced stiffness at rest. Errors refer to rows.
     pub fn new(
         tensors: Arc<MassTensors>,
         reduction: Arc<Reduction>,
@@ -198,7 +198,7 @@ impl Equilibrium {
         Ok((Self { energy, tensors, reduction, solver, options: *options, tissue }, method))
     }
 
-    /// Bytes of a factor; 0 for conjugate gradients, which keep nothing from one tangent to the next.
+    /// Bytes of a factorisation; 0 for conjugate gradients, which keep nothing from one tangent to the next.
     pub fn bytes(&self) -> usize {
         match &self.solver {
             TangentSolver::Cholesky(symbolic) => symbolic.factor_bytes(),
@@ -211,7 +211,7 @@ impl Equilibrium {
         Ok(self.energy.state(u)?.forces)
     }
 
-    /// Displacements of the unknown rows with contact settled.
+    /// Displacements of the unknown rows at contact equilibrium.
     pub fn solve(
         &self,
         prescribed: &[[f64; 3]],
@@ -234,7 +234,7 @@ impl Equilibrium {
         };
         match self.slide(&target(), slide, solve) {
             Ok((u, state)) => return Ok(settled(&u, state)),
-            // Too far for one go: shares of the way for every set of normals.
+            // Too large a step: the plan is applied in shares, for every set of normals.
             Err(
                 MtmError::NotConverged { .. }
                 | MtmError::NotPositiveDefinite { .. }
@@ -249,8 +249,8 @@ impl Equilibrium {
         Ok(settled(&body.u, state))
     }
 
-    /// The state that `target` asks for, from the state `u`: at once, or by shares of the way where Newton's
-    /// method loses it.
+    /// The state of `target`, reached from the state `u`: in one step, or in several if Newton's method does
+    /// not converge.
     fn follow(
         &self,
         u: Vec<[f64; 3]>,
@@ -259,7 +259,7 @@ impl Equilibrium {
     ) -> Result<Vec<[f64; 3]>> {
         let (mut here, mut done, mut share) = (u, 0.0, 1.0_f64);
         while done < 1.0 {
-            // Of the way that is left.
+            // Share of the remaining motion.
             let part = (share / (1.0 - done)).min(1.0);
             match self.advance(&here, target, part, solve) {
                 Ok(next) => {
@@ -285,7 +285,7 @@ impl Equilibrium {
         part: f64,
         solve: &mut Solve<'_>,
     ) -> Result<Vec<[f64; 3]>> {
-        // The boundary moves; the unknowns follow as the tangent says.
+        // The boundary moves; the unknowns follow as predicted by the tangent.
         let mut moved = target.prescribed.to_vec();
         for &j in &self.reduction.unknowns {
             moved[j as usize] = u[j as usize];
@@ -323,11 +323,11 @@ impl Equilibrium {
         self.descend(pose, target, (f64::INFINITY, &[]), step, solve)
     }
 
-    /// The end of Newton's steps from `pose`, each of which `next` makes from a pose, the tangent, and the
-    /// error that it may have, mm.
+    /// The result of Newton's steps from `pose`. `next` computes each step from a pose, the tangent to use, and
+    /// the error allowed in the step, mm.
     ///
-    /// `last`: the error that the last step may have, mm, and the rows that no step carries further than it
-    /// says.
+    /// `finest`: the error allowed in the last step, mm; `on_walls`: the rows that no step carries further than
+    /// computed.
     fn descend(
         &self,
         mut pose: Pose,
@@ -337,10 +337,11 @@ impl Equilibrium {
         solve: &mut Solve<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         let by_factor = matches!(self.solver, TangentSolver::Cholesky(_));
-        // Length from which the exact tangent is worth trying.
+        // Step length below which the exact tangent is worth trying.
         let mut near = if by_factor { f64::INFINITY } else { NEAR_REST * reach(&pose, target) };
         let mut length = f64::INFINITY;
-        // Error of the state once it is small enough and one step as fine as the last one may be is left.
+        // Error of the state once it is small enough, when one step with the accuracy of the last one is still
+        // to be done.
         let mut ending = None;
         for _ in 0..MAX_STEPS {
             if (solve.interrupted)() {
@@ -359,7 +360,8 @@ impl Equilibrium {
             let before = length;
             length = step.length();
             solve.effort.history.push(length);
-            // A tangent that is not the energy's own gains as much each time as the last time.
+            // With a tangent that is not that of the energy, convergence is linear, at the rate of the last
+            // step.
             let own = kind == Exact || length == 0.0;
             let gain = if own { 1.0 } else { 1.0 - (length / before).min(1.0) };
             let goal = self.options.tolerance * reach(&pose, target);
@@ -376,11 +378,11 @@ impl Equilibrium {
         Err(lost("the estimated error of a node", length, limit, " mm"))
     }
 
-    /// The state at the end of `step`, shortened until it lies downhill but for its slack.
+    /// The state at the end of `step`, shortened until it lies downhill, up to the slack of the step.
     ///
-    /// Where the tangent is not the energy's own, steps are lengthened as long as that leads further down: a
-    /// curvature whose sign was turned tells how far the energy is to be trusted, not where it ends. Rows
-    /// `on_walls` stay where the step puts them.
+    /// If the tangent is not that of the energy, steps are lengthened as long as the energy keeps decreasing: a
+    /// curvature with its sign reversed limits how far the quadratic model can be trusted, but does not locate
+    /// the minimum. Rows `on_walls` stay at the end of the step.
     fn search(
         &self,
         pose: Pose,
@@ -419,7 +421,7 @@ impl Equilibrium {
         Err(lost("the share of the last step that lowers the energy", share, SHORTEST, ""))
     }
 
-    /// Error that the next step from `pose` may have, mm, after one of `length`; 0 by a factor.
+    /// Error allowed in the next step from `pose`, mm, after a step of `length`; 0 for a factorisation.
     fn allowed(&self, pose: &Pose, target: &Target<'_>, length: f64) -> f64 {
         if matches!(self.solver, TangentSolver::Cholesky(_)) {
             return 0.0;
@@ -456,7 +458,7 @@ impl Equilibrium {
     }
 
     /// Tangent system at `pose` on the rows, without constraints and springs: its matrix, and the right-hand
-    /// side where the other nodes go by `change`.
+    /// side if the other nodes move by `change`.
     fn tangent(
         &self,
         pose: &Pose,
@@ -475,7 +477,7 @@ impl Equilibrium {
 
     /// Newton step from `pose` on the rows.
     ///
-    /// `how`: the tangent, and the error that the step may have, mm.
+    /// `how`: the tangent, and the error allowed in the step, mm.
     fn step(
         &self,
         pose: &Pose,
@@ -515,7 +517,7 @@ impl Equilibrium {
     }
 }
 
-/// That Newton's method did not bring `quantity` to `limit`.
+/// The error for a `quantity` that Newton's method did not bring to `limit`.
 fn lost(quantity: &'static str, value: f64, limit: f64, unit: &'static str) -> MtmError {
     MtmError::NotConverged {
         method: "newton",
@@ -525,8 +527,8 @@ fn lost(quantity: &'static str, value: f64, limit: f64, unit: &'static str) -> M
     }
 }
 
-/// What `solve` gives under the tangent `first`, or under the definite one where the exact one is not positive
-/// definite; and which it was.
+/// The result of `solve` with the tangent `first`, or with the definite one if the exact one is not positive
+/// definite; and the tangent used.
 fn by_tangent<T>(
     first: TangentKind,
     mut solve: impl FnMut(TangentKind) -> Result<T>,
@@ -546,7 +548,7 @@ fn along_slope(rows: &[[f64; 3]], pose: &Pose) -> f64 {
     rows.iter().zip(&pose.slope).map(|(&d, &s)| dot(d, s)).sum()
 }
 
-/// Length that the tolerance refers to, mm.
+/// Reference length of the tolerance, mm.
 fn reach(pose: &Pose, target: &Target<'_>) -> f64 {
     pose.u.iter().fold(target.scale, |m, v| m.max(norm(*v)))
 }

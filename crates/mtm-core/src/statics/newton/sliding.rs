@@ -1,6 +1,6 @@
-//! Newton's method with contact settled in every step: the tangent system is solved under the contact
-//! conditions themselves, not under their slope. Each step then costs what a plan of a linear body costs,
-//! where contact round Newton's method would cost a whole run of it for every set of normals.
+//! Newton's method with contact solved in every step: the tangent system is solved under the contact conditions
+//! themselves, not under their linearisation. Each step then costs as much as a plan of a linear body, whereas
+//! contact iterations around Newton's method would cost a whole Newton run for every set of normals.
 
 use crate::boundary::Motion;
 use crate::contact::{ContactState, Sliding};
@@ -17,35 +17,35 @@ use crate::statics::solution::Clock;
 use crate::statics::system::{Begin, BodyRows, Linked, Settle, Settled, System};
 use crate::vector::{add, sub};
 
-/// Sliding nodes of a body with what their solver asks.
+/// Sliding nodes of a body, with the input of their solver.
 pub(crate) struct Slide<'a> {
     pub sliding: &'a Sliding,
-    /// One of each segment.
+    /// One motion per segment.
     pub motions: &'a [&'a Motion],
     /// How the body is held.
     pub held: Held,
 }
 
-/// What each step of a body in contact is solved for.
+/// Input of every step of a body in contact.
 struct Wanted<'a> {
     target: &'a Target<'a>,
     slide: &'a Slide<'a>,
 }
 
-/// Where a step starts.
+/// Starting state of a step.
 #[derive(Default)]
 struct Start<'a> {
-    /// How far the nodes go that are no unknowns; none where they stay.
+    /// Displacements of the nodes that are not unknowns; none if they do not move.
     change: Option<&'a [[f64; 3]]>,
-    /// Where contact was.
+    /// Previous contact state.
     contact: Option<&'a ContactState>,
 }
 
 impl Equilibrium {
-    /// The state that `target` asks for with contact settled, from rest.
+    /// The state of `target` with contact at equilibrium, from rest.
     ///
     /// # Errors
-    /// `NotConverged` where the steps do not end, whatever contact and the solver report.
+    /// `NotConverged` if the steps do not converge, and any error of contact and of the solver.
     pub(super) fn slide(
         &self,
         target: &Target<'_>,
@@ -59,7 +59,7 @@ impl Equilibrium {
         for &j in &self.reduction.unknowns {
             change[j as usize] = [0.0; 3];
         }
-        // Walls move the body also where no node is joined to one.
+        // Walls move the body even if no node is joined to one.
         let far = slide.sliding.farthest(slide.motions).max(reach(&rest, target));
         let first = far * STEP_SHARE.max(STEP_TOLERANCE * self.options.tolerance);
         let ((rows, mut contact), _) = by_tangent(Exact, |kind| {
@@ -69,7 +69,7 @@ impl Equilibrium {
         solve.effort.iterations += 1;
         let ahead: Vec<[f64; 3]> = rest.u.iter().zip(&change).map(|(a, b)| add(*a, *b)).collect();
         let pose = self.pose(moved_by(&self.reduction, &ahead, &rows, 1.0), target)?;
-        // Error of a step that leaves contact as settled as it was asked for, mm.
+        // Error of a step that keeps contact within its required accuracy, mm.
         let fine = slide.sliding.gap_limit(&self.options.contact);
         let mut before = first;
         let on_walls: Vec<u32> = slide.sliding.nodes().iter().map(|n| n.row).collect();
@@ -77,7 +77,8 @@ impl Equilibrium {
             let start = Start { contact: Some(&contact), ..Start::default() };
             let (rows, state) = self.settled(pose, &wanted, &start, how, interrupted)?;
             contact = ContactState { iterations: contact.iterations + state.iterations, ..state };
-            // Walls do no work along themselves, and what they do through gaps is not of the body.
+            // Walls do no work along themselves, and their work across gaps does not enter the energy of the
+            // body.
             let gaps = 2.0 * how.1.max(before).max(fine);
             before = how.1;
             let slack = contact.forces.iter().map(|f| f.abs() * gaps).sum();
@@ -88,9 +89,9 @@ impl Equilibrium {
         Ok((u, contact))
     }
 
-    /// The step of the rows that solves the tangent system at `pose` with contact settled.
+    /// The step of the rows that solves the tangent system at `pose` with contact at equilibrium.
     ///
-    /// `how`: the tangent, and the error that the step may have, mm.
+    /// `how`: the tangent, and the error allowed in the step, mm.
     fn settled(
         &self,
         pose: &Pose,
@@ -102,11 +103,11 @@ impl Equilibrium {
         let &Wanted { target, slide } = wanted;
         let here = self.reduction.rows(&pose.u);
         let (matrix, mut b) = self.tangent(pose, kind, start.change)?;
-        // K (x − u) = −slope: the contact conditions are on x, the whole displacement.
+        // K (x − u) = −slope: the contact conditions apply to x, the whole displacement.
         for (b, f) in b.iter_mut().zip(matrix.multiply(&here)) {
             *b = add(*b, f);
         }
-        // Closest points settle no nearer than the solves are.
+        // Closest points cannot converge further than the solves do.
         let far = reach(pose, target);
         let share = if far > 0.0 { allowed / far } else { STEP_SHARE };
         let mut options = self.step_options(share);
@@ -132,7 +133,7 @@ impl Equilibrium {
         Ok((step, contact))
     }
 
-    /// Options of the system of one step, whose error may be `share` of the reach.
+    /// Options of the system of one step, with an error of at most `share` of the reach.
     fn step_options(&self, share: f64) -> StaticOptions {
         let method = match self.solver {
             TangentSolver::Cholesky(_) => Method::Cholesky,
