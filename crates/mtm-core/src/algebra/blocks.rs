@@ -7,7 +7,7 @@ use crate::algebra::simd::{Kernel, LANES, add_products, widest};
 /// A 3×3 block, row by row.
 pub type Block = [f64; 9];
 
-/// Rows a parallel product hands to a thread at once: large enough to hide the hand-over.
+/// Rows per parallel task of a product: enough to hide the cost of the hand-over.
 const ROWS_PER_TASK: usize = 512;
 
 /// Square sparse matrix of 3×3 blocks, both triangles stored, columns ascending in each row.
@@ -87,7 +87,8 @@ impl BlockMatrix {
         }
     }
 
-    /// `y = A x`, parallel over rows; each row sums in column order, so the bits do not depend on threads.
+    /// `y = A x`, parallel over rows; each row is summed in column order, so the result is bitwise identical
+    /// for any number of threads.
     pub fn multiply_into(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
         y.par_chunks_mut(ROWS_PER_TASK).enumerate().for_each(|(chunk, rows)| {
             self.multiply_rows(chunk * ROWS_PER_TASK, x, rows);
@@ -110,8 +111,8 @@ impl BlockMatrix {
     #[inline(always)]
     pub fn row_product(&self, j: usize, x: &[[f64; 3]]) -> [f64; 3] {
         let (columns, blocks) = self.row(j);
-        // One sum a row of the block, its lanes over the components of x. The fourth lane is loaded
-        // because memory has it, and left out at the end; the last row takes the first for that.
+        // One sum per row of the block, with the components of x in its lanes. The fourth lane is loaded
+        // because the memory exists, and dropped at the end; the last row does so with its first lane.
         let mut sums = [[0.0; LANES]; 3];
         for (&k, b) in columns.iter().zip(blocks) {
             let v = x[k as usize];
@@ -128,7 +129,7 @@ impl BlockMatrix {
     }
 }
 
-/// Some rows of a product.
+/// A range of rows of a product.
 struct RowProducts<'a> {
     matrix: &'a BlockMatrix,
     first: usize,

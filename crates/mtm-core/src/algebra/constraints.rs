@@ -1,5 +1,5 @@
-//! Normal constraints n·u = g on rows of the system by projection: the pattern stays, and the constraints
-//! hold to rounding.
+//! Normal constraints n·u = g on rows of the system, by projection: the sparsity pattern is unchanged, and the
+//! constraints hold to rounding.
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::vector::{dot, scaled, sub};
@@ -11,7 +11,7 @@ pub struct Constraint {
     pub row: usize,
     /// Unit normal n.
     pub normal: [f64; 3],
-    /// Prescribed component along it, mm.
+    /// Prescribed component along the normal, mm.
     pub offset: f64,
 }
 
@@ -77,7 +77,7 @@ pub fn projected_rhs(
     rhs
 }
 
-/// Gives each constrained row of `x` the component along its normal that the constraint asks for.
+/// Sets the component of each constrained row of `x` along its normal to the constraint's value.
 pub fn add_offsets(x: &mut [[f64; 3]], constraints: &[Constraint]) {
     for &Constraint { row, normal: n, offset } in constraints {
         let along = dot(n, x[row]);

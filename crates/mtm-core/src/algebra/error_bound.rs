@@ -1,46 +1,45 @@
-//! How far an iterate of conjugate gradients is from the solution, and when that is near enough.
+//! How far an iterate of conjugate gradients is from the solution, and when it is near enough.
 //!
-//! The coefficients of the iteration spell out a Lanczos matrix of the preconditioned system: its
-//! smallest eigenvalue (Ritz value) turns a residual into an estimate of the error. It is no bound: Ritz
-//! values lie above the spectrum, and a slow motion that the residual hardly holds shows in them late.
+//! The coefficients of the iteration define a Lanczos matrix of the preconditioned system. Its smallest
+//! eigenvalue (Ritz value) turns a residual into an estimate of the error. The estimate is not a bound: Ritz
+//! values lie above the spectrum, and a slow motion that is hardly present in the residual affects them late.
 
 /// Fraction of the smallest Ritz value taken as the lower end of the spectrum (Ritz values approach it from
 /// above).
 const RITZ_SAFETY: f64 = 0.5;
-/// Ratio of the extreme Ritz values up to which that fraction serves; beyond, it falls with the root. Soft
-/// tissue with muscles has 6 to 8.
+/// Ratio of the extreme Ritz values up to which that fraction is used; above it, the fraction decreases with
+/// the square root of the ratio. Soft tissue with muscles has 6 to 8.
 const RITZ_SPREAD: f64 = 10.0;
-/// Ratio of the extreme Ritz values above which an estimate is not believed without a trial.
+/// Ratio of the extreme Ritz values above which an estimate is not trusted without a trial.
 const DOUBTFUL_SPREAD: f64 = 40.0;
-/// Multiple of the largest error over preconditioned residual of a trial that stands for that of any
-/// solution.
+/// Multiple of a trial's largest error over preconditioned residual that is taken as that of any solution.
 const TRIAL_AMPLIFICATION: f64 = 4.0;
 /// Relative change of the smallest Ritz value, over the last [`RITZ_WINDOW`] of all iterations, below
 /// which it counts as resolved.
 const RITZ_SETTLED: f64 = 0.1;
-/// Power of the fall of the smallest Ritz value over that window by which the estimates count as larger
-/// where it is not resolved: it may go on to fall as much several times more.
+/// Exponent applied to the decrease of the smallest Ritz value over that window to enlarge the estimates if it
+/// is not resolved: the value may decrease by the same factor several more times.
 const RITZ_DOUBT: i32 = 4;
-/// Share of all iterations over which the smallest Ritz value must stay put. A share, not a number: a
-/// weak preconditioner lets it rest on plateaus for long before the slowest motion shows.
+/// Share of all iterations over which the smallest Ritz value must remain constant. A share, not a number: with
+/// a weak preconditioner it stays on plateaus for a long time before the slowest motion appears.
 const RITZ_WINDOW: f64 = 0.3;
-/// Fewest iterations over which it must.
+/// Minimum number of iterations over which it must remain constant.
 const RITZ_WINDOW_MIN: usize = 3;
-/// Fewest iterations without any decrease of the estimated error that count as stagnation; the
-/// block-Jacobi method may need hundreds before it first falls.
+/// Minimum number of iterations without any decrease of the estimated error that counts as stagnation; the
+/// block-Jacobi method may need hundreds before the first decrease.
 pub(crate) const STAGNATION_ITERATIONS: usize = 500;
 /// How often the iteration may restart from the true residual.
 const MAX_RESTARTS: usize = 5;
-/// Share of the error at the last restart that the next must get below, or the round-off floor is
-/// reached.
+/// The error at a restart must be below this share of the error at the previous one; otherwise the round-off
+/// floor is reached.
 pub(crate) const FLOOR_PROGRESS: f64 = 0.5;
-/// Relative energy `√(rᵀz / r₀ᵀz₀)` at which nothing but round-off is left.
+/// Relative energy `√(rᵀz / r₀ᵀz₀)` at which only round-off is left.
 const ROUND_OFF: f64 = 1e-15;
 /// Bisection steps for an extreme eigenvalue of a tridiagonal matrix.
 const BISECTIONS: usize = 40;
-/// Relative change of an extreme eigenvalue that is not looked for.
+/// Relative change of an extreme eigenvalue that is ignored.
 const EXTREME_CHANGE: f64 = 1e-6;
-/// Smallest ratio of extreme eigenvalues that the bisection looks for.
+/// Smallest ratio of extreme eigenvalues that the bisection can resolve.
 const SPECTRUM_RANGE: f64 = 1e-14;
 
 /// When [`pcg`](crate::algebra::krylov::pcg) stops.
@@ -50,9 +49,9 @@ pub struct PcgOptions {
     pub tolerance: f64,
     /// Estimated error in the energy norm, relative to the energy norm of the solution.
     pub energy_tolerance: f64,
-    /// Iterations after which the method gives up.
+    /// Maximum number of iterations.
     pub max_iterations: usize,
-    /// Iterations before which no estimate is believed: the smallest Ritz value must be resolved first.
+    /// Iterations before which no estimate is trusted: the smallest Ritz value must be resolved first.
     pub min_iterations: usize,
     /// Multiple of both tolerances still accepted once round-off stops all further progress.
     pub slack: f64,
@@ -71,14 +70,14 @@ impl Default for PcgOptions {
 }
 
 impl PcgOptions {
-    /// Both estimates over their tolerances, the larger of the two; infinite if not a number.
+    /// The larger of the two estimates over their tolerances; infinite if not a number.
     pub(crate) fn excess(&self, error_mm: f64, energy_error: f64) -> f64 {
         let excess = (error_mm / self.tolerance).max(energy_error / self.energy_tolerance);
         if excess.is_nan() { f64::INFINITY } else { excess }
     }
 }
 
-/// When the true residual is looked at, and what follows from it.
+/// When the true residual is computed, and what follows from it.
 #[derive(Debug)]
 pub(crate) struct StoppingRule<'a> {
     options: &'a PcgOptions,
@@ -91,24 +90,23 @@ pub(crate) struct StoppingRule<'a> {
     restarts: usize,
 }
 
-/// Why the true residual is due.
+/// Why the true residual has to be computed.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Due {
-    /// Factor by which the estimates count as larger: one where the spectrum is resolved, see
-    /// [`Spectrum::doubt`].
+    /// Factor by which the estimates are enlarged: one if the spectrum is resolved, see [`Spectrum::doubt`].
     pub(crate) doubt: f64,
-    /// Whether no iteration is left.
+    /// Whether the maximum number of iterations is reached.
     pub(crate) exhausted: bool,
 }
 
-/// What the true residual leads to.
+/// Consequence of the true residual.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Verdict {
     /// The iterate is the solution.
     Converged,
-    /// The iteration goes on from the true residual.
+    /// The iteration continues from the true residual.
     Restart,
-    /// No further iteration helps, or none is left.
+    /// Further iterations do not help, or none is left.
     GiveUp,
 }
 
@@ -117,10 +115,10 @@ impl<'a> StoppingRule<'a> {
         Self { options, first_rz, best: (f64::INFINITY, 0), verified: f64::INFINITY, restarts: 0 }
     }
 
-    /// The reason, if there is one, to look at the true residual after so many iterations.
+    /// The reason, if there is one, to compute the true residual after so many iterations.
     ///
-    /// `error_mm`: estimate as the recurrence carries it. `excess`: see [`PcgOptions::excess`]; asked
-    /// only if all else is met.
+    /// `error_mm`: the estimate from the recurrence. `excess`: see [`PcgOptions::excess`]; evaluated only if
+    /// all other conditions are met.
     pub(crate) fn due(
         &mut self,
         iterations: usize,
@@ -145,7 +143,7 @@ impl<'a> StoppingRule<'a> {
         (met || floor || stagnant || exhausted).then_some(Due { doubt, exhausted })
     }
 
-    /// What follows from the estimates by the true residual.
+    /// The consequence of the estimates that are based on the true residual.
     pub(crate) fn verdict(
         &mut self,
         due: Due,
@@ -153,7 +151,7 @@ impl<'a> StoppingRule<'a> {
         error_mm: f64,
         excess: f64,
     ) -> Verdict {
-        // Two restarts in a row from the same true residual: round-off lets it go no lower.
+        // Two restarts in a row from the same true residual: round-off prevents any further decrease.
         let at_floor = self.restarts >= MAX_RESTARTS || excess > FLOOR_PROGRESS * self.verified;
         let allowed = if at_floor && !due.exhausted { self.options.slack } else { 1.0 };
         if due.doubt * excess <= allowed {
@@ -169,29 +167,29 @@ impl<'a> StoppingRule<'a> {
     }
 }
 
-/// The Lanczos matrix of `M⁻¹ A` that the coefficients of the iteration spell out.
+/// The Lanczos matrix of `M⁻¹ A` defined by the coefficients of the iteration.
 ///
-/// It may outlive a solution, for the next of a system that differs little.
+/// It may be kept after a solution, for the next system if that differs little.
 #[derive(Debug, Default, Clone)]
 pub(crate) struct Spectrum {
     alphas: Vec<f64>,
     betas: Vec<f64>,
     diagonal: Vec<f64>,
     off_squared: Vec<f64>,
-    /// Smallest Ritz value, the lowest over all restarts.
+    /// Smallest Ritz value over all restarts.
     pub(crate) smallest: f64,
     /// Largest Ritz value over all restarts.
     pub(crate) largest: f64,
     /// Extreme Ritz values since the last restart.
     extremes: Option<[f64; 2]>,
     recent: Vec<f64>,
-    /// Largest error over preconditioned residual that a trial showed, both in the largest norm of a node;
-    /// 0 without one.
+    /// Largest error over preconditioned residual observed in a trial, both in the largest norm of a node; 0
+    /// without a trial.
     amplification: f64,
 }
 
 impl Spectrum {
-    /// Forgets the matrix, for new search directions, but not the values seen.
+    /// Discards the matrix when the search directions are reset, but not the values seen.
     pub(crate) fn restart(&mut self) {
         self.alphas.clear();
         self.betas.clear();
@@ -200,12 +198,12 @@ impl Spectrum {
         self.extremes = None;
     }
 
-    /// Notes that an error of a known solution was `ratio` times its preconditioned residual.
+    /// Records that the error of a known solution was `ratio` times its preconditioned residual.
     pub(crate) fn amplified(&mut self, ratio: f64) {
         self.amplification = self.amplification.max(ratio);
     }
 
-    /// Takes over what a trial with the same operator showed.
+    /// Adopts the result of a trial with the same operator.
     pub(crate) fn learn(&mut self, trial: &Self) {
         if self.amplification >= trial.amplification && self.smallest <= trial.smallest {
             return;
@@ -221,7 +219,7 @@ impl Spectrum {
         self.largest = self.largest.max(trial.largest);
     }
 
-    /// Whether the spectrum is so wide that a slow motion may hide in it.
+    /// Whether the spectrum is so wide that a slow motion may remain undetected.
     pub(crate) fn is_wide(&self) -> bool {
         self.spread() > DOUBTFUL_SPREAD
     }
@@ -231,7 +229,7 @@ impl Spectrum {
         if self.smallest > 0.0 { self.largest / self.smallest } else { 1.0 }
     }
 
-    /// T has 1/α_k + β_{k−1}/α_{k−1} on the diagonal and √β_k/α_k beside it.
+    /// T has 1/α_k + β_{k−1}/α_{k−1} on the diagonal and √β_k/α_k next to it.
     pub(crate) fn push(&mut self, alpha: f64, beta: f64) {
         let k = self.alphas.len();
         if k == 0 {
@@ -251,8 +249,8 @@ impl Spectrum {
         self.recent.push(self.smallest);
     }
 
-    /// Factor of doubt in the estimates: one where the smallest Ritz value has come to rest, a power of its
-    /// recent fall where it has not, infinite where too little is known.
+    /// Factor by which the estimates are in doubt: one if the smallest Ritz value has converged, a power of its
+    /// recent decrease if it has not, infinite if too little is known.
     pub(crate) fn doubt(&self) -> f64 {
         let window = RITZ_WINDOW_MIN.max((RITZ_WINDOW * self.recent.len() as f64) as usize);
         let Some(before) = self.recent.len().checked_sub(window + 1) else {
@@ -262,7 +260,7 @@ impl Spectrum {
         if fall <= 1.0 + RITZ_SETTLED { 1.0 } else { fall.powi(RITZ_DOUBT) }
     }
 
-    /// A lower end of the spectrum, as far as it has shown.
+    /// A lower end of the spectrum, as far as it is known.
     fn lower_end(&self) -> f64 {
         let safety =
             RITZ_SAFETY * (RITZ_SPREAD / self.spread().min(DOUBTFUL_SPREAD)).sqrt().min(1.0);
@@ -302,13 +300,13 @@ impl Spectrum {
 
 /// Smallest and largest eigenvalues of a positive definite tridiagonal matrix by bisection on Sturm counts.
 ///
-/// `off_squared`: squares of the entries beside the diagonal, one fewer than `diagonal`.
+/// `off_squared`: squares of the off-diagonal entries, one fewer than `diagonal`.
 pub(crate) fn tridiagonal_extremes(diagonal: &[f64], off_squared: &[f64]) -> [f64; 2] {
     extremes_after(None, diagonal, off_squared, 0.0)
 }
 
-/// [`tridiagonal_extremes`] of a matrix that grew by one row since its extremes were `before`: they have
-/// moved apart (Cauchy's interlacing), mostly by less than the relative `change` that is not looked for.
+/// [`tridiagonal_extremes`] of a matrix that grew by one row since its extremes were `before`: they have moved
+/// further apart (Cauchy's interlacing), mostly by less than the relative `change` that is ignored.
 fn extremes_after(
     before: Option<[f64; 2]>,
     diagonal: &[f64],
@@ -360,7 +358,7 @@ mod tests {
 
     #[test]
     fn extremes_of_a_known_tridiagonal_matrix() {
-        // 2 on the diagonal, −1 beside it: eigenvalues 2 − 2 cos(kπ/(n+1)).
+        // 2 on the diagonal, −1 next to it: eigenvalues 2 − 2 cos(kπ/(n+1)).
         let n = 50;
         let [low, high] = tridiagonal_extremes(&vec![2.0; n], &vec![1.0; n - 1]);
         let angle = std::f64::consts::PI / (n + 1) as f64;

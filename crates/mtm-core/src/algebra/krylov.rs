@@ -1,10 +1,10 @@
 //! Preconditioned conjugate gradients that stop on an estimate of the error, not on the residual.
 //!
-//! At a material contrast of 1e6 a relative residual of 1e-6 can leave centimetres of error: a stiff
-//! muscle dominates the norm while the fat beside it is still wrong. The iteration here ends when
-//! both the estimated error in millimetres and that in energy are small enough, and both are checked once
-//! more with the true residual `b − A x` before a solution is handed out. Where the estimates have reason
-//! to miss a slow motion, [`trial`] measures them on a known solution first.
+//! At a material contrast of 1e6 a relative residual of 1e-6 can leave centimetres of error: a stiff muscle
+//! dominates the norm while the fat next to it is still wrong. The iteration here ends when the estimated
+//! errors in millimetres and in energy are both small enough, and both are confirmed with the true residual `b
+//! − A x` before a solution is returned. If the estimates are likely to miss a slow motion, [`trial`] first
+//! measures them on a known solution.
 
 use rayon::prelude::*;
 
@@ -20,18 +20,18 @@ use crate::error::{ErrorKind, MtmError, Result, Shortfall, check_finite_rows};
 pub use crate::algebra::error_bound::PcgOptions;
 pub(crate) use crate::algebra::error_bound::Spectrum;
 
-/// Fall of the error of a trial after which its true residual is looked at again.
+/// Decrease of the error of a trial after which its true residual is computed again.
 const TRIAL_FALL: f64 = 0.1;
-/// Growth of the iterations of a trial after which it is looked at at the latest.
+/// Growth of the number of iterations of a trial after which it is computed at the latest.
 const TRIAL_PAUSE: f64 = 1.3;
 /// True rᵀz over that of the recurrence above which the recurrence has drifted: the round-off floor.
 const DRIFT: f64 = 4.0;
-/// Iterations whose decrease of the energy stands for what is left of it.
+/// Number of last iterations whose decrease of the energy estimates the remaining decrease.
 const ENERGY_DELAY: usize = 6;
 
 /// A symmetric positive definite matrix, as conjugate gradients see it.
 ///
-/// It may be one on a subspace alone: [`Operator::project`] then says which.
+/// It may be defined on a subspace only: [`Operator::project`] then defines which.
 pub trait Operator: Sync {
     /// Number of block rows.
     fn n_rows(&self) -> usize;
@@ -39,18 +39,18 @@ pub trait Operator: Sync {
     /// Writes `y = A x` for an `x` of the subspace; `y` lies in it too.
     fn multiply_into(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]);
 
-    /// Writes `y = A x` and returns `xᵀ y`. The bits must not depend on the threads.
+    /// Writes `y = A x` and returns `xᵀ y`. The result must not depend on the number of threads.
     fn multiply_and_dot(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) -> f64 {
         self.multiply_into(x, y);
         dot(x, y)
     }
 
-    /// Least pᵀ A p of a direction that counts as held.
+    /// Smallest pᵀ A p of a direction that counts as constrained.
     fn least_curvature(&self, _p: &[[f64; 3]]) -> f64 {
         0.0
     }
 
-    /// Replaces `x` by its nearest vector of the subspace; nothing where that is the whole space.
+    /// Replaces `x` by its nearest vector of the subspace; does nothing if that is the whole space.
     fn project(&self, _x: &mut [[f64; 3]]) {}
 }
 
@@ -72,7 +72,8 @@ impl Operator for BlockMatrix {
 pub trait Preconditioner: Sync {
     /// Writes `z = M⁻¹ r`.
     ///
-    /// `r`, `z`: one row of three per block row. The bits of `z` must not depend on the threads.
+    /// `r`, `z`: one row of three per block row. `z` must not depend, even in its bits, on the number of
+    /// threads.
     fn apply(&self, r: &[[f64; 3]], z: &mut [[f64; 3]]);
 }
 
@@ -121,35 +122,35 @@ impl Preconditioner for BlockJacobi {
     }
 }
 
-/// The solution of [`pcg`] and how good it is.
+/// The solution of [`pcg`] and its accuracy.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PcgOutcome {
     /// The solution, one row of three per block row, mm.
     pub solution: Vec<[f64; 3]>,
     /// Iterations done, over all restarts.
     pub iterations: usize,
-    /// Estimate of the largest nodal error, mm: `max_j |z_j| / θ_min` with the true residual, `θ_min` half
-    /// the smallest Ritz value of `M⁻¹ A`. No bound: Ritz values lie above the spectrum.
+    /// Estimate of the largest nodal error, mm: `max_j |z_j| / θ_min` with the true residual, `θ_min` half the
+    /// smallest Ritz value of `M⁻¹ A`. Not a bound: Ritz values lie above the spectrum.
     pub error_estimate_mm: f64,
     /// Estimate of the error in the energy norm, relative to the energy norm of the solution.
     pub energy_error: f64,
-    /// `‖b − A x‖ / ‖b‖`, computed afresh. Says little at high contrast.
+    /// `‖b − A x‖ / ‖b‖`, recomputed at the end. Of little meaning at high contrast.
     pub residual: f64,
-    /// Relative residual after each iteration, as the recurrence carries it.
+    /// Relative residual after each iteration, from the recurrence.
     pub residual_history: Vec<f64>,
-    /// Smallest and largest Ritz values of `M⁻¹ A` seen: their ratio is the condition number that
-    /// the preconditioner left.
+    /// Smallest and largest Ritz values of `M⁻¹ A` observed: their ratio is the condition number of the
+    /// preconditioned system.
     pub ritz: [f64; 2],
 }
 
 /// Solves `A x = b` by preconditioned conjugate gradients (Hestenes & Stiefel 1952).
 ///
-/// `b`, `x0`: one row of three per block row, N and mm. `interrupted` is asked once per iteration, on
-/// the calling thread. The bits of the result do not depend on the number of threads.
+/// `b`, `x0`: one row of three per block row, N and mm. `interrupted` is called once per iteration, on the
+/// calling thread. The result is bitwise identical for any number of threads.
 ///
-/// Stops when `max_j |z_j| / θ_min ≤ tolerance` and when the Gauss–Radau estimate of the energy error
-/// (Meurant & Tichý 2013, with the smallest Ritz value less a safety margin as lower end of the
-/// spectrum) is within `energy_tolerance`; both must then hold for the true residual as well.
+/// Stops when `max_j |z_j| / θ_min ≤ tolerance` and the Gauss–Radau estimate of the energy error (Meurant &
+/// Tichý 2013, with the smallest Ritz value minus a safety margin as lower end of the spectrum) is within
+/// `energy_tolerance`; both must then hold for the true residual as well.
 ///
 /// # Errors
 /// [`MtmError::Length`] and [`MtmError::NotFinite`] for input that does not fit,
@@ -174,22 +175,22 @@ pub(crate) struct Problem<'a> {
     pub a: &'a dyn Operator,
     pub b: &'a [[f64; 3]],
     pub preconditioner: &'a dyn Preconditioner,
-    /// Asked once per iteration, on the calling thread.
+    /// Called once per iteration, on the calling thread.
     pub interrupted: &'a (dyn Fn() -> bool + Sync),
 }
 
-/// What is enough of a solution that is only a step on the way to another system.
+/// Accuracy required of a solution that is only an intermediate step.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Enough {
-    /// An estimated error, mm, of this share of that at the start.
+    /// Estimated error, mm, as a share of the error at the start.
     Error(f64),
-    /// An error in the energy norm of this share of what the iteration has taken off: with springs much stiffer than
-    /// the preconditioner knows, the largest row of z says nothing about the error.
+    /// Error in the energy norm as a share of the decrease due to the iteration: with springs much stiffer than
+    /// the preconditioner accounts for, the largest row of z is not a measure of the error.
     Energy(f64),
 }
 
-/// What the last iterations took off the energy: their sum estimates what is left (Hestenes & Stiefel 1952; with a
-/// delay Strakoš & Tichý 2002).
+/// Decrease of the energy in the last iterations: their sum estimates what is left (Hestenes & Stiefel 1952;
+/// with a delay Strakoš & Tichý 2002).
 #[derive(Default)]
 struct Decrease {
     whole: f64,
@@ -204,35 +205,35 @@ impl Decrease {
         self.count += 1;
     }
 
-    /// Whether what is left is within the square of `share` of what was taken off.
+    /// Whether the remaining decrease is within the square of `share` of the decrease so far.
     fn is_within(&self, share: f64) -> bool {
         self.count >= ENERGY_DELAY && self.last.iter().sum::<f64>() <= share * share * self.whole
     }
 }
 
-/// Where [`pcg_near`] ended.
+/// How [`pcg_near`] ended.
 pub(crate) enum Reached {
-    /// Within the tolerances, checked with the true residual.
+    /// Within the tolerances, confirmed with the true residual.
     Solution(PcgOutcome),
-    /// Near enough for a step; its estimate is that of the recurrence.
+    /// Near enough for a step; the estimate is that of the recurrence.
     Step(PcgOutcome),
     /// The matrix is indefinite, or nearly so.
     Indefinite(Box<Indefinite>),
 }
 
-/// Where an iteration met a direction that does not count as held.
+/// The end of an iteration at a direction that does not count as constrained.
 pub(crate) struct Indefinite {
-    /// The solution as far as it came.
+    /// The solution reached so far.
     pub solution: Vec<[f64; 3]>,
     pub direction: Vec<[f64; 3]>,
-    /// What to report where no indefinite matrix was to be expected.
+    /// The error to report if an indefinite matrix was not expected.
     pub error: MtmError,
     pub iterations: usize,
     pub residual_history: Vec<f64>,
 }
 
 impl Reached {
-    /// What was reached, where the matrix is definite.
+    /// The result, if the matrix is definite.
     pub(crate) fn into_outcome(self) -> Result<PcgOutcome> {
         match self {
             Self::Solution(outcome) | Self::Step(outcome) => Ok(outcome),
@@ -243,9 +244,9 @@ impl Reached {
 
 /// [`pcg`] for one of several systems that differ little, with the same preconditioner.
 ///
-/// `seen`: what earlier systems showed of the spectrum. With `enough`, the solution is only a step on the
-/// way to another system: the iteration ends as soon as that is reached (the estimate of the step is then as good
-/// as what was seen), unless it lies within the tolerances.
+/// `seen`: what earlier systems revealed of the spectrum. With `enough`, the solution is only an intermediate
+/// step: the iteration ends as soon as that accuracy is reached (the estimate of the step is then as good as
+/// what was seen), unless it lies within the tolerances.
 pub(crate) fn pcg_near(
     problem: &Problem<'_>,
     x0: &[[f64; 3]],
@@ -325,7 +326,7 @@ pub(crate) fn pcg_near(
         let excess = || state.excess(options);
         let due = rule.due(iterations, state.rz, state.spectrum, state.error_mm(), excess);
         let Some(due) = due else { continue };
-        // The recurrence drifts from b − A x at the round-off floor: only the true residual counts.
+        // At the round-off floor the recurrence drifts from b − A x: only the true residual is reliable.
         in_pool(|| state.replace_residual());
         match rule.verdict(due, iterations, state.error_mm(), state.excess(options)) {
             Verdict::Converged => {
@@ -340,22 +341,22 @@ pub(crate) fn pcg_near(
     }
 }
 
-/// What conjugate gradients made of a system whose solution is known.
+/// Result of conjugate gradients on a system whose solution is known.
 #[derive(Debug, Clone)]
 pub(crate) struct Trial {
-    /// The spectrum, and how errors follow from residuals.
+    /// The spectrum, and the relation between errors and residuals.
     pub seen: Spectrum,
-    /// Largest nodal error that was reached, over the largest displacement.
+    /// Largest nodal error that was reached, relative to the largest displacement.
     pub error: f64,
     pub iterations: usize,
 }
 
-/// How well conjugate gradients can solve with `a`: a system with a known solution, on which errors are
-/// measured, not estimated.
+/// How accurately conjugate gradients can solve with `a`: a system with a known solution, on which errors are
+/// measured instead of estimated.
 ///
-/// In the known field every node goes its own way, so that each slow motion has its share of it and none
-/// of the residual. `goal`: error over the largest displacement at which the trial ends; it ends as well
-/// where rounding lets the error fall no further, and after `max_iterations`.
+/// In the known field every node moves independently, so that it contains a share of each slow motion, while
+/// the residual contains almost none. `goal`: error relative to the largest displacement at which the trial
+/// ends; it also ends if rounding prevents a further decrease of the error, and after `max_iterations`.
 pub(crate) fn trial(
     a: &dyn Operator,
     preconditioner: &dyn Preconditioner,
@@ -478,7 +479,7 @@ impl<'a> State<'a> {
         (self.rz, self.largest_z) = dot_and_largest(&self.r, &self.z);
     }
 
-    /// rᵀz and the largest row of z for the true residual, without a change of the iteration.
+    /// rᵀz and the largest row of z for the true residual, without changing the iteration.
     fn true_residual(&mut self) -> (f64, f64) {
         let (r, z) = (self.r.clone(), self.z.clone());
         let (rz, r_norm, largest_z) = (self.rz, self.r_norm, self.largest_z);
@@ -489,8 +490,8 @@ impl<'a> State<'a> {
         found
     }
 
-    /// z = P M⁻¹ P r, P the projection of the operator: what rounding leaves outside the subspace may be
-    /// all of a small residual, and there the operator says nothing.
+    /// z = P M⁻¹ P r, P the projection of the operator: the rounding errors outside the subspace may make up
+    /// all of a small residual, and the operator is undefined there.
     fn precondition(&mut self) {
         self.a.project(&mut self.r);
         self.preconditioner.apply(&self.r, &mut self.z);
@@ -516,13 +517,13 @@ impl<'a> State<'a> {
         }
     }
 
-    /// Forgets the search directions: the next step follows z alone.
+    /// Discards the search directions: the next step follows z alone.
     fn restart(&mut self) {
         self.p.copy_from_slice(&self.z);
         self.spectrum.restart();
     }
 
-    /// One iteration; what it takes off the square of the error in the energy norm, N mm.
+    /// One iteration; returns the decrease of the squared error in the energy norm, N mm.
     fn step(&mut self) -> Result<f64> {
         let pq = self.a.multiply_and_dot(&self.p, &mut self.q);
         let is_held = pq > self.a.least_curvature(&self.p);
@@ -572,8 +573,7 @@ impl<'a> State<'a> {
         }
     }
 
-    /// What kept the iteration from converging, of the three that must be met: the one that is furthest
-    /// from it.
+    /// What kept the iteration from converging: of the three conditions, the one furthest from being met.
     fn not_converged(&self, due: Due, options: &PcgOptions, iterations: usize) -> MtmError {
         let (error, energy) = (due.doubt * self.error_mm(), due.doubt * self.energy_error());
         let by_energy = energy / options.energy_tolerance > error / options.tolerance;

@@ -1,27 +1,27 @@
-//! An allocator that asks for huge pages behind large buffers.
+//! An allocator that requests huge pages for large buffers.
 //!
-//! Factors, tensors and multigrid levels are hundreds of megabytes that are written once and streamed.
-//! In pages of 4 KiB the first touch of that memory cost more than the arithmetic on it: the numeric
-//! factorisation of 300 000 tets took three times as long. Where transparent huge pages are set to
-//! `madvise` (Debian, Ubuntu) or `always`, one call per buffer avoids this; elsewhere it changes nothing.
+//! Factorisations, tensors and multigrid levels take hundreds of megabytes that are written once and then
+//! streamed. With pages of 4 KiB the first access to that memory cost more than the arithmetic on it: the
+//! numeric factorisation of 300 000 tets took three times as long. If transparent huge pages are set to
+//! `madvise` (Debian, Ubuntu) or `always`, one call per buffer avoids this; elsewhere it has no effect.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 
 /// Size of a huge page on x86-64 and most arm64 systems, bytes.
 #[cfg(target_os = "linux")]
 const HUGE_PAGE: usize = 2 << 20;
-/// Buffers from this size on get pages of their own, bytes.
+/// Buffers of at least this size get their own pages, bytes.
 #[cfg(target_os = "linux")]
 const LARGE: usize = HUGE_PAGE;
 
-/// The system's allocator, with huge pages behind large buffers on Linux.
+/// The system's allocator, with huge pages for large buffers on Linux.
 ///
 /// A binary opts in: `#[global_allocator] static MEMORY: HugePages = HugePages;`
 pub struct HugePages;
 
-// SAFETY: small requests are the system allocator's own. Large ones are private anonymous mappings,
-// zeroed by the kernel, of at least the size asked for and aligned to a huge page (more than any
-// layout asks for below that); they are unmapped with the same size, computed from the same layout.
+// SAFETY: small requests are passed to the system allocator. Large ones are private anonymous mappings, zeroed
+// by the kernel, of at least the requested size and aligned to a huge page (more than any layout requests below
+// that); they are unmapped with the same size, computed from the same layout.
 #[allow(unsafe_code)]
 unsafe impl GlobalAlloc for HugePages {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
@@ -88,8 +88,8 @@ fn rounded(size: usize) -> usize {
 unsafe fn map(size: usize) -> *mut u8 {
     let length = rounded(size);
     let Some(reserved) = length.checked_add(HUGE_PAGE) else { return std::ptr::null_mut() };
-    // SAFETY: an anonymous mapping wherever the kernel likes; one huge page more than needed, so that an
-    // aligned run of the length lies in it; what lies before and after that run is given back.
+    // SAFETY: an anonymous mapping at an address chosen by the kernel, one huge page longer than needed, so
+    // that it contains an aligned run of the length; the parts before and after that run are given back.
     unsafe {
         let base = libc::mmap(
             std::ptr::null_mut(),
@@ -112,7 +112,7 @@ unsafe fn map(size: usize) -> *mut u8 {
         if after > 0 {
             libc::munmap(pointer.add(length).cast(), after);
         }
-        // A refusal leaves ordinary pages, which serve as well, slower.
+        // If the kernel refuses, ordinary pages are used, which are only slower.
         libc::madvise(pointer.cast(), length, libc::MADV_HUGEPAGE);
         pointer
     }

@@ -1,5 +1,5 @@
-//! Elimination order of the nodes: nested dissection where METIS is built in, postordering, and keeping
-//! a chosen set of nodes last. The only file that names METIS.
+//! Elimination order of the nodes: nested dissection if METIS is built in, postordering, and keeping a chosen
+//! set of nodes last. The only file that refers to METIS.
 
 use crate::algebra::blocks::BlockMatrix;
 #[cfg(feature = "metis")]
@@ -16,7 +16,7 @@ pub struct NodeGraph {
 }
 
 impl NodeGraph {
-    /// The graph of the rows of `matrix` for which `keep` holds, and the row each of its nodes stands for.
+    /// The graph of the rows of `matrix` for which `keep` holds, and the row that each of its nodes represents.
     pub fn of_rows(matrix: &BlockMatrix, keep: impl Fn(usize) -> bool) -> (Self, Vec<u32>) {
         let n = matrix.n_rows();
         let rows: Vec<u32> = (0..n).filter(|&j| keep(j)).map(|j| j as u32).collect();
@@ -48,11 +48,11 @@ mod metis {
 
     /// Length of the options.
     pub const N_OPTIONS: usize = 40;
-    /// Place of the seed of the random numbers among the options.
+    /// Index of the random seed among the options.
     pub const SEED: usize = 9;
-    /// Place of the first index, 0 or 1.
+    /// Index of the option for the first index, 0 or 1.
     pub const NUMBERING: usize = 18;
-    /// What a call without a fault returns.
+    /// Return value of a successful call.
     pub const OK: c_int = 1;
 
     #[allow(unsafe_code)]
@@ -70,17 +70,17 @@ mod metis {
     }
 }
 
-/// The right to call METIS, which one thread of a process has at a time.
+/// The right to call METIS, which only one thread of a process has at a time.
 ///
-/// METIS draws from C's rand(), seeded at each call: two calls at once would share the sequence and the
-/// order would depend on timing. A process that was forked while another thread of its parent was at it
-/// takes the right over: that thread is not in this process.
+/// METIS uses C's rand(), seeded at each call: two simultaneous calls would share the sequence, and the order
+/// would depend on timing. A process that was forked while another thread of its parent held the right takes it
+/// over, since that thread does not exist in this process.
 #[cfg(feature = "metis")]
 struct Turn;
 
 #[cfg(feature = "metis")]
 impl Turn {
-    /// The process that is at it; 0: none.
+    /// The process that holds it; 0: none.
     const NOBODY: u32 = 0;
 
     fn holder() -> &'static std::sync::atomic::AtomicU32 {
@@ -144,7 +144,7 @@ pub fn nested_dissection(graph: &NodeGraph) -> Result<Option<Vec<u32>>> {
         )
     };
     if status != metis::OK {
-        // The graph is well formed, so memory is all that can fail.
+        // The graph is well formed, so the only possible failure is lack of memory.
         return Err(MtmError::OutOfMemory {
             what: "nested dissection",
             needed_mb: (64 * neighbours.len()) >> 20,
@@ -155,14 +155,14 @@ pub fn nested_dissection(graph: &NodeGraph) -> Result<Option<Vec<u32>>> {
     Ok(Some(order.iter().map(|&j| j as u32).collect()))
 }
 
-/// Without METIS there is no nested dissection; the caller falls back to minimum degree.
+/// Without METIS there is no nested dissection; the caller uses minimum degree instead.
 #[cfg(not(feature = "metis"))]
 pub fn nested_dissection(_graph: &NodeGraph) -> Result<Option<Vec<u32>>> {
     Ok(None)
 }
 
-/// Postorder of a forest given by parents (`usize::MAX` for roots): children before parents, each
-/// subtree together, so that columns of one supernode become neighbours.
+/// Postorder of a forest given by parents (`usize::MAX` for roots): children before parents, each subtree
+/// contiguous, so that columns of one supernode become neighbours.
 pub fn postorder(parents: &[usize]) -> Vec<u32> {
     let n = parents.len();
     let (mut first_child, mut sibling) = (vec![usize::MAX; n], vec![usize::MAX; n]);

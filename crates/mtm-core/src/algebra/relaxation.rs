@@ -1,4 +1,5 @@
-//! The mass-tensor iteration of the literature: each node in turn moves to where its own forces balance.
+//! The mass-tensor iteration of the literature: each node in turn moves to the position where its own forces
+//! balance.
 //!
 //! u_j ← u_j − ω K_jj⁻¹ f_j with f_j = K_jj u_j + Σ_k K_jk u_k − b_j (Cotin et al. 2000; Mollemans et al.
 //! 2007), which is block Gauss–Seidel with over-relaxation ω. Kept for comparison: the number of sweeps
@@ -9,9 +10,9 @@ use nalgebra::Matrix3;
 use crate::algebra::blocks::{Block, BlockMatrix};
 use crate::error::{MtmError, Result, Shortfall};
 
-/// Sweeps over which the contraction of the steps is measured.
+/// Number of sweeps over which the contraction of the steps is measured.
 const WINDOW: usize = 20;
-/// Contraction assumed at most 1 − this, so that the bound stays finite.
+/// The contraction is taken as at most 1 − this, so that the bound stays finite.
 const LEAST_PROGRESS: f64 = 1e-9;
 
 /// Parameters of the iteration.
@@ -21,7 +22,7 @@ pub struct RelaxationOptions {
     pub tolerance: f64,
     /// Over-relaxation ω, 0 < ω < 2; 1 is the plain iteration.
     pub factor: f64,
-    /// Sweeps after which the method gives up.
+    /// Maximum number of sweeps.
     pub max_sweeps: usize,
 }
 
@@ -93,8 +94,8 @@ pub fn relax(
         if step == 0.0 {
             bound = 0.0;
         } else if sweep > WINDOW {
-            // ρ/(1−ρ) times the last step, with ρ the measured contraction. Not a bound: a slow mode that
-            // has hardly moved yet does not show in the steps.
+            // ρ/(1−ρ) times the last step, with ρ the measured contraction. Not a bound: a slow mode that has
+            // hardly moved yet has no effect on the steps.
             let ratio = step / steps[sweep - 1 - WINDOW];
             let contraction = ratio.powf(1.0 / WINDOW as f64).min(1.0 - LEAST_PROGRESS);
             bound = options.factor * step * contraction / (1.0 - contraction);

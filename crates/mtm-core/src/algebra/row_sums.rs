@@ -1,10 +1,10 @@
-//! Sums over the rows of vectors, with the same bits for any number of threads.
+//! Sums over the rows of vectors, bitwise identical for any number of threads.
 
 use rayon::prelude::*;
 
 use crate::algebra::blocks::BlockMatrix;
 
-/// Rows in one partial sum: fixed, so that a dot product has the same bits for any thread count.
+/// Rows in one partial sum: fixed, so that a dot product is bitwise identical for any number of threads.
 pub(crate) const ROWS_PER_SUM: usize = 1024;
 
 /// Runs `f` on a thread of the pool, so that the parallel loops inside start without a hand-over.
@@ -51,7 +51,7 @@ pub(crate) fn dot_and_largest(r: &[[f64; 3]], z: &[[f64; 3]]) -> (f64, f64) {
     (sum, largest.sqrt())
 }
 
-/// Largest Euclidean distance between the rows of `x` and `y`; not a number where one is not.
+/// Largest Euclidean distance between the rows of `x` and `y`; NaN if one of them is.
 pub(crate) fn farthest(x: &[[f64; 3]], y: &[[f64; 3]]) -> f64 {
     let most = |m: f64, d: f64| if d > m || d.is_nan() { d } else { m };
     let partial: Vec<f64> = x

@@ -1,17 +1,17 @@
-//! Kernels compiled twice: for every processor, and for the wide vectors of the one at hand.
+//! Kernels compiled twice: for any processor, and for the wide vectors of the current one.
 //!
-//! A binary for any x86-64 processor may only use vectors of two doubles, and the sparse products here
-//! then wait for arithmetic instead of memory. Both versions are the same sums in the same order, without
-//! fused multiply-adds, so they give the same bits.
+//! A binary for any x86-64 processor may only use vectors of two doubles, and the sparse products here are then
+//! limited by arithmetic instead of memory. Both versions compute the same sums in the same order, without
+//! fused multiply-adds, so their results are bitwise identical.
 
 use pulp::{Arch, Simd, WithSimd};
 
-/// Doubles that the kernels here add at once.
+/// Number of doubles that the kernels here add at once.
 pub(crate) const LANES: usize = 4;
 
-/// A loop over many rows. `run` is to be `#[inline(always)]`, with all it calls in the loop.
+/// A loop over many rows. `run`, and everything it calls in the loop, must be `#[inline(always)]`.
 pub(crate) trait Kernel {
-    /// What the loop leaves.
+    /// Result of the loop.
     type Output;
     /// The loop.
     fn run(self) -> Self::Output;

@@ -2,11 +2,11 @@
 
 use super::symmetric::{DenseFactor, DenseSymmetric, Rough};
 
-/// The flexibility of the tail nodes: everything that sliding nodes do to one another.
+/// The flexibility of the tail nodes: the whole interaction of the sliding nodes.
 pub struct TailFlexibility {
     /// S⁻¹, mm/N.
     flexibility: DenseSymmetric,
-    /// The same for displacements on the way to a rest.
+    /// The same in single precision, for intermediate displacements.
     rough: Rough,
     /// Row of the system of each tail node.
     rows: Vec<u32>,
@@ -30,7 +30,7 @@ impl TailFlexibility {
         self.flexibility.bytes() + self.rough.bytes()
     }
 
-    /// Flexibility of tail node `i` by itself along the unit vector `axis`, mm/N.
+    /// Flexibility of tail node `i` on its own along the unit vector `axis`, mm/N.
     pub fn own(&self, i: usize, axis: [f64; 3]) -> f64 {
         let [c0, c1, c2] = [0, 1, 2].map(|b| self.flexibility.column(3 * i + b));
         let [x, y, z] = axis;
@@ -45,12 +45,12 @@ impl TailFlexibility {
         vectors(&self.flexibility.multiply(forces.as_flattened()))
     }
 
-    /// The same to six digits of the largest, for half the time.
+    /// The same to six digits of the largest, in half the time.
     pub fn respond_roughly(&self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
         vectors(&self.rough.multiply(forces.as_flattened()))
     }
 
-    /// Normal flexibility n_rᵀ S⁻¹_ij n_s of constraint rows: row r holds tail node i = `nodes[r]` along
+    /// Normal flexibility n_rᵀ S⁻¹_ij n_s of constraint rows: row r constrains tail node i = `nodes[r]` along
     /// the unit normal `normals[r]`; a node may have several rows. `softness[r]` (mm/N) is added to the
     /// diagonal.
     pub fn normal_flexibility(
@@ -61,8 +61,8 @@ impl TailFlexibility {
     ) -> DenseSymmetric {
         DenseSymmetric::from_columns(nodes.len(), |c, column| {
             let (j, n_j) = (nodes[c], normals[c]);
-            // S⁻¹ n_j for node j and those after it. The columns begin on the diagonal, and what the
-            // second and third lack of the block there is in the first.
+            // S⁻¹ n_j for node j and those after it. The columns begin on the diagonal, and the part of the
+            // block there that is missing in the second and third is in the first.
             let [c0, c1, c2] = [0, 1, 2].map(|b| self.flexibility.column(3 * j + b));
             let mut along: Vec<f64> = c0.iter().map(|v| v * n_j[0]).collect();
             for (out, v) in along[1..].iter_mut().zip(c1) {

@@ -1,4 +1,4 @@
-//! The matrix that the tests of this folder factor.
+//! The matrix that the tests of this folder factorise.
 
 use crate::algebra::blocks::BlockMatrix;
 

@@ -1,5 +1,5 @@
-//! Sparse Cholesky factorisation of the block system, and the dense factorisations of sliding contact.
-//! The only folder that names faer.
+//! Sparse Cholesky factorisation of the block system, and the dense factorisations of sliding contact. The only
+//! folder that refers to faer.
 
 mod dense;
 #[cfg(test)]
@@ -35,10 +35,10 @@ use crate::error::{MtmError, Result};
 
 /// Relative error of a known solution above which the system counts as singular to working precision.
 const TRIAL_ERROR: f64 = 1e-5;
-/// Which rows are eliminated last, so that their Schur complement is the end of the factor.
+/// Which rows are eliminated last, so that their Schur complement is at the end of the factor.
 pub type Tail<'a> = &'a [u32];
 
-/// Elimination order and structure of the factor: depends on the pattern alone.
+/// Elimination order and structure of the factor: depends only on the sparsity pattern.
 pub struct Symbolic {
     /// Row of the system at each position.
     order: Vec<u32>,
@@ -52,7 +52,7 @@ pub struct Symbolic {
 pub struct Factor {
     symbolic: Arc<Symbolic>,
     values: Vec<f64>,
-    /// Relative error with which a known solution came back.
+    /// Relative error with which a known solution was recovered.
     trial_error: f64,
 }
 
@@ -103,8 +103,8 @@ impl Symbolic {
     /// `NotPositiveDefinite` where a pivot is not positive or a known solution is not recovered.
     pub fn factor(self: &Arc<Self>, matrix: &BlockMatrix) -> Result<Factor> {
         let bytes = self.factor_bytes();
-        // Asked for first, so that too little memory is an error and not an abort; then taken zeroed
-        // from the system, which touches each page once.
+        // Requested first, so that too little memory is an error and not an abort; then allocated zeroed from
+        // the system, which touches each page once.
         Vec::<f64>::new()
             .try_reserve_exact(self.structure.len_val())
             .map_err(|_| out_of_memory("the Cholesky factor", bytes))?;
@@ -163,17 +163,17 @@ impl Factor {
         self.symbolic.unpermuted(x)
     }
 
-    /// What the given rows of the system reach in the factor.
+    /// The part of the factor that the given rows of the system reach.
     pub fn reach(&self, rows: &[u32]) -> Reach {
         let position = structure::positions(&self.symbolic.order);
         let places = rows.iter().map(|&row| 3 * position[row as usize] as usize).collect();
         Reach::new(&self.symbolic.structure, places)
     }
 
-    /// The factor after it recovered a known solution.
+    /// The factor, after it has recovered a known solution.
     ///
-    /// The residual of a solve does not tell its error; a solution that is known does, at the price of
-    /// one product and one solve per factor.
+    /// The residual of a solve is not a measure of its error; a known solution is, at the price of one product
+    /// and one solve per factorisation.
     fn tried(mut self, matrix: &BlockMatrix) -> Result<Self> {
         let known: Vec<[f64; 3]> = (0..self.symbolic.order.len())
             .map(|j| [0, 1, 2].map(|i| 1.0 + 0.5 * ((3 * j + i) as f64 * 0.7).sin()))
@@ -199,7 +199,7 @@ impl Factor {
         })
     }
 
-    /// Smallest share of its diagonal entry that a pivot keeps, and its row.
+    /// The smallest pivot relative to its diagonal entry, and its row.
     fn smallest_pivot(&self, matrix: &BlockMatrix) -> (f64, usize) {
         let l = supernodal::SupernodalLltRef::new(&self.symbolic.structure, &self.values);
         let (mut worst, mut at) = (f64::INFINITY, 0);
@@ -262,8 +262,8 @@ impl Factor {
         Sweep::new((&self.symbolic.structure, &self.values), &self.symbolic.tree)
     }
 
-    /// Forces on the tail rows that `b` is to them once all others are eliminated, and what is left of the
-    /// elimination for [`Self::above_tail`].
+    /// Forces on the tail rows to which `b` reduces once all others are eliminated, and the remaining data of
+    /// the elimination for [`Self::above_tail`].
     pub fn on_tail(&self, b: &[[f64; 3]]) -> (Vec<[f64; 3]>, Vec<f64>) {
         let (mut x, first) = (self.symbolic.permuted(b), self.symbolic.first_of_tail());
         self.sweep().forward_to(first, &mut x);
@@ -313,8 +313,8 @@ impl Factor {
         reach.clear(&self.symbolic.structure, work);
     }
 
-    /// Flexibility of the rows of `reach` along a unit normal each, mm/N, and the row of the set that each
-    /// of its rows is.
+    /// Flexibility of the rows of `reach` along a unit normal each, mm/N, and for each of its rows the row of
+    /// the set.
     pub fn reach_flexibility(
         &self,
         reach: &Reach,

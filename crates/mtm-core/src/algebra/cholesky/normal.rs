@@ -1,48 +1,48 @@
 //! Contact forces under normals that change from one solve to the next.
 //!
-//! The normal flexibility Nᵀ S⁻¹ N of a solve differs from that of an earlier one by how far the normals
-//! turned in between: conjugate gradients that the earlier one preconditions need a few products. Each
-//! brings the displacements along, so that the matrix need not be written down.
+//! The normal flexibility Nᵀ S⁻¹ N of a solve differs from that of an earlier one only by the rotation of the
+//! normals in between: conjugate gradients preconditioned with the earlier one need a few products. Each
+//! product also gives the displacements, so that the matrix need not be assembled.
 //!
-//! Products may be rough: what they leave open shows in one that is not, from where the steps go on
+//! Products may be approximate: their error is detected by an exact product, from which the steps continue
 //! (iterative refinement; Wilkinson 1963).
 
 use super::symmetric::{DenseFactor, DenseSymmetric, Rough, dot};
 
-/// Steps after which a new factor is cheaper than more of them.
+/// Number of steps after which a new factorisation is cheaper than further steps.
 const MOST_STEPS: usize = 12;
-/// Steps that tell how many it will take: later ones gain no less.
+/// Number of steps from which the total is predicted: later steps converge at least as fast.
 const TRIAL_STEPS: usize = 5;
-/// Share of the residual that rough products may be trusted to reach.
+/// Share of the residual down to which approximate products are trusted.
 pub const ROUGH: f64 = 1e-6;
-/// Row of the kept factor that a constraint has none in.
+/// Marks a constraint that has no row in the kept factorisation.
 const NO_ROW: u32 = u32::MAX;
 
-/// A constraint row: tail node, and how many rows of the same node stand before it.
+/// A constraint row: tail node, and how many rows of the same node precede it.
 pub type RowKey = (usize, usize);
 
-/// What answers for the normal flexibility of some constraint rows, and for others like them.
+/// A solver for the normal flexibility of some constraint rows, and a preconditioner for similar ones.
 pub struct NormalFactor {
     answer: Answer,
     keys: Vec<RowKey>,
 }
 
-/// How a right-hand side is answered.
+/// How a right-hand side is solved for.
 enum Answer {
-    /// By the factor: soon made.
+    /// By the factor: cheap to compute.
     Factor(DenseFactor),
-    /// By the inverse, to single precision: soon applied.
+    /// By the inverse, in single precision: cheap to apply.
     Inverse(Rough),
 }
 
 impl NormalFactor {
-    /// The factor of `flexibility`, whose rows are `keys`; the first row without a positive pivot on
-    /// failure.
+    /// The factorisation of `flexibility`, whose rows are `keys`; on failure, the first row without a positive
+    /// pivot.
     pub fn new(flexibility: DenseSymmetric, keys: Vec<RowKey>) -> Result<Self, usize> {
         Ok(Self { answer: Answer::Factor(flexibility.factor()?), keys })
     }
 
-    /// The same by its inverse, for many right-hand sides: to single precision, as is enough for a
+    /// The same by its inverse, for many right-hand sides: in single precision, which is enough for a
     /// [`Preconditioner`].
     pub fn inverse(self) -> Self {
         let answer = match self.answer {
@@ -60,7 +60,7 @@ impl NormalFactor {
         }
     }
 
-    /// A⁻¹ b of the matrix that was factored.
+    /// A⁻¹ b of the matrix that was factorised.
     pub fn solve(&self, mut b: Vec<f64>) -> Vec<f64> {
         match &self.answer {
             Answer::Factor(factor) => {
@@ -72,7 +72,7 @@ impl NormalFactor {
     }
 }
 
-/// How exact a product is to be.
+/// Accuracy of a product.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Precision {
     /// To six digits.
@@ -81,71 +81,71 @@ pub enum Precision {
     Exact,
 }
 
-/// What forces along the rows do.
+/// The effect of forces along the rows.
 pub struct Moved {
     /// Displacement along each row, mm.
     pub along: Vec<f64>,
     /// Displacement of every node, mm.
     pub nodes: Vec<[f64; 3]>,
-    /// How exact they are.
+    /// Accuracy of the displacements.
     pub precision: Precision,
 }
 
-/// Where conjugate gradients begin.
+/// Starting point of conjugate gradients.
 pub struct Begun {
     /// Force of each row.
     pub forces: Vec<f64>,
-    /// What they do.
+    /// Their effect.
     pub moved: Moved,
 }
 
-/// Forces along the rows, N, and what they do.
+/// Forces along the rows, N, and their effect.
 pub struct NormalForces {
     /// Force of each row.
     pub forces: Vec<f64>,
     /// Displacement of every node under them, mm.
     pub nodes: Vec<[f64; 3]>,
-    /// How exact these displacements are.
+    /// Accuracy of these displacements.
     pub precision: Precision,
     /// Whether the forces are [`Wanted::exact`] under exact products.
     pub solved: bool,
 }
 
-/// How good a solution is to be.
+/// Accuracy required of a solution.
 #[derive(Clone, Copy)]
 pub struct Wanted {
-    /// Relative error in the energy norm that is as good as none.
+    /// Relative error in the energy norm at which the solution counts as exact.
     pub exact: f64,
-    /// Measure of the residual, see [`Preconditioner::measure`], that will do for now; 0 where none does.
+    /// Norm of the residual, see [`Preconditioner::measure`], that suffices for now; 0 if none does.
     pub enough: f64,
 }
 
-/// How far conjugate gradients have come.
+/// Progress of conjugate gradients.
 pub struct Progress {
     /// Steps done.
     pub step: usize,
-    /// Measure of the residual over that at the start.
+    /// Norm of the residual relative to that at the start.
     pub fallen: f64,
     /// Relative error in the energy norm.
     pub error: f64,
-    /// The error at which they end.
+    /// The error at which the iteration ends.
     pub goal: f64,
 }
 
-/// Whether more steps cost more than a factor, judged by how the error has fallen so far.
+/// Whether further steps cost more than a factorisation, judged by the decrease of the error so far.
 pub fn hopeless(progress: &Progress) -> bool {
     let Progress { step, fallen, error, goal } = *progress;
     let rest = (MOST_STEPS as f64 - step as f64) / step.max(1) as f64;
     step >= MOST_STEPS || step >= TRIAL_STEPS && error * fallen.powf(rest) > goal
 }
 
-/// x with A x = `goals` by conjugate gradients from `begun`.
+/// x with A x = `goals` by conjugate gradients, starting from `begun`.
 ///
-/// `product`: what forces along the rows do, A x along them.
+/// `product`: the effect of forces along the rows, including A x along them.
 ///
 /// # Errors
-/// The relative error in the energy norm that was left where `give_up` held, or where `product` proved
-/// not to be that of a positive definite matrix.
+/// The remaining relative error in the energy norm, if `give_up` held, or if `product` proved not to be that of
+/// a positive definite matrix.
 pub fn conjugate_gradients(
     mut product: impl FnMut(&[f64], Precision) -> Moved,
     preconditioner: &Preconditioner<'_>,
@@ -163,7 +163,7 @@ pub fn conjugate_gradients(
     let (first, mut renewed, mut step) = (rz, rz, 0);
     let mut enough = wanted.enough;
     loop {
-        // xᵀA x = xᵀ(g − r): how large the solution is in the same norm.
+        // xᵀA x = xᵀ(g − r): the size of the solution in the same norm.
         let size: f64 = x.iter().zip(goals.iter().zip(&r)).map(|(x, (g, r))| x * (g - r)).sum();
         let error = (rz / size).sqrt();
         let solved = rz == 0.0 || error <= wanted.exact;
@@ -182,7 +182,8 @@ pub fn conjugate_gradients(
             z = preconditioner.apply(&r);
             rz = dot(&r, &z);
             renewed = rz;
-            // So near the end it is not left for another set of normals.
+            // This close to the end, the solution is completed instead of continuing with another set of
+            // normals.
             enough = 0.0;
             p.clone_from(&z);
             continue;
@@ -213,16 +214,16 @@ pub fn conjugate_gradients(
     }
 }
 
-/// The kept factor on the rows it has, the diagonal on the others: positive definite for any rows.
+/// The kept factorisation on the rows it contains, the diagonal on the others: positive definite for any rows.
 pub struct Preconditioner<'a> {
     kept: &'a NormalFactor,
-    /// Row of the factor that stands for each row of the matrix.
+    /// Row of the factorisation that corresponds to each row of the matrix.
     row: Vec<u32>,
     diagonal: Vec<f64>,
 }
 
 impl<'a> Preconditioner<'a> {
-    /// `kept` on those of `keys` that it has, `diagonal` (above 0) on the others.
+    /// `kept` on those of `keys` that it contains, `diagonal` (above 0) on the others.
     pub fn new(diagonal: Vec<f64>, keys: &[RowKey], kept: &'a NormalFactor) -> Self {
         let mut places: Vec<(RowKey, u32)> =
             kept.keys.iter().enumerate().map(|(row, &key)| (key, row as u32)).collect();
@@ -234,7 +235,7 @@ impl<'a> Preconditioner<'a> {
         Self { kept, row, diagonal }
     }
 
-    /// About A⁻¹ r, and its measure √(rᵀz).
+    /// Approximation of A⁻¹ r, and its norm √(rᵀz).
     pub fn measure(&self, r: &[f64]) -> (Vec<f64>, f64) {
         let z = self.apply(r);
         let measure = dot(r, &z).sqrt();
@@ -261,8 +262,8 @@ mod tests {
     use super::*;
     use nalgebra::{DMatrix, DVector};
 
-    /// Flexibility of points on a line that fades with their distance, each pushed along a direction in
-    /// the plane that has turned by `turn`: what a normal flexibility looks like.
+    /// Flexibility of points on a line that decays with their distance, each pushed along a direction in the
+    /// plane that is rotated by `turn`: similar to a normal flexibility.
     fn turned(n: usize, turn: f64) -> DMatrix<f64> {
         let angle = |i: usize| turn * (0.5 + 0.5 * (i as f64 * 0.3).sin());
         DMatrix::from_fn(n, n, |i, j| {
@@ -283,10 +284,10 @@ mod tests {
         (0..n).map(|i| (i, 0)).collect()
     }
 
-    /// As exact as contact asks for at its end, and more.
+    /// At least as exact as contact requires at its end.
     const EXACT: Wanted = Wanted { exact: 1e-12, enough: 0.0 };
 
-    /// Forces by conjugate gradients from zero that `kept` preconditions.
+    /// Forces by conjugate gradients from zero, preconditioned with `kept`.
     fn found(
         now: &DMatrix<f64>,
         keys: &[RowKey],
@@ -311,8 +312,8 @@ mod tests {
         conjugate_gradients(product, &preconditioner, goals, begun, wanted, hopeless)
     }
 
-    /// Rows that the kept factor has, rows it lacks, and rows that have gone: the dense solution each time,
-    /// and the displacements that it makes.
+    /// Rows that the kept factorisation contains, rows that it lacks, and rows that have been removed: each
+    /// time the dense solution, and the displacements that follow from it.
     #[test]
     fn forces_by_another_factor_equal_the_dense_ones() {
         let n = 60;
@@ -342,7 +343,7 @@ mod tests {
         }
     }
 
-    /// What will do for now is not exact, and says so; its residual is as small as was asked.
+    /// A solution that suffices for now is not exact, and is marked so; its residual is as small as requested.
     #[test]
     fn forces_are_as_good_as_wanted() {
         let n = 60;
@@ -357,7 +358,7 @@ mod tests {
         assert!(!found.solved && measure <= 1.001 * wanted.enough, "{measure:e}");
     }
 
-    /// A factor that is no help is given up; one made anew answers, as its inverse does.
+    /// An unsuitable factorisation is given up; a new one solves the system, as does its inverse.
     #[test]
     fn factor_that_does_not_help_is_given_up() {
         let n = 60;

@@ -1,9 +1,9 @@
-//! Numeric factorisation, multifrontal (Duff & Reid 1983): each supernode gathers its part of the matrix
-//! and what its children leave, factors its columns densely, and passes the rest to its parent.
+//! Numeric factorisation, multifrontal (Duff & Reid 1983): each supernode gathers its part of the matrix and
+//! the updates of its children, factorises its columns densely, and passes the rest to its parent.
 //!
-//! Independent subtrees run on different threads with sequential dense kernels; the few large fronts
-//! at the top, where nothing else is left to do, use all threads in their kernels. Children are added in
-//! a fixed order, so the bits do not depend on the number of threads.
+//! Independent subtrees run on different threads with sequential dense kernels; the few large fronts at the
+//! top, where no other work is left, use all threads in their kernels. Children are added in a fixed order, so
+//! the result is bitwise identical for any number of threads.
 
 use std::ops::Range;
 
@@ -19,9 +19,9 @@ use crate::algebra::blocks::BlockMatrix;
 
 /// Multiplications below which a subtree is not worth another thread.
 const LEAST_WORK_FOR_A_THREAD: f64 = 2e7;
-/// Share of the work that the lesser side must have: it bounds the depth of the sharing.
+/// Minimum share of the work on the smaller side: it bounds the depth of the sharing.
 const LEAST_SHARE_FOR_A_THREAD: f64 = 0.05;
-/// Rows of a front from which its dense kernels gain from threads.
+/// Number of rows from which the dense kernels of a front benefit from threads.
 const LEAST_ROWS_FOR_THREADS: usize = 384;
 
 /// Elimination tree of the supernodes.
@@ -33,7 +33,7 @@ pub struct Tree {
     work: Vec<f64>,
     /// Roots among the supernodes before the tail, ascending.
     pub(super) roots: Vec<usize>,
-    /// First supernode that holds a tail column: from there on the order is no postorder.
+    /// First supernode that holds a tail column: from there on the order is not a postorder.
     pub(super) tail: usize,
 }
 
@@ -70,7 +70,8 @@ impl Tree {
     }
 }
 
-/// What a supernode leaves to its parent: the lower triangle of a square by columns, rows of its pattern.
+/// The update that a supernode passes to its parent: the lower triangle of a square by columns, rows of its
+/// pattern.
 type Update = (usize, Vec<f64>);
 
 struct Work<'a> {
@@ -81,7 +82,7 @@ struct Work<'a> {
     position: Vec<u32>,
 }
 
-/// Fills `values` (zeros) with the factor; the column of the first pivot that is not positive on failure.
+/// Fills `values` (zeros) with the factor; on failure, the column of the first pivot that is not positive.
 pub fn factor(
     structure: &SymbolicSupernodalCholesky<usize>,
     tree: &Tree,
@@ -106,8 +107,8 @@ pub fn factor(
 }
 
 impl Work<'_> {
-    /// Factors the subtrees of `roots`, whose values begin with those of supernode `first`; what each
-    /// leaves, in order.
+    /// Factorises the subtrees of `roots`, whose values begin with those of supernode `first`; returns their
+    /// updates, in order.
     fn subtrees(
         &self,
         roots: &[usize],
@@ -138,8 +139,8 @@ impl Work<'_> {
         Ok(updates)
     }
 
-    /// How many of `roots` to hand to one thread so that two are busy alike; nothing where the lesser
-    /// share is not worth a thread.
+    /// How many of `roots` to give to one thread so that two have the same amount of work; nothing if the
+    /// smaller share is not worth a thread.
     fn cut(&self, roots: &[usize]) -> Option<usize> {
         let work: f64 = roots.iter().map(|&r| self.tree.work[r]).sum();
         let (mut cut, mut done) = (0, 0.0);
@@ -151,12 +152,12 @@ impl Work<'_> {
         (lesser > LEAST_WORK_FOR_A_THREAD.max(LEAST_SHARE_FOR_A_THREAD * work)).then_some(cut)
     }
 
-    /// Factors the subtree of `root`, whose values begin with those of supernode `first`; what it leaves
+    /// Factorises the subtree of `root`, whose values begin with those of supernode `first`; returns its update
     /// to its parent.
     ///
-    /// The subtree is a run of supernodes in postorder: it is walked in a loop, with what is left on a
-    /// stack, but for the one place below its heaviest branch where two threads can share it. So the
-    /// depth of the recursion is that of the sharing, not of the tree.
+    /// The subtree is a run of supernodes in postorder. It is processed in a loop, with the pending updates on
+    /// a stack, except at the one place below its heaviest branch where two threads can share it. The depth of
+    /// the recursion is therefore that of the sharing, not of the tree.
     fn subtree(
         &self,
         root: usize,
@@ -193,7 +194,7 @@ impl Work<'_> {
         Ok(updates.pop().map(|(_, update)| update).unwrap_or_default())
     }
 
-    /// Factors the columns of supernode `s` into `own`; the update of its pattern.
+    /// Factorises the columns of supernode `s` into `own`; returns the update of its pattern.
     fn supernode(
         &self,
         s: usize,
@@ -267,8 +268,8 @@ impl Work<'_> {
                 };
                 for axis in 0..3 {
                     let column = &mut own[(3 * p + axis - begin) * rows..][..rows];
-                    // The stored block is (p, q); the front wants its transpose at (q, p). On the
-                    // diagonal only the part on and below it.
+                    // The stored block is (p, q); the front needs its transpose at (q, p). On the diagonal only
+                    // the part on and below it.
                     let from = if q == p { axis } else { 0 };
                     for a in from..3 {
                         column[at + a] += block[3 * axis + a];
@@ -279,7 +280,7 @@ impl Work<'_> {
     }
 }
 
-/// Where the rows of a child's pattern stand in its parent's front, as runs of neighbours.
+/// Positions of the rows of a child's pattern in its parent's front, as runs of neighbours.
 struct Runs {
     /// First row of the child, first row of the front, length.
     runs: Vec<(usize, usize, usize)>,

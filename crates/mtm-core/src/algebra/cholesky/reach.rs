@@ -1,8 +1,9 @@
 //! Sweeps through the part of the factor that a few rows reach: their columns and all ancestors in the
 //! elimination tree (Gilbert & Peierls 1988).
 //!
-//! A force on those rows changes L⁻¹ b there alone, and their displacements depend on nothing else. So
-//! forces on sliding nodes become displacements of sliding nodes without the rest of the body.
+//! A force on those rows changes L⁻¹ b only there, and their displacements depend on nothing else.
+//! Displacements of sliding nodes under forces on sliding nodes can therefore be computed without the rest of
+//! the body.
 
 use faer::linalg::matmul::matmul;
 use faer::linalg::matmul::triangular::{self, BlockStructure};
@@ -13,7 +14,7 @@ use faer::{Accum, Mat, MatMut, MatRef, Par};
 use super::sweep::{Columns, Split, Supernode};
 use super::symmetric::DenseSymmetric;
 
-/// Entries of a product from which its dense kernels gain from threads.
+/// Entries of a product from which its dense kernels benefit from threads.
 const LEAST_WORK_FOR_THREADS: usize = 1 << 22;
 
 /// The supernodes that a set of rows reaches, in elimination order.
@@ -59,14 +60,14 @@ impl Reach {
         self.places.iter().map(|&p| [x[p], x[p + 1], x[p + 2]]).collect()
     }
 
-    /// Zeros in `x` wherever the rows of the set reach.
+    /// Sets `x` to zero wherever the rows of the set reach.
     pub fn clear(&self, structure: &SymbolicSupernodalCholesky<usize>, x: &mut [f64]) {
         for &s in &self.supernodes {
             x[structure.supernode_begin()[s]..structure.supernode_end()[s]].fill(0.0);
         }
     }
 
-    /// x ← L⁻¹ x where x is zero but for the rows of the set.
+    /// x ← L⁻¹ x for an x that is zero except at the rows of the set.
     pub fn forward(&self, l: Columns<'_>, x: &mut [f64]) {
         let base = x.len();
         let (mut x, mut front) = (Split { own: x, origin: 0, above: &mut [][..], base }, vec![]);
@@ -84,11 +85,11 @@ impl Reach {
         }
     }
 
-    /// Flexibility n_iᵀ A⁻¹ n_j of the rows of the set along one unit normal each, mm/N, and the row of
-    /// the set that each of its rows is.
+    /// Flexibility n_iᵀ A⁻¹ n_j of the rows of the set along one unit normal each, mm/N, and for each of its
+    /// rows the row of the set.
     ///
-    /// With Y = L⁻¹ N it is YᵀY. In elimination order the columns of Y that a supernode's subtree holds
-    /// are a run, so each supernode works on a dense block and hands what is left to its parent.
+    /// With Y = L⁻¹ N it is YᵀY. In elimination order the columns of Y in a supernode's subtree are contiguous,
+    /// so each supernode works on a dense block and passes the rest to its parent.
     pub fn normal_flexibility(
         &self,
         l: Columns<'_>,
@@ -155,7 +156,7 @@ impl Reach {
     }
 }
 
-/// What a supernode leaves to its parent: columns from `first` on, on the rows of its pattern.
+/// The update that a supernode passes to its parent: columns from `first` on, on the rows of its pattern.
 struct Left {
     supernode: usize,
     first: usize,
@@ -172,8 +173,8 @@ fn supernode_of(structure: &SymbolicSupernodalCholesky<usize>) -> Vec<usize> {
     of
 }
 
-/// Where the rows of a child's pattern stand in the front of its parent: `width` columns from `begin`,
-/// then `pattern`, which holds the rest of them.
+/// Positions of the rows of a child's pattern in the front of its parent: `width` columns from `begin`, then
+/// `pattern`, which holds the rest of them.
 fn places_in(child: &[usize], begin: usize, width: usize, pattern: &[usize]) -> Vec<usize> {
     let mut at = 0;
     let place = |&row: &usize| {
@@ -217,7 +218,7 @@ mod tests {
                 assert!((whole[row as usize][i] - v[i]).abs() <= 1e-13 * largest);
             }
         }
-        // The workspace comes back as it was lent.
+        // The workspace is returned unchanged.
         assert!(x.iter().all(|&v| v == 0.0));
     }
 

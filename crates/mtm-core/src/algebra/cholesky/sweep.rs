@@ -1,8 +1,8 @@
 //! Sweeps of one column through the factor: x ← L⁻¹ x and x ← L⁻ᵀ x.
 //!
-//! One column waits for the factor to be read, which two threads do faster than one: independent subtrees
-//! of the elimination tree run side by side. Which do is decided by the structure alone, and what they
-//! bring to their ancestors is added in a fixed order: the bits do not depend on the number of threads.
+//! The time for one column is that of reading the factor, which two threads do faster than one: independent
+//! subtrees of the elimination tree run in parallel. Only the structure decides which, and their contributions
+//! to their ancestors are added in a fixed order, so the result is bitwise identical for any number of threads.
 
 use faer::sparse::linalg::cholesky::supernodal::SymbolicSupernodalCholesky;
 
@@ -15,7 +15,7 @@ pub type Columns<'a> = (&'a SymbolicSupernodalCholesky<usize>, &'a [f64]);
 
 /// Entries of the factor below which a subtree is not worth another thread: 4 MB, a third of a millisecond.
 const LEAST_ENTRIES_FOR_A_THREAD: usize = 1 << 19;
-/// The same as a share of the factor: it bounds the copies of what lies above the subtrees.
+/// The same as a share of the factor: it limits the copies of what lies above the subtrees.
 const LEAST_SHARE_FOR_A_THREAD: f64 = 1.0 / 16.0;
 
 /// One supernode: its columns of L, and the rows below them.
@@ -24,11 +24,11 @@ pub struct Supernode<'a> {
     pub begin: usize,
     /// Number of columns.
     pub width: usize,
-    /// How many of them, from the first on, sweeps take.
+    /// How many of them, from the first on, sweeps use.
     swept: usize,
     /// Rows below the columns, ascending.
     pub pattern: &'a [usize],
-    /// Columns of `rows()` entries; what stands above the diagonal is not read.
+    /// Columns of `rows()` entries; entries above the diagonal are not read.
     pub values: &'a [f64],
 }
 
@@ -56,8 +56,8 @@ impl<'a> Supernode<'a> {
         self.width + self.pattern.len()
     }
 
-    /// Eliminates its columns from x; where they are zero nothing is read, so that a right-hand side of few
-    /// rows costs what these reach (Gilbert & Peierls 1988).
+    /// Eliminates its columns from x; columns in which x is zero are not read, so that the cost of a sparse
+    /// right-hand side is that of the part it reaches (Gilbert & Peierls 1988).
     pub fn forward(&self, x: &mut Split<'_, &mut [f64]>, front: &mut Vec<f64>) {
         let own = self.begin - x.origin;
         if x.own[own..own + self.swept].iter().all(|&v| v == 0.0) {
@@ -77,7 +77,7 @@ impl<'a> Supernode<'a> {
         }
     }
 
-    /// Substitutes what is known above back into its columns of x.
+    /// Substitutes the values known above back into its columns of x.
     pub fn backward(&self, x: &mut Split<'_, &[f64]>, front: &mut Vec<f64>) {
         let own = self.begin - x.origin;
         front.clear();
@@ -91,20 +91,20 @@ impl<'a> Supernode<'a> {
     }
 }
 
-/// The part of x that one thread has: a run of columns from `origin` on, and those from `base` on, which
+/// The part of x that belongs to one thread: a run of columns from `origin` on, and those from `base` on, which
 /// other threads see as well.
 pub struct Split<'a, Above> {
     /// The run.
     pub own: &'a mut [f64],
     /// Column of its first entry.
     pub origin: usize,
-    /// Forward: what the run brings to the columns above. Backward: their values.
+    /// Forward: contribution of the run to the columns above. Backward: their values.
     pub above: Above,
     /// Column of the first entry of `above`.
     pub base: usize,
 }
 
-/// front ← what the first columns leave of it, and what they bring to the rows below.
+/// Forward step of a front: its first columns, and their contribution to the rows below.
 struct Eliminate<'a> {
     values: &'a [f64],
     columns: usize,
@@ -170,8 +170,8 @@ impl<'a> Sweep<'a> {
         self.backward_from(self.l.0.nrows(), x);
     }
 
-    /// Eliminates the columns before `end`, the first of the tail or past the last: what it leaves from
-    /// there on is the right-hand side of their Schur complement.
+    /// Eliminates the columns before `end`, which is the first of the tail or past the last: the remaining
+    /// part, from `end` on, is the right-hand side of their Schur complement.
     pub fn forward_to(&self, end: usize, x: &mut [f64]) {
         let (n, base) = (self.l.0.nrows(), self.base());
         let (inner, rest) = x.split_at_mut(base);
@@ -184,7 +184,7 @@ impl<'a> Sweep<'a> {
         }
     }
 
-    /// Columns before `end`, as in [`Self::forward_to`], from those that are known from there on.
+    /// Columns before `end`, as in [`Self::forward_to`], computed from the known ones from there on.
     pub fn backward_from(&self, end: usize, x: &mut [f64]) {
         let (n, base) = (self.l.0.nrows(), self.base());
         let (inner, rest) = x.split_at_mut(base);
@@ -196,13 +196,13 @@ impl<'a> Sweep<'a> {
         self.backward_below(&self.tree.roots, inner, rest, base);
     }
 
-    /// First column of the supernodes that hold the tail; past the last where there is none.
+    /// First column of the supernodes that hold the tail; past the last column if there is no tail.
     fn base(&self) -> usize {
         let begin = self.l.0.supernode_begin();
         begin.get(self.tree.tail).copied().unwrap_or(self.l.0.nrows())
     }
 
-    /// Supernodes that hold the tail, as far as they begin before column `end`.
+    /// Supernodes that hold the tail, up to column `end`.
     fn tail_before(&self, end: usize) -> impl DoubleEndedIterator<Item = Supernode<'a>> {
         let begin = &self.l.0.supernode_begin()[self.tree.tail..];
         let count = begin.partition_point(|&b| b < end);
@@ -210,8 +210,8 @@ impl<'a> Sweep<'a> {
         (self.tree.tail..self.tree.tail + count).map(move |s| Supernode::new(l, s).before(end))
     }
 
-    /// Forward through the subtrees of `roots`, whose columns are `own`; what they bring to the columns
-    /// from `base` on.
+    /// Forward through the subtrees of `roots`, whose columns are `own`; returns their contribution to the
+    /// columns from `base` on.
     fn forward_below(&self, roots: &[usize], own: &mut [f64], base: usize) -> Vec<f64> {
         let (n, begin) = (self.l.0.nrows(), self.l.0.supernode_begin());
         let (Some(&first), Some(&last)) = (roots.first(), roots.last()) else {
@@ -269,7 +269,7 @@ impl<'a> Sweep<'a> {
             Supernode::new(self.l, s).backward(&mut x, &mut front);
             next = s;
             if shared == Some(s) {
-                // Siblings between the run and the base are nobody's ancestors in it.
+                // Siblings between the run and the base are not ancestors of any column in the run.
                 let (below, rest) = own.split_at_mut(begin[s] - origin);
                 let mut known = rest.to_vec();
                 known.resize(base - begin[s], 0.0);
@@ -287,8 +287,8 @@ impl<'a> Sweep<'a> {
         start[root + 1] - start[self.tree.first[root]]
     }
 
-    /// How many of `roots` to hand to one thread so that two are busy alike; nothing where the lesser
-    /// share is not worth a thread.
+    /// How many of `roots` to give to one thread so that two have the same amount of work; nothing if the
+    /// smaller share is not worth a thread.
     fn cut(&self, roots: &[usize]) -> Option<usize> {
         let all: usize = roots.iter().map(|&r| self.entries(r)).sum();
         let (mut cut, mut done) = (0, 0);
@@ -326,8 +326,8 @@ mod tests {
     use super::super::{Symbolic, grid::grid};
     use super::Sweep;
 
-    /// One column shared by 1, 2 and 3 threads: the same bits, and the answer of several columns at once; on
-    /// right-hand sides of all rows and of few, with rows kept last and without.
+    /// One column shared by 1, 2 and 3 threads: bitwise identical, and equal to the result for several columns
+    /// at once; for dense and sparse right-hand sides, with and without rows kept last.
     #[test]
     fn sweeps_equal_those_of_several_columns_for_any_number_of_threads() {
         let n = 40;
@@ -360,7 +360,8 @@ mod tests {
         }
     }
 
-    /// What reaches the rows kept last, through their flexibility, and back to the rest: the whole solution.
+    /// The forward sweep to the rows kept last, their flexibility, and the backward sweep give the whole
+    /// solution.
     #[test]
     fn sweeps_to_the_tail_and_back_equal_whole_ones() {
         let n = 40;

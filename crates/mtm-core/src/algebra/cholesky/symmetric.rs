@@ -1,4 +1,4 @@
-//! Dense symmetric matrices by their lower triangle: product with a vector, and Cholesky factor.
+//! Dense symmetric matrices stored as their lower triangle: product with a vector, and Cholesky factor.
 
 use std::iter::Sum;
 use std::ops::{AddAssign, Mul, Range};
@@ -13,16 +13,18 @@ use rayon::prelude::*;
 use super::workspace::parallelism;
 use crate::algebra::simd::{Kernel, LANES, widest};
 
-/// Parts of a product that threads may share: fixed, so that the bits do not depend on the threads.
+/// Number of parts of a product that threads may share: fixed, so that the result does not depend on the number
+/// of threads.
 const PARTS: usize = 16;
-/// Rows below which a product is not worth sharing.
+/// Number of rows below which a product is not worth sharing.
 const ROWS_TO_SHARE: usize = 512;
-/// Columns that a product takes at once: one by one it would wait for its own vectors more than for the matrix.
+/// Columns that a product processes at once: one by one, it would spend more time on its vectors than on the
+/// matrix.
 const COLUMNS_AT_ONCE: usize = 4;
-/// Sums that run side by side in a scalar product: the width of two vector registers.
+/// Independent sums in a scalar product: the width of two vector registers.
 const SUMS: usize = 8;
 
-/// Numbers of a product: doubles, or floats where reading half as much counts for more.
+/// Number type of a product: doubles, or floats if reading half as much matters more.
 pub trait Number: Copy + Default + Send + Sync + AddAssign + Mul<Output = Self> + Sum {
     /// Runs [`DotsAndAdd`] in as many lanes as a register has.
     fn dots_and_add(pass: DotsAndAdd<'_, Self>) -> [Self; COLUMNS_AT_ONCE];
@@ -43,7 +45,7 @@ impl Number for f32 {
 /// Dense symmetric matrix, lower triangle by columns.
 pub struct DenseSymmetric<T = f64> {
     size: usize,
-    /// Column by column, `size` each; what stands above the diagonal is not read.
+    /// Column by column, `size` each; entries above the diagonal are not read.
     values: Vec<T>,
 }
 
@@ -54,8 +56,8 @@ pub struct DenseFactor {
 }
 
 impl DenseSymmetric {
-    /// The matrix of `size` rows whose columns `fill` writes from the diagonal down, in parallel: it gets
-    /// the column's number and its zeros.
+    /// The matrix of `size` rows whose columns `fill` writes from the diagonal down, in parallel: `fill`
+    /// receives the column index and a slice of zeros.
     pub fn from_columns(size: usize, fill: impl Fn(usize, &mut [f64]) + Sync) -> Self {
         let mut values = vec![0.0; size * size];
         values
@@ -75,7 +77,7 @@ impl DenseSymmetric {
         self.size
     }
 
-    /// The Cholesky factor; the row of the first pivot that is not positive on failure.
+    /// The Cholesky factor; on failure, the row of the first pivot that is not positive.
     pub fn factor(self) -> Result<DenseFactor, usize> {
         let Self { size: n, mut values } = self;
         if n == 0 {
@@ -116,7 +118,7 @@ impl<T: Number> DenseSymmetric<T> {
             self.add_columns(0..n, x, &mut y);
             return y;
         }
-        // Column c holds n − c entries: parts of equal area end where (n − c)² falls evenly.
+        // Column c holds n − c entries: parts of equal area end where (n − c)² decreases in equal steps.
         let end = |part: usize| {
             let left = (PARTS - part) as f64 / PARTS as f64;
             n - (n as f64 * left.sqrt()).round() as usize
@@ -139,7 +141,7 @@ impl<T: Number> DenseSymmetric<T> {
         y
     }
 
-    /// Adds what `columns` bring to A x; `x` and `y` begin at the first of them.
+    /// Adds the contribution of `columns` to A x; `x` and `y` begin at the first of them.
     fn add_columns(&self, columns: Range<usize>, x: &[T], y: &mut [T]) {
         let (first, mut c) = (columns.start, columns.start);
         while c + COLUMNS_AT_ONCE <= columns.end {
@@ -176,7 +178,7 @@ impl<T: Number> DenseSymmetric<T> {
 
 /// A positive definite matrix in single precision: half as much to read.
 pub struct Rough {
-    /// With ones on the diagonal: its numbers fit whatever the units.
+    /// Scaled to ones on the diagonal, so that its numbers are in range whatever the units.
     matrix: DenseSymmetric<f32>,
     /// Square root of each diagonal entry.
     scale: Vec<f64>,
@@ -202,7 +204,7 @@ impl Rough {
         self.matrix.bytes() + size_of_val(&self.scale[..])
     }
 
-    /// A x to six or seven digits of what the largest entries bring.
+    /// A x to six or seven digits of the contribution of the largest entries.
     pub fn multiply(&self, x: &[f64]) -> Vec<f64> {
         let scaled = || x.iter().zip(&self.scale).map(|(x, s)| x * s);
         let largest = scaled().fold(f64::MIN_POSITIVE, |m, v| m.max(v.abs()));
@@ -218,7 +220,7 @@ impl DenseFactor {
         Self { size, values }
     }
 
-    /// A⁻¹ = L⁻ᵀ L⁻¹: for many products, each of which reads it once where a solution reads L twice.
+    /// A⁻¹ = L⁻ᵀ L⁻¹: for many products, each of which reads it once, whereas a solution reads L twice.
     pub fn inverse(&self) -> DenseSymmetric {
         let size = self.size;
         let par = parallelism(size);
@@ -245,7 +247,7 @@ impl DenseFactor {
         8 * self.values.len()
     }
 
-    /// A⁻¹ b, in place. One column is bound by reading L, which plain sweeps do at full speed.
+    /// A⁻¹ b, in place. The time for one column is that of reading L, which plain sweeps do at full speed.
     pub fn solve(&self, b: &mut [f64]) {
         let n = self.size;
         let column = |c: usize| &self.values[c * n + c..(c + 1) * n];
@@ -285,7 +287,8 @@ pub(super) fn add_scaled(a: &[f64], weight: f64, y: &mut [f64]) {
     }
 }
 
-/// Adds Σ `weights` · `a` to `y` and gives each aᵀx, in one pass over all: x and y are read once for the four.
+/// Adds Σ `weights` · `a` to `y` and returns each aᵀx, in one pass over all: x and y are read once for all
+/// four.
 pub struct DotsAndAdd<'a, T> {
     a: [&'a [T]; COLUMNS_AT_ONCE],
     x: &'a [T],
@@ -313,8 +316,8 @@ impl<T: Number> DotsAndAdd<'_, T> {
 
 /// The rows of a pass that fill registers.
 ///
-/// What it reads is copied before what it writes, and the lanes are summed outside: both keep the sums in
-/// registers, which makes it three times as fast.
+/// Its inputs are copied before its outputs are written, and the lanes are summed outside: both keep the sums
+/// in registers, which makes it three times as fast.
 struct InLanes<'a, T, const LANES: usize> {
     a: [&'a [[T; LANES]]; COLUMNS_AT_ONCE],
     x: &'a [[T; LANES]],
@@ -377,7 +380,7 @@ mod tests {
         }
     }
 
-    /// Six digits, also where the rows are of very different size.
+    /// Six digits, even if the rows are of very different size.
     #[test]
     fn rough_product_equals_the_dense_one_to_single_precision() {
         let (dense, ..) = example(ROWS_TO_SHARE + 13);

@@ -1,25 +1,26 @@
-//! Workspace and threads that the factorisations ask for.
+//! Workspace and threads for the factorisations.
 
 use faer::Par;
 use faer::dyn_stack::{MemBuffer, StackReq};
 
 use crate::error::{MtmError, Result};
 
-/// Below this many unknowns threads cost more than they bring in dense work and in several columns at once.
+/// Number of unknowns below which threads cost more than they save in dense work and in several columns at
+/// once.
 const PARALLEL_UNKNOWNS: usize = 3000;
 
-/// Threads for dense work and for several columns at once, where they pay.
+/// Threads for dense work and for several columns at once, if they pay off.
 pub fn parallelism(unknowns: usize) -> Par {
     if unknowns < PARALLEL_UNKNOWNS { Par::Seq } else { Par::rayon(0) }
 }
 
-/// Workspace of the given need.
+/// Workspace of the required size.
 pub fn buffer(need: StackReq) -> Result<MemBuffer> {
     MemBuffer::try_new(need)
         .map_err(|_| out_of_memory("workspace of the factorisation", need.size_bytes()))
 }
 
-/// That the system does not give `bytes` for `what`.
+/// The error for a system that cannot provide `bytes` for `what`.
 pub fn out_of_memory(what: &'static str, bytes: usize) -> MtmError {
     MtmError::OutOfMemory {
         what,

@@ -41,9 +41,9 @@ impl Aggregates {
         Self::from_weights(&a.row_start, &a.columns, &weights)
     }
 
-    /// Greedy, in row order: a row whose strong neighbours are all free founds an aggregate with them;
-    /// rows left over join the neighbour they are most strongly tied to; what is still left founds
-    /// aggregates of its own. Rows without any strong connection stay outside: the smoother suffices.
+    /// Greedy, in row order: a row whose strong neighbours are all free forms an aggregate with them; remaining
+    /// rows join the neighbour they are most strongly connected to; rows still left form their own aggregates.
+    /// Rows without any strong connection stay outside: the smoother suffices for them.
     fn from_weights(row_start: &[usize], columns: &[u32], weights: &[f32]) -> Self {
         let n = row_start.len() - 1;
         let mut of_row = vec![UNASSIGNED; n];

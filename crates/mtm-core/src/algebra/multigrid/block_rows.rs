@@ -1,13 +1,13 @@
-//! Arrays and matrices in block rows, cut into runs of rows that threads fill at once.
+//! Arrays and matrices in block rows, split into runs of rows that threads fill in parallel.
 
 use std::ops::Range;
 
 use crate::algebra::blocks::BlockMatrix;
 
-/// Entries (blocks × rows × columns) a thread is handed at once.
+/// Entries (blocks × rows × columns) per parallel task.
 pub(super) const ENTRIES_PER_TASK: usize = 64 * 1024;
 
-/// A square f64 matrix of N×N blocks in rows, as the levels are built from it.
+/// A square f64 matrix of N×N blocks in rows, from which the levels are built.
 pub(super) trait SystemRows<const N: usize>: Sync {
     fn row_start(&self) -> &[usize];
     fn columns(&self) -> &[u32];
@@ -41,7 +41,7 @@ pub(super) struct RowsPart<'a, T> {
     pub(super) data: &'a mut [T],
 }
 
-/// Cuts an array in block rows into parts of `rows_per_part` rows, to be filled in parallel.
+/// Splits an array in block rows into parts of `rows_per_part` rows, to be filled in parallel.
 pub(super) fn split_rows<'a, T>(
     data: &'a mut [T],
     row_start: &[usize],

@@ -5,7 +5,7 @@ use super::galerkin::CoarseMatrix;
 use super::rigid_modes::MODES;
 use super::scaling::{PIVOT_TOLERANCE, Scaling, scaled_block};
 
-/// Dense L Lᵀ of the coarsest scaled matrix; dependent unknowns get an infinite pivot, so stay zero.
+/// Dense L Lᵀ of the coarsest scaled matrix; dependent unknowns get an infinite pivot, so they stay zero.
 #[derive(Debug)]
 pub(super) struct DenseCholesky {
     pub(super) size: usize,

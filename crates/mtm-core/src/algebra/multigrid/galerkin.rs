@@ -8,7 +8,7 @@ use super::rigid_modes::{MODES, ModeBlock};
 use super::scaling::Scaling;
 use super::small_blocks::{add_product, add_transposed_product};
 
-/// A column that a row has not met.
+/// A column that has not occurred in the row.
 const UNSEEN: u32 = u32::MAX;
 
 /// A coarse matrix in double precision, kept only until the next level is built.
@@ -36,8 +36,8 @@ impl SystemRows<MODES> for CoarseMatrix {
     }
 }
 
-/// Pᵀ (S A Sᵀ) P, computed as P'ᵀ A P' with P' = Sᵀ P. The upper triangle is summed, the lower one
-/// mirrored, so that the result is symmetric in every bit.
+/// Pᵀ (S A Sᵀ) P, computed as P'ᵀ A P' with P' = Sᵀ P. The upper triangle is summed and the lower one mirrored,
+/// so that the result is symmetric in every bit.
 pub(super) fn galerkin<const N: usize>(
     a: &impl SystemRows<N>,
     scaling: &Scaling<N>,
@@ -107,7 +107,7 @@ pub(super) fn galerkin<const N: usize>(
         );
 
     let transposed = p.transposed();
-    // Pattern first again: growing the rows one by one would go through the allocator's locks.
+    // Pattern first again: growing the rows one by one would contend for the allocator's locks.
     let counts: Vec<usize> = (0..p.n_coarse)
         .into_par_iter()
         .with_min_len(16)
@@ -157,7 +157,7 @@ pub(super) fn galerkin<const N: usize>(
     (mirror(&row_start, &columns, &blocks), transposed)
 }
 
-/// The distinct columns of row `coarse` of Pᵀ A P on and above the diagonal; leaves `marker` clean.
+/// The distinct columns of row `coarse` of Pᵀ A P on and above the diagonal; resets `marker`.
 fn collect_upper(
     transposed: &TransposedIndex,
     ap_start: &[usize],
@@ -180,7 +180,7 @@ fn collect_upper(
     }
 }
 
-/// The distinct coarse columns that row `i` of A P reaches; leaves `marker` clean.
+/// The distinct coarse columns in row `i` of A P; resets `marker`.
 fn collect_row<const N: usize>(
     a: &impl SystemRows<N>,
     p: &Prolongator<N>,
@@ -219,7 +219,7 @@ fn mirror(
         }
     }
     let row_start = running_sum(&sizes);
-    // Column of each block and where it stands in the upper triangle.
+    // Column of each block and its position in the upper triangle.
     let mut sources = vec![(0_u32, 0_u32); row_start[n]];
     let mut next = row_start.clone();
     for i in 0..n {
@@ -257,8 +257,8 @@ fn mirror(
 }
 
 impl CoarseMatrix {
-    /// Turns the blocks below the diagonal, copied from above it, into their transposes, and makes the
-    /// diagonal blocks symmetric in every bit.
+    /// Transposes the blocks below the diagonal, which were copied from above it, and makes the diagonal blocks
+    /// symmetric in every bit.
     fn transpose_lower(&mut self) {
         let (row_start, columns) = (&self.row_start, &self.columns);
         split_rows(&mut self.blocks, row_start, 64).into_par_iter().for_each(|part| {

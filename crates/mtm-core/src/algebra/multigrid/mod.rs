@@ -1,14 +1,14 @@
 //! Smoothed aggregation with the six rigid modes, as a preconditioner for [`crate::algebra::krylov::pcg`].
 //!
-//! Vaněk, Mandel & Brezina 1996: nodes that pull strongly on one another form an aggregate, the
-//! rigid motions of the aggregates are the coarse unknowns, one Jacobi step smooths them, and the
-//! coarse matrix is the Galerkin product. Every level is scaled by the Cholesky factors of its
-//! diagonal blocks, S A Sᵀ with unit diagonal blocks: the block-Jacobi method becomes the identity,
-//! and entries of tissues that differ 1e8 times in stiffness fit into single precision together.
+//! Vaněk, Mandel & Brezina 1996: strongly coupled nodes form an aggregate, the rigid motions of the aggregates
+//! are the coarse unknowns, one Jacobi step smooths them, and the coarse matrix is the Galerkin product. Every
+//! level is scaled by the Cholesky factors of its diagonal blocks, S A Sᵀ with unit diagonal blocks: the
+//! block-Jacobi method becomes the identity, and entries of tissues that differ 1e8 times in stiffness fit into
+//! single precision together.
 //!
-//! The scaled matrices and the prolongators are *stored* in single precision (half the traffic) but
-//! every sum is double. The Galerkin products use the double-precision matrices throughout: a stiff
-//! inclusion afloat in fat owes its coarse stiffness to cancellation.
+//! The scaled matrices and the prolongators are *stored* in single precision (half the memory traffic) but
+//! every sum is in double precision. The Galerkin products use the double-precision matrices throughout: the
+//! coarse stiffness of a stiff inclusion surrounded by fat results from cancellation.
 
 mod aggregation;
 mod block_rows;
@@ -43,15 +43,15 @@ use small_blocks::{add_transposed_product, times, transposed_times};
 use smoother::{Smoother, Vectors};
 use transfer::Transfer;
 
-/// Share of rows a level must lose for the next one to be worth having.
+/// Share of rows that must be eliminated by a level to make the next one worthwhile.
 const STALL: f64 = 0.8;
-/// Rows of a coarsest level too large to factor densely when coarsening stalls.
+/// Number of rows above which the coarsest level is too large for a dense factorisation when coarsening stalls.
 const DENSE_LIMIT: usize = 400;
 
 /// Vectors that a pass of the smoother reads or writes: d, r twice, the next d, x twice.
 const VECTORS_PER_PASS: usize = 6;
 
-/// How the hierarchy is built and cycled.
+/// How the hierarchy is built and the cycle is run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MultigridOptions {
     /// Relative block norm above which two nodes are strongly connected; halved on each level.
@@ -60,9 +60,9 @@ pub struct MultigridOptions {
     pub smoother_degree: usize,
     /// Damping of the prolongator smoothing, as a multiple of 1/λ_max.
     pub prolongator_damping: f64,
-    /// Block rows at which a level is solved directly.
+    /// Number of block rows at which a level is solved directly.
     pub coarsest_rows: usize,
-    /// Most levels.
+    /// Maximum number of levels.
     pub max_levels: usize,
 }
 
@@ -79,9 +79,8 @@ impl Default for MultigridOptions {
 }
 
 /// A symmetric positive definite multigrid cycle for one [`BlockMatrix`].
-///
-/// Built once per matrix, applied by any number of threads at once. The bits of both depend neither
-/// on the number of threads nor on the machine's load.
+/// Built once per matrix, and applied by any number of threads at once. Both are bitwise independent of the
+/// number of threads and of the machine's load.
 #[derive(Debug)]
 pub struct Multigrid {
     /// S of the finest level: r̃ = S r, z = Sᵀ z̃.
@@ -180,7 +179,7 @@ impl Multigrid {
         })
     }
 
-    /// Rows of each level, the finest first.
+    /// Number of rows of each level, the finest first.
     pub fn level_rows(&self) -> Vec<usize> {
         let mut rows = vec![self.finest.matrix.n_rows()];
         rows.extend(self.coarse.iter().map(|l| l.matrix.n_rows()));
@@ -196,10 +195,10 @@ impl Multigrid {
             + self.coarsest.as_ref().map_or(0, |c| 8 * c.size * c.size)
     }
 
-    /// Bytes that one application moves at the least: every matrix and vector once per pass over it.
+    /// Minimum memory traffic of one application, bytes: every matrix and vector once per pass over it.
     pub fn traffic_bytes(&self) -> usize {
         let passes = self.smoother.passes();
-        // The scaling, r in and z out, and the scaled vector between.
+        // The scaling, r in and z out, and the scaled vector in between.
         let ends = self.scaling.len() * (2 * 72 + 4 * 24);
         ends + self.finest.traffic_bytes(passes)
             + self.coarse.iter().map(|l| l.traffic_bytes(passes)).sum::<usize>()
@@ -293,7 +292,7 @@ struct CoarseSystem {
     modes: Vec<ModeBlock>,
 }
 
-/// A level of the cycle and the way to the one below, if there is one.
+/// A level of the cycle and the transfer to the next coarser one, if there is one.
 #[derive(Debug)]
 struct Level<const N: usize> {
     matrix: ScaledMatrix<N>,

@@ -88,7 +88,7 @@ impl<const N: usize> Prolongator<N> {
         Self { row_start, columns, blocks, n_coarse: aggregates.count }
     }
 
-    /// Where the blocks of Pᵀ stand in P.
+    /// Positions of the blocks of Pᵀ in P.
     pub(super) fn transposed(&self) -> TransposedIndex {
         let mut sizes = vec![0; self.n_coarse];
         for &c in &self.columns {
@@ -110,7 +110,7 @@ impl<const N: usize> Prolongator<N> {
     }
 }
 
-/// For each coarse row, the fine rows that reach it and where their blocks stand.
+/// For each coarse row, the fine rows connected to it and the positions of their blocks.
 #[derive(Debug)]
 pub(super) struct TransposedIndex {
     pub(super) start: Vec<usize>,

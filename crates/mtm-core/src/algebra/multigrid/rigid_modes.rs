@@ -4,16 +4,16 @@ use rayon::prelude::*;
 
 use super::aggregation::Aggregates;
 
-/// Rigid motions per aggregate, so unknowns per coarse row.
+/// Number of rigid motions per aggregate, and so of unknowns per coarse row.
 pub(super) const MODES: usize = 6;
-/// Length of a rigid mode, relative to what it was, below which an aggregate cannot carry it.
+/// Length of a rigid mode, relative to its original length, below which an aggregate cannot represent it.
 const RANK_TOLERANCE: f64 = 1e-6;
 
 /// A square block in the unknowns of coarse rows.
 pub(super) type ModeBlock = [[f64; MODES]; MODES];
 
-/// Translations and rotations about the centroid, in lengths of the largest distance from it; on
-/// sliding rows without their normal component.
+/// Translations and rotations about the centroid, in units of the largest distance from it; on sliding rows
+/// without their normal component.
 pub(super) fn rigid_modes(
     nodes: &[[f64; 3]],
     normals: &[(usize, [f64; 3])],
@@ -49,8 +49,8 @@ pub(super) fn rigid_modes(
     modes
 }
 
-/// Replaces the modes of each aggregate by an orthonormal basis Q and returns R, the modes in the
-/// coarse unknowns. A mode that an aggregate cannot tell from the others has a zero column in Q.
+/// Replaces the modes of each aggregate by an orthonormal basis Q and returns R, the modes in the coarse
+/// unknowns. A mode that is linearly dependent on an aggregate has a zero column in Q.
 pub(super) fn orthonormalise<const N: usize>(
     aggregates: &Aggregates,
     modes: &mut [[[f64; MODES]; N]],

@@ -128,7 +128,7 @@ impl<const N: usize> ScaledMatrix<N> {
     }
 }
 
-/// Some rows of A v − β v₋₁, v₋₁ the vector before.
+/// A range of rows of A v − β v₋₁, where v₋₁ is the previous vector.
 struct LanczosRows<'a, const N: usize> {
     a: &'a ScaledMatrix<N>,
     first: usize,

@@ -1,4 +1,4 @@
-//! The Cholesky factors of the diagonal blocks, by which a level is scaled.
+//! The Cholesky factors of the diagonal blocks, which scale a level.
 
 use rayon::prelude::*;
 
@@ -62,7 +62,7 @@ fn factor<const N: usize>(a: &[[f64; N]; N]) -> ([[f64; N]; N], [[f64; N]; N], b
     (l, s, dependent)
 }
 
-/// `S_i A S_jᵀ`, associated so that the block of the transposed position is its transpose in every bit.
+/// `S_i A S_jᵀ`, associated so that the block at the transposed position is its transpose in every bit.
 #[inline]
 pub(super) fn scaled_block<const N: usize>(
     s_i: &[[f64; N]; N],

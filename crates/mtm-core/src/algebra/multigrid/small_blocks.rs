@@ -2,17 +2,17 @@
 
 use crate::algebra::simd::{LANES, add_scaled};
 
-/// Sum of the products of a row of blocks, stored by columns, with the rows of `x` they meet.
+/// Sum of the products of a row of blocks, stored by columns, with the corresponding rows of `x`.
 ///
-/// A column of R values is loaded as its first four and, where R is not four, its last four: of three
-/// rows, the first columns take the next one's head along, and the last column the one's before.
+/// A column of R values is loaded as its first four and, if R is not four, its last four: with three rows, the
+/// first columns also load the start of the next one, and the last column the end of the previous one.
 #[inline(always)]
 pub(super) fn block_row_product<const C: usize, const R: usize>(
     columns: &[u32],
     blocks: &[[[f32; R]; C]],
     x: &[[f64; C]],
 ) -> [f64; R] {
-    // Sums of even and odd columns apart: one alone would wait for its own last addition.
+    // Separate sums of even and odd columns: a single sum would wait for its own last addition.
     let (mut heads, mut tails) = ([[0.0; LANES]; 2], [[0.0; LANES]; 2]);
     for (&j, block) in columns.iter().zip(blocks) {
         let x = &x[j as usize];

@@ -37,8 +37,8 @@ pub(super) struct Smoother {
 }
 
 impl Smoother {
-    /// Chebyshev polynomials of the fourth kind with optimised weights (Lottes 2023, algorithm 2 and
-    /// table 1): best for a multigrid cycle, and no lower end of the spectrum to guess.
+    /// Chebyshev polynomials of the fourth kind with optimised weights (Lottes 2023, algorithm 2 and table 1):
+    /// optimal for a multigrid cycle, and without the need to guess the lower end of the spectrum.
     pub(super) fn new(degree: usize) -> Self {
         const WEIGHTS: [&[f64]; 4] = [
             &[1.125],
@@ -117,8 +117,8 @@ struct SmootherStep {
 }
 
 impl SmootherStep {
-    /// One sweep of [r, d_next, x]: r −= A d, then the new direction from r; x takes `correction` times the old
-    /// direction besides.
+    /// One sweep of [r, d_next, x]: r −= A d, then the new direction from r; x also receives `correction` times
+    /// the old direction.
     fn sweep<const N: usize>(
         &self,
         a: &ScaledMatrix<N>,
@@ -138,7 +138,7 @@ impl SmootherStep {
     }
 }
 
-/// Some rows of r −= A x.
+/// A range of rows of r −= A x.
 struct Residual<'a, const N: usize> {
     a: &'a ScaledMatrix<N>,
     first: usize,
@@ -159,7 +159,7 @@ impl<const N: usize> Kernel for Residual<'_, N> {
     }
 }
 
-/// Some rows of [`SmootherStep::sweep`]; `d` is whole, the other vectors are those rows.
+/// A range of rows of [`SmootherStep::sweep`]; `d` is whole, the other vectors are restricted to those rows.
 struct Sweep<'a, const N: usize> {
     step: SmootherStep,
     a: &'a ScaledMatrix<N>,

@@ -106,7 +106,7 @@ impl<const N: usize> Transfer<N> {
     }
 }
 
-/// The products of some rows of blocks, which begin where `start` says.
+/// The products of a range of rows of blocks, which begins at `start`.
 struct Products<'a, const C: usize, const R: usize> {
     start: &'a [usize],
     columns: &'a [u32],
