@@ -1,8 +1,8 @@
-//! Hash tables whose keys are places on a lattice.
+//! Hash tables whose keys are positions on a lattice.
 
 use std::hash::Hasher;
 
-/// Hash of places, packed or not: they are no stranger's choice, so speed decides.
+/// Hash of positions, packed or not: they are not chosen by an adversary, so only speed matters.
 #[derive(Debug, Default)]
 pub(crate) struct KeyHasher(u64);
 
@@ -18,7 +18,8 @@ impl Hasher for KeyHasher {
     }
 
     fn write_u64(&mut self, key: u64) {
-        // Knuth's multiplicative hash with the golden ratio; the table takes its index from both ends.
+        // Knuth's multiplicative hash with the golden ratio; the table takes its index from both ends of the
+        // value.
         let product = (self.0 ^ key).wrapping_mul(0x9E37_79B9_7F4A_7C15);
         self.0 = product ^ product >> 32;
     }

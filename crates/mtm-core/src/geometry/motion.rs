@@ -1,5 +1,4 @@
-//! Motions that a plan prescribes: of a rigid segment, or of a surface whose vertices moved one by
-//! one.
+//! Motions that a plan prescribes: of a rigid segment, or of a surface whose vertices moved individually.
 
 use nalgebra::{Matrix3, Rotation2, Rotation3};
 use rayon::prelude::*;
@@ -8,23 +7,23 @@ use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::surface::{Closest, Surface};
 use crate::vector::Vec3;
 
-/// Largest entry by which RᵀR of a matrix that is read as a rigid motion may differ from I.
+/// Largest entry by which RᵀR of a matrix that is to be read as a rigid motion may differ from I.
 ///
-/// Entries written with four decimals are off by 5e-5 at most, which changes RᵀR by 2 · √3 · 5e-5 =
-/// 1.8e-4: every rotation written with four decimals or more passes, and lengths that change by
-/// more than 0.01 % do not. What passes is made orthogonal, see [`rigid_matrix`].
+/// Entries written with four decimals have errors of at most 5e-5, which change RᵀR by 2 · √3 · 5e-5 = 1.8e-4:
+/// every rotation written with four or more decimals is accepted, and lengths that change by more than 0.01 %
+/// are not. Accepted matrices are made orthogonal, see [`rigid_matrix`].
 pub const RIGID_TOLERANCE: f64 = 2e-4;
 
 /// Largest entry by which the bottom row of such a matrix may differ from 0 0 0 1.
 pub const BOTTOM_ROW_TOLERANCE: f64 = 1e-6;
 
-/// Deviation of RᵀR from I that is rounding: such matrices are rigid as they are.
+/// Deviation of RᵀR from I that is due to rounding: such matrices are used unchanged.
 ///
-/// Far above what products and inverses of rotations accumulate, and so small that a point 1 m from
-/// the origin is 1e-11 mm off.
+/// Far above what products and inverses of rotations accumulate, and so small that a point 1 m from the origin
+/// moves by only 1e-11 mm.
 const ROUNDING: f64 = 1e-14;
 
-/// Points a thread takes at once.
+/// Points per parallel task.
 const POINTS_PER_TASK: usize = 64;
 
 /// A rigid motion x' = R x + t.
@@ -34,11 +33,11 @@ pub struct RigidMotion {
 }
 
 impl RigidMotion {
-    /// Motion of the named segment by a 4×4 matrix, row by row, t in mm, as [`rigid_matrix`] makes it
-    /// exactly rigid.
+    /// Motion of the named segment by a 4×4 matrix, row by row, t in mm, made exactly rigid by
+    /// [`rigid_matrix`].
     ///
     /// # Errors
-    /// [`MtmError::Plan`] with the segment's name where [`rigid_matrix`] refuses the matrix.
+    /// [`MtmError::Plan`] with the segment's name if [`rigid_matrix`] rejects the matrix.
     pub fn new(segment: &str, matrix: &[[f64; 4]; 4]) -> Result<Self> {
         match nearest_rigid(matrix) {
             Ok(matrix) => Ok(Self { matrix }),
@@ -60,8 +59,8 @@ impl RigidMotion {
         &self.matrix
     }
 
-    /// The motion as far as it has come at `share` of the way: turned by that share of the angle, while the point
-    /// `centre` goes straight.
+    /// The part of the motion done at `share` of the way: a rotation by that share of the angle, while the
+    /// point `centre` moves along a straight line.
     pub fn partial(&self, share: f64, centre: [f64; 3]) -> Self {
         let rotation = Rotation3::from_matrix_unchecked(Matrix3::from_fn(|i, j| self.matrix[i][j]));
         let turned = Rotation3::new(rotation.scaled_axis() * share);
@@ -90,7 +89,7 @@ impl RigidMotion {
         })
     }
 
-    /// Position that the motion takes to `point`: R⁻¹ (x − t), mm.
+    /// Position that the motion maps to `point`: R⁻¹ (x − t), mm.
     pub fn apply_inverse(&self, point: [f64; 3]) -> [f64; 3] {
         let m = &self.matrix;
         let r = Matrix3::from_fn(|i, j| m[i][j]);
@@ -107,22 +106,23 @@ impl RigidMotion {
         })
     }
 
-    /// R⁻¹ v: a direction turned back.
+    /// R⁻¹ v: the direction before the motion.
     pub fn rotate_inverse(&self, vector: [f64; 3]) -> [f64; 3] {
         [0, 1, 2].map(|i| (0..3).map(|j| self.matrix()[j][i] * vector[j]).sum())
     }
 }
 
-/// The rigid matrix nearest to `matrix` (4×4, row by row): the one check of what may be called rigid.
+/// The rigid matrix nearest to `matrix` (4×4, row by row): the only check of whether a matrix may be called
+/// rigid.
 ///
-/// R is replaced by the rotation nearest to it (its polar factor), the bottom row by 0 0 0 1; t stays
-/// as given. A matrix that is rigid to rounding already comes back bit for bit, so the function may
-/// be applied again.
+/// R is replaced by the rotation nearest to it (its polar factor), the bottom row by 0 0 0 1; t is kept. A
+/// matrix that is already rigid to rounding is returned unchanged in every bit, so the function may be applied
+/// repeatedly.
 ///
 /// # Errors
-/// [`MtmError::NotRigid`] of the family `kind`, which calls the matrix `what`: an entry that is not
-/// finite, a bottom row that differs from 0 0 0 1 by more than [`BOTTOM_ROW_TOLERANCE`], a mirror, or
-/// RᵀR that differs from I by more than [`RIGID_TOLERANCE`] (scale or shear), with the figure.
+/// [`MtmError::NotRigid`] with the error kind `kind` and the name `what` of the matrix: an entry that is not
+/// finite, a bottom row that differs from 0 0 0 1 by more than [`BOTTOM_ROW_TOLERANCE`], a reflection, or RᵀR
+/// that differs from I by more than [`RIGID_TOLERANCE`] (scale or shear), with the figure.
 pub fn rigid_matrix(what: &str, matrix: &[[f64; 4]; 4], kind: ErrorKind) -> Result<[[f64; 4]; 4]> {
     nearest_rigid(matrix).map_err(|problem| MtmError::NotRigid {
         what: what.to_owned(),
@@ -189,9 +189,9 @@ fn nearest_rotation(mut r: Matrix3<f64>) -> Matrix3<f64> {
     r
 }
 
-/// By how much a matrix shortens and lengthens, from RᵀR, in words; nothing where that overflows.
+/// How much a matrix shortens and lengthens, from RᵀR, in words; nothing if that overflows.
 fn length_changes(product: &Matrix3<f64>) -> String {
-    // Beyond this, eigenvalues say nothing that the deviation does not.
+    // Beyond this, the eigenvalues add nothing to the deviation.
     const LARGEST: f64 = 1e12;
     if !product.iter().all(|entry| entry.abs() < LARGEST) {
         return String::new();
@@ -201,7 +201,7 @@ fn length_changes(product: &Matrix3<f64>) -> String {
     format!(" (lengths change by {:+.3} % to {:+.3} %)", change.min(), change.max())
 }
 
-/// The motion of a surface whose vertices moved one by one, carried on to points near it.
+/// The motion of a surface whose vertices moved individually, extended to points near it.
 #[derive(Debug, Clone)]
 pub struct SurfaceMotion {
     rest: Surface,
@@ -209,7 +209,7 @@ pub struct SurfaceMotion {
 }
 
 impl SurfaceMotion {
-    /// Motion that takes the vertices of `rest` to `moved_vertices` (mm, in the same order).
+    /// Motion that maps the vertices of `rest` to `moved_vertices` (mm, in the same order).
     ///
     /// # Errors
     /// Those of [`Surface::moved`]: another count of vertices, one that is not finite, or a
@@ -231,12 +231,12 @@ impl SurfaceMotion {
 
     /// Displacement of each point (mm, at rest, finite), mm, in the order of `points`.
     ///
-    /// A point x keeps its place relative to its closest triangle: x' = c' + R (x − c), with c its
-    /// closest point, c' the same place on the moved triangle, and R the rotation of the triangle
-    /// (the polar factor of its tangent map extended by the normals). So a rigid motion is followed
-    /// exactly, on the surface and off it. On the surface the displacement is continuous; off it,
-    /// it jumps with R between triangles that turn differently, by the distance to the surface
-    /// times the difference of R. Parallel; the result does not depend on the number of threads.
+    /// A point x keeps its position relative to its closest triangle: x' = c' + R (x − c), with c its closest
+    /// point, c' the same point on the moved triangle, and R the rotation of the triangle (the polar factor of
+    /// its tangent map extended by the normals). A rigid motion is therefore reproduced exactly, on the surface
+    /// and off it. On the surface the displacement is continuous; off it, it jumps with R between triangles
+    /// that rotate differently, by the distance to the surface times the difference of R. Parallel; the result
+    /// does not depend on the number of threads.
     pub fn displacement(&self, points: &[[f64; 3]]) -> Vec<[f64; 3]> {
         points
             .par_iter()

@@ -1,7 +1,7 @@
 //! Triangle surfaces: closest point and continuous normal, on the rest shape and on moved ones.
 //!
-//! The only file that names parry, whose bounding-volume hierarchy finds the candidates; the
-//! distance to a triangle is computed in [`crate::triangle`].
+//! The only file that refers to parry, whose bounding-volume hierarchy finds the candidates; the distance to a
+//! triangle is computed in [`crate::triangle`].
 
 use std::cell::Cell;
 use std::cmp::Ordering;
@@ -19,8 +19,8 @@ use crate::geometry::triangle::Feature;
 use crate::geometry::triangle::{self, Facet, TrianglePoint};
 use crate::vector::Vec3;
 
-/// Angle between facet normals above which an edge is a crease, rad (60°): box and tooth edges stay
-/// sharp, coarse round shapes stay smooth.
+/// Angle between facet normals above which an edge is a crease, rad (60°): edges of boxes and teeth stay sharp,
+/// coarse round shapes stay smooth.
 pub const CREASE_ANGLE: f64 = PI / 3.0;
 
 /// Padding of a triangle's box relative to the largest coordinate: more than the rounding of a
@@ -28,16 +28,16 @@ pub const CREASE_ANGLE: f64 = PI / 3.0;
 /// boxes a volume, by which parry splits them.
 const BOX_PADDING: f64 = 8.0 * f64::EPSILON;
 
-/// Factor on squared distances to boxes that makes them a lower bound in spite of rounding.
+/// Factor on squared distances to boxes that keeps them a lower bound despite rounding.
 const BOUND_SLACK: f64 = 1.0 - 16.0 * f64::EPSILON;
 
-/// Length of a blended normal below which its direction is lost and the facet normal stands in.
+/// Length of a blended normal below which its direction is lost and the facet normal is used instead.
 const NORMAL_CANCELLED: f64 = 1e-6;
 
-/// Points a thread takes at once: large enough to hide the hand-over.
+/// Points per parallel task: enough to hide the cost of the hand-over.
 const POINTS_PER_TASK: usize = 64;
 
-/// Triangles a thread takes at once.
+/// Triangles per parallel task.
 const TRIANGLES_PER_TASK: usize = 1024;
 
 /// An immutable triangle surface with closest-point queries and continuous normals.
@@ -57,7 +57,8 @@ struct Shape {
     areas: Vec<f64>,
     /// Unit normal of each smoothing group.
     group_normals: Vec<Vec3>,
-    /// Angle-weighted unit normal over all triangles of a vertex, zero where none or cancelled.
+    /// Angle-weighted unit normal over all triangles of a vertex, zero if there are none or their normals
+    /// cancel.
     vertex_normals: Vec<Vec3>,
     bvh: Bvh,
     area: f64,
@@ -71,7 +72,7 @@ struct Shape {
 pub struct Closest {
     /// The point on the surface, mm.
     pub point: [f64; 3],
-    /// Unit normal there, continuous across all edges but creases.
+    /// Unit normal there, continuous across all edges except creases.
     pub normal: [f64; 3],
     /// Triangle it lies on; of several equally close ones, that with the smallest index.
     pub triangle: u32,
@@ -79,13 +80,13 @@ pub struct Closest {
     pub barycentric: [f64; 3],
     /// Part of that triangle it lies on.
     pub feature: Feature,
-    /// Whether it lies on a border edge or vertex: the true partner may be past the border.
+    /// Whether it lies on a border edge or vertex: the true partner may be beyond the border.
     pub on_border: bool,
     /// Distance to the query point, mm, never negative.
     pub distance: f64,
     /// The same distance, mm, negative behind the surface (inside, if it is closed).
     ///
-    /// The side is that of the pseudo-normal of the face, edge or vertex, which is right for every
+    /// The side is determined by the pseudo-normal of the face, edge or vertex, which is correct for every
     /// point (Bærentzen & Aanæs 2005); that of `normal` may fail next to sharp or coarse edges.
     pub signed_distance: f64,
 }
@@ -154,10 +155,10 @@ impl Surface {
         Ok(Self { topology: Arc::new(topology), shape: Arc::new(shape) })
     }
 
-    /// The same triangles with their vertices elsewhere.
+    /// The same triangles with moved vertices.
     ///
-    /// `vertices`: mm, as many as before. Creases stay where the rest shape has them, so normals
-    /// change continuously with the motion.
+    /// `vertices`: mm, as many as before. Creases stay where they are in the rest shape, so normals change
+    /// continuously with the motion.
     ///
     /// # Errors
     /// [`MtmError::Length`], [`MtmError::NotFinite`], [`MtmError::DegenerateTriangle`].
@@ -184,7 +185,7 @@ impl Surface {
         Ok(Self { topology: Arc::clone(&self.topology), shape: Arc::new(shape) })
     }
 
-    /// The surface carried by a rigid motion.
+    /// The surface after a rigid motion.
     ///
     /// `rigid`: 4×4 row by row, x' = R x + t, used as given; [`crate::geometry::motion::RigidMotion`] checks
     /// one.
@@ -214,10 +215,10 @@ impl Surface {
 
     /// Closest point of the surface to `point` (mm, finite).
     ///
-    /// Exact to rounding: the tree only leaves out triangles that cannot be closer.
+    /// Exact to rounding: the tree only skips triangles that cannot be closer.
     pub fn closest_one(&self, point: [f64; 3]) -> Closest {
         let (p, query) = (Vec3::from(point), Vector::from(point));
-        // Triangle 0 stands until something closer is found, and wins every tie.
+        // Triangle 0 is the candidate until something closer is found, and wins every tie.
         let start = self.closest_on(&p, 0);
         let start_squared = (p - start.point).norm_squared();
         let best = Cell::new((start_squared, 0, start));
@@ -232,7 +233,7 @@ impl Surface {
             if squared < best_squared || (squared == best_squared && t < best_triangle) {
                 best.set((squared, t, candidate));
             }
-            // Above zero, so that a box at distance zero is still entered and ties are all seen.
+            // Above zero, so that a box at distance zero is still entered and all ties are seen.
             Some(squared + f64::MIN_POSITIVE)
         };
         let _: Option<(u32, f64)> =
@@ -247,7 +248,7 @@ impl Surface {
         (a * barycentric[0] + b * barycentric[1] + c * barycentric[2]).into()
     }
 
-    /// Unit normal at a point of a triangle, continuous across all edges but creases.
+    /// Unit normal at a point of a triangle, continuous across all edges except creases.
     ///
     /// `triangle`: its index, below the number of triangles. `barycentric`: weights of its corners.
     pub fn normal_at(&self, triangle: u32, barycentric: [f64; 3]) -> [f64; 3] {
@@ -327,8 +328,8 @@ impl Surface {
         self.shape.mean_edge
     }
 
-    /// An order of surfaces by their shape alone, so that sums over several of them do not depend on the
-    /// order in which they are listed; only equal shapes tie.
+    /// An ordering of surfaces by their shape alone, so that sums over several of them do not depend on the
+    /// order in which they are listed; only identical shapes compare equal.
     pub(crate) fn order(&self, other: &Self) -> Ordering {
         let coordinates = |s: &Self| s.shape.vertices.as_flattened().to_vec();
         let by_area = self.area().total_cmp(&other.area());

@@ -1,13 +1,13 @@
-//! How the triangles of a surface hang together: edges, neighbours, border, smoothing groups.
+//! How the triangles of a surface are connected: edges, neighbours, border, smoothing groups.
 
 use crate::vector::Vec3;
 use rayon::prelude::*;
 
-/// Stands for "no neighbour": a border, non-manifold or flipped edge.
+/// Means "no neighbour": a border, non-manifold or flipped edge.
 pub(crate) const NO_TRIANGLE: u32 = u32::MAX;
 
-/// Cosine by which two normals must differ beyond the crease angle: keeps rounding from creasing
-/// flats.
+/// Cosine by which two normals must differ beyond the crease angle: keeps rounding from creating creases on
+/// flat surfaces.
 const CREASE_ROUNDING: f64 = 1e-12;
 
 /// Connectivity of a triangle surface and the smoothing groups of its rest shape.

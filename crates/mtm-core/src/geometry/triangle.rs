@@ -2,7 +2,7 @@
 
 use crate::vector::Vec3;
 
-/// Area of a triangle over its longest edge squared below which it has no usable normal.
+/// Area of a triangle over its longest edge squared, below which it has no usable normal.
 ///
 /// At this limit rounding of double-precision corners turns the normal by about 1e-6 rad.
 pub const DEGENERATE_AREA: f64 = 1e-10;
@@ -31,9 +31,9 @@ pub(crate) struct TrianglePoint {
 
 /// Closest point to `p` of the triangle with these corners (Ericson 2005, section 5.1.5).
 ///
-/// The tests on the inside are written as triple products, which keep their digits on slivers where
-/// Ericson's products of dot products cancel. A point on an edge is computed from the end with the
-/// smaller vertex index, so two triangles that share the edge return the same bits.
+/// The inside tests are written as triple products, which keep their digits on slivers where Ericson's products
+/// of dot products cancel. A point on an edge is computed from the end with the smaller vertex index, so two
+/// triangles that share the edge give bitwise identical results.
 pub(crate) fn closest_point(p: &Vec3, corners: &[Vec3; 3], indices: [u32; 3]) -> TrianglePoint {
     let [a, b, c] = corners;
     let (ab, ac) = (b - a, c - a);
@@ -104,7 +104,7 @@ pub(crate) struct Facet {
     pub angles: [f64; 3],
 }
 
-/// Normal, area and angles of a triangle; the area alone as an error where it is degenerate
+/// Normal, area and angles of a triangle; the area alone as an error if the triangle is degenerate
 /// ([`DEGENERATE_AREA`]).
 pub(crate) fn facet(corners: &[Vec3; 3]) -> std::result::Result<Facet, f64> {
     let [a, b, c] = corners;
@@ -112,11 +112,11 @@ pub(crate) fn facet(corners: &[Vec3; 3]) -> std::result::Result<Facet, f64> {
     let n = ab.cross(&-ca);
     let twice_area = n.norm();
     let longest = ab.norm_squared().max(bc.norm_squared()).max(ca.norm_squared());
-    // Not `<=`: an area that overflows to NaN must be refused too.
+    // Not `<=`: an area that overflows to NaN must be rejected too.
     if !(twice_area > 2.0 * DEGENERATE_AREA * longest && twice_area.is_finite()) {
         return Err(0.5 * twice_area);
     }
-    // Every corner spans the same |e × f|, so one cross product serves all three angles.
+    // |e × f| is the same at every corner, so one cross product serves all three angles.
     let angle = |e: &Vec3, f: &Vec3| twice_area.atan2(-e.dot(f));
     Ok(Facet {
         normal: n / twice_area,

@@ -1,5 +1,5 @@
-//! Generalised winding number of a triangle surface: how often it wraps a point, also where it has
-//! holes, overlaps or flipped triangles.
+//! Generalised winding number of a triangle surface: how often it winds around a point, even if it has holes,
+//! overlaps or flipped triangles.
 
 use std::f64::consts::PI;
 
@@ -9,18 +9,18 @@ use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::surface::Surface;
 use crate::vector::Vec3;
 
-/// Triangles below which a cluster is not split: one pass over them costs about as much as two far
+/// Number of triangles below which a cluster is not split: one pass over them costs about as much as two far
 /// fields.
 const LEAF_TRIANGLES: usize = 8;
 
-/// Real part of a product of half-angles within which it may take another factor: positive, and far from
-/// over- and underflow.
+/// Range of the real part of a product of half-angles within which another factor may be multiplied: positive,
+/// and far from overflow and underflow.
 const PRODUCT_RANGE: std::ops::Range<f64> = 1e-100..1e100;
 
-/// Points a thread takes at once.
+/// Points per parallel task.
 const POINTS_PER_TASK: usize = 64;
 
-/// How far a cluster of triangles must be to be replaced by its expansion.
+/// How far away a cluster of triangles must be to be replaced by its expansion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WindingOptions {
     /// Distance to the centre of a cluster over its radius above which the expansion is used.
@@ -36,9 +36,8 @@ impl Default for WindingOptions {
     }
 }
 
-/// A tree over the triangles of a surface that sums their solid angles, the distant ones in
-/// clusters (Barill, Dickson, Schmidt, Levin, Jacobson 2018, "Fast winding numbers for soups and
-/// clouds").
+/// A tree over the triangles of a surface that sums their solid angles, replacing distant triangles by clusters
+/// (Barill, Dickson, Schmidt, Levin, Jacobson 2018, "Fast winding numbers for soups and clouds").
 #[derive(Debug, Clone)]
 pub struct WindingTree {
     /// Depth-first: the first child of an inner cluster follows it.
@@ -77,7 +76,7 @@ struct Cluster {
     /// Traceless symmetric part of ∫ n ⊗ d ⊗ d dA, each entry times the number of its permutations:
     /// xxx, yyy, zzz, xxy, xxz, xyy, yyz, xzz, yzz, xyz.
     second: [f64; 10],
-    /// Cluster to go on with when this one is done; past the end for the last.
+    /// Cluster to continue with after this one; past the end for the last.
     next: u32,
     /// Triangles of a leaf; empty range for an inner cluster.
     first_triangle: u32,
@@ -112,9 +111,9 @@ impl WindingTree {
 
     /// Winding number at each point (mm, finite), in their order.
     ///
-    /// 1 inside a closed surface with outward normals, 0 outside, values between where it has
-    /// holes; on the surface itself the value between both sides or that of either. Parallel; the
-    /// result does not depend on the number of threads.
+    /// 1 inside a closed surface with outward normals, 0 outside, values in between if it has holes; on the
+    /// surface itself, the mean of both sides or the value of either. Parallel; the result does not depend on
+    /// the number of threads.
     pub fn winding_number(&self, points: &[[f64; 3]]) -> Vec<f64> {
         points
             .par_iter()
@@ -178,7 +177,7 @@ pub fn winding_number_exact(surface: &Surface, points: &[[f64; 3]]) -> Vec<f64> 
         .collect()
 }
 
-/// Triangles of one cluster and where the depth-first walk goes on after it.
+/// Triangles of one cluster, and where the depth-first walk continues after it.
 struct ClusterRange {
     start: usize,
     end: usize,
@@ -220,7 +219,7 @@ fn moments(ranges: &[ClusterRange], triangles: &[Sheet]) -> Vec<Moments> {
             Moments::of(leaf)
         })
         .collect();
-    // The halves of a cluster stand behind it.
+    // The two halves of a cluster are stored after it.
     for at in (0..ranges.len()).rev().filter(|&at| !ranges[at].is_leaf) {
         let halves = [at + 1, ranges[at + 1].next as usize];
         moments[at] = Moments::joined(halves.map(|half| &moments[half]));
@@ -228,7 +227,8 @@ fn moments(ranges: &[ClusterRange], triangles: &[Sheet]) -> Vec<Moments> {
     moments
 }
 
-/// Area of a cluster and its moments about its centroid, with n dA the area element and d the way from there.
+/// Area of a cluster and its moments about its centroid, with n dA the area element and d the vector from
+/// there.
 #[derive(Debug, Clone, Default)]
 struct Moments {
     area: f64,
@@ -280,7 +280,7 @@ impl Moments {
         let centre = (a.centre * a.area + b.centre * b.area) / area;
         let mut sum = Self { area, centre, ..Self::default() };
         for half in halves {
-            // d about the common centre is d about the half's own and the way between the two.
+            // d about the common centre is d about the half's own centre plus the vector between the two.
             let s = half.centre - centre;
             let n = half.zeroth;
             sum.zeroth += n;
@@ -376,8 +376,8 @@ fn traceless_second(t: &[[[f64; 3]; 3]; 3]) -> [f64; 10] {
     ]
 }
 
-/// Solid angle of triangles seen from a point, positive where it lies behind them; summed in the order in
-/// which they come.
+/// Solid angle of triangles seen from a point, positive if the point lies behind them; summed in the given
+/// order.
 ///
 /// tan(Ω/2) = det(a, b, c) / (|a||b||c| + (a·b)|c| + (b·c)|a| + (c·a)|b|) (van Oosterom & Strackee
 /// 1983). Half-angles are added as complex products while both stay below a right angle, so that
@@ -410,8 +410,8 @@ impl SolidAngle {
             }
             let scale = 1.0 / product;
             let (x, y) = (x * scale, y * scale);
-            // Both factors lie within a right angle of the real axis, so their angles add without a
-            // turn.
+            // Both factors lie within a right angle of the real axis, so their angles add up without wrapping
+            // around.
             (self.re, self.im) = (self.re * x - self.im * y, self.re * y + self.im * x);
             if !PRODUCT_RANGE.contains(&self.re) {
                 self.half_angles += self.im.atan2(self.re);

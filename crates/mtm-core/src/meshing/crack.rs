@@ -1,8 +1,8 @@
-//! A mesh parted along an open surface: lips that an image shows as one become two.
+//! A mesh split along an open surface: lips that are fused in an image become separate.
 //!
-//! Nodes near the surface move onto it where no tet suffers; tets are sorted by side; every node on the faces
-//! between both sides is doubled, one copy for each part of the tets round it. The rim of the surface stays
-//! joined, so that the cut ends where the surface ends.
+//! Nodes near the surface move onto it if no tet degenerates; tets are sorted by side; every node on the faces
+//! between the two sides is duplicated, one copy for each part of the tets around it. The rim of the surface
+//! stays connected, so that the cut ends where the surface ends.
 
 use std::collections::HashMap;
 
@@ -12,17 +12,17 @@ use crate::mesh::TetMesh;
 use crate::meshing::stuffing::cut::shape;
 use crate::vector::{add, dot, norm, scaled, sub};
 
-/// A node moves onto the surface from up to this share of its shortest edge.
+/// A node moves onto the surface from a distance of up to this share of its shortest edge.
 const REACH: f64 = 0.4;
 /// Smallest dihedral angle that a move may leave, radians.
 const LEAST_DIHEDRAL: f64 = 10.0 * std::f64::consts::PI / 180.0;
-/// Sine of the angle between the normal and the way to the rim, above which a point lies beside it.
+/// Sine of the angle between the normal and the direction to the rim, above which a point lies outside the rim.
 const BESIDE: f64 = 0.2;
 
-/// A parted mesh.
+/// A split mesh.
 #[derive(Debug, Clone)]
 pub struct Parted {
-    /// The mesh; the nodes that it had keep their numbers, copies follow.
+    /// The mesh; existing nodes keep their numbers, copies follow.
     pub mesh: TetMesh,
     /// Number of copies.
     pub doubled: usize,
@@ -50,9 +50,9 @@ pub fn part(mesh: &TetMesh, surface: &Surface) -> Result<Parted> {
     Ok(Parted { mesh: TetMesh::new(nodes, tets)?, doubled })
 }
 
-/// Signed distance from the surface; none beside its rim, where "above" and "below" mean nothing.
+/// Signed distance from the surface; none outside its rim, where "above" and "below" are undefined.
 ///
-/// Over a bend of the surface the way to it leads off the normal too, but there the side is known.
+/// Over a bend of the surface the direction to it also deviates from the normal, but there the side is known.
 fn height(surface: &Surface, x: [f64; 3]) -> Option<f64> {
     let closest = surface.closest_one(x);
     let along = dot(sub(x, closest.point), closest.normal);
@@ -92,7 +92,7 @@ fn snap(mesh: &TetMesh, surface: &Surface, nodes: &mut [[f64; 3]]) {
     }
 }
 
-/// +1 or −1 for tets beside the surface, 0 for all others.
+/// +1 or −1 for tets next to the surface, 0 for all others.
 fn sides(mesh: &TetMesh, surface: &Surface, nodes: &[[f64; 3]]) -> Vec<i8> {
     mesh.tets()
         .iter()
@@ -115,7 +115,7 @@ fn sides(mesh: &TetMesh, surface: &Surface, nodes: &[[f64; 3]]) -> Vec<i8> {
         .collect()
 }
 
-/// Gives each part of the tets round a node of the crack its own copy; the number of copies.
+/// Gives each part of the tets around a node of the crack its own copy; returns the number of copies.
 fn double(mesh: &TetMesh, sides: &[i8], nodes: &mut Vec<[f64; 3]>, tets: &mut [[u32; 4]]) -> usize {
     let before = nodes.len();
     let cracked = |s: u32, t: u32| sides[s as usize] * sides[t as usize] < 0;
@@ -126,7 +126,7 @@ fn double(mesh: &TetMesh, sides: &[i8], nodes: &mut Vec<[f64; 3]>, tets: &mut [[
         {
             continue;
         }
-        // The parts of the star that hang together by faces which the crack does not run through.
+        // The parts of the star that are connected by faces which the crack does not cross.
         let place: HashMap<u32, usize> = star.iter().enumerate().map(|(i, &t)| (t, i)).collect();
         let mut part = vec![usize::MAX; star.len()];
         let mut parts = 0;
@@ -147,7 +147,7 @@ fn double(mesh: &TetMesh, sides: &[i8], nodes: &mut Vec<[f64; 3]>, tets: &mut [[
             }
             parts += 1;
         }
-        // Where the star hung in parts before, at a hinge of the mesh, those stay as they were.
+        // If the star was already disconnected, at a hinge of the mesh, those parts stay as they were.
         for p in 1..parts {
             let copy = nodes.len() as u32;
             nodes.push(nodes[node]);

@@ -1,4 +1,4 @@
-//! Signed distance of a surface on a grid, in a band round it.
+//! Signed distance of a surface on a grid, in a band around it.
 
 use rayon::prelude::*;
 
@@ -8,14 +8,14 @@ use crate::geometry::winding::WindingTree;
 use crate::meshing::stuffing::level::{Grid, LevelImage};
 use crate::vector::{norm, sub};
 
-/// Winding number that parts inside from outside.
+/// Winding number that separates inside from outside.
 const INSIDE: f64 = 0.5;
 
 /// Signed distance to `surface` on `grid`, positive inside, clipped at ±`band` (mm).
 ///
-/// Inside is where the generalised winding number exceeds one half (Barill et al. 2018): overlapping parts
-/// count once, small holes do no harm. Along a row of voxels the distance says how many of them need no look
-/// (Hart 1996, sphere tracing). Parallel; the result does not depend on the number of threads.
+/// A point is inside if the generalised winding number exceeds one half (Barill et al. 2018): overlapping parts
+/// count once, and small holes do no harm. Along a row of voxels the distance shows how many of the next ones
+/// can be skipped (Hart 1996, sphere tracing). Parallel; the result does not depend on the number of threads.
 ///
 /// # Errors
 /// A band that is not positive.
@@ -41,12 +41,13 @@ pub fn signed_distance(surface: &Surface, grid: Grid, band: f64) -> Result<Level
         while k < nz {
             let x = grid.centre(row * nz + k);
             let d = distance(x);
-            // Farther than a step from the surface, the next voxel lies on the same side.
+            // If the surface is further away than one step, the next voxel lies on the same side.
             let side = match previous {
                 Some((side, d)) if d > step => side,
                 _ => sign(x),
             };
-            // A distance shrinks by a step per voxel at most: those up to here are beyond the band too.
+            // The distance decreases by at most one step per voxel: all voxels up to here are beyond the band
+            // too.
             let beyond = ((d - band) / step).floor().max(0.0) as usize;
             let end = (k + 1 + beyond).min(nz);
             out[k..end].fill((side * d.min(band)) as f32);

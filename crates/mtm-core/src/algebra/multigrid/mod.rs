@@ -79,6 +79,7 @@ impl Default for MultigridOptions {
 }
 
 /// A symmetric positive definite multigrid cycle for one [`BlockMatrix`].
+///
 /// Built once per matrix, and applied by any number of threads at once. Both are bitwise independent of the
 /// number of threads and of the machine's load.
 #[derive(Debug)]

@@ -1,4 +1,5 @@
-//! The lattice cut by the zero set of a level: snap near vertices to it, cut the edges that still cross.
+//! The lattice cut by the zero set of a level: vertices near it are snapped to it, edges that still cross it
+//! are cut.
 //!
 //! Labelle & Shewchuk (2007), sections 3.2 and 3.3. On a lattice of one size no tet has a dihedral angle
 //! below 10.78° or above 164.75°, whatever the level.
@@ -16,7 +17,7 @@ const SNAP_LONG: f64 = 0.24999;
 const SNAP_SHORT: f64 = 0.41189;
 /// Length of an edge between a corner and a centre, in edges of the cube: √3/2.
 const SHORT_EDGE: f64 = 0.866_025_403_784_438_6;
-/// Halvings that find a crossing on an edge: an edge of 3 mm is known to 3e-9 mm.
+/// Bisection steps to find a crossing on an edge: on an edge of 3 mm it is accurate to 3e-9 mm.
 const HALVINGS: usize = 30;
 
 /// Tets inside the zero set.
@@ -30,7 +31,7 @@ pub struct Cut {
     pub on_surface: Vec<bool>,
 }
 
-/// Where the vertices of the lattice stand to the level, and the edges that cross it.
+/// Position of the lattice vertices relative to the level, and the edges that cross it.
 struct Crossings<'a> {
     places: &'a [Place],
     /// Size of the smallest cube at each vertex, mm.
@@ -44,7 +45,7 @@ struct Crossings<'a> {
     points: Vec<[f64; 3]>,
 }
 
-/// The tets of `lattice` inside `level`; lattice place p lies at origin + unit · p.
+/// The tets of `lattice` inside `level`; lattice position p lies at origin + unit · p.
 pub fn cut(lattice: &Lattice, level: &LevelImage, origin: [f64; 3], unit: f64) -> Cut {
     let mut crossings = Crossings::find(lattice, level, origin, unit);
     crossings.snap();
@@ -52,7 +53,7 @@ pub fn cut(lattice: &Lattice, level: &LevelImage, origin: [f64; 3], unit: f64) -
 }
 
 impl Cut {
-    /// Drops the nodes that no tet uses; the order of the others stays.
+    /// Removes the nodes that no tet uses; the order of the others is kept.
     pub fn compress(&mut self) {
         let mut number = vec![u32::MAX; self.nodes.len()];
         for &v in self.tets.iter().flatten() {
@@ -121,7 +122,7 @@ impl<'a> Crossings<'a> {
         Self { places: &lattice.places, sizes, positions, signs, edges, points }
     }
 
-    /// Moves vertices to the nearest crossing that is too near, one after the other in their order.
+    /// Moves vertices to the nearest crossing that is too close, one after another in their order.
     fn snap(&mut self) {
         let n = self.signs.len();
         let mut start = vec![0_u32; n + 1];
@@ -149,7 +150,7 @@ impl<'a> Crossings<'a> {
                         return None;
                     }
                     let part = norm(sub(self.points[edge as usize], self.positions[v]));
-                    // Where cubes of two sizes meet, the smaller one says how far a vertex may go.
+                    // Where cubes of two sizes meet, the smaller one limits how far a vertex may move.
                     let limit = if is_along_axis(self.places[v], self.places[other]) {
                         SNAP_LONG
                     } else {
@@ -167,7 +168,8 @@ impl<'a> Crossings<'a> {
 
     fn tets(&self, lattice: &Lattice) -> Cut {
         let n = self.signs.len() as u32;
-        // Cut points follow the lattice vertices in a common numbering, which is then made dense.
+        // Cut points follow the lattice vertices in a common numbering, from which unused numbers are then
+        // removed.
         let pieces: Vec<[u32; 4]> = lattice
             .tets
             .par_iter()
@@ -236,7 +238,7 @@ impl<'a> Crossings<'a> {
                 let [m1, m2] = [next_minus(), next_minus()];
                 let [a, b] = [next_plus(), next_plus()];
                 let columns = [[a, b], [cut(a, m1), cut(b, m1)], [cut(a, m2), cut(b, m2)]];
-                // Column 0 before column 1 means the diagonal from a to the crossing of b.
+                // Column 0 before column 1 stands for the diagonal from a to the crossing of b.
                 let first = self.ordered(a, b, m1)[0] == a;
                 let second = self.ordered(a, b, m2)[0] == a;
                 let orders: &[[usize; 3]] = match (first, second) {
@@ -245,7 +247,7 @@ impl<'a> Crossings<'a> {
                     (false, true) => &[[1, 0, 2]],
                     (false, false) => &[[1, 2, 0], [2, 1, 0]],
                 };
-                // The diagonal inside the cut is free: the one that leaves the better tets.
+                // The diagonal inside the cut can be chosen freely: the one with the better tets is used.
                 let best = orders
                     .iter()
                     .map(|order| prism(order.map(|c| columns[c])).map(|p| self.oriented(p, n)))
@@ -275,7 +277,7 @@ impl<'a> Crossings<'a> {
         (square, p)
     }
 
-    /// The two inside vertices of a face, the one first whose diagonal cuts the quadrilateral.
+    /// The two inside vertices of a face, with the one whose diagonal splits the quadrilateral first.
     fn ordered(&self, a: u32, b: u32, m: u32) -> [u32; 2] {
         if self.order(a, m) > self.order(b, m) { [a, b] } else { [b, a] }
     }
@@ -302,8 +304,8 @@ fn is_along_axis(p: Place, q: Place) -> bool {
     (0..3).filter(|&a| p[a] != q[a]).count() == 1
 }
 
-/// Shape of a tet: its smallest dihedral angle, radians; if it is inverted, its volume over its longest
-/// edge cubed, which is negative, so that less inverted is better.
+/// Quality of a tet: its smallest dihedral angle, radians; for an inverted tet, its volume over its longest
+/// edge cubed, which is negative, so that a less inverted tet has a higher quality.
 pub fn shape(x: [[f64; 3]; 4]) -> f64 {
     let [e1, e2, e3] = [1, 2, 3].map(|k| sub(x[k], x[0]));
     let sixfold = dot(cross(e1, e2), e3);
@@ -317,7 +319,7 @@ pub fn shape(x: [[f64; 3]; 4]) -> f64 {
         .map(|n| scaled(n, 1.0 / norm(n)));
     let largest_cosine =
         pairs().map(|[f, g]| -dot(normals[f], normals[g])).fold(f64::NEG_INFINITY, f64::max);
-    // The arc cosine is coarse near 0 (1e-8 rad), where a tet is worthless however flat; better shapes are far
-    // from there, and equal ones stay equal.
+    // The arc cosine is inaccurate near 0 (1e-8 rad), where a tet is useless however flat; better shapes are
+    // far from there, and equal shapes give equal values.
     largest_cosine.clamp(-1.0, 1.0).acos()
 }

@@ -6,16 +6,16 @@ use rayon::prelude::*;
 
 use super::level::Grid;
 
-/// Squared distance of a voxel that sees no target near enough.
+/// Squared distance of a voxel that has no target near enough.
 const FAR: f32 = f32::INFINITY;
 
-/// Lines that are taken through memory together: a cache line of them.
+/// Number of lines processed together: a cache line of them.
 const TILE: usize = 16;
 
 /// Squared distance of every voxel centre to the nearest centre that is a target, mm².
 ///
-/// Infinite without targets, and where it is above `most` (mm²): what lies far from all targets then costs
-/// little. Parallel; the result does not depend on the number of threads.
+/// Infinite if there are no targets, and where it exceeds `most` (mm²), so that regions far from all targets
+/// take little time. Parallel; the result does not depend on the number of threads.
 pub fn squared_distance(grid: &Grid, most: f32, target: impl Fn(usize) -> bool + Sync) -> Vec<f32> {
     let [nx, ny, nz] = grid.shape;
     let plane = ny * nz;
@@ -35,7 +35,7 @@ pub fn squared_distance(grid: &Grid, most: f32, target: impl Fn(usize) -> bool +
             }
         }
     });
-    // Along i: one slab per j is made beside the array, then written back plane by plane.
+    // Along i: one slab per j is computed in a separate buffer, then written back plane by plane.
     let slabs: Vec<Vec<f32>> = (0..ny)
         .into_par_iter()
         .map_init(
@@ -69,12 +69,11 @@ pub fn squared_distance(grid: &Grid, most: f32, target: impl Fn(usize) -> bool +
     squared
 }
 
-/// Voxels of the shape that no ball of `radius` inside it comes near: its sheets and spikes.
+/// Voxels of the shape that are not close to any ball of `radius` inside it: its sheets and spikes.
 ///
 /// `squared` is the squared distance of each voxel to the complement, at least where it is below
-/// [`core_squared`]. A voxel is thin if it lies farther
-/// than (1 + `slack`) · radius from every place where such a ball has its centre; a slack of 0.5 leaves edges
-/// and corners of 90° alone.
+/// [`core_squared`]. A voxel is thin if it is further than (1 + `slack`) · radius from every centre of such a
+/// ball; a slack of 0.5 excludes edges and corners of 90°.
 pub fn thin_parts(grid: &Grid, squared: &[f32], radius: f64, slack: f64) -> Vec<bool> {
     let core = core_squared(grid, radius);
     let reach = ((1.0 + slack) * radius + half_voxel(grid)).powi(2) as f32;
@@ -91,15 +90,15 @@ pub fn core_squared(grid: &Grid, radius: f64) -> f32 {
     (radius + half_voxel(grid)).powi(2) as f32
 }
 
-/// Distances run from centre to centre: the surface lies about this much nearer.
+/// Distances are measured between voxel centres: the surface is nearer by about this much.
 fn half_voxel(grid: &Grid) -> f64 {
     0.5 * grid.spacing.iter().copied().fold(f64::INFINITY, f64::min)
 }
 
-/// Squared distances along one row to its own targets, up to `most`; the others are far already.
+/// Squared distances along one row to its own targets, up to `most`; the others are infinite already.
 fn scan(row: &mut [f32], spacing: f32, most: f32, target: impl Fn(usize) -> bool) {
     let n = row.len();
-    // From each target up to `most` or half of the way to the next one.
+    // From each target as far as `most` or half-way to the next one.
     let spread = |row: &mut [f32], from: usize, to: usize| {
         for (k, value) in row[from..to].iter_mut().enumerate() {
             *value = (k as f32 * spacing).powi(2);
@@ -136,18 +135,18 @@ fn scan(row: &mut [f32], spacing: f32, most: f32, target: impl Fn(usize) -> bool
     }
 }
 
-/// What the lines of a tile hold.
+/// Content of the lines of a tile.
 #[derive(PartialEq)]
 enum Distances {
-    /// No distance at all.
+    /// No finite distance.
     Far,
-    /// Targets alone.
+    /// Targets only.
     Zero,
-    /// Distances, which are loaded.
+    /// Distances, which have to be loaded.
     Some,
 }
 
-/// Lines of one length, side by side, whose squared distances go on along them.
+/// Lines of one length, next to each other, along which squared distances are propagated.
 struct Lines {
     /// Line after line.
     values: Vec<f32>,
@@ -161,7 +160,7 @@ impl Lines {
         Self { values: vec![FAR; TILE * n], n, most, envelope: Envelope::new(n, spacing) }
     }
 
-    /// Takes lines from rows across them, unless all are of one value.
+    /// Loads lines from rows across them, unless all entries have the same value.
     fn load<'a>(&mut self, row: impl Fn(usize) -> &'a [f32]) -> Distances {
         let (mut least, mut greatest) = ([FAR; TILE], [0.0; TILE]);
         for q in 0..self.n {
@@ -191,7 +190,7 @@ impl Lines {
         }
     }
 
-    /// Writes what the lines have at place `q`.
+    /// Writes the values of the lines at position `q`.
     fn store(&self, q: usize, row: &mut [f32]) {
         for (line, value) in row.iter_mut().enumerate() {
             *value = self.values[line * self.n + q];
@@ -211,9 +210,9 @@ struct Envelope {
 #[derive(Clone, Copy)]
 struct Parabola {
     apex: usize,
-    /// Its height above 0 at place 0.
+    /// Its height above 0 at position 0.
     at_zero: f64,
-    /// Place from which on it is the lowest.
+    /// Position from which on it is the lowest.
     start: f64,
 }
 
@@ -229,7 +228,7 @@ impl Envelope {
         self.parabolas.clear();
         for q in 0..n {
             let height = heights[q];
-            // Between targets a target is the nearest to itself alone.
+            // Among targets, each target is nearest only to itself.
             let is_enclosed = height == 0.0
                 && (q == 0 || heights[q - 1] == 0.0)
                 && (q + 1 == n || heights[q + 1] == 0.0);
@@ -250,7 +249,7 @@ impl Envelope {
         }
         let mut from = 0;
         for (at, parabola) in self.parabolas.iter().enumerate() {
-            // A place on the border of two belongs to the first.
+            // A position on the border of two belongs to the first.
             let next = self.parabolas.get(at + 1).map_or(f64::INFINITY, |next| next.start);
             let end = if next < 0.0 { 0 } else { n.min((next as usize).saturating_add(1)) };
             for q in from..end {

@@ -1,8 +1,9 @@
-//! Better shapes for the few tets that a graded lattice leaves poor: move their nodes, drop what stays poor.
+//! Better shapes for the few poor tets of a graded lattice: their nodes are moved, and tets that stay poor are
+//! removed.
 //!
-//! Nodes move one after the other, each to where the worst tet round it is best; those on the surface stay on
-//! it. What is still poor lies at the surface, where a tet can be dropped: the mesh stays conforming and the
-//! surface moves by less than the height of that tet.
+//! Nodes move one after another, each to the position that is best for the worst tet around it; nodes on the
+//! surface stay on it. Tets that are still poor lie at the surface, where a tet can be removed: the mesh stays
+//! conforming, and the surface moves by less than the height of that tet.
 
 use crate::mesh::Incidence;
 use crate::vector::{add, dot, norm, scaled, sub};
@@ -10,29 +11,29 @@ use crate::vector::{add, dot, norm, scaled, sub};
 use super::cut::{Cut, shape};
 use super::level::LevelImage;
 
-/// Smallest dihedral angle that is left alone, radians: some way above what must hold.
+/// Smallest dihedral angle above which a tet is not improved, radians: somewhat above the required minimum.
 const GOAL: f64 = 15.0 * std::f64::consts::PI / 180.0;
 /// Smallest dihedral angle of the result, radians.
 pub const LEAST_DIHEDRAL: f64 = 10.0 * std::f64::consts::PI / 180.0;
-/// Rounds over the poor tets.
+/// Number of passes over the poor tets.
 const ROUNDS: usize = 12;
-/// Steps of a move, in the node's shortest edge, tried one after the other.
+/// Lengths of a move, relative to the node's shortest edge, tried one after another.
 const STEPS: [f64; 4] = [0.3, 0.15, 0.07, 0.03];
-/// Gain below which a move is not worth making, radians.
+/// Improvement below which a move is not worthwhile, radians.
 const LEAST_GAIN: f64 = 1e-4;
-/// Newton steps that bring a point back to the surface.
+/// Newton steps that move a point back to the surface.
 const PROJECTIONS: usize = 8;
-/// Distance from the surface, in the node's shortest edge, at which it counts as reached.
+/// Distance from the surface, relative to the node's shortest edge, at which the surface counts as reached.
 const ON_SURFACE: f64 = 1e-3;
 
-/// Improves `cut` in place until no tet is below `LEAST_DIHEDRAL`; the number of tets dropped.
+/// Improves `cut` in place until no tet is below `LEAST_DIHEDRAL`; returns the number of tets removed.
 pub fn improve(cut: &mut Cut, level: &LevelImage) -> usize {
     let before = cut.tets.len();
     while smooth(cut, level) < LEAST_DIHEDRAL && drop_poor(cut) {}
     before - cut.tets.len()
 }
 
-/// Moves the nodes of poor tets; the worst shape that is left.
+/// Moves the nodes of poor tets; returns the worst remaining quality.
 fn smooth(cut: &mut Cut, level: &LevelImage) -> f64 {
     let stars = Incidence::new(cut.nodes.len(), &cut.tets);
     let shape_of = |cut: &Cut, t: u32| shape(cut.tets[t as usize].map(|v| cut.nodes[v as usize]));
@@ -46,7 +47,7 @@ fn smooth(cut: &mut Cut, level: &LevelImage) -> f64 {
         for &node in &nodes {
             moved |= move_node(cut, level, stars.of(node as usize), node);
         }
-        // Moving may have made others poor, never poorer than the worst beside them was.
+        // Moves may have made other tets poor, but never poorer than the worst adjacent one was.
         poor = nodes.iter().flat_map(|&v| stars.of(v as usize).iter().copied()).collect();
         poor.sort_unstable();
         poor.dedup();
@@ -58,7 +59,7 @@ fn smooth(cut: &mut Cut, level: &LevelImage) -> f64 {
     poor.iter().map(|&t| shape_of(cut, t)).fold(f64::INFINITY, f64::min)
 }
 
-/// Moves one node to a better place, if there is one.
+/// Moves one node to a better position, if there is one.
 fn move_node(cut: &mut Cut, level: &LevelImage, star: &[u32], node: u32) -> bool {
     let start = cut.nodes[node as usize];
     let worst_at = |place: [f64; 3], at_least: f64| {
@@ -123,7 +124,8 @@ fn projected(level: &LevelImage, point: [f64; 3], reach: f64) -> Option<[f64; 3]
             return None;
         }
         let step = value / square;
-        // A clipped level says less than the distance, a steep one more: half an edge is far enough.
+        // A clipped level underestimates the distance, a steep one overestimates it: half an edge is far
+        // enough.
         let length = (step * square.sqrt()).abs();
         let scale = if length > 0.5 * reach { 0.5 * reach / length } else { 1.0 };
         x = sub(x, scaled(gradient, step * scale));
@@ -134,7 +136,7 @@ fn projected(level: &LevelImage, point: [f64; 3], reach: f64) -> Option<[f64; 3]
     None
 }
 
-/// Drops tets below the limit that have a face on the boundary; whether there was one.
+/// Removes tets below the limit that have a face on the boundary; returns whether there was one.
 fn drop_poor(cut: &mut Cut) -> bool {
     let stars = Incidence::new(cut.nodes.len(), &cut.tets);
     let tets = &cut.tets;
@@ -154,7 +156,7 @@ fn drop_poor(cut: &mut Cut) -> bool {
     }
     let mut kept = keep.iter();
     cut.tets.retain(|_| *kept.next().expect("one per tet"));
-    // What lay behind a dropped tet is boundary now, but not on the zero set: it may move freely.
+    // Nodes behind a removed tet are on the boundary now, but not on the zero set: they may move freely.
     cut.compress();
     true
 }

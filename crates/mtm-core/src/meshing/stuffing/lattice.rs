@@ -1,10 +1,10 @@
 //! Graded body-centred cubic lattice: an octree of cubes, their corners and centres, and its tets.
 //!
-//! Labelle & Shewchuk (2007), sections 3.1 and 3.4. Two cubes of one size share the four tets of the BCC
-//! lattice round each edge of their common face, cut in two where an edge has a midpoint; between cubes of
-//! two sizes stand half pyramids. Cubes that touch differ by one level at most.
+//! Labelle & Shewchuk (2007), sections 3.1 and 3.4. Two cubes of the same size share the four tets of the BCC
+//! lattice around each edge of their common face, split in two where an edge has a midpoint; between cubes of
+//! different sizes there are half pyramids. Cubes that touch differ by at most one level.
 //!
-//! Coordinates are whole numbers in units of half the finest cube, so that equal places are equal bits.
+//! Coordinates are integers in units of half the finest cube, so that equal positions are equal in every bit.
 
 use std::collections::HashMap;
 use std::hash::BuildHasherDefault;
@@ -13,7 +13,7 @@ use rayon::prelude::*;
 
 use crate::geometry::lattice_hash::KeyHasher;
 
-/// A place of the lattice, in units.
+/// A position of the lattice, in units.
 pub type Place = [i32; 3];
 
 /// Cubes at the coarsest level, each the root of a tree.
@@ -43,7 +43,7 @@ pub struct Leaf {
 /// Vertices and tets of the lattice.
 #[derive(Debug, Clone)]
 pub struct Lattice {
-    /// Places, ascending.
+    /// Positions, ascending.
     pub places: Vec<Place>,
     /// Size of the smallest cube at each vertex, units.
     pub sizes: Vec<i32>,
@@ -72,7 +72,7 @@ impl Octree {
         self.coarse
     }
 
-    /// The leaf at a place, lower faces included; none outside or far from the tissue.
+    /// The leaf at a position, lower faces included; none outside or far from the tissue.
     pub fn leaf_at(&self, place: Place) -> Option<Leaf> {
         let mut cube = [0_usize; 3];
         for axis in 0..3 {
@@ -105,7 +105,7 @@ impl Octree {
         Some(Leaf { origin, size, index })
     }
 
-    /// Splits the leaf at `place` until it is not larger than `size`.
+    /// Splits the leaf at `place` until it is no larger than `size`.
     pub fn refine(&mut self, place: Place, size: i32) {
         while let Some(leaf) = self.leaf_at(place).filter(|leaf| leaf.size > size) {
             self.split(leaf.index);
@@ -117,7 +117,7 @@ impl Octree {
         self.children.extend([NONE; 8]);
     }
 
-    /// Splits until cubes that share a face, an edge or a corner differ by one level at most.
+    /// Splits until cubes that share a face, an edge or a corner differ by at most one level.
     pub fn balance(&mut self) {
         let mut pending = self.leaves();
         while !pending.is_empty() {
@@ -128,7 +128,7 @@ impl Octree {
                 .collect();
             let mut split = Vec::new();
             for (place, size) in too_large {
-                // Another of these may have split it far enough already.
+                // A previous split in this pass may have refined it far enough already.
                 if let Some(leaf) = self.leaf_at(place).filter(|leaf| leaf.size > 2 * size) {
                     self.split(leaf.index);
                     split.push(leaf);
@@ -177,7 +177,7 @@ impl Octree {
     }
 }
 
-/// A place inside each of the 26 cubes of the leaf's own size round it.
+/// A position inside each of the 26 neighbouring cubes of the leaf's own size.
 fn neighbours(leaf: &Leaf) -> impl Iterator<Item = Place> + use<> {
     let Leaf { origin, size, .. } = *leaf;
     (0..27).filter(|&d| d != 13).map(move |d| {
@@ -219,7 +219,7 @@ impl Lattice {
     }
 }
 
-/// Appends the tets that a leaf owns: those of its upper faces towards cubes of its size, and all
+/// Appends the tets that belong to a leaf: those of its upper faces towards cubes of its size, and all those
 /// towards larger cubes.
 fn tets_of(
     tree: &Octree,
@@ -235,7 +235,7 @@ fn tets_of(
             let mut beyond = centre;
             beyond[axis] += side * leaf.size;
             let Some(other) = tree.leaf_at(beyond) else { continue };
-            // The same place lies in a smaller cube's corner: those cubes make the tets.
+            // The same position is a corner of a smaller cube: the smaller cubes create the tets.
             if other.size < leaf.size || (other.size == leaf.size && side < 0) {
                 continue;
             }
@@ -263,7 +263,7 @@ fn tets_of(
                 }
                 continue;
             }
-            // The diagonal of the quarter face runs from the middle of the large face outwards.
+            // The diagonal of the quarter face runs outwards from the centre of the large face.
             let from = (0..4)
                 .find(|&v| corners[v][b] == other_centre[b] && corners[v][c] == other_centre[c])
                 .expect("a quarter of a face has a corner at its middle");

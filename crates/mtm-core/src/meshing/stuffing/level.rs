@@ -6,8 +6,8 @@ use crate::error::{ErrorKind, MtmError, Result};
 
 /// Value far outside the grid, and of a clipped level far outside the tissue.
 const OUTSIDE: f32 = -1.0;
-/// Smallest size of a level made from labels at a voxel centre. Smoothing rounds the steps between
-/// voxels, but it must not take a voxel its label: sheets and gaps one voxel thick stay.
+/// Smallest absolute value at a voxel centre of a level made from labels. Smoothing rounds the steps between
+/// voxels, but must not change the label of any voxel: sheets and gaps one voxel thick are preserved.
 const LABEL_FLOOR: f32 = 0.1;
 
 /// A voxel and its 26 neighbours.
@@ -64,7 +64,7 @@ impl Grid {
         self.shape.iter().product()
     }
 
-    /// Whether there is no voxel; a checked grid has some.
+    /// Whether there are no voxels; a checked grid has some.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -86,7 +86,7 @@ impl LevelImage {
     /// The level image of `values` on `grid`.
     ///
     /// # Errors
-    /// Another number of values than voxels, NaN or infinity.
+    /// A number of values that differs from the number of voxels, NaN or infinity.
     pub fn new(grid: Grid, values: Vec<f32>) -> Result<Self> {
         let kind = ErrorKind::Mesh;
         if values.len() != grid.len() {
@@ -107,11 +107,11 @@ impl LevelImage {
 
     /// The level image of labels: non-zero is tissue.
     ///
-    /// Steps between voxels are smoothed by the binomial filter (1 2 1)/4 along each axis, which keeps
-    /// flat faces half-way between voxels; every voxel centre keeps its side.
+    /// Steps between voxels are smoothed by the binomial filter (1 2 1)/4 along each axis, which keeps flat
+    /// faces half-way between voxels; every voxel centre stays on its side.
     ///
     /// # Errors
-    /// Another number of labels than voxels.
+    /// A number of labels that differs from the number of voxels.
     pub fn from_labels(grid: Grid, inside: &[bool]) -> Result<Self> {
         if inside.len() != grid.len() {
             return Err(MtmError::Length {
@@ -124,7 +124,7 @@ impl LevelImage {
         }
         let [nx, ny, nz] = grid.shape;
         let plane = ny * nz;
-        // Along j and k plane by plane, then along i from the three planes round each.
+        // Along j and k plane by plane, then along i from three neighbouring planes each.
         let mut smooth = vec![0.0_f32; grid.len()];
         smooth.par_chunks_mut(plane).zip(inside.par_chunks(plane)).for_each(|(out, labels)| {
             let mut rows = vec![0.0_f32; plane];
@@ -171,7 +171,7 @@ impl LevelImage {
         &self.values
     }
 
-    /// Value of each voxel, k fastest, given away.
+    /// Value of each voxel, k fastest, moved out of the level.
     pub fn into_values(self) -> Vec<f32> {
         self.values
     }
@@ -216,9 +216,10 @@ impl LevelImage {
         })
     }
 
-    /// Volume inside, mm³: voxels at their value's share, linear across the surface.
+    /// Volume inside, mm³: voxels count by the share given by their value, linear across the surface.
     ///
-    /// A voxel whose neighbours all have its sign counts whole; the others by eight sub-samples.
+    /// A voxel whose neighbours all have its sign counts fully; the others are evaluated with eight
+    /// sub-samples.
     pub fn volume(&self) -> f64 {
         let [nx, ny, nz] = self.grid.shape;
         let voxel = self.grid.spacing.iter().product::<f64>();
@@ -240,7 +241,7 @@ impl LevelImage {
         eighths as f64 / 8.0 * voxel
     }
 
-    /// Writes how many of the nine voxels in and beside each of row (i, j) lie inside.
+    /// Writes how many of the nine voxels in and next to each of row (i, j) lie inside.
     fn count_inside(&self, i: usize, j: usize, inside: &mut [u8]) {
         let [nx, ny, nz] = self.grid.shape;
         inside.fill(0);
@@ -279,7 +280,7 @@ impl LevelImage {
 mod tests {
     use super::*;
 
-    /// Every voxel by its eight sub-samples, and whole only where all 27 signs agree.
+    /// Every voxel evaluated with eight sub-samples, and counted fully only if all 27 signs agree.
     #[test]
     fn volume_counts_surrounded_voxels_whole_and_the_others_by_eighths() {
         let grid = Grid::new([13, 11, 17], [1.0, 1.2, 0.8], [-3.0, 2.0, 1.0]).expect("a grid");

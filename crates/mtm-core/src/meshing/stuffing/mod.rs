@@ -56,7 +56,7 @@ impl Default for StuffingOptions {
     }
 }
 
-/// How often the edge is halved at each voxel of a level image, in the order of its values.
+/// How many times the edge is halved at each voxel of a level image, in the order of its values.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Halvings<'a> {
     /// At most, for what is thin there; as the options say if none.
@@ -65,28 +65,28 @@ pub struct Halvings<'a> {
     pub needed: Option<&'a [u8]>,
 }
 
-/// A mesh with what its making left out and how near it came to its level.
+/// A mesh, with what was removed from it and how closely it follows its level.
 #[derive(Debug, Clone)]
 pub struct Stuffed {
     /// The mesh.
     pub mesh: TetMesh,
-    /// Bodies that were too small to keep.
+    /// Bodies that were removed because they were too small.
     pub dropped: Dropped,
-    /// Poor tets at the surface that were dropped.
+    /// Poor tets at the surface that were removed.
     pub dropped_tets: usize,
     /// Volume inside the level image, mm³.
     pub level_volume: f64,
     /// Mean distance of the boundary triangles' centroids from the zero set, mm.
     pub boundary_error_mean: f64,
-    /// Largest of these distances, mm; at most the edge length, where the zero set is out of reach.
+    /// Largest of these distances, mm; at most the edge length if the zero set is out of reach.
     pub boundary_error_max: f64,
 }
 
 /// The mesh of `level`, with dihedral angles of at least 10°.
 ///
 /// # Errors
-/// Options or halvings out of range, no tissue in the image, or none that the lattice catches, an edge
-/// length so small that the lattice has no end.
+/// Options or numbers of halvings out of range, no tissue in the image or none that the lattice resolves, an
+/// edge length so small that the lattice would become too large.
 pub fn stuff(
     level: &LevelImage,
     options: &StuffingOptions,
@@ -131,7 +131,7 @@ fn boundary_error(mesh: &TetMesh, level: &LevelImage, reach: f64) -> (f64, f64) 
             let [a, b, c] = triangle.map(|v| mesh.nodes()[v as usize]);
             let normal = cross(sub(b, a), sub(c, a));
             let centroid = scaled(add(add(a, b), c), 1.0 / 3.0);
-            // Outwards where the centroid lies inside, inwards where it lies outside.
+            // Outwards if the centroid lies inside, inwards if it lies outside.
             let inside = level.value(centroid) > 0.0;
             let sense = if inside { 1.0 } else { -1.0 } / norm(normal);
             let at = |d: f64| level.value(add(centroid, scaled(normal, d * sense))) > 0.0;
@@ -222,7 +222,7 @@ impl Cover {
         let (low, high) = inside_bounds(level)
             .ok_or(MtmError::Empty { what: "tissue of the image", kind: ErrorKind::Mesh })?;
         let edge = options.edge_length;
-        // The surface lies up to one voxel beyond the last voxel inside; one cube more on every side.
+        // The surface lies up to one voxel beyond the last voxel inside; one additional cube on every side.
         let margin = grid.spacing.map(|s| s + edge);
         let origin = [0, 1, 2].map(|a| low[a] - margin[a]);
         let counts = [0, 1, 2].map(|a| ((high[a] + margin[a] - origin[a]) / edge).ceil().max(1.0));
@@ -239,7 +239,8 @@ impl Cover {
         Ok(Self { origin, counts: counts.map(|c| c as usize), edge, unit })
     }
 
-    /// The octree over the cubes near tissue, refined where tissue or a gap in it is thin or it is needed.
+    /// The octree over the cubes near tissue, refined where the tissue or a gap in it is thin, or where
+    /// requested.
     fn tree(
         &self,
         level: &LevelImage,
@@ -258,14 +259,14 @@ impl Cover {
             }
         }
         let values = level.values();
-        // The longest edge asks farthest.
+        // The longest edge has the largest reach.
         let most = core_squared(grid, THIN_RADIUS * self.edge);
         let to_outside = squared_distance(grid, most, |index| values[index] <= 0.0);
         let to_inside = squared_distance(grid, most, |index| values[index] > 0.0);
         let voxel = grid.spacing.iter().product::<f64>().cbrt();
         for refinement in 0..options.refinements {
             let edge = self.edge / f64::from(1_u32 << refinement);
-            // What is finer than the image is its noise.
+            // Anything finer than the image is noise.
             if 0.5 * edge < LEAST_EDGE_IN_VOXELS * voxel {
                 break;
             }
@@ -285,7 +286,7 @@ impl Cover {
         tree
     }
 
-    /// Refines the cubes at a point and at the corners of a box round it.
+    /// Refines the cubes at a point and at the corners of a box around it.
     fn refine_round(&self, tree: &mut Octree, point: [f64; 3], reach: f64, size: i32) {
         for corner in 0..8 {
             let side = [0, 1, 2].map(|a| if corner >> a & 1 == 1 { reach } else { -reach });
@@ -298,7 +299,7 @@ impl Cover {
         [0, 1, 2].map(|a| ((point[a] - self.origin[a]) / self.unit).floor() as i32)
     }
 
-    /// Whether each cube, or one beside it, holds a voxel inside or next to one.
+    /// Whether each cube, or one next to it, holds a voxel inside or next to one.
     fn active(&self, level: &LevelImage) -> Vec<bool> {
         let grid = level.grid();
         let [nx, ny, nz] = self.counts;
@@ -306,7 +307,7 @@ impl Cover {
             .into_par_iter()
             .map(|c| {
                 let cube = [c / (ny * nz), c / nz % ny, c % nz];
-                // Voxels from one before the cube to one after it, the cubes beside it included.
+                // Voxels from one before the cube to one after it, including the neighbouring cubes.
                 let span = |a: usize| {
                     let low = self.origin[a] + (cube[a] as f64 - 1.0) * self.edge;
                     let high = low + 3.0 * self.edge;

@@ -1,10 +1,10 @@
-//! The bodies of a cut lattice: specks go, and bodies that only touch are parted.
+//! The bodies of a cut lattice: specks are removed, and bodies that only touch are separated.
 
 use crate::vector::{cross, dot, sub};
 
 use super::cut::Cut;
 
-/// What was left out of a mesh.
+/// What was removed from a mesh.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Dropped {
     /// Bodies.
@@ -13,9 +13,10 @@ pub struct Dropped {
     pub volume: f64,
 }
 
-/// Keeps the bodies of at least `least` (mm³), the largest in any case; a body is what hangs together by faces.
+/// Keeps the bodies of at least `least` (mm³), the largest in any case; a body is a set of tets connected by
+/// faces.
 ///
-/// Two bodies that share a node, as specks on a surface do, would hinge there: each gets a node of its own.
+/// Two bodies that share a node, as specks on a surface do, would form a hinge there: each gets its own node.
 pub fn keep_bodies(cut: &mut Cut, least: f64) -> Dropped {
     let body = bodies(&cut.tets);
     let n_bodies = body.iter().max().map_or(0, |&b| b as usize + 1);
