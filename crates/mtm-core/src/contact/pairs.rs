@@ -6,6 +6,7 @@
 //! or is a part of the boundary of the tissue itself, deformed with it. The problem is solved by the method of
 //! multipliers (Hestenes 1969, Powell 1969; for inequalities Rockafellar 1973; for contact Simo & Laursen
 //! 1992). Each round minimises
+//!
 //! ```text
 //! E(u) + Σ ½ k (g(u) − λ/k)²     over the nodes with λ − k g > 0,
 //! ```

@@ -1,9 +1,9 @@
-//! Iterative closest points: the rigid motion that lays points on a surface, or on other points.
+//! Iterative closest points: the rigid motion that aligns points with a surface, or with other points.
 //!
-//! Besl & McKay (1992) with the worst pairs left out (Chetverikov et al. 2002). Steps are those to the
-//! tangent planes (Chen & Medioni 1992); one that would raise the distances is replaced by the best
-//! motion of the pairs themselves, which never does. Both have the same fixed points: Σ (x − c) = 0
-//! and Σ x × (x − c) = 0 over the pairs of a point x and its closest point c.
+//! Besl & McKay (1992) without the worst pairs (Chetverikov et al. 2002). Steps minimise the distances to the
+//! tangent planes (Chen & Medioni 1992); a step that would increase the distances is replaced by the best
+//! motion of the pairs themselves, which never does. Both have the same fixed points: Σ (x − c) = 0 and Σ x ×
+//! (x − c) = 0 over the pairs of a point x and its closest point c.
 
 use nalgebra::{Matrix4, Matrix6, UnitQuaternion, Vector6};
 use rayon::prelude::*;
@@ -16,24 +16,24 @@ use crate::registration::rigid::{LEAST_PAIRS, Pose, fit_pairs};
 use crate::registration::spread::{check_coordinates, check_not_in_line};
 use crate::vector::Vec3;
 
-/// Pairs that fix a motion by their tangent planes.
+/// Number of pairs that determine a motion by their tangent planes.
 const LEAST_PLANE_PAIRS: usize = 6;
 
-/// Distance over the largest coordinate below which the direction to the closest point is rounding,
-/// and the surface's normal stands in.
+/// Distance over the largest coordinate below which the direction to the closest point is mere rounding, and
+/// the normal of the surface is used instead.
 const TOUCHING: f64 = 64.0 * f64::EPSILON;
 
-/// Smallest over largest eigenvalue of the normal equations of a step to tangent planes below which
-/// some motion leaves all pairs as they are.
+/// Ratio of the smallest to the largest eigenvalue of the normal equations of a tangent-plane step below which
+/// some motion leaves all pairs unchanged.
 const FREE_MOTION: f64 = 1e-10;
 
-/// Points a thread takes at once.
+/// Points per parallel task.
 const POINTS_PER_TASK: usize = 64;
 
 /// Names of the methods.
 pub const METHODS: &str = "plane, point";
 
-/// What the moving points are brought to.
+/// What the moving points are aligned with.
 #[derive(Debug, Clone, Copy)]
 pub enum Fixed<'a> {
     /// The closest point of a surface.
@@ -42,17 +42,17 @@ pub enum Fixed<'a> {
     Points(&'a PointTree),
 }
 
-/// How a step is found.
+/// How a step is computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum IcpMethod {
-    /// Distances to tangent planes of the surface: quadratic near the end.
+    /// From the distances to tangent planes of the surface: quadratic convergence near the end.
     Plane,
-    /// Distances to the closest points: linear, often slow.
+    /// From the distances to the closest points: linear convergence, often slow.
     Point,
 }
 
 impl IcpMethod {
-    /// Method of a name.
+    /// The method called `name`.
     ///
     /// # Errors
     /// [`MtmError::UnknownName`].
@@ -73,23 +73,23 @@ impl IcpMethod {
 /// Options of an iteration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct IcpOptions {
-    /// How a step is found; tangent planes for a surface, points for points if none.
+    /// How a step is computed; if none, tangent planes for a surface, and points for points.
     pub method: Option<IcpMethod>,
-    /// Rigid motion to begin with, 4×4 row by row.
+    /// Initial rigid motion, 4×4 row by row.
     pub initial: [[f64; 4]; 4],
-    /// Share of the pairs, those farthest apart, that a step leaves out: 0 to below 1.
+    /// Share of the pairs, those furthest apart, that a step ignores: 0 to below 1.
     pub trim: f64,
-    /// Distance beyond which a pair is left out, mm.
+    /// Distance beyond which a pair is ignored, mm.
     pub max_distance: Option<f64>,
-    /// Angle between the normals of a pair beyond which it is left out, rad.
+    /// Angle between the normals of a pair beyond which it is ignored, rad.
     pub max_angle: Option<f64>,
-    /// Whether pairs on the border of an open surface count: where the moving points reach past it,
-    /// their partners there are not the right ones.
+    /// Whether pairs on the border of an open surface count: where the moving points extend beyond the border,
+    /// their partners on it are not the correct ones.
     pub keep_border: bool,
-    /// Most steps.
+    /// Maximum number of steps.
     pub max_iterations: usize,
-    /// Largest motion of a point in a step over the radius of the points below which they rest; 0:
-    /// exactly `max_iterations` steps are done.
+    /// Largest motion of a point in a step, over the radius of the points, below which the iteration has
+    /// converged; 0: exactly `max_iterations` steps are done.
     pub tolerance: f64,
 }
 
@@ -111,19 +111,19 @@ impl Default for IcpOptions {
 /// Outcome of an iteration.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IcpFit {
-    /// Rigid motion, row by row: moving points to the fixed ones, `initial` included.
+    /// Rigid motion, row by row, from the moving points to the fixed ones, including `initial`.
     pub matrix: [[f64; 4]; 4],
     /// Root mean square distance of the pairs that count, mm.
     pub rms: f64,
     /// Steps done.
     pub iterations: usize,
-    /// Whether the points came to rest.
+    /// Whether the iteration converged.
     pub converged: bool,
     /// Whether the pair of each moving point counts.
     pub kept: Vec<bool>,
     /// Distance of each moved point from its closest one, mm.
     pub distances: Vec<f64>,
-    /// `rms` before the first step and after each.
+    /// `rms` before the first step and after each step.
     pub rms_history: Vec<f64>,
 }
 
@@ -145,7 +145,7 @@ struct Pairs {
     mean_square: f64,
 }
 
-/// Rigid motion that brings `moving` (mm) closest to `fixed`.
+/// The rigid motion that brings `moving` (mm) closest to `fixed`.
 ///
 /// `normals`: unit normal of each moving point, for [`IcpOptions::max_angle`]. The result does not
 /// depend on the number of threads.
@@ -262,7 +262,7 @@ impl Pairs {
     }
 }
 
-/// Leaves out the share of the counting pairs that is farthest apart; of equal ones the last.
+/// Ignores the share of the counting pairs that is furthest apart; of equal ones, the last.
 fn trim(matches: &mut [Match], share: f64) {
     if share == 0.0 {
         return;
@@ -286,14 +286,14 @@ fn point_step(moving: &[[f64; 3]], pairs: &Pairs) -> Result<Pose> {
     let partners: Vec<[f64; 3]> = pairs.matches.iter().map(|pair| pair.closest.into()).collect();
     let fit = fit_pairs(moving, &partners, &weights, false)?;
     let centre = centroid(moving);
-    // About the centroid of all points, as every pose here.
+    // About the centroid of all points, like every pose here.
     Ok(Pose { image: fit.apply(centre), centre, ..fit })
 }
 
 /// The pose that brings the points closest to the tangent planes at their partners, to first order.
 ///
-/// Turning by ω about the centre m and moving by τ changes n·(x − c) by n·(ω × (x − m) + τ) =
-/// ω·((x − m) × n) + τ·n. With n the direction from c to x it is the change of their distance.
+/// Rotating by ω about the centre m and translating by τ changes n·(x − c) by n·(ω × (x − m) + τ) = ω·((x − m)
+/// × n) + τ·n. With n the direction from c to x this is the change of their distance.
 fn plane_step(pose: &Pose, pairs: &Pairs, radius: f64) -> Result<Pose> {
     let (mut a, mut b) = (Matrix6::<f64>::zeros(), Vector6::<f64>::zeros());
     let rounding = TOUCHING * (pose.image.amax() + radius);
@@ -301,7 +301,7 @@ fn plane_step(pose: &Pose, pairs: &Pairs, radius: f64) -> Result<Pose> {
         let offset = pair.moved - pair.closest;
         let touching = pair.distance <= rounding;
         let towards = if touching { pair.normal } else { offset / pair.distance };
-        // Turns are measured by the way of a point at the radius, mm, like translations.
+        // Rotations are measured by the displacement of a point at the radius, mm, like translations.
         let turn = ((pair.moved - pose.image) / radius).cross(&towards);
         let row = Vector6::new(turn.x, turn.y, turn.z, towards.x, towards.y, towards.z);
         a += row * row.transpose();
@@ -331,7 +331,7 @@ fn plane_step(pose: &Pose, pairs: &Pairs, radius: f64) -> Result<Pose> {
     })
 }
 
-/// Bound of the way of any moving point from one pose to another, mm.
+/// Upper bound of the displacement of any moving point from one pose to another, mm.
 fn largest_motion(from: &Pose, to: &Pose, radius: f64) -> f64 {
     let turn = (to.rotation * from.rotation.inverse()).angle();
     (to.image - from.image).norm() + turn * radius

@@ -1,4 +1,4 @@
-//! Registration: maps that bring landmarks or points to others.
+//! Registration: maps that align landmarks or points with others.
 
 pub mod icp;
 pub mod nearest;

@@ -3,17 +3,17 @@
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::registration::spread::check_coordinates;
 
-/// Points below which a box is not split: looking at all of them is faster.
+/// Number of points below which a box is not split: checking all of them is faster.
 const LEAF_POINTS: usize = 8;
 
-/// Points that can be asked for the nearest to a place.
+/// A set of points that can be searched for the point nearest to a position.
 #[derive(Debug, Clone)]
 pub struct PointTree {
-    /// The points in the order of the tree: the middle one of a range parts it.
+    /// The points in the order of the tree: the middle one of a range splits it.
     points: Vec<[f64; 3]>,
-    /// Their index as given.
+    /// Their indices in the original order.
     index: Vec<u32>,
-    /// Axis along which the range with this middle is parted.
+    /// Axis along which the range with this middle is split.
     axis: Vec<u8>,
 }
 
@@ -22,7 +22,7 @@ pub struct PointTree {
 pub struct Nearest {
     /// Its index; of several equally near ones, the smallest.
     pub index: u32,
-    /// Its place, mm.
+    /// Its position, mm.
     pub point: [f64; 3],
     /// Its squared distance, mm².
     pub squared: f64,
@@ -45,7 +45,7 @@ impl PointTree {
         Ok(Self { points: sorted, index, axis })
     }
 
-    /// The nearest point to `place` (mm, finite).
+    /// The nearest point to the position `place` (mm, finite).
     pub fn nearest(&self, place: [f64; 3]) -> Nearest {
         let mut best = Nearest { index: u32::MAX, point: [0.0; 3], squared: f64::INFINITY };
         self.search(0, self.points.len(), &place, &mut best);
@@ -67,7 +67,7 @@ impl PointTree {
         };
         self.search(near.0, near.1, place, best);
         self.compare(middle, place, best);
-        // Equal distances are looked at as well: the smallest index wins.
+        // Equal distances are checked as well: the smallest index wins.
         if beyond * beyond <= best.squared {
             self.search(far.0, far.1, place, best);
         }
@@ -84,7 +84,7 @@ impl PointTree {
     }
 }
 
-/// Orders `index` so that the middle parts the range along its longest axis, and so in each half.
+/// Orders `index` so that the middle splits the range along its longest axis, and each half likewise.
 fn part(points: &[[f64; 3]], index: &mut [u32], axis: &mut [u8]) {
     if index.len() <= LEAF_POINTS {
         return;

@@ -1,4 +1,4 @@
-//! Rigid motion, with a scale if asked for, that brings points closest to their partners.
+//! Rigid motion, optionally with a scale, that brings points closest to their partners.
 
 use nalgebra::{Matrix3, Matrix4, Quaternion, UnitQuaternion};
 
@@ -6,28 +6,28 @@ use crate::error::{ErrorKind, MtmError, Result};
 use crate::registration::spread::{check_coordinates, check_not_in_line};
 use crate::vector::Vec3;
 
-/// Pairs that fix a rigid motion, if they are not in one line.
+/// Number of pairs that determine a rigid motion, if they are not collinear.
 pub const LEAST_PAIRS: usize = 3;
 
-/// Gap between the best and the next best quaternion, over the spread of the points, below which
-/// the rotation is not determined: rounding then turns it by 1e-6 rad.
+/// Gap between the best and the second-best quaternion, over the spread of the points, below which the rotation
+/// is not determined: rounding then rotates it by 1e-6 rad.
 const UNDETERMINED_GAP: f64 = 1e-10;
 
 /// How pairs are fitted.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct RigidFitOptions<'a> {
-    /// Weight of each pair, 0 or more; all alike if none.
+    /// Weight of each pair, 0 or more; equal weights if none.
     pub weights: Option<&'a [f64]>,
-    /// Whether a uniform scale is fitted too.
+    /// Whether a uniform scale is fitted as well.
     pub scale: bool,
 }
 
 /// The best motion of paired points.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RigidFit {
-    /// x ↦ s R x + t, row by row, t in mm; R is a proper rotation always.
+    /// x ↦ s R x + t, row by row, t in mm; R is always a proper rotation.
     pub matrix: [[f64; 4]; 4],
-    /// s: 1 unless it was asked for.
+    /// s: 1 unless a scale was requested.
     pub scale: f64,
     /// Distance of each moved point from its partner, mm.
     pub residuals: Vec<f64>,
@@ -37,8 +37,8 @@ pub struct RigidFit {
 
 /// Motion s R x + t that minimises Σ w |s R x + t − y|² over pairs x of `moving`, y of `fixed` (mm).
 ///
-/// The rotation is the unit quaternion q that maximises qᵀ N q (Horn 1987, section 4), so it never
-/// mirrors; the scale is Σ w y·R x / Σ w |x|² about the centroids (Umeyama 1991, eq. 42).
+/// The rotation is the unit quaternion q that maximises qᵀ N q (Horn 1987, section 4), so it is never a
+/// reflection; the scale is Σ w y·R x / Σ w |x|² about the centroids (Umeyama 1991, eq. 42).
 ///
 /// # Errors
 /// [`MtmError::Length`], [`MtmError::NotFinite`], [`MtmError::OutOfRange`] for weights and coordinates,
@@ -71,7 +71,7 @@ pub fn rigid_fit(
     Ok(RigidFit { matrix: pose.matrix(), scale: pose.scale, residuals, rms: squares.sqrt() })
 }
 
-/// A motion about the centroid of the points it moves, where it loses no digits.
+/// A motion about the centroid of the points it moves, which loses no digits.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Pose {
     pub rotation: UnitQuaternion<f64>,
@@ -102,7 +102,7 @@ pub(crate) fn fit_pairs(
     weights: &[f64],
     with_scale: bool,
 ) -> Result<Pose> {
-    // Shares of the total: weights of any size give the same sums.
+    // Weights relative to their total: weights of any size give the same sums.
     let total: f64 = weights.iter().sum();
     let centroid = |points: &[[f64; 3]]| {
         points.iter().zip(weights).map(|(&p, w)| Vec3::from(p) * (w / total)).sum::<Vec3>()
@@ -161,7 +161,8 @@ fn best_rotation(m: &Matrix3<f64>) -> Result<UnitQuaternion<f64>> {
         });
     }
     let best = eigen.eigenvectors.column(order[0]);
-    // Of q and −q the one that turns less: the same bits whatever sign the eigenvector came with.
+    // Of q and −q, the one with the smaller rotation angle: bitwise the same whatever the sign of the
+    // eigenvector.
     let sign = if best[0] < 0.0 { -1.0 } else { 1.0 };
     Ok(UnitQuaternion::from_quaternion(Quaternion::new(best[0], best[1], best[2], best[3]) * sign))
 }

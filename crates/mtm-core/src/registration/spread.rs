@@ -1,4 +1,4 @@
-//! Whether points can carry a registration: their coordinates, and how they spread in space.
+//! Whether points can determine a registration: their coordinates, and how they are spread in space.
 
 use nalgebra::Matrix3;
 
@@ -7,10 +7,10 @@ use crate::vector::Vec3;
 
 /// Thickness of points over their longest extent below which they count as lying in a plane or line.
 ///
-/// At this limit, 0.015 mm in a head, no operator places points well enough to tell the direction.
+/// At this limit, 0.015 mm in a head, no operator places points accurately enough to determine the direction.
 pub const FLAT_THICKNESS: f64 = 1e-4;
 
-/// Refuses NaN, infinity and coordinates that are too large, naming the row.
+/// Rejects NaN, infinity and coordinates that are too large, stating the row.
 pub(crate) fn check_coordinates(what: &str, points: &[[f64; 3]]) -> Result<()> {
     error::check_coordinates(what, points, ErrorKind::Registration)
 }
@@ -31,13 +31,13 @@ pub(crate) fn extents(points: &[Vec3]) -> [f64; 3] {
     extents
 }
 
-/// Refuses points that all lie in one line.
+/// Rejects points that are all collinear.
 pub(crate) fn check_not_in_line(what: &'static str, points: &[Vec3]) -> Result<()> {
     let [_, width, size] = extents(points);
     check_thickness(what, "line", width, size)
 }
 
-/// Refuses points that all lie in one plane or line.
+/// Rejects points that are all collinear or coplanar.
 pub(crate) fn check_not_in_plane(what: &'static str, points: &[Vec3]) -> Result<()> {
     let [thickness, width, size] = extents(points);
     check_thickness(what, "line", width, size)?;

@@ -1,4 +1,4 @@
-//! Thin-plate spline in three dimensions: a smooth map that takes landmarks to landmarks.
+//! Thin-plate spline in three dimensions: a smooth map that takes landmarks to their targets.
 //!
 //! With U(r) = r, the fundamental solution of the biharmonic equation in 3-D (Bookstein 1989 has the
 //! 2-D one, r² log r), landmarks s_j and their targets y_j,
@@ -18,22 +18,24 @@ use crate::error::{ErrorKind, MtmError, Result};
 use crate::registration::spread::{check_coordinates, check_not_in_plane, extents};
 use crate::vector::Vec3;
 
-/// Landmarks that a spline needs: four that are not in one plane fix its affine part.
+/// Number of landmarks that a spline needs: four that are not coplanar determine its affine part.
 pub const LEAST_LANDMARKS: usize = 4;
 
-/// Landmarks that a spline takes at most: its dense system has their number squared, 134 MB.
+/// Maximum number of landmarks of a spline: the number of entries of its dense system is the square of theirs,
+/// 134 MB.
 pub const MOST_LANDMARKS: usize = 4096;
 
-/// Distance of two landmarks over the longest extent below which they count as one point.
+/// Distance of two landmarks over the longest extent below which they count as the same point.
 pub const COINCIDENT_DISTANCE: f64 = 1e-6;
 
-/// Times the residual of the solved system is solved for: one brings it to rounding, one is spare.
+/// Number of refinement steps on the residual of the solved system: one reduces it to rounding, the second is a
+/// reserve.
 const REFINEMENTS: usize = 2;
 
-/// Points evaluated side by side: their sums stay in the vector registers.
+/// Points evaluated together: their sums stay in the vector registers.
 const LANES: usize = 4;
 
-/// Points a thread takes at once.
+/// Points per parallel task.
 const POINTS_PER_TASK: usize = 1024;
 
 /// A map through landmarks with the least bending.
@@ -42,7 +44,7 @@ pub struct ThinPlateSpline {
     source: Vec<[f64; 3]>,
     target: Vec<[f64; 3]>,
     smoothing: f64,
-    /// Mean of the source: distances are taken in coordinates about it.
+    /// Mean of the source: coordinates are relative to it.
     centre: Vec3,
     /// Affine part: image of `centre`, and A.
     image: Vec3,
@@ -52,12 +54,12 @@ pub struct ThinPlateSpline {
     bending_energy: f64,
 }
 
-/// A landmark's part in the sum.
+/// Contribution of a landmark to the sum.
 #[derive(Debug, Clone, Copy)]
 struct Term {
     /// s_j about the centre, mm.
     at: [f64; 3],
-    /// w_j, without unit.
+    /// w_j, dimensionless.
     weight: [f64; 3],
 }
 
@@ -75,8 +77,8 @@ pub struct Folds {
 impl ThinPlateSpline {
     /// Spline that takes each point of `source` to the one of `target` with the same index.
     ///
-    /// `source`, `target`: mm. `smoothing`: λ, mm, 0 for a spline exact at the landmarks; a landmark
-    /// whose weight is w then stays λ |w| away from its target.
+    /// `source`, `target`: mm. `smoothing`: λ, mm, 0 for a spline that is exact at the landmarks; otherwise a
+    /// landmark with weight w stays λ |w| away from its target.
     ///
     /// # Errors
     /// [`MtmError::Length`] for sets of different size, [`MtmError::TooFewPoints`] and
@@ -91,7 +93,7 @@ impl ThinPlateSpline {
         };
         let (centre, middle) = (mean(&source), mean(&target));
         let about: Vec<Vec3> = source.iter().map(|&s| Vec3::from(s) - centre).collect();
-        // In units of the landmarks' radius L all entries of the system are of one size.
+        // In units of the landmarks' radius L, all entries of the system have the same magnitude.
         let radius = about.iter().fold(0.0_f64, |largest, s| largest.max(s.norm()));
         check_spread(&about)?;
 
@@ -140,9 +142,9 @@ impl ThinPlateSpline {
 
     /// Jacobian ∂f/∂x at each of `points` (mm): entry (i, k) is ∂f_i/∂x_k.
     ///
-    /// J = A + Σ w_j ⊗ (x − s_j)/|x − s_j|. At a landmark the spline has no derivative: its own term
-    /// is taken as zero there, the mean over all directions; along a unit vector e the one-sided
-    /// derivative is J e + w_j.
+    /// J = A + Σ w_j ⊗ (x − s_j)/|x − s_j|. At a landmark the spline has no derivative: its own term is taken
+    /// as zero there, the mean over all directions; along a unit vector e the one-sided derivative is J e +
+    /// w_j.
     ///
     /// # Errors
     /// Those of [`ThinPlateSpline::warp`].
@@ -171,11 +173,11 @@ impl ThinPlateSpline {
         ))
     }
 
-    /// Smallest determinant that the Jacobian takes on the way to each landmark, over all directions.
+    /// Smallest determinant of the Jacobian in the limit at each landmark, over all directions of approach.
     ///
-    /// Coming from the direction e it is det(J + w eᵀ) = det J + eᵀ adj(J) w with J as
-    /// [`ThinPlateSpline::jacobian`] has it, so the smallest is det J − |adj(J) w|: zero or less
-    /// where the spline folds next to the landmark.
+    /// Approached from the direction e, the determinant is det(J + w eᵀ) = det J + eᵀ adj(J) w with J as in
+    /// [`ThinPlateSpline::jacobian`], so the smallest is det J − |adj(J) w|: zero or less if the spline folds
+    /// next to the landmark.
     pub fn landmark_folds(&self) -> Folds {
         let smallest = |(&at, term): (&[f64; 3], &Term)| {
             let j = self.derivative(at);
@@ -191,7 +193,7 @@ impl ThinPlateSpline {
         &self.source
     }
 
-    /// Landmarks that the map goes through, or past with smoothing, mm.
+    /// Target landmarks, which the map interpolates, or approximates with smoothing, mm.
     pub fn target(&self) -> &[[f64; 3]] {
         &self.target
     }
@@ -201,7 +203,7 @@ impl ThinPlateSpline {
         self.smoothing
     }
 
-    /// Distance of each landmark's image from its target, mm: rounding without smoothing.
+    /// Distance of each landmark's image from its target, mm: only rounding without smoothing.
     pub fn residuals(&self) -> &[f64] {
         &self.residuals
     }
@@ -211,7 +213,7 @@ impl ThinPlateSpline {
         self.bending_energy
     }
 
-    /// Weight w_j of each landmark, without unit.
+    /// Weight w_j of each landmark, dimensionless.
     pub fn weights(&self) -> Vec<[f64; 3]> {
         self.terms.iter().map(|term| term.weight).collect()
     }
@@ -302,7 +304,7 @@ struct System {
 }
 
 impl System {
-    /// None where rounding leaves the system without a factor.
+    /// None if rounding makes the factorisation of the system fail.
     fn new(points: &[Vec3], smoothing: f64) -> Option<Self> {
         let n = points.len();
         let mut kernel = DMatrix::from_fn(n, n, |i, j| -(points[i] - points[j]).norm());
@@ -367,7 +369,7 @@ impl Pair {
     }
 }
 
-/// The closest two of the points, of which there are two at least.
+/// The closest two of the points, of which there are at least two.
 fn closest_pair(points: &[Vec3]) -> Pair {
     let mut closest = Pair { first: 0, second: 1, distance: f64::INFINITY };
     for second in 1..points.len() {
@@ -423,7 +425,7 @@ fn check_landmarks(source: &[[f64; 3]], target: &[[f64; 3]], smoothing: f64) -> 
     check_coordinates("target landmarks", target)
 }
 
-/// Refuses points of which two coincide, or that all lie in one plane.
+/// Rejects points of which two coincide, or that are all coplanar.
 fn check_spread(about: &[Vec3]) -> Result<()> {
     let [.., size] = extents(about);
     let closest = closest_pair(about);

@@ -2,7 +2,7 @@
 
 use crate::vector::Vec3;
 
-/// A box along the coordinate axes, mm; empty where `low` exceeds `high`.
+/// A box along the coordinate axes, mm; empty if `low` exceeds `high`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct AlignedBox {
     pub low: Vec3,

@@ -1,4 +1,4 @@
-//! The border of a surface as a chain, which is all that its winding number owes its smooth changes to.
+//! The border of a surface as a chain, which alone determines the smooth changes of its winding number.
 
 use std::collections::HashMap;
 use std::f64::consts::PI;
@@ -8,9 +8,9 @@ use crate::vector::Vec3;
 
 /// Edges at which the triangles of a surface do not cancel.
 ///
-/// An edge counts once for each triangle that runs along it one way more than the other; vertices at the
-/// same place are one. Without such edges the winding number is a whole number everywhere, whatever the
-/// surface overlaps; next to a hole or a flipped triangle it is not.
+/// An edge counts by the difference between the numbers of triangles that use it in either direction; vertices
+/// at the same position are identified. Without such edges the winding number is an integer everywhere, however
+/// the surface overlaps; next to a hole or a flipped triangle it is not.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Border {
     edges: Vec<BorderEdge>,
@@ -20,7 +20,7 @@ pub(super) struct Border {
 struct BorderEdge {
     middle: Vec3,
     half_length: f64,
-    /// Length times how often the edge counts, mm.
+    /// Length times the count of the edge, mm.
     weight: f64,
 }
 
@@ -57,10 +57,10 @@ impl Border {
         self.edges.is_empty()
     }
 
-    /// Most by which the winding number, less its jumps across the surface, differs between the centre of a
-    /// ball and a point of it; infinite above `enough`.
+    /// Upper bound of the difference in winding number, apart from its jumps across the surface, between the
+    /// centre of a ball and any of its points; infinite above `enough`.
     ///
-    /// |∇w| ≤ 1/4π ∮ ds/r² (Biot and Savart), with the least r of each edge to the ball.
+    /// |∇w| ≤ 1/4π ∮ ds/r² (Biot and Savart), with r the smallest distance of each edge from the ball.
     pub fn change_within(&self, centre: &Vec3, radius: f64, enough: f64) -> f64 {
         let mut sum = 0.0;
         for edge in &self.edges {
@@ -77,10 +77,10 @@ impl Border {
     }
 }
 
-/// For each vertex the first one at the same place.
+/// For each vertex, the first one at the same position.
 fn places(vertices: &[[f64; 3]]) -> Vec<u32> {
     let mut first: HashMap<[u64; 3], u32> = HashMap::with_capacity(vertices.len());
-    // −0 and 0 are one place.
+    // −0 and 0 are the same position.
     let key = |v: &[f64; 3]| v.map(|x| (x + 0.0).to_bits());
     (0..vertices.len() as u32)
         .map(|i| *first.entry(key(&vertices[i as usize])).or_insert(i))

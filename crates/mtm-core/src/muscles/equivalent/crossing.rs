@@ -6,10 +6,10 @@ use crate::muscles::equivalent::shape::{InsideTest, MuscleShape, Side};
 use crate::muscles::equivalent::tet_tree::{Branch, TetTree};
 use crate::vector::Vec3;
 
-/// Triangles and tets of a branch, multiplied, above which its halves go to different threads.
+/// Product of the numbers of triangles and tets of a branch above which its halves go to different threads.
 const PARALLEL_PAIRS: usize = 1 << 16;
 
-/// A tet that a muscle has a part in.
+/// A tet that contains part of a muscle.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Touch {
     pub tet: u32,
@@ -21,14 +21,14 @@ pub(super) struct Touch {
     is_whole: bool,
 }
 
-/// The tets that a muscle has a part in.
+/// The tets that contain part of a muscle.
 #[derive(Debug, Default)]
 pub(super) struct Touches {
     pub tets: Vec<Touch>,
     triangles: Vec<u32>,
-    /// Points whose side was asked for.
+    /// Number of points whose side was evaluated.
     pub evaluations: usize,
-    /// Tets that were looked at one by one.
+    /// Number of tets that were examined individually.
     pub looked_at: usize,
 }
 
@@ -69,10 +69,10 @@ pub(super) struct Passage<'a> {
 }
 
 impl Passage<'_> {
-    /// The tets that the muscle has a part in, or some of them after `stop` has said so.
+    /// The tets that contain part of the muscle, or some of them once `stop` returns true.
     ///
-    /// A branch of tets whose box no triangle meets is settled by one evaluation where the winding number
-    /// can; below it no tet is looked at.
+    /// A branch of tets whose box no triangle meets is decided by one evaluation if the winding number allows;
+    /// its tets are then not examined.
     pub fn touches(&self) -> Touches {
         let all: Vec<u32> = (0..self.muscle.n_triangles() as u32).collect();
         self.visit(0, &all)
@@ -121,7 +121,7 @@ impl Passage<'_> {
         triangles.iter().filter(meets).copied().collect()
     }
 
-    /// Settles the tets of a leaf one by one.
+    /// Decides the tets of a leaf individually.
     fn look_at(&self, leaf: &Branch, triangles: &[u32], found: &mut Touches) {
         for &tet in self.tree.tets(leaf) {
             let bounds = &self.boxes[tet as usize];
@@ -170,7 +170,7 @@ impl Faces {
     }
 }
 
-/// False only if a face of the tet, or the triangle's own plane, parts the two.
+/// False only if a face of the tet, or the plane of the triangle, separates the two.
 fn may_cross(tet: &[Vec3; 4], Faces(faces): &Faces, triangle: &[Vec3; 3]) -> bool {
     if faces.iter().any(|(n, offset)| triangle.iter().all(|p| n.dot(p) > *offset)) {
         return false;

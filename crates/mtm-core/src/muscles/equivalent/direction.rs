@@ -1,26 +1,26 @@
-//! The mean direction of fibres, whose signs mean nothing.
+//! The mean direction of fibres, whose signs have no meaning.
 
 use nalgebra::{Matrix3, SymmetricEigen};
 
 use crate::vector::Vec3;
 
-/// Difference of eigenvalues over their sum below which they tie.
+/// Difference of eigenvalues over their sum below which they count as equal.
 const TIE: f64 = 1e-9;
 
 /// Weighted sum of a ⊗ a over fibre directions a.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct DirectionSum {
     tensor: Matrix3<f64>,
-    /// The first direction that came, which decides where eigenvalues tie.
+    /// The first direction added, which decides if eigenvalues are equal.
     first: Option<Vec3>,
 }
 
 /// Mean direction of fibres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeanDirection {
-    /// Unit vector; its component of largest size is positive. Zero where there is no fibre.
+    /// Unit vector; its component of largest magnitude is positive. Zero if there is no fibre.
     pub direction: [f64; 3],
-    /// (λ₁ − λ₂)/(λ₁ + λ₂ + λ₃) of Σ w a ⊗ a: 1 where all fibres are parallel, 0 where no direction leads.
+    /// (λ₁ − λ₂)/(λ₁ + λ₂ + λ₃) of Σ w a ⊗ a: 1 if all fibres are parallel, 0 if no direction dominates.
     pub coherence: f64,
 }
 
@@ -37,7 +37,7 @@ impl DirectionSum {
         self.tensor *= factor;
     }
 
-    /// Adds all of another sum, whose directions come after those of this one.
+    /// Adds another sum, whose directions follow those of this one.
     pub fn append(&mut self, other: &Self) {
         self.tensor += other.tensor;
         self.first = self.first.or(other.first);
@@ -45,8 +45,8 @@ impl DirectionSum {
 
     /// Principal eigenvector of the sum.
     ///
-    /// Where the largest eigenvalue is double or triple, it is the direction of that eigenspace nearest to
-    /// the first direction that was added.
+    /// If the largest eigenvalue is double or triple, it is the direction of that eigenspace nearest to the
+    /// first direction added.
     pub fn mean(&self) -> MeanDirection {
         let Some(first) = self.first else {
             return MeanDirection { direction: [0.0; 3], coherence: 0.0 };
@@ -64,14 +64,14 @@ impl DirectionSum {
                 e * e.dot(&first)
             })
             .sum();
-        // `first` is part of the sum, so its eigenspace is seldom at right angles to it.
+        // `first` is part of the sum, so its eigenspace is rarely perpendicular to it.
         let axis = nearest.try_normalize(TIE).unwrap_or(lead);
         let coherence = ((leading - second) / sum).clamp(0.0, 1.0);
         MeanDirection { direction: signed(axis).into(), coherence }
     }
 }
 
-/// The one of ±`a` whose component of largest size is positive.
+/// The one of ±`a` whose component of largest magnitude is positive.
 fn signed(a: Vec3) -> Vec3 {
     if a[a.iamax()] < 0.0 { -a } else { a }
 }

@@ -34,11 +34,11 @@ use tet_tree::TetTree;
 
 /// Volume fraction and fibre direction of the muscles in every tet.
 ///
-/// A tet that no surface crosses is decided by one evaluation, many at once where they lie together; a
-/// crossed one by `samples` low-discrepancy points, uniform in volume, with a shift of its own drawn from
-/// `seed`. A point inside k ≥ 2 muscles counts once in the fraction of the tet and 1/k for each of them.
-/// The fibre of a tet is the principal eigenvector of Σ w a ⊗ a over the fibre directions a at its samples in
-/// muscle, the first 16 of each, with these weights w ([`MeanDirection`]). Without muscles every tet is fat.
+/// A tet that no surface crosses is decided by one evaluation, which may cover many adjacent tets at once; a
+/// crossed one by `samples` low-discrepancy points, uniform in volume, with its own shift drawn from `seed`. A
+/// point inside k ≥ 2 muscles counts once in the fraction of the tet and 1/k for each of them. The fibre of a
+/// tet is the principal eigenvector of Σ w a ⊗ a over the fibre directions a at its samples in muscle, the
+/// first 16 of each, with these weights w ([`MeanDirection`]). Tets without muscle are fat.
 ///
 /// The result does not depend on the number of threads, nor on the order of the muscles.
 ///
@@ -90,7 +90,7 @@ pub fn sample_muscles(
     }
     let crossing = start.elapsed() - trees;
 
-    // Sums run in an order that the shapes themselves give.
+    // Sums are computed in an order that depends only on the shapes.
     let mut rank: Vec<u32> = (0..muscles.len() as u32).collect();
     rank.sort_by(|&i, &j| muscles[i as usize].surface.order(&muscles[j as usize].surface));
     let by_tet = TetTouches::new(&touches, &rank);

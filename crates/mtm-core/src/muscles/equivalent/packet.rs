@@ -1,14 +1,14 @@
-//! The sides of all samples of one tet at once: one winding number, carried on by crossings.
+//! The sides of all samples of one tet at once: one winding number, updated by crossings.
 
 use crate::geometry::triangle;
 use crate::muscles::equivalent::sequence::{Sequence, place};
 use crate::muscles::equivalent::shape::{InsideTest, MuscleShape, is_inside};
 use crate::vector::Vec3;
 
-/// Distance of an anchor to the surface over the longest edge of the tet below which another is taken: its
-/// side must be beyond the rounding of coordinates.
+/// Distance of an anchor from the surface over the longest edge of the tet below which another one is chosen:
+/// its side must not depend on the rounding of coordinates.
 const CLEARANCE: f64 = 1e-9;
-/// Smallest positive number: t > −SMALLEST says t ≥ 0, so that both are one comparison.
+/// Smallest positive number: t > −SMALLEST means t ≥ 0, so that both are one comparison.
 const SMALLEST: f64 = f64::MIN_POSITIVE;
 
 /// Samples of one tet, relative to its centroid, coordinate by coordinate.
@@ -17,17 +17,17 @@ pub(super) struct Packet {
     corners: [Vec3; 4],
     centroid: Vec3,
     coordinates: [Vec<f64>; 3],
-    /// Winding number of each sample less that of the anchor.
+    /// Winding number of each sample minus that of the anchor.
     turns: Vec<f64>,
     /// The coordinates again, relative to an anchor that is not the centroid.
     shifted: [Vec<f64>; 3],
 }
 
-/// Planes that tell whether the way from the anchor to a sample crosses a triangle.
+/// Planes that determine whether the segment from the anchor to a sample crosses a triangle.
 struct Gate {
     /// Three normals of the planes through the anchor and an edge, then that of the triangle.
     normals: [Vec3; 4],
-    /// What the products with them must exceed.
+    /// Thresholds for the products with them.
     limits: [f64; 4],
     /// Change of the winding number.
     turn: f64,
@@ -41,7 +41,7 @@ impl Packet {
         Self { corners, centroid, coordinates: rows(), turns: vec![0.0; n], shifted: rows() }
     }
 
-    /// Puts the samples into a tet.
+    /// Maps the samples into a tet.
     pub fn fill(&mut self, sequence: &Sequence, seed: u64, tet: u32, corners: [Vec3; 4]) {
         self.corners = corners;
         self.centroid = corners.iter().sum::<Vec3>() / 4.0;
@@ -68,11 +68,11 @@ impl Packet {
 
     /// Writes whether each sample lies inside `muscle`; `near` are the triangles that may cross the tet.
     ///
-    /// The winding number jumps by one across each triangle and, between them, changes only with the border
-    /// of the surface. So one value at an anchor and the triangles on the straight way from there to a
-    /// sample give that of the sample, as long as the border is too far away to matter; else each sample is
-    /// evaluated by itself. Two triangles on an edge see the same bits of the plane through it and the
-    /// anchor: no way slips between them or counts twice.
+    /// The winding number jumps by one across each triangle and, between triangles, changes only because of the
+    /// border of the surface. The value at an anchor, and the triangles on the straight segment from there to a
+    /// sample, therefore determine the value at the sample, as long as the border is too far away to matter;
+    /// otherwise each sample is evaluated separately. Two triangles at an edge use bitwise the same plane
+    /// through the edge and the anchor: no segment slips between them or counts twice.
     pub fn inside(&mut self, muscle: &MuscleShape<'_>, near: &[u32], inside: &mut [bool]) {
         let (_, radius) = self.ball();
         let anchored = match muscle.test {
@@ -81,7 +81,7 @@ impl Packet {
         };
         let settled = anchored.and_then(|anchor| {
             let w = muscle.winding(&anchor);
-            // The ball about the anchor holds all of the tet.
+            // The ball about the anchor contains the whole tet.
             let reach = radius + (anchor - self.centroid).norm();
             muscle.is_settled(w, &anchor, reach).then_some((anchor, w))
         });
@@ -111,7 +111,7 @@ impl Packet {
         }
     }
 
-    /// A point of the tet that is clear of the surface: the centroid, or half-way to a corner.
+    /// A point of the tet that is far enough from the surface: the centroid, or half-way to a corner.
     fn anchor(&self, muscle: &MuscleShape<'_>, near: &[u32], radius: f64) -> Option<Vec3> {
         let clearance = CLEARANCE * radius;
         let is_clear = |p: &Vec3| {
@@ -129,8 +129,8 @@ impl Packet {
 }
 
 impl Gate {
-    /// Gate of a triangle given relative to the anchor; none where the anchor lies in its plane, as such a
-    /// triangle is seen edge-on and hides nothing.
+    /// Gate of a triangle given relative to the anchor; none if the anchor lies in its plane, since the
+    /// triangle is then seen edge-on and hides nothing.
     fn new(corners: &[Vec3; 3], orientation: f64) -> Option<Self> {
         let [a, b, c] = corners;
         let normal = (b - a).cross(&(c - a));
@@ -138,20 +138,20 @@ impl Gate {
         if height == 0.0 {
             return None;
         }
-        // Seen from behind the triangle's corners turn one way, from the front the other.
+        // The corners of the triangle run one way when seen from behind, and the other way from the front.
         let side = height.signum();
         let mut normals = [normal * side; 4];
         let mut limits = [height.abs(); 4];
         for (k, (p, q)) in [(a, b), (b, c), (c, a)].into_iter().enumerate() {
-            // p × q and q × p have the same digits, so the two triangles on an edge agree; a sample exactly in
-            // the plane goes to the one that runs along it upwards, as seen.
+            // p × q and q × p have the same digits, so the two triangles at an edge agree; a sample exactly in
+            // the plane belongs to the triangle that traverses the edge upwards, as seen from the anchor.
             normals[k] = p.cross(q) * side;
             limits[k] = if precedes(p, q) == (side > 0.0) { -SMALLEST } else { 0.0 };
         }
         Some(Self { normals, limits, turn: -side * orientation })
     }
 
-    /// Adds the turn to every sample behind the triangle as seen from the anchor.
+    /// Adds the change of the winding number to every sample behind the triangle as seen from the anchor.
     fn count(&self, x: &[f64], y: &[f64], z: &[f64], turns: &mut [f64]) {
         let [m, n, o, p] = &self.normals;
         let [lm, ln, lo, lp] = self.limits;
@@ -164,7 +164,7 @@ impl Gate {
     }
 }
 
-/// Order of places by coordinates, the same for every triangle at them.
+/// Order of positions by coordinates, the same for every triangle at them.
 fn precedes(p: &Vec3, q: &Vec3) -> bool {
     (p.x, p.y, p.z) < (q.x, q.y, q.z)
 }

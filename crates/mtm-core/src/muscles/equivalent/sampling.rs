@@ -1,4 +1,4 @@
-//! What is sampled, how finely, and the work that it took.
+//! What is sampled, how finely, and the work involved.
 
 use std::sync::Arc;
 
@@ -9,27 +9,27 @@ use crate::muscles::fibre::MuscleFibres;
 
 /// Names of the inside tests.
 pub const INSIDE_TESTS: &str = "winding, normal";
-/// Most samples of a tet.
+/// Maximum number of samples per tet.
 pub const MOST_SAMPLES: usize = 1 << 20;
 
-/// A muscle: its surface and the course of its fibres.
+/// A muscle: its surface and its fibres.
 #[derive(Debug, Clone)]
 pub struct Muscle {
-    /// Its surface with outward normals; one that is inside out is turned, and
-    /// [`MuscleVolume::was_turned`](crate::MuscleVolume::was_turned) says so.
+    /// Its surface with outward normals; one that is inside out is reversed, and reported by
+    /// [`MuscleVolume::was_turned`](crate::MuscleVolume::was_turned).
     pub surface: Arc<Surface>,
-    /// Where its fibres run.
+    /// The directions of its fibres.
     pub fibres: Arc<MuscleFibres>,
 }
 
 /// How the tets are sampled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SamplingOptions {
-    /// Points in each tet that a surface crosses; the others take one.
+    /// Number of points in each tet that a surface crosses; the others take one.
     pub samples: usize,
     /// Seed of the points.
     pub seed: u64,
-    /// How a point is found to lie inside.
+    /// How a point is classified as inside.
     pub inside: InsideTest,
 }
 
@@ -55,25 +55,25 @@ impl InsideTest {
     }
 }
 
-/// Work that a sampling took.
+/// Work of a sampling.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct SamplingCounts {
-    /// Points whose side of a muscle's surface was asked for: one for a tet or group of tets that the
+    /// Number of points whose side of a muscle's surface was evaluated: one for a tet or group of tets that the
     /// surface does not cross, all samples for one that it does.
     pub points: usize,
-    /// Pairs of a tet and a muscle that were looked at by themselves.
+    /// Number of pairs of a tet and a muscle that were examined individually.
     pub pairs: usize,
-    /// Tets that took samples.
+    /// Number of tets that were sampled.
     pub crossed: usize,
 }
 
-/// Time that a sampling took, s.
+/// Time of a sampling, s.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SamplingTimings {
-    /// Trees over triangles and tets.
+    /// Building the trees over triangles and tets.
     pub trees: f64,
-    /// Which tets the surfaces cross.
+    /// Finding the tets that the surfaces cross.
     pub crossing: f64,
-    /// Samples, directions and sums.
+    /// Evaluating samples, directions and sums.
     pub sampling: f64,
 }

@@ -1,4 +1,4 @@
-//! Points spread evenly in a tet: a Sobol sequence, shifted anew for each tet.
+//! Points spread evenly in a tet: a Sobol sequence, with a different shift for each tet.
 
 use crate::vector::Vec3;
 
@@ -9,7 +9,7 @@ const BITS: u32 = 52;
 /// and x² + x + 1 (Sobol 1967; first numbers of Joe & Kuo 2008).
 const RECURRENCES: [(&[u64], &[usize]); 2] = [(&[1], &[]), (&[1, 3], &[1])];
 
-/// The points in the unit cube that every tet starts from.
+/// The points in the unit cube that all tets use.
 #[derive(Debug, Clone)]
 pub(super) struct Sequence {
     /// Binary digits of the coordinates, the first in bit 51.
@@ -38,8 +38,8 @@ impl Sequence {
 
     /// Barycentric weights of corners 1 to 3 of each point in a tet, uniform in volume.
     ///
-    /// The digits are shifted (exclusive or) by a number that depends on `seed` and `tet` alone: each point is
-    /// uniform, so fractions are unbiased, the points stay as even as they were, and the errors of two
+    /// The digits are shifted (exclusive or) by a number that depends only on `seed` and `tet`: each point is
+    /// uniform, so fractions are unbiased, the points stay as evenly spread as before, and the errors of two
     /// tets are independent (L'Ecuyer & Lemieux 2002).
     pub fn in_tet(&self, seed: u64, tet: u32) -> impl Iterator<Item = [f64; 3]> + '_ {
         let shift = shift(seed, tet);
@@ -64,21 +64,21 @@ fn directions(first: &[u64], marked: &[usize]) -> Vec<u64> {
 
 /// Weights of corners 1 to 3 of a tet for a point of the unit cube, uniform in volume.
 ///
-/// The distribution functions of the corners' weights one after the other, inverted: on points this even it
-/// halves the error of folding the cube into a tet.
+/// The distribution functions of the corners' weights, inverted one after another: with points this evenly
+/// spread, it halves the error of folding the cube into a tet.
 fn weights([x, y, z]: [f64; 3]) -> [f64; 3] {
     let a = 1.0 - x.cbrt();
     let b = (1.0 - a) * (1.0 - y.sqrt());
     [a, b, (1.0 - a - b).max(0.0) * z]
 }
 
-/// Three numbers of [`BITS`] bits that depend on `seed` and `tet` alone.
+/// Three numbers of [`BITS`] bits that depend only on `seed` and `tet`.
 fn shift(seed: u64, tet: u32) -> [u64; 3] {
     let start = mixed(seed ^ mixed(u64::from(tet)));
     [1, 2, 3].map(|k| mixed(start.wrapping_add(k)) >> (u64::BITS - BITS))
 }
 
-/// A permutation of the 64-bit numbers that leaves no pattern (SplitMix64; Steele, Lea & Flood 2014).
+/// A permutation of the 64-bit numbers without recognisable pattern (SplitMix64; Steele, Lea & Flood 2014).
 fn mixed(x: u64) -> u64 {
     let mut z = x.wrapping_add(0x9e37_79b9_7f4a_7c15);
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);

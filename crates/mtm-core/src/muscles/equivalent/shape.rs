@@ -1,4 +1,4 @@
-//! A muscle's surface made ready for many questions: triangles with their boxes, border, winding tree.
+//! A muscle's surface prepared for many queries: triangles with their boxes, border, winding tree.
 
 use crate::geometry::surface::Surface;
 use crate::geometry::winding::{WindingOptions, WindingTree};
@@ -6,25 +6,25 @@ use crate::muscles::equivalent::aligned_box::AlignedBox;
 use crate::muscles::equivalent::border::Border;
 use crate::vector::Vec3;
 
-/// Winding number that parts inside from outside.
+/// Winding number that separates inside from outside.
 const INSIDE: f64 = 0.5;
 /// Error of a hierarchical winding number, with a margin: the tests hold it below half of this.
 const WINDING_ERROR: f64 = 0.02;
 
-/// [`WindingOptions::beta`] of a surface without a border: its winding number is whole, so that an error of
-/// a tenth says as much as one of a hundredth.
+/// [`WindingOptions::beta`] of a surface without a border: its winding number is an integer, so that an error
+/// of a tenth is as good as one of a hundredth.
 const CLOSED_BETA: f64 = 1.4;
 
-/// How a point is found to lie inside a muscle.
+/// How a point is classified as inside a muscle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[non_exhaustive]
 pub enum InsideTest {
-    /// The generalised winding number exceeds one half (Barill et al. 2018): right also where the surface
+    /// The generalised winding number exceeds one half (Barill et al. 2018): correct even if the surface
     /// overlaps itself, has small holes or a few flipped triangles.
     #[default]
     Winding,
     /// The normal at the closest point of the surface points away from the point (Kim et al. 2010, section
-    /// 2.3): right for closed surfaces that do not overlap themselves.
+    /// 2.3): correct for closed surfaces that do not overlap themselves.
     Normal,
 }
 
@@ -33,11 +33,11 @@ pub enum InsideTest {
 pub(super) enum Side {
     Inside,
     Outside,
-    /// Perhaps both: next to a hole, a level of the winding number parts them, not a triangle.
+    /// Possibly on both sides: next to a hole, a level of the winding number separates them, not a triangle.
     Mixed,
 }
 
-/// A muscle's surface with what the inside tests need.
+/// A muscle's surface with the data for the inside tests.
 #[derive(Debug)]
 pub(super) struct MuscleShape<'a> {
     surface: &'a Surface,
@@ -46,9 +46,9 @@ pub(super) struct MuscleShape<'a> {
     bounds: AlignedBox,
     border: Border,
     tree: WindingTree,
-    /// Volume between the triangles and the middle of their box, mm³.
+    /// Volume between the triangles and the centre of their box, mm³.
     signed_volume: f64,
-    /// −1 for a surface that is inside out, whose normals are turned; else 1.
+    /// −1 for a surface that is inside out, whose normals are reversed; otherwise 1.
     pub orientation: f64,
     pub test: InsideTest,
 }
@@ -81,24 +81,25 @@ impl<'a> MuscleShape<'a> {
         &self.boxes[triangle as usize]
     }
 
-    /// Box round the whole surface: outside of it no point counts as inside.
+    /// Box around the whole surface: no point outside it counts as inside.
     pub fn bounds(&self) -> &AlignedBox {
         &self.bounds
     }
 
-    /// Volume that the surface encloses, mm³; none where it has a border. Vertices at one place are one.
+    /// Volume that the surface encloses, mm³; none if it has a border. Vertices at the same position are
+    /// identified.
     pub fn enclosed(&self) -> Option<f64> {
         self.border.is_empty().then_some(self.signed_volume.abs())
     }
 
-    /// Winding number at `p`, positive inside whichever way the triangles turn; whole where the surface has
-    /// no border.
+    /// Winding number at `p`, positive inside whatever the orientation of the triangles; an integer if the
+    /// surface has no border.
     pub fn winding(&self, p: &Vec3) -> f64 {
         let w = self.unrounded_winding(p);
         if self.border.is_empty() { w.round() } else { w }
     }
 
-    /// The same as the tree gives it.
+    /// The same as computed by the tree.
     pub fn unrounded_winding(&self, p: &Vec3) -> f64 {
         self.orientation * self.tree.winding_number_one((*p).into())
     }
@@ -117,7 +118,7 @@ impl<'a> MuscleShape<'a> {
 
     /// Side of a ball that no triangle meets, by one evaluation at its centre.
     ///
-    /// The closest normal cannot tell where its answer changes: it stands for the whole ball.
+    /// The closest normal does not show where its answer changes: it is used for the whole ball.
     pub fn side_of(&self, centre: &Vec3, radius: f64) -> Side {
         let is_inside = match self.test {
             InsideTest::Winding => {
@@ -132,13 +133,13 @@ impl<'a> MuscleShape<'a> {
         if is_inside { Side::Inside } else { Side::Outside }
     }
 
-    /// Whether a winding number `w` at `centre`, counted on by the surface's crossings, decides for every
+    /// Whether a winding number `w` at `centre`, updated by the crossings of the surface, decides for every
     /// point of the ball as the exact winding number there would.
     pub fn is_settled(&self, w: f64, centre: &Vec3, radius: f64) -> bool {
         if self.border.is_empty() {
             return true;
         }
-        // Crossings change w by whole numbers: what counts is how near w is to ½ modulo 1.
+        // Crossings change w by integers: only the distance of w from ½ modulo 1 matters.
         let margin = ((w - INSIDE) - (w - INSIDE).round()).abs() - WINDING_ERROR;
         margin > 0.0 && self.border.change_within(centre, radius, margin) < margin
     }

@@ -12,15 +12,15 @@ use crate::muscles::equivalent::shape::MuscleShape;
 use crate::muscles::fibre::NearFibres;
 use crate::vector::Vec3;
 
-/// Tets that a thread takes at once.
+/// Tets per parallel task.
 const TETS_PER_TASK: usize = 64;
 
-/// Factor of the standard error: tets cut by planes err by 0.7 to 0.9 of it, whatever fraction and number of
-/// samples (`tests/rust/muscles/equivalent.rs`).
+/// Factor of the standard error: tets cut by planes have errors of 0.7 to 0.9 of it, for any fraction and
+/// number of samples (`tests/rust/muscles/equivalent.rs`).
 const ERROR_FACTOR: f64 = 0.7;
 
-/// Samples in a muscle whose fibre directions are taken, the first of a tet: they lie as evenly as all of
-/// them, and directions change little within a tet.
+/// Maximum number of samples in a muscle whose fibre directions are used, the first of a tet: they are as
+/// evenly spread as all samples, and directions change little within a tet.
 const DIRECTION_SAMPLES: u32 = 16;
 
 /// Muscle in a mesh, tet by tet.
@@ -28,19 +28,19 @@ const DIRECTION_SAMPLES: u32 = 16;
 pub struct MuscleShares {
     /// Volume fraction of muscle in each tet, 0 to 1.
     pub fraction: Vec<f64>,
-    /// Direction of the fibres of each tet; zero where it holds no muscle.
+    /// Direction of the fibres of each tet; zero if it contains no muscle.
     pub fibre: Vec<MeanDirection>,
-    /// Standard error of each fraction, 0.7 q^(1/3) n^(−2/3) with q = min(p, 1 − p), where the surface is
-    /// smooth over the tet; never more than that of as many random points, √(p(1−p)/n). 0 where no surface
-    /// crosses the tet.
+    /// Standard error of each fraction, 0.7 q^(1/3) n^(−2/3) with q = min(p, 1 − p), if the surface is smooth
+    /// over the tet; never more than that of as many random points, √(p(1−p)/n). 0 if no surface crosses the
+    /// tet.
     pub error: Vec<f64>,
-    /// The tets that hold muscle, ascending.
+    /// The tets that contain muscle, ascending.
     pub tets: Vec<TetShares>,
     /// Volumes of each muscle, in the order given.
     pub volumes: Vec<MuscleVolume>,
-    /// Work that it took.
+    /// Work involved.
     pub counts: SamplingCounts,
-    /// Time that it took.
+    /// Time taken.
     pub timings: SamplingTimings,
 }
 
@@ -62,7 +62,7 @@ pub struct Share {
     pub inside: f64,
     /// The same where k muscles overlap counted 1/k: these sum to the fraction of the tet.
     pub fraction: f64,
-    /// Direction of this muscle's fibres in the tet.
+    /// Direction of the fibres of this muscle in the tet.
     pub fibre: MeanDirection,
 }
 
@@ -75,22 +75,22 @@ pub struct MuscleVolume {
     pub shared: f64,
     /// Standard error of `inside`, mm³, stated as that of [`MuscleShares::error`].
     pub error: f64,
-    /// Volume that the surface encloses, mm³, in the mesh or not, what overlaps itself twice; none where it
-    /// is not closed.
+    /// Volume that the surface encloses, mm³, inside the mesh or not, where it overlaps itself counted twice;
+    /// none if it is not closed.
     pub enclosed: Option<f64>,
-    /// Whether its triangles faced inwards and were taken the other way round.
+    /// Whether its triangles faced inwards and were reversed.
     pub was_turned: bool,
 }
 
-/// What one tet comes to.
+/// Result of one tet.
 #[derive(Debug, Clone)]
 pub(super) struct TetMuscle {
     shares: TetShares,
     fraction: f64,
     fibre: MeanDirection,
-    /// Number of samples; 1 where no surface crosses the tet.
+    /// Number of samples; 1 if no surface crosses the tet.
     samples: usize,
-    /// Muscles that cross the tet, and so were asked at every sample.
+    /// Muscles that cross the tet, and were therefore evaluated at every sample.
     crossing: usize,
 }
 
@@ -130,7 +130,7 @@ impl TetTouches {
     }
 }
 
-/// All that the samples of a tet need.
+/// Input for sampling a tet.
 pub(super) struct Sampler<'a> {
     pub mesh: &'a TetMesh,
     pub muscles: &'a [Muscle],
@@ -141,19 +141,19 @@ pub(super) struct Sampler<'a> {
     pub stop: &'a (dyn Fn() -> bool + Sync),
 }
 
-/// Buffers that a thread fills anew for each tet.
+/// Buffers that a thread refills for each tet.
 struct Scratch {
     packet: Packet,
     /// Whether each sample lies inside each muscle of the tet, muscle by muscle.
     inside: Vec<bool>,
-    /// Number of muscles that hold each sample.
+    /// Number of muscles that contain each sample.
     depth: Vec<u32>,
-    /// What the fibre directions in the tet depend on.
+    /// The data that determine the fibre directions in the tet.
     near: NearFibres,
 }
 
 impl Sampler<'_> {
-    /// What each touched tet comes to, ascending; incomplete after `stop` has said so.
+    /// Result of each touched tet, ascending; incomplete once `stop` returns true.
     pub fn shares(&self, touched: &TetTouches) -> Vec<TetMuscle> {
         let n = self.sequence.len();
         let scratch = || Scratch {
@@ -257,7 +257,7 @@ impl Sampler<'_> {
 }
 
 impl MuscleShares {
-    /// The whole mesh from what its touched tets come to.
+    /// The whole mesh from the results of its touched tets.
     pub(super) fn new(
         mesh: &TetMesh,
         shapes: &[MuscleShape<'_>],
@@ -306,11 +306,11 @@ impl MuscleShares {
     }
 }
 
-/// 0.7 q^(1/3) n^(−2/3), q = min(p, 1 − p), or √(p(1−p)/n) if that is less; with p drawn away from 0 and 1 by
-/// half a point, as a crossed tet is never known exactly.
+/// 0.7 q^(1/3) n^(−2/3), q = min(p, 1 − p), or √(p(1−p)/n) if that is less; p is kept away from 0 and 1 by half
+/// a point, since the fraction of a crossed tet is never known exactly.
 ///
-/// Points one to each of n equal cells err only in the cells that the surface cuts, about (nq)^(2/3) of them
-/// round a part of size q, by up to a half each.
+/// With one point in each of n equal cells, errors occur only in the cells that the surface cuts, about
+/// (nq)^(2/3) of them around a part of size q, of up to a half each.
 fn standard_error(fraction: f64, samples: usize) -> f64 {
     let n = samples as f64;
     let p = (fraction * n + 0.5) / (n + 1.0);

@@ -1,4 +1,4 @@
-//! From the muscles' shares in the tets to their tissue.
+//! From the muscle fractions of the tets to their tissue.
 
 use rayon::prelude::*;
 
@@ -9,9 +9,9 @@ use crate::muscles::equivalent::shares::{MuscleShares, TetShares};
 impl MuscleShares {
     /// Tissue of every tet with the constants of `preset`.
     ///
-    /// [`Mixing::Moduli`]: Young's moduli and Poisson's ratio mix with the fraction of muscle, along the mean
-    /// fibre (Kim et al. 2010, section 2.3). [`Mixing::Stiffness`]: C = Σ p_i C_muscle(a_i) + (1 − Σ p_i)
-    /// C_fat with fraction p_i and fibre a_i of each muscle (Voigt's bound).
+    /// [`Mixing::Moduli`]: Young's moduli and Poisson's ratio are interpolated with the fraction of muscle,
+    /// along the mean fibre (Kim et al. 2010, section 2.3). [`Mixing::Stiffness`]: C = Σ p_i C_muscle(a_i) + (1
+    /// − Σ p_i) C_fat with fraction p_i and fibre a_i of each muscle (Voigt's bound).
     ///
     /// # Errors
     /// [`crate::MtmError::IndefiniteMaterial`] with the tet.
@@ -36,7 +36,7 @@ impl MuscleShares {
 /// Σ p_i C(a_i) + (1 − Σ p_i) C_fat of one tet.
 fn stiffness(tet: &TetShares, fat: &Voigt, muscle: &Spencer) -> Voigt {
     let rest = 1.0 - tet.shares.iter().map(|share| share.fraction).sum::<f64>();
-    // Shares that fill the tet may sum to a rounding more than 1.
+    // Shares that fill the tet may exceed 1 by rounding.
     let mut sum = fat.map(|row| row.map(|c| c * rest.max(0.0)));
     for share in &tet.shares {
         let one = muscle.voigt(share.fibre.direction);

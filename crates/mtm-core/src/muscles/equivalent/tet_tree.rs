@@ -1,14 +1,14 @@
-//! A tree of boxes over tets, so that what lies far from a muscle is settled many tets at a time.
+//! A tree of boxes over tets, so that regions far from a muscle are decided many tets at a time.
 
 use crate::muscles::equivalent::aligned_box::AlignedBox;
 use crate::vector::Vec3;
 
-/// Tets below which a branch is not split: their boxes are looked at one by one.
+/// Number of tets below which a branch is not split: their boxes are checked individually.
 const LEAF_TETS: usize = 4;
-/// Tets above which the two halves of a branch are built by different threads.
+/// Number of tets above which the two halves of a branch are built by different threads.
 const PARALLEL_TETS: usize = 4096;
 
-/// Tets in an order that keeps neighbours together, and the boxes of halves of halves of them.
+/// Tets in an order that keeps neighbours together, and the boxes of recursive halves of them.
 #[derive(Debug)]
 pub(super) struct TetTree {
     /// Depth-first: the first half of a branch follows it.
@@ -23,7 +23,7 @@ pub(super) struct Branch {
     pub bounds: AlignedBox,
     start: u32,
     end: u32,
-    /// Place of the second half; 0 for a leaf.
+    /// Index of the second half; 0 for a leaf.
     second: u32,
 }
 
@@ -40,7 +40,7 @@ impl TetTree {
         Self { branches, tets: items.into_iter().map(|(tet, _)| tet).collect() }
     }
 
-    /// Branch `at`; 0 is the root. None where there is no tet at all.
+    /// Branch `at`; 0 is the root. None if there is no tet at all.
     pub fn branch(&self, at: usize) -> Option<&Branch> {
         self.branches.get(at)
     }
@@ -52,7 +52,7 @@ impl TetTree {
 }
 
 impl Branch {
-    /// Places of the two halves of branch `at`, which is this one; none for a leaf.
+    /// Indices of the two halves of branch `at`, which is this one; none for a leaf.
     pub fn halves(&self, at: usize) -> Option<[usize; 2]> {
         (self.second > 0).then_some([at + 1, self.second as usize])
     }
@@ -63,14 +63,14 @@ fn n_branches(n: usize) -> usize {
     if n <= LEAF_TETS { 1 } else { 1 + n_branches(n / 2) + n_branches(n - n / 2) }
 }
 
-/// Fills `branches`, the first of which has place `at`, with the tree over `items`, which start at `start`.
+/// Fills `branches`, the first of which has index `at`, with the tree over `items`, which start at `start`.
 fn build(items: &mut [(u32, AlignedBox)], start: usize, branches: &mut [Branch], at: usize) {
     let n = items.len();
     let bounds = items.iter().fold(AlignedBox::EMPTY, |all, (_, one)| all.joined(one));
     let mut second = 0;
     let (this, rest) = branches.split_at_mut(1);
     if n > LEAF_TETS {
-        // Twice the centres: where they spread most.
+        // Twice the centres: split along the axis of largest spread.
         let centre = |b: &AlignedBox| -> Vec3 { b.low + b.high };
         let spread = items.iter().fold(AlignedBox::EMPTY, |all, (_, one)| {
             let c = centre(one);

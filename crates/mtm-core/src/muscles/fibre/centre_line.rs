@@ -8,19 +8,19 @@ use crate::vector::Vec3;
 /// Slices of equal area whose centroids the line is fitted to.
 const SLICES: usize = 16;
 
-/// Rounds of cutting across the line and fitting it anew; the first cuts are across the longest
-/// axis. A strap bent by a right angle settles within a tenth of a degree.
+/// Number of times that the region is cut across the line and the line fitted again; the first cuts are across
+/// the longest axis. A strap bent by a right angle converges to within a tenth of a degree.
 const ROUNDS: usize = 5;
 
-/// Length over width for each degree of the line in that direction: shorter than this, what a region
-/// shows beyond a straight line is the shape of its ends, not a bend.
+/// Length over width needed for each degree of the line in that direction: in a shorter region, deviations from
+/// a straight line come from the shape of its ends, not from a bend.
 const SLENDERNESS_PER_DEGREE: f64 = 2.0;
 
-/// How much less the slices at the ends count than those in the middle: a slanting end cuts off one
-/// side of them, and draws their centroids to the other.
+/// How much less the slices at the ends count than those in the middle: an oblique end removes one side of
+/// them, which shifts their centroids to the other.
 const END_DOUBT: f64 = 0.9;
 
-/// Slices at each end whose tangent is that of their neighbour: a polynomial swings out at its ends.
+/// Number of slices at each end that take the tangent of their neighbour: a polynomial oscillates at its ends.
 const END_SLICES: f64 = 1.0;
 
 /// Highest degree of the line: two bends.
@@ -29,7 +29,7 @@ const HIGHEST_DEGREE: usize = 4;
 /// Extent of a bar over the standard deviation of its points.
 pub(super) const EXTENT_PER_DEVIATION: f64 = 3.464_101_615_137_754_6; // √12
 
-/// A line along the middle of a region, by the share of the area that lies before a place.
+/// A line along the middle of a region, parametrised by the share of the area before a position.
 #[derive(Debug, Clone)]
 pub(super) struct CentreLine {
     /// Coefficients of 1, t, t², …, mm.
@@ -41,7 +41,8 @@ pub(super) struct CentreLine {
 impl CentreLine {
     /// The line of a region with these moments.
     ///
-    /// It bends the more freely in each direction the longer the region is than wide in it.
+    /// The longer the region is relative to its width in a direction, the more the line may bend in that
+    /// direction.
     pub fn new(region: &Region, moments: &Moments) -> Self {
         let axes = moments.axes();
         let mut line = Self::straight(axes[0]);
@@ -99,7 +100,7 @@ impl CentreLine {
                 DMatrix::from_fn(SLICES, degree + 1, |i, k| weight(i) * places[i].powi(k as i32));
             let values =
                 DVector::from_fn(SLICES, |i, _| weight(i) * axis.dot(&slices[i].1.centroid));
-            // Distinct places make the columns independent, so that QR has a solution.
+            // Distinct positions make the columns independent, so that QR has a solution.
             let qr = powers.qr();
             let solution = qr.r().solve_upper_triangular(&(qr.q().transpose() * values))?;
             for (coefficient, &value) in coefficients.iter_mut().zip(&solution) {
@@ -109,7 +110,7 @@ impl CentreLine {
         Some(Self { coefficients, places })
     }
 
-    /// Unit tangent where `share` (0 to 1) of the area lies before.
+    /// Unit tangent at the position with `share` (0 to 1) of the area before it.
     pub fn tangent(&self, share: f64) -> Vec3 {
         let last = self.places.len() - 1;
         let at =
@@ -130,9 +131,9 @@ impl CentreLine {
         tangents.windows(2).map(|pair| pair[0].angle(&pair[1])).sum()
     }
 
-    /// The region in `count` slices of equal area, cut across the line, in its order.
+    /// The region in `count` slices of equal area, cut across the line, in order along it.
     ///
-    /// In halves, so that a plane cuts only what lies near it along the line.
+    /// By recursive halving, so that a plane only cuts what is near it along the line.
     pub fn cut(&self, region: &Region, count: usize) -> Vec<Region> {
         let mut slices = Vec::with_capacity(count);
         self.cut_between(region.clone(), [0, count], count, &mut slices);

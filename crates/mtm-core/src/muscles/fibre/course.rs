@@ -1,15 +1,15 @@
-//! Directions from known fibre lines.
+//! Fibre directions from known fibre lines.
 
 use crate::vector::Vec3;
 
-/// Distance within which a line counts as met, relative to the mean length of the lines: 0.4 mm on
+/// Distance within which a point counts as lying on a line, relative to the mean length of the lines: 0.4 mm on
 /// a muscle of 40 mm.
 const SOFTENING: f64 = 0.01;
 
-/// A line whose ends are nearer than this to each other, relative to its length, is closed.
+/// A line counts as closed if its ends are closer to each other than this, relative to its length.
 const CLOSED: f64 = 1e-6;
 
-/// Margin of a distance within which a segment counts as near, relative to it: far above rounding.
+/// Relative margin on a distance within which a segment counts as near: far above rounding.
 const NEAR_MARGIN: f64 = 1e-9;
 
 /// Fibre lines with a unit tangent at each point.
@@ -24,7 +24,7 @@ pub(super) struct Courses {
 #[derive(Debug, Clone, Default)]
 pub(super) struct Segments {
     list: Vec<Segment>,
-    /// Where each line ends in the list; no line is without a segment.
+    /// Where each line ends in the list; every line has at least one segment.
     ends: Vec<usize>,
 }
 
@@ -40,7 +40,7 @@ struct Segment {
 }
 
 impl Courses {
-    /// Lines of two points or more, whose neighbouring points differ.
+    /// Lines of two points or more, in which neighbouring points differ.
     pub fn new(lines: &[Vec<Vec3>]) -> Self {
         let length = |line: &Vec<Vec3>| line.windows(2).map(|w| (w[1] - w[0]).norm()).sum::<f64>();
         let mean = lines.iter().map(length).sum::<f64>() / lines.len() as f64;
@@ -64,7 +64,7 @@ impl Courses {
 
     /// Writes into `near` the segments that may be the nearest of their line to a point of a ball.
     ///
-    /// One farther from the centre than the nearest by more than the ball's diameter is none.
+    /// Segments further from the centre than the nearest by more than the ball's diameter cannot be.
     pub fn segments_near(&self, centre: &Vec3, radius: f64, near: &mut Segments) {
         near.list.clear();
         near.ends.clear();
@@ -100,7 +100,7 @@ impl Segments {
 }
 
 impl Segment {
-    /// Part of the way along the segment at which it is nearest to a point.
+    /// Position along the segment, as a share, at which it is nearest to a point.
     fn part(&self, from: &Vec3) -> f64 {
         (from.dot(&self.step) / self.square).clamp(0.0, 1.0)
     }
@@ -111,7 +111,7 @@ impl Segment {
     }
 }
 
-/// Tangents by the parabola through three points; a closed line goes on beyond its ends.
+/// Tangents from the parabola through three points; a closed line continues beyond its ends.
 fn tangents(line: &[Vec3], length: f64) -> Vec<Vec3> {
     let last = line.len() - 1;
     let closed = last > 2 && (line[last] - line[0]).norm() <= CLOSED * length;
@@ -134,7 +134,7 @@ fn tangents(line: &[Vec3], length: f64) -> Vec<Vec3> {
             if i == 0 { at_end } else { -at_end }
         };
         let size = along.norm();
-        // Where the line turns back on itself the parabola has no tangent: its chord has.
+        // Where the line reverses its direction, the parabola has no tangent: that of its chord is used.
         if size > 0.0 {
             along / size
         } else {

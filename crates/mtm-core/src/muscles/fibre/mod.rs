@@ -1,10 +1,10 @@
 //! Fibre directions of a muscle, from oriented boxes of its surface (Kim et al. 2010, section 2.2)
 //! or from known fibre lines.
 //!
-//! A box lies along the principal axes of a part of the surface. One box alone is the paper's; parts
-//! in series follow a bend, lanes side by side converge where the muscle tapers, sectors go round
-//! an opening. Between boxes the direction turns smoothly: it is the principal axis of the mean of
-//! a aᵀ over the boxes' directions a, in which signs cannot cancel.
+//! A box is aligned with the principal axes of a part of the surface. A single box is the method of the paper;
+//! parts in series follow a bend, parallel lanes converge where the muscle tapers, sectors surround an opening.
+//! Between boxes the direction changes smoothly: it is the principal axis of the mean of a aᵀ over the boxes'
+//! directions a, in which signs cannot cancel.
 
 mod centre_line;
 mod course;
@@ -21,46 +21,46 @@ use course::{Courses, Segments};
 use parts::Part;
 use region::Region;
 
-/// Second extent over the first above which a muscle's longest axis does not tell where its fibres
-/// run.
+/// Ratio of the second extent to the first above which the longest axis of a muscle does not determine the
+/// direction of its fibres.
 pub const SHEET_RATIO: f64 = 0.7;
 
-/// Deviation of box axes from orthonormal that is allowed.
+/// Permitted deviation of box axes from orthonormality.
 pub const AXES_TOLERANCE: f64 = 1e-6;
 
-/// Smallest half extent of a box that counts in the distance to it, relative to its largest: a flat
-/// box would have no neighbourhood.
+/// Smallest half extent of a box used in the distance to it, relative to its largest: a flat box would
+/// otherwise have no neighbourhood.
 const LEAST_EXTENT: f64 = 0.05;
 
-/// Decay of a box's weight, exp(−q/2) with q = Σ (offset/half extent)²: between the middles of two
-/// equal boxes the share of one then falls almost linearly.
+/// Decay of a box's weight, exp(−q/2) with q = Σ (offset/half extent)²: between the centres of two equal boxes
+/// the share of one then decreases almost linearly.
 const DECAY: f64 = 0.5;
 
-/// Difference in q above which the weight of a box is lost in rounding.
+/// Difference in q above which the weight of a box vanishes in rounding.
 const NEGLIGIBLE: f64 = 75.0;
 
-/// Fewest boxes that go round an opening.
+/// Minimum number of boxes around an opening.
 const LEAST_ROUND: usize = 3;
 
-/// Most boxes that may be asked for of one muscle.
+/// Maximum number of boxes for one muscle.
 ///
-/// Boxes of a real muscle would be less than 1 mm long beyond it; cutting a surface into 100 000 of them
+/// Beyond it, the boxes of a real muscle would be less than 1 mm long; cutting a surface into 100 000 of them
 /// takes minutes and gigabytes.
 pub const MOST_BOXES: usize = 64;
 
-/// Points a thread takes at once.
+/// Points per parallel task.
 const POINTS_PER_TASK: usize = 256;
 
 /// How the fibres of a muscle run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MuscleKind {
-    /// Along it.
+    /// Along the muscle.
     Strap,
     /// From a wide origin to a narrow insertion.
     Fan,
     /// Round an opening.
     Ring,
-    /// In a layer; the direction is no better than its outline tells.
+    /// In a layer; the outline gives no more than an approximate direction.
     Sheet,
 }
 
@@ -75,7 +75,7 @@ impl MuscleKind {
         }
     }
 
-    /// The kind of a name.
+    /// The kind called `name`.
     ///
     /// # Errors
     /// [`MtmError::UnknownName`].
@@ -111,11 +111,11 @@ pub struct MuscleFibres {
     extents: Option<[f64; 3]>,
 }
 
-/// The parts of fibre lines that decide the directions in a ball; a buffer that is filled anew for each.
+/// The segments and boxes that determine the directions in a ball; a buffer that is refilled for each ball.
 #[derive(Debug, Clone, Default)]
 pub struct NearFibres(Segments);
 
-/// A box as its weights need it.
+/// A box in the form in which its weight is computed.
 #[derive(Debug, Clone, Copy)]
 struct Reach {
     centre: Vec3,
@@ -127,10 +127,9 @@ struct Reach {
 impl MuscleFibres {
     /// The fibres of a muscle from oriented boxes of its surface.
     ///
-    /// `surface`: areas alone count, it may have holes and flipped triangles; pieces that do not
-    /// belong to the muscle must be taken away first. `boxes`: how many, in series (strap, sheet),
-    /// side by side (fan) or round the opening (ring, at least 3), [`MOST_BOXES`] at most; none: as the
-    /// shape needs.
+    /// `surface`: only areas count, so it may have holes and flipped triangles; pieces that do not belong to
+    /// the muscle must be removed first. `boxes`: how many, in series (strap, sheet), side by side (fan) or
+    /// around the opening (ring, at least 3), [`MOST_BOXES`] at most; none: as many as the shape needs.
     ///
     /// # Errors
     /// [`MtmError::OutOfRange`] for the number of boxes.
@@ -168,9 +167,9 @@ impl MuscleFibres {
     /// Fibres along the first axes of `boxes`.
     ///
     /// # Errors
-    /// [`MtmError::Empty`] without a box; [`MtmError::NotFinite`] for a centre, axis or extent that is
-    /// NaN or infinite; [`MtmError::OutOfRange`] for axes that are not orthonormal within
-    /// [`AXES_TOLERANCE`], and for half extents of which one is negative or all are 0.
+    /// [`MtmError::Empty`] without a box; [`MtmError::NotFinite`] for a centre, axis or extent that is NaN or
+    /// infinite; [`MtmError::OutOfRange`] for axes that are not orthonormal within [`AXES_TOLERANCE`], and if a
+    /// half extent is negative or all are 0.
     pub fn from_boxes(boxes: Vec<OrientedBox>) -> Result<Self> {
         let kind = ErrorKind::Mesh;
         if boxes.is_empty() {
@@ -202,7 +201,7 @@ impl MuscleFibres {
         Ok(Self::of_boxes(boxes))
     }
 
-    /// Fibres along known lines alone; see [`MuscleFibres::with_courses`].
+    /// Fibres along known lines only; see [`MuscleFibres::with_courses`].
     ///
     /// # Errors
     /// Those of [`MuscleFibres::with_courses`].
@@ -212,9 +211,8 @@ impl MuscleFibres {
 
     /// The same muscle with known fibre lines, which are followed instead of the boxes.
     ///
-    /// Between lines the tangents where they are nearest are weighted by the inverse fourth power of
-    /// the distance. `lines`: points from origin to insertion, mm; a line that ends where it starts
-    /// is closed.
+    /// Between lines, their tangents at the nearest points are weighted by the inverse fourth power of the
+    /// distance. `lines`: points from origin to insertion, mm; a line that ends where it starts is closed.
     ///
     /// # Errors
     /// [`MtmError::Empty`] without a line; [`MtmError::NotFinite`]; [`MtmError::Length`] for a line
@@ -248,17 +246,17 @@ impl MuscleFibres {
         Self { boxes, reaches, courses: None, kind: None, extents: None }
     }
 
-    /// The boxes of the surface; none where the fibres were made from lines alone.
+    /// The boxes of the surface; none if the fibres were made from lines alone.
     pub fn boxes(&self) -> &[OrientedBox] {
         &self.boxes
     }
 
-    /// What the muscle was taken for; none where no surface was given.
+    /// The kind of muscle that was assumed; none if no surface was given.
     pub fn kind(&self) -> Option<MuscleKind> {
         self.kind
     }
 
-    /// Extents of the whole muscle along its principal axes, mm; none where no surface was given.
+    /// Extents of the whole muscle along its principal axes, mm; none if no surface was given.
     pub fn extents(&self) -> Option<[f64; 3]> {
         self.extents
     }
@@ -269,8 +267,8 @@ impl MuscleFibres {
         self.extents.map(|[first, second, _]| second / first)
     }
 
-    /// Whether the outline hardly tells the direction: a sheet without known lines, or a strap
-    /// without them whose two longest extents are nearly equal (above [`SHEET_RATIO`]).
+    /// Whether the outline hardly determines the direction: a sheet without known lines, or a strap without
+    /// them whose two longest extents are nearly equal (above [`SHEET_RATIO`]).
     pub fn is_sheet(&self) -> bool {
         if self.courses.is_some() {
             return false;
@@ -282,7 +280,7 @@ impl MuscleFibres {
         }
     }
 
-    /// Unit direction of the fibres at `point` (mm, finite); its sign means nothing.
+    /// Unit direction of the fibres at `point` (mm, finite); its sign has no meaning.
     pub fn direction(&self, point: [f64; 3]) -> [f64; 3] {
         let x = Vec3::from(point);
         match &self.courses {
@@ -291,15 +289,15 @@ impl MuscleFibres {
         }
     }
 
-    /// Writes into `near` what the directions in a ball (mm) depend on.
+    /// Writes into `near` the data that determine the directions in a ball (mm).
     pub fn near(&self, centre: [f64; 3], radius: f64, near: &mut NearFibres) {
         if let Some(courses) = &self.courses {
             courses.segments_near(&Vec3::from(centre), radius, &mut near.0);
         }
     }
 
-    /// Unit direction of the fibres at `point` of the ball that `near` was made for: that of
-    /// [`MuscleFibres::direction`], for less.
+    /// Unit direction of the fibres at `point` of the ball that `near` was filled for: the same as
+    /// [`MuscleFibres::direction`], at lower cost.
     pub fn direction_near(&self, near: &NearFibres, point: [f64; 3]) -> [f64; 3] {
         let x = Vec3::from(point);
         match &self.courses {
@@ -353,8 +351,8 @@ fn oriented_box(part: &Part) -> OrientedBox {
     }
 }
 
-/// The principal axis of Σ w a aᵀ over directions a with weights w; the direction of largest weight
-/// where it has none.
+/// The principal axis of Σ w a aᵀ over directions a with weights w; the direction of largest weight if the sum
+/// has none.
 fn blended(directions: impl Iterator<Item = (Vec3, f64)>) -> Vec3 {
     let (mut sum, mut heaviest, mut most) = (Matrix3::zeros(), Vec3::x(), 0.0);
     for (direction, weight) in directions {
@@ -363,13 +361,12 @@ fn blended(directions: impl Iterator<Item = (Vec3, f64)>) -> Vec3 {
             (heaviest, most) = (direction, weight);
         }
     }
-    // One direction has all the weight but rounding.
+    // One direction has all the weight, up to rounding.
     let rest = sum.trace() - most;
     if rest <= f64::EPSILON * most { heaviest } else { principal_direction(&sum, heaviest) }
 }
 
-/// Unit eigenvector of the largest eigenvalue of a symmetric matrix; `otherwise` where that is
-/// double.
+/// Unit eigenvector of the largest eigenvalue of a symmetric matrix; `otherwise` if that eigenvalue is double.
 ///
 /// The eigenvalue in closed form (Smith 1961), the vector as the largest cross product of two rows
 /// of A − λI.
@@ -380,7 +377,7 @@ fn principal_direction(a: &Matrix3<f64>, otherwise: Vec3) -> Vec3 {
     if size <= f64::EPSILON * mean.abs() {
         return otherwise;
     }
-    // A rounding of the angle near 0 is lost in its cosine.
+    // Rounding of the angle near 0 is lost in its cosine.
     let half_determinant = (0.5 * deviator.determinant() / size.powi(3)).clamp(-1.0, 1.0);
     let largest = 2.0 * size * (half_determinant.acos() / 3.0).cos();
     let m = deviator - Matrix3::identity() * largest;

@@ -1,4 +1,4 @@
-//! The parts of a muscle, each with one direction: in series, side by side, or round an opening.
+//! The parts of a muscle, each with one direction: in series, side by side, or around an opening.
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
@@ -6,36 +6,36 @@ use super::centre_line::{CentreLine, EXTENT_PER_DEVIATION};
 use super::region::{Moments, Region};
 use crate::vector::Vec3;
 
-/// Turn of the centre line that one box stands for, rad (8°): at its ends it is off by half of that.
+/// Rotation of the centre line per box, rad (8°): at the ends of a box the direction is off by half of that.
 const TURN_PER_BOX: f64 = 0.14;
 
-/// Most boxes one after another: a line that turns further turns back.
+/// Maximum number of boxes in series: a line that would need more reverses its direction.
 const MOST_IN_SERIES: usize = 12;
 
-/// Boxes round an opening where no number is given: each stands for 15°.
+/// Number of boxes around an opening if none is given: each covers 15°.
 const BOXES_ROUND: usize = 24;
 
 /// Angle between neighbouring lanes of a fan, rad (9°).
 const TURN_PER_LANE: f64 = 0.16;
 
-/// A lane is this many times longer than wide, so that its own centre line shows.
+/// Ratio of length to width from which a lane's own centre line is determined.
 const LANE_SLENDERNESS: f64 = 3.0;
 
-/// Most lanes side by side.
+/// Maximum number of lanes side by side.
 const MOST_LANES: usize = 10;
 
-/// Slices across a sheet from which its taper is found.
+/// Number of slices across a sheet that determine its taper.
 const TAPER_SLICES: usize = 8;
 
-/// Change of width over the length of a sheet, relative to the larger width, below which its lanes
-/// are parallel: straps narrow by that much at their ends alone.
+/// Change of width over the length of a sheet, relative to the larger width, below which its lanes are
+/// parallel: straps become that much narrower at their ends alone.
 const PARALLEL_TAPER: f64 = 0.15;
 
-/// Rounds of turning a pencil to the apex found and looking again.
+/// Number of times that a pencil is aligned with the apex found and the search repeated.
 const AIMS: usize = 4;
 
-/// Distance of the apex beyond the tip, relative to the length, at least: planes through it must
-/// not cut one another inside.
+/// Minimum distance of the apex beyond the tip, relative to the length: planes through it must not intersect
+/// inside.
 const APEX_MARGIN: f64 = 0.02;
 
 /// A piece of a muscle's surface with one direction of its fibres.
@@ -55,10 +55,10 @@ impl Part {
     }
 }
 
-/// Parts one after another along the centre line; `count`, or as many as it turns.
+/// Parts in series along the centre line; `count`, or as many as its rotation requires.
 ///
-/// One part that was asked for has its principal axis (Kim et al. 2010), otherwise the tangents of the
-/// line are the directions.
+/// A single requested part has its principal axis (Kim et al. 2010); otherwise the directions are the tangents
+/// of the line.
 pub(super) fn in_series(region: &Region, count: Option<usize>) -> Vec<Part> {
     let Some(moments) = region.moments() else { return Vec::new() };
     if count == Some(1) {
@@ -72,8 +72,8 @@ pub(super) fn in_series(region: &Region, count: Option<usize>) -> Vec<Part> {
     slices.filter_map(|(i, slice)| Part::new(slice, middle(i))).collect()
 }
 
-/// Parts in lanes that run to where the muscle tapers; `lanes` of one part each, or as many as the
-/// shape needs, each in series.
+/// Parts in lanes that converge where the muscle tapers; `lanes` of one part each, or as many as the shape
+/// needs, each in series.
 ///
 /// `towards`: from the wide side to the narrow one.
 pub(super) fn in_lanes(region: &Region, towards: Vec3, lanes: Option<usize>) -> Vec<Part> {
@@ -95,10 +95,10 @@ pub(super) fn in_lanes(region: &Region, towards: Vec3, lanes: Option<usize>) -> 
     parts
 }
 
-/// Parts round an opening, each with the tangent of the line through the parts.
+/// Parts around an opening, each with the tangent of the line through the parts.
 ///
-/// The opening is a slit along the longer axis, as long as the ring is longer than wide: rays leave it
-/// square where it is straight and turn about its ends.
+/// The opening is a slit along the longer axis, whose length is the difference between length and width of the
+/// ring: rays are perpendicular to it where it is straight, and turn around its ends.
 pub(super) fn in_ring(region: &Region, count: Option<usize>) -> Vec<Part> {
     let Some(moments) = region.moments() else { return Vec::new() };
     let count = count.unwrap_or(BOXES_ROUND);
@@ -121,14 +121,14 @@ pub(super) fn in_ring(region: &Region, count: Option<usize>) -> Vec<Part> {
     parts.map(|((region, moments), direction)| Part { region, moments, direction }).collect()
 }
 
-/// The way round a slit at half the width of a ring.
+/// The path around a slit at half the width of a ring.
 struct Track {
     centre: Vec3,
     /// Unit vectors along and across the slit, in the plane of the ring.
     axes: [Vec3; 2],
     /// Half the length of the slit, mm.
     slit: f64,
-    /// Distance of the track from the slit, mm.
+    /// Distance of the path from the slit, mm.
     radius: f64,
 }
 
@@ -152,12 +152,12 @@ impl Track {
         Self { centre, axes, slit: slit.abs(), radius }
     }
 
-    /// The ray at a share of the way round.
+    /// The ray at a given share of the way around.
     fn ray(&self, share: f64) -> Ray {
         let [u, v] = self.axes;
         let (straight, bend) = (2.0 * self.slit, PI * self.radius);
         let half = straight + bend;
-        // Both halves are alike but for a half turn.
+        // The halves are equal up to a rotation by 180°.
         let way = 2.0 * share.rem_euclid(1.0);
         let (sign, way) = if way < 1.0 { (1.0, way * half) } else { (-1.0, (way - 1.0) * half) };
         let (place, angle) = if way < straight {
@@ -192,14 +192,14 @@ pub(super) fn taper_direction(region: &Region, moments: &Moments) -> Vec3 {
     if length > 0.0 { skew / length } else { first }
 }
 
-/// Planes that hold the thin axis of a sheet and meet in an apex, or are parallel.
+/// Planes that contain the thin axis of a sheet and meet in an apex, or are parallel.
 struct Pencil {
     origin: Vec3,
     along: Vec3,
     across: Vec3,
-    /// Distance of the apex from the origin along the sheet, mm; none where the planes are parallel.
+    /// Distance of the apex from the origin along the sheet, mm; none if the planes are parallel.
     apex: Option<f64>,
-    /// How many lanes the shape needs.
+    /// Number of lanes that the shape needs.
     lanes: usize,
 }
 
@@ -215,14 +215,14 @@ impl Pencil {
         pencil
     }
 
-    /// The pencil with the apex where the widths of slices across it run out.
+    /// The pencil with the apex at which the widths of slices across it extrapolate to zero.
     fn aimed(self, region: &Region) -> Self {
         let mut slices = self.slices(region);
         let widest = |slices: &[Slice]| {
             let order = |i: &usize, j: &usize| slices[*i].width.total_cmp(&slices[*j].width);
             (0..slices.len()).max_by(order).unwrap_or(0)
         };
-        // A rounded wide end tapers too: what counts lies between the widest slice and the tip.
+        // A rounded wide end also tapers: only the part between the widest slice and the tip counts.
         let fitted = slices.split_off(widest(&slices));
         let Some(Taper { width, middle }) = Taper::of(&fitted) else { return self };
         let [low, high] = region.range(&self.along).map(|s| s - self.along.dot(&self.origin));
@@ -268,34 +268,34 @@ impl Pencil {
         [self.along.dot(&x), self.across.dot(&x)]
     }
 
-    /// What is constant on each plane.
+    /// A function that is constant on each plane.
     fn slope(&self, x: &Vec3) -> f64 {
         let [s, v] = self.place(x);
         self.apex.map_or(v, |apex| v / (apex - s))
     }
 
-    /// Signed height over the plane of a slope, linear in x.
+    /// Signed height above the plane of a slope, linear in x.
     fn height(&self, x: &Vec3, slope: f64) -> f64 {
         let [s, v] = self.place(x);
         self.apex.map_or(v - slope, |apex| v - slope * (apex - s))
     }
 }
 
-/// One slice across a pencil, mm: where it lies along it, its middle and width across.
+/// One slice across a pencil, mm: its position along it, its centre and width across it.
 struct Slice {
     place: f64,
     middle: f64,
     width: f64,
 }
 
-/// Width and middle as linear functions of the place: value at 0 and slope.
+/// Width and centre as linear functions of the position: value at 0 and slope.
 struct Taper {
     width: [f64; 2],
     middle: [f64; 2],
 }
 
 impl Taper {
-    /// The least-squares lines; none through fewer than two places.
+    /// The least-squares lines; none if there are fewer than two positions.
     fn of(slices: &[Slice]) -> Option<Self> {
         let n = slices.len() as f64;
         let mean = slices.iter().map(|s| s.place).sum::<f64>() / n;

@@ -1,14 +1,14 @@
-//! A piece of a surface as loose triangles: exact moments of its area, and cuts by planes.
+//! A piece of a surface as unconnected triangles: exact moments of its area, and cuts by planes.
 //!
-//! Areas alone count, so that holes and flipped triangles do no harm.
+//! Only areas count, so that holes and flipped triangles do no harm.
 
 use nalgebra::{Matrix3, SymmetricEigen};
 
 use crate::geometry::surface::Surface;
 use crate::vector::Vec3;
 
-/// Halvings of the interval in which a plane of a given share of area is sought: the offset is then
-/// exact to a millionth of the extent, far below the size of a box.
+/// Bisection steps in the search for a plane with a given share of the area: the offset is then exact to a
+/// millionth of the extent, far below the size of a box.
 const HALVINGS: usize = 20;
 
 /// Triangles, mm, that need not be connected.
@@ -33,7 +33,7 @@ impl Region {
         Self { triangles }
     }
 
-    /// Exact moments; none of a region without area.
+    /// Exact moments; none for a region without area.
     ///
     /// Over a triangle of area A with corners v and their sum s: ∫ x = A s/3 and
     /// ∫ x xᵀ = A/12 (Σ v vᵀ + s sᵀ).
@@ -58,8 +58,8 @@ impl Region {
 
     /// Mean of |q|² q over the area, q the part of x − `centre` in the plane of two unit `axes`.
     ///
-    /// It points to the side on which the area tapers off. By the rule of degree 3 on triangles
-    /// (Strang & Fix 1973), so exact.
+    /// It points to the side on which the area tapers off. Computed with the rule of degree 3 on triangles
+    /// (Strang & Fix 1973), so it is exact.
     pub fn skew(&self, centre: Vec3, axes: [Vec3; 2]) -> Vec3 {
         let mut sum = Vec3::zeros();
         for triangle in &self.triangles {
@@ -77,7 +77,7 @@ impl Region {
         sum
     }
 
-    /// Least and greatest value of `axis`·x.
+    /// Minimum and maximum of `axis`·x.
     pub fn range(&self, axis: &Vec3) -> [f64; 2] {
         self.triangles
             .iter()
@@ -142,10 +142,10 @@ impl Moments {
         principal_axes(self.covariance)
     }
 
-    /// Unit axes with the given first one, the others principal in the plane across it.
+    /// Unit axes with the given first one; the others are principal in the plane across it.
     pub fn axes_about(&self, first: Vec3) -> [Vec3; 3] {
         let across = Matrix3::identity() - first * first.transpose();
-        // The first axis keeps the largest variance, whatever lies in the plane.
+        // The first axis keeps the largest variance, whatever the distribution in the plane.
         let largest = self.covariance.trace();
         let flat = across * self.covariance * across + first * first.transpose() * (2.0 * largest);
         let second = principal_axes(flat)[1];
