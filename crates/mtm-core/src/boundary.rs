@@ -1,4 +1,4 @@
-//! Node kinds, bone segments and plans: what is fixed, what moves with bone, what slides on it.
+//! Node kinds, bone segments and plans: which nodes are fixed, which move with bone, which slide on it.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -16,16 +16,16 @@ pub enum Gap {
     Uniform(f64),
     /// One per sliding node, in the order they were given.
     PerNode(Vec<f64>),
-    /// The offset each node has from its closest point at rest, carried by the segment.
+    /// The offset of each node from its closest point at rest, moved with the segment.
     Rest,
 }
 
 /// What happens when a node is given two kinds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Conflicts {
-    /// Refuse, naming the node.
+    /// Report an error that names the node.
     Refuse,
-    /// Fixed wins over joined, joined over sliding; the losers are counted.
+    /// Fixed takes precedence over joined, joined over sliding; the overridden kinds are counted.
     Resolve,
 }
 
@@ -44,40 +44,40 @@ pub struct Segment {
     pub gap: Gap,
 }
 
-/// What the nodes of a [`TouchingPair`] may not enter.
+/// A surface that the nodes of a [`TouchingPair`] may not enter.
 #[derive(Debug, Clone)]
 pub enum Against {
     /// The tissue behind these triangles of the mesh's boundary, outward normals; they deform with it.
     Tissue(Vec<[u32; 3]>),
-    /// Bone behind a surface at rest, normals out of the bone.
+    /// Bone behind a surface at rest, with normals pointing out of the bone.
     Bone {
         /// The surface.
         surface: Arc<Surface>,
-        /// The segment that it moves with; none for bone that stays where it is.
+        /// The segment that it moves with; none for bone that does not move.
         segment: Option<String>,
     },
 }
 
-/// Nodes that may touch what they do not slide on, and lift off again: without friction, and without a force while
-/// they are apart.
+/// Nodes that may touch a surface on which they do not slide, and separate from it again: without friction, and
+/// without force while separated.
 #[derive(Debug, Clone)]
 pub struct TouchingPair {
     /// The nodes.
     pub nodes: Vec<u32>,
-    /// What they may touch.
+    /// The surface that they may touch.
     pub against: Against,
 }
 
-/// Kinds of the nodes: every node not named is free, each node has one kind.
+/// Kinds of the nodes: every node not listed is free, and each node has one kind.
 #[derive(Debug, Clone)]
 pub struct Boundary {
     fixed: Vec<u32>,
     segments: Vec<Segment>,
     touching: Vec<TouchingPair>,
-    /// Joined nodes as the caller gave them: rows of a plan's displacements follow this order.
+    /// Joined nodes in the order given by the caller: rows of a plan's displacements follow this order.
     given: Vec<Vec<u32>>,
     conflicts: usize,
-    /// Joined nodes in the middle of an edge, with its ends.
+    /// Joined mid-edge nodes, with the ends of their edges.
     inherited: HashMap<u32, [u32; 2]>,
 }
 
@@ -87,7 +87,7 @@ pub struct Boundary {
 pub enum Motion {
     /// As a rigid body.
     Rigid(RigidMotion),
-    /// Its joined nodes by these displacements, mm, in the order they were given.
+    /// Its joined nodes move by these displacements, mm, in the order they were given.
     Nodes(Vec<[f64; 3]>),
     /// As a surface whose vertices have new positions.
     Surface(Arc<SurfaceMotion>),
@@ -99,7 +99,7 @@ pub type Plan = Vec<(String, Motion)>;
 /// Kind of a node, with the index of its segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum NodeKind {
-    /// Moves as the forces say.
+    /// Moves according to the forces.
     Free,
     /// Does not move.
     Fixed,
@@ -113,9 +113,9 @@ impl Boundary {
     /// The checked boundary.
     ///
     /// # Errors
-    /// A node of two kinds (unless resolved), a node joined to two segments, segments of the same name,
-    /// with nothing attached, sliding without a contact surface, a wrong number of gaps, gaps that are
-    /// not finite.
+    /// A node of two kinds (unless resolved), a node joined to two segments, segments with the same name, with
+    /// nothing attached, or sliding without a contact surface, a wrong number of gaps, gaps that are not
+    /// finite.
     pub fn new(fixed: Vec<u32>, segments: Vec<Segment>, conflicts: Conflicts) -> Result<Self> {
         let mut boundary = Self {
             fixed: unique(&fixed),
@@ -173,7 +173,7 @@ impl Boundary {
     /// The boundary with pairs that may touch.
     ///
     /// # Errors
-    /// A pair without nodes or without triangles, or with a segment that the boundary does not have.
+    /// A pair without nodes or without triangles, or with a segment that is not part of the boundary.
     pub fn with_touching(mut self, pairs: Vec<TouchingPair>) -> Result<Self> {
         for (pair, TouchingPair { nodes, against }) in pairs.iter().enumerate() {
             let fail = |problem: String| Err(MtmError::TouchingPair { pair, problem });
@@ -199,12 +199,12 @@ impl Boundary {
         Ok(self)
     }
 
-    /// The boundary with the nodes in the middle of edges: node `n_corners + i` lies between `edges[i]`.
+    /// The boundary with mid-edge nodes: node `n_corners + i` lies between `edges[i]`.
     ///
-    /// A node is fixed or joined where both ends of its edge are (to one segment), slides where both slide
-    /// on one segment and its edge lies on the surface of the body, and is free otherwise. (Across the body
-    /// an edge may end at a sliding node and lead away from its contact surface.) A prescribed gap is the
-    /// mean of the ends'.
+    /// A node is fixed or joined if both ends of its edge are (to the same segment), slides if both ends slide
+    /// on the same segment and its edge lies on the surface of the body, and is free otherwise. (An edge
+    /// through the body may end at a sliding node and lead away from its contact surface.) A prescribed gap is
+    /// the mean of those of the ends.
     ///
     /// # Errors
     /// A node index of `n_corners` or more.
@@ -306,7 +306,7 @@ impl Boundary {
         &self.touching
     }
 
-    /// How many nodes were given two kinds and lost one of them.
+    /// Number of nodes that were given two kinds, one of which was dropped.
     pub fn conflicts(&self) -> usize {
         self.conflicts
     }
@@ -349,8 +349,8 @@ impl Boundary {
     /// The motions of `plan` in the order of the segments.
     ///
     /// # Errors
-    /// A segment that the plan lacks or names twice, a name that is no segment, displacements of the
-    /// wrong number or not finite, displacements for a segment with sliding nodes.
+    /// A segment that the plan lacks or lists twice, a name that is not a segment, displacements of the wrong
+    /// number or not finite, displacements for a segment with sliding nodes.
     pub fn motions<'a>(&self, plan: &'a Plan) -> Result<Vec<&'a Motion>> {
         let fail = |segment: &str, problem: String| MtmError::Plan {
             segment: segment.to_owned(),
@@ -444,7 +444,7 @@ impl Boundary {
 /// The motion of each of `segments` in `plan`, in their order.
 ///
 /// # Errors
-/// A segment that the plan lacks or names twice, a name that is no segment.
+/// A segment that the plan lacks or lists twice, a name that is not a segment.
 pub(crate) fn matched<'a>(plan: &'a Plan, segments: &[&str]) -> Result<Vec<&'a Motion>> {
     let fail =
         |segment: &str, problem: String| MtmError::Plan { segment: segment.to_owned(), problem };
@@ -480,12 +480,12 @@ pub(crate) fn matched<'a>(plan: &'a Plan, segments: &[&str]) -> Result<Vec<&'a M
         .collect()
 }
 
-/// Whether a gap, mm, is one that contact can keep.
+/// Whether a gap, mm, is within the range that contact can maintain.
 fn is_gap(value: f64) -> bool {
     value.abs() <= LARGEST_COORDINATE
 }
 
-/// Whether a motion leads out of all that coordinates may be, whatever centre it turns about.
+/// Whether a motion leads outside the range of coordinates, for any centre of rotation.
 fn is_far(rigid: &RigidMotion) -> bool {
     rigid.matrix().iter().any(|row| row[3].abs() > 10.0 * LARGEST_COORDINATE)
 }

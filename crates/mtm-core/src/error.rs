@@ -1,10 +1,10 @@
-//! The one error type of the crate: each variant is a fact with the offending index and value.
+//! The only error type of the crate: each variant states a fact, with the offending index and value.
 
 use thiserror::Error;
 
 /// What went wrong, where, how much, and what to do about it.
 ///
-/// Variants fall in the families of [`ErrorKind`]; wrong input is found at construction, a numerical
+/// Variants belong to the families of [`ErrorKind`]; wrong input is detected at construction, a numerical
 /// outcome (no convergence, a mechanism) is reported by the solver with the figures reached.
 #[derive(Debug, Clone, PartialEq, Error)]
 #[non_exhaustive]
@@ -14,7 +14,7 @@ pub enum MtmError {
     Empty {
         /// The array.
         what: &'static str,
-        /// Whose input it is.
+        /// The family of the error.
         kind: ErrorKind,
     },
     /// Two arrays that belong together have different lengths.
@@ -24,11 +24,11 @@ pub enum MtmError {
         what: String,
         /// Its length.
         found: usize,
-        /// The length it needs.
+        /// The required length.
         expected: usize,
-        /// What fixes that length.
+        /// What determines that length.
         why: &'static str,
-        /// Whose input it is.
+        /// The family of the error.
         kind: ErrorKind,
     },
     /// A value is NaN or infinite.
@@ -40,7 +40,7 @@ pub enum MtmError {
         index: usize,
         /// The value.
         value: f64,
-        /// Whose input it is.
+        /// The family of the error.
         kind: ErrorKind,
     },
     /// A value lies outside the allowed range.
@@ -54,7 +54,7 @@ pub enum MtmError {
         value: f64,
         /// The allowed range, in words.
         allowed: &'static str,
-        /// Whose input it is.
+        /// The family of the error.
         kind: ErrorKind,
     },
     /// An index points past the end of what it indexes.
@@ -70,7 +70,7 @@ pub enum MtmError {
         index: usize,
         /// How many items there are.
         count: usize,
-        /// Whose input it is.
+        /// The family of the error.
         kind: ErrorKind,
     },
     /// A tet names the same node twice.
@@ -99,7 +99,7 @@ pub enum MtmError {
         /// How many tets are inverted.
         count: usize,
     },
-    /// A tet has no volume to speak of.
+    /// A tet has practically no volume.
     #[error(
         "tet {tet} is degenerate: volume {volume:.6e} for a longest edge of {edge:.6e}, below {limit:.1e} of its cube; remove or re-mesh it (nodes {nodes:?})"
     )]
@@ -115,7 +115,7 @@ pub enum MtmError {
         /// Its four nodes.
         nodes: [u32; 4],
     },
-    /// The same four nodes make two tets.
+    /// Two tets have the same four nodes.
     #[error(
         "tets {first} and {second} have the same four nodes {nodes:?}: remove one, or its stiffness counts twice"
     )]
@@ -174,7 +174,7 @@ pub enum MtmError {
         tet: usize,
         /// Smallest eigenvalue of C in Mandel form, MPa.
         eigenvalue: f64,
-        /// The constants that made it.
+        /// The constants that define it.
         constants: String,
     },
     /// A fibre direction is not a unit vector.
@@ -189,7 +189,7 @@ pub enum MtmError {
         /// Allowed deviation.
         tolerance: f64,
     },
-    /// A node was given two kinds that cannot both hold.
+    /// A node was given two contradictory kinds.
     #[error("node {node} is both {first} and {second}: a node has one kind")]
     NodeOfTwoKinds {
         /// The node.
@@ -199,15 +199,15 @@ pub enum MtmError {
         /// Second role.
         second: String,
     },
-    /// A segment has sliding nodes and no contact surface, or the other way round, or nothing at all.
+    /// A segment has sliding nodes and no contact surface, or the reverse, or nothing attached to it.
     #[error("segment \"{segment}\" {problem}")]
     Segment {
         /// The segment's name.
         segment: String,
-        /// What is wrong with it, and the mend.
+        /// What is wrong with it, and the fix.
         problem: String,
     },
-    /// Nodes that may touch something do not fit what they face.
+    /// Nodes that may touch a surface do not match it.
     #[error("touching pair {pair} {problem}")]
     TouchingPair {
         /// Index of the pair.
@@ -220,7 +220,7 @@ pub enum MtmError {
     Plan {
         /// The segment's name.
         segment: String,
-        /// What is wrong, and the mend.
+        /// What is wrong, and the fix.
         problem: String,
     },
     /// Part of the body can move without deforming.
@@ -237,22 +237,22 @@ pub enum MtmError {
         /// One of them.
         node: usize,
     },
-    /// A contact surface cannot serve.
+    /// A contact surface is not usable.
     #[error("contact surface of segment \"{segment}\" {problem}")]
     ContactSurface {
         /// The segment's name.
         segment: String,
-        /// What is wrong, where, and the mend.
+        /// What is wrong, where, and the fix.
         problem: String,
     },
-    /// The steps of the contact solver ran out, or led nowhere.
+    /// The contact solver ran out of steps, or made no progress.
     #[error(
         "contact did not converge: after {iterations} steps nodes {nodes:?} are off their surfaces or out of balance (largest gap {gap:.3e} mm); smooth the contact surface there, refine the tissue, or check that bones do not pass through each other"
     )]
     ContactNotConverged {
         /// Steps done.
         iterations: usize,
-        /// The nodes that are farthest from a solution (ten of them).
+        /// The nodes that are furthest from a solution (at most ten).
         nodes: Vec<usize>,
         /// Largest gap reached, mm.
         gap: f64,
@@ -264,17 +264,17 @@ pub enum MtmError {
     NotPositiveDefinite {
         /// Node of the failing pivot.
         node: usize,
-        /// What was seen.
+        /// What was observed.
         detail: String,
     },
-    /// An iterative method stopped before what it estimates of its error was small enough.
+    /// An iterative method stopped before its estimated error was small enough.
     #[error("{method} did not converge: after {iterations} iterations {shortfall}; {advice}")]
     NotConverged {
         /// The method.
         method: &'static str,
         /// Iterations done.
         iterations: usize,
-        /// What was not reached.
+        /// The condition that was not met.
         shortfall: Shortfall,
         /// What to try.
         advice: &'static str,
@@ -284,19 +284,19 @@ pub enum MtmError {
     OutOfMemory {
         /// The step.
         what: &'static str,
-        /// Its need, MB.
+        /// Memory required, MB.
         needed_mb: usize,
-        /// The limit that the caller set, MB; none where the system refused.
+        /// The limit that the caller set, MB; none if the system refused.
         limit_mb: Option<usize>,
         /// What to try.
         advice: &'static str,
     },
-    /// A forked process could start no threads.
+    /// A forked process could not start any threads.
     #[error(
         "no threads could be started ({reason}): allow this process more, or set RAYON_NUM_THREADS to fewer"
     )]
     NoThreads {
-        /// What the system answered.
+        /// The error reported by the system.
         reason: String,
     },
     /// Fewer points than a registration needs.
@@ -308,10 +308,10 @@ pub enum MtmError {
         found: usize,
         /// How many are needed.
         needed: usize,
-        /// What they must be, in words.
+        /// What the points must be, in words.
         shape: &'static str,
     },
-    /// Two points of a registration are one.
+    /// Two points of a registration coincide.
     #[error(
         "{what} {first} and {second} coincide: {distance:.3e} mm apart; remove one of them or place it again"
     )]
@@ -341,7 +341,7 @@ pub enum MtmError {
         /// Allowed ratio of both.
         limit: f64,
     },
-    /// The points of a registration leave its motion open.
+    /// The points of a registration do not determine its motion.
     #[error("{what} is not determined: {reason}")]
     NotDetermined {
         /// What is sought.
@@ -349,14 +349,14 @@ pub enum MtmError {
         /// Why, and what to do.
         reason: String,
     },
-    /// A matrix is no rigid motion.
+    /// A matrix is not a rigid motion.
     #[error("{what}: {problem}")]
     NotRigid {
         /// The matrix.
         what: String,
         /// What is wrong with it, and the fix.
         problem: String,
-        /// Whose input it is.
+        /// The family of the error.
         kind: ErrorKind,
     },
     /// Iterative closest points were still moving at the last step.
@@ -368,7 +368,7 @@ pub enum MtmError {
         iterations: usize,
         /// Largest motion of a point in the last step, mm.
         motion: f64,
-        /// Motion that counts as rest, mm.
+        /// Motion below which the points count as converged, mm.
         tolerance: f64,
         /// Root mean square distance before the first step and after each, mm.
         history: Vec<f64>,
@@ -385,12 +385,12 @@ pub enum MtmError {
         found: String,
         /// The names that exist.
         known: &'static str,
-        /// Whose input it is.
+        /// The family of the error.
         kind: ErrorKind,
     },
 }
 
-/// A value as an error shows it: without hundreds of digits.
+/// A value as shown in an error: without hundreds of digits.
 fn shown(value: f64) -> String {
     let size = value.abs();
     if value.is_finite() && size != 0.0 && !(1e-5..1e9).contains(&size) {
@@ -400,14 +400,14 @@ fn shown(value: f64) -> String {
     }
 }
 
-/// A quantity that an iteration did not bring down to where it was asked to.
+/// A quantity that an iteration did not reduce to the required value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shortfall {
     /// The quantity, in words.
     pub quantity: &'static str,
-    /// What it was at the end; infinite where it could not be computed.
+    /// Its final value; infinite if it could not be computed.
     pub value: f64,
-    /// What was asked for.
+    /// The required value.
     pub limit: f64,
     /// Its unit with a space before it; empty if it has none.
     pub unit: &'static str,
@@ -434,11 +434,11 @@ pub enum ErrorKind {
     Material,
     /// Node kinds, segments, plans.
     Boundary,
-    /// Contact surfaces and the contact loop.
+    /// Contact surfaces and the contact solver.
     Contact,
     /// Solver options and outcomes.
     Solver,
-    /// Landmarks and points that are to be brought together.
+    /// Landmarks and points that are to be aligned.
     Registration,
     /// The caller asked to stop.
     Interrupted,
@@ -483,7 +483,8 @@ impl MtmError {
         }
     }
 
-    /// Whether the input is at fault (Python: the error is also a `ValueError`), not a numerical outcome.
+    /// Whether the input is at fault (Python: the error is also a `ValueError`), rather than a numerical
+    /// outcome.
     pub fn is_input(&self) -> bool {
         !matches!(
             self,
@@ -501,7 +502,7 @@ impl MtmError {
 /// Result of a fallible operation of this crate.
 pub type Result<T> = std::result::Result<T, MtmError>;
 
-/// Refuses NaN and infinity in rows of three, naming the row.
+/// Rejects NaN and infinity in rows of three, stating the row.
 pub(crate) fn check_finite_rows(what: &str, rows: &[[f64; 3]], kind: ErrorKind) -> Result<()> {
     for (index, row) in rows.iter().enumerate() {
         if let Some(&value) = row.iter().find(|v| !v.is_finite()) {
@@ -516,18 +517,18 @@ pub const LARGEST_COORDINATE: f64 = 1e6;
 /// Largest force on a node, N.
 pub const LARGEST_FORCE: f64 = 1e12;
 
-/// Refuses NaN, infinity and coordinates or displacements beyond [`LARGEST_COORDINATE`], naming the row.
+/// Rejects NaN, infinity and coordinates or displacements beyond [`LARGEST_COORDINATE`], stating the row.
 pub(crate) fn check_coordinates(what: &str, rows: &[[f64; 3]], kind: ErrorKind) -> Result<()> {
     check_rows_within(what, rows, LARGEST_COORDINATE, "-1e6 to 1e6 mm; check the units", kind)
 }
 
-/// Refuses NaN, infinity and displacements that no body has, naming the row: those of a solution under
+/// Rejects NaN, infinity and displacements that no body can have, stating the row: those of a solution under
 /// absurd loads may be beyond [`LARGEST_COORDINATE`].
 pub(crate) fn check_displacements(what: &str, rows: &[[f64; 3]], kind: ErrorKind) -> Result<()> {
     check_rows_within(what, rows, 1e30, "-1e30 to 1e30 mm", kind)
 }
 
-/// Refuses NaN, infinity and forces beyond [`LARGEST_FORCE`], naming the row.
+/// Rejects NaN, infinity and forces beyond [`LARGEST_FORCE`], stating the row.
 pub(crate) fn check_forces(what: &str, rows: &[[f64; 3]], kind: ErrorKind) -> Result<()> {
     check_rows_within(what, rows, LARGEST_FORCE, "-1e12 to 1e12 N; check the units", kind)
 }

@@ -31,14 +31,14 @@
 //!
 //! # Units and signs
 //!
-//! mm, N, MPa; radians. Unknown 3·node + axis. Internal force = K u: the force that deformation needs at
-//! a node, zero at free nodes in equilibrium, and at joined nodes the force that the bone exerts. Voigt
-//! order xx, yy, zz, yz, xz, xy with engineering shears. Surfaces have outward normals; those of contact
-//! surfaces point out of the bone, into the tissue.
+//! mm, N, MPa; radians. Unknown 3·node + axis. Internal force = K u: the external force required at a node to
+//! maintain the deformation, zero at free nodes in equilibrium, and at joined nodes the force that the bone
+//! exerts. Voigt order xx, yy, zz, yz, xz, xy with engineering shears. Surfaces have outward normals; those of
+//! contact surfaces point out of the bone, into the tissue.
 //!
-//! # Bits
+//! # Reproducibility
 //!
-//! The same input gives the same bits for any number of threads.
+//! Results are bitwise identical for any number of threads.
 //!
 //! # Example
 //!

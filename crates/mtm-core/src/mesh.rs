@@ -9,8 +9,8 @@ use crate::vector::{add, cross, dot, norm, scaled, sub};
 /// dihedral angle of 0.1° is near 2e-4; f64 geometry keeps about three digits at this limit.
 pub const DEGENERATE_RELATIVE_VOLUME: f64 = 1e-12;
 
-/// Length that the longest edge of a tet has at least, mm: the products of shorter ones leave the range of
-/// normal numbers.
+/// Minimum length of the longest edge of a tet, mm: products of shorter lengths are outside the range of normal
+/// numbers.
 const SHORTEST_EDGE: f64 = 1e-9;
 
 /// The four faces of a tet, outward when the tet is positively oriented.
@@ -133,7 +133,7 @@ impl TetMesh {
         self.nodes.iter().fold([0.0; 3], |c, &x| add(c, scaled(x, share)))
     }
 
-    /// Length of the diagonal of the bounding box, mm: the length that relative tolerances refer to.
+    /// Length of the diagonal of the bounding box, mm: the reference length of relative tolerances.
     pub fn diagonal(&self) -> f64 {
         let (lo, hi) = bounds(&self.nodes);
         norm(sub(hi, lo))
@@ -282,7 +282,7 @@ fn check_volumes(nodes: &[[f64; 3]], tets: &[[u32; 4]], volumes: &[f64]) -> Resu
 fn check_duplicates(tets: &[[u32; 4]], incident: &Incidence) -> Result<()> {
     let found = (0..tets.len()).into_par_iter().find_map_first(|t| {
         let tet = &tets[t];
-        // Any duplicate shares every node: the node with the fewest tets is the cheapest place to look.
+        // Duplicates share every node, so only the node with the fewest tets has to be searched.
         let node = tet.iter().min_by_key(|&&v| incident.of(v as usize).len())?;
         incident
             .of(*node as usize)

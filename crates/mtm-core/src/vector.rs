@@ -1,8 +1,8 @@
-//! Arithmetic of vectors in space: of `[f64; 3]`, and nalgebra's where a formula reads better with it.
+//! Arithmetic of vectors in space: `[f64; 3]`, and nalgebra's type where a formula is more readable with it.
 
 use nalgebra::Vector3;
 
-/// A point or direction, mm or unitless.
+/// A point or direction, mm or dimensionless.
 pub(crate) type Vec3 = Vector3<f64>;
 
 pub(crate) fn sub(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
@@ -17,7 +17,7 @@ pub(crate) fn scaled(a: [f64; 3], s: f64) -> [f64; 3] {
     [a[0] * s, a[1] * s, a[2] * s]
 }
 
-/// a + share (b − a) row by row, and `b` itself for the whole way.
+/// a + share (b − a) row by row, and exactly `b` for a share of one.
 pub(crate) fn between(a: &[[f64; 3]], b: &[[f64; 3]], share: f64) -> Vec<[f64; 3]> {
     if share == 1.0 {
         return b.to_vec();

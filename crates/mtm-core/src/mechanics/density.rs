@@ -1,12 +1,12 @@
 //! Strain energy of a material point under large rotation: value, stress and tangent by the deformation
 //! gradient F. Energies in MPa = N mm/mm³.
 //!
-//! Corotational: W = ½ e : C : e with the stretch e = U − I of F = R U (Biot 1965). For isotropic C its
-//! force is the corotational one, R K (Rᵀ x − X) (Müller & Gross 2004); for a fibre it is the one that an
-//! energy has, and leaves no moment behind.
+//! Corotational: W = ½ e : C : e with the stretch e = U − I of F = R U (Biot 1965). For isotropic C its force
+//! is the corotational one, R K (Rᵀ x − X) (Müller & Gross 2004); for a fibre it is the one derived from an
+//! energy, and exerts no net moment.
 //!
-//! Hyperelastic: a law of isotropic tissue for the isotropic stiffness nearest to C (Fedorov 1968), and
-//! ½ e : (C − C_iso) : e for the fibre. At F = I the tangent is C.
+//! Hyperelastic: a law of isotropic tissue for the isotropic stiffness nearest to C (Fedorov 1968), plus ½ e :
+//! (C − C_iso) : e for the fibre. At F = I the tangent is C.
 
 use nalgebra::{Cholesky, Matrix3, Matrix6, SymmetricEigen, Vector3};
 
@@ -15,15 +15,15 @@ use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::material::{Lame, TetMaterial, Voigt};
 use crate::mechanics::polar::Polar;
 
-/// Sum of two principal stretches below which rotation about the third axis has no meaning: both sides of
-/// the tet have all but passed each other.
+/// Sum of two principal stretches below which the rotation about the third axis is undefined: the tet is almost
+/// completely inverted.
 const LEAST_STRETCH_SUM: f64 = 1e-2;
-/// Stiffness added to a tangent over its largest entry, so that its zeros, as those of turning a body at
-/// rest, do not count as negative by rounding. Newton's method converges as without.
+/// Stiffness added to a tangent, relative to its largest entry, so that its zero eigenvalues, such as those of
+/// rotations at rest, do not become negative by rounding. Newton's method converges as fast with it.
 const DEFINITE_LIFT: f64 = 1e-10;
 /// Rows and columns of strain components in Voigt order.
 const PAIRS: [(usize, usize); 6] = [(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)];
-/// Place in Voigt order of each entry of a tensor, row by row.
+/// Index in Voigt order of each entry of a tensor, row by row.
 const VOIGT: [usize; 9] = [0, 5, 4, 5, 1, 3, 4, 3, 2];
 
 /// Energy density of one material.
@@ -34,7 +34,7 @@ pub(crate) struct Density {
     stretch: Option<Stiffness>,
 }
 
-/// C for the stretch energy, without a detour through a box: it is read at every point.
+/// C for the stretch energy, stored without a box, since it is read at every point.
 #[derive(Debug, Clone, Copy)]
 #[allow(clippy::large_enum_variant)]
 enum Stiffness {
@@ -42,7 +42,7 @@ enum Stiffness {
     General(Voigt),
 }
 
-/// What a volumetric measure gives at a point: θ and ∂θ/∂F.
+/// A volumetric measure at a point: θ and ∂θ/∂F.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Volumetric {
     /// tr U − 3 (corotational) or J − 1 (hyperelastic).
@@ -52,7 +52,7 @@ pub(crate) struct Volumetric {
 }
 
 impl Density {
-    /// The energy of `material` under `kinematics`, which is not linear.
+    /// The energy of `material` under `kinematics`, which must not be linear.
     pub fn new(material: &TetMaterial<'_>, kinematics: Kinematics) -> Self {
         let stiffness = match material {
             TetMaterial::Isotropic(lame) => Stiffness::Isotropic(*lame),
@@ -81,7 +81,7 @@ impl Density {
         }
     }
 
-    /// Energy and stress at `f`, with `pressure` on the volumetric measure of `kinematics` added to the stress.
+    /// Energy and stress at `f`; `pressure` on the volumetric measure of `kinematics` is added to the stress.
     pub fn response(
         &self,
         f: &Matrix3<f64>,
@@ -140,15 +140,17 @@ pub(crate) fn volumetric(f: &Matrix3<f64>, kinematics: Kinematics) -> Volumetric
     }
 }
 
-/// `tangent` without negative curvature: steps along it downhill.
+/// `tangent` without negative curvature: steps computed with it go downhill.
 ///
-/// Hyperelastic points keep its size, so that steps stay as short along it as along positive curvature (Chen et
-/// al. 2024), where without it they leap. Corotational points lose it (Teran et al. 2005): theirs is of turns
-/// that lie far from rest, and short steps would not come to their end.
+/// For hyperelastic points negative curvature is replaced by its absolute value, so that steps stay as short
+/// along it as along positive curvature (Chen et al. 2024); without it they would overshoot. For corotational
+/// points it is removed (Teran et al. 2005): it comes from rotations far from rest, which short steps would not
+/// complete.
 ///
-/// Most points have none: a factor of it with a trifle added shows that, and that sum is then the answer.
+/// Most points have none: a Cholesky factorisation with a small shift shows that, and the shifted tangent is
+/// the answer.
 pub(crate) fn definite(tangent: Tangent, kinematics: Kinematics) -> Tangent {
-    // The eigenvalue iteration would not end.
+    // The eigenvalue iteration would not terminate.
     if tangent.iter().any(|x| !x.is_finite()) {
         return tangent;
     }
@@ -204,7 +206,7 @@ impl Stiffness {
 }
 
 impl Stiffness {
-    /// C in the axes that are the columns of `v`, by the stress transformation of Bond (1943).
+    /// C in the axes given by the columns of `v`, by the stress transformation of Bond (1943).
     fn in_frame(&self, v: &Matrix3<f64>) -> Voigt {
         match self {
             Self::Isotropic(l) => std::array::from_fn(|i| {
@@ -216,7 +218,7 @@ impl Stiffness {
                 })
             }),
             Self::General(c) => {
-                // σ'_ij = Σ v_ki v_lj σ_kl: a shear stress of Voigt stands for two of the sum.
+                // σ'_ij = Σ v_ki v_lj σ_kl: each shear stress in Voigt order occurs twice in the sum.
                 let bond = Matrix6::from_fn(|row, col| {
                     let ((i, j), (k, l)) = (PAIRS[row], PAIRS[col]);
                     let one = v[(k, i)] * v[(l, j)];
@@ -251,11 +253,11 @@ fn stretch_sum(a: f64, b: f64) -> f64 {
     (a + b).max(LEAST_STRETCH_SUM)
 }
 
-/// ∂²W/∂F² of the stretch energy; `pressure` is added to T where U bends.
+/// ∂²W/∂F² of the stretch energy; `pressure` is added to T in the terms from the second derivative of U.
 ///
 /// With A = Qᵀ δF V, E_ij = (u_i A_ij + u_j A_ji)/(u_i + u_j) is δU and Ω_ij = (A_ij − A_ji)/(u_i + u_j) the
-/// turn, A_ij = Ω_ij u_j + E_ij, in the principal frame at rest. Then δ²W = E : C : E + T : δ²U, and
-/// U² = FᵀF differentiated twice gives δ²U_ij = 2 Σ_k (A_ki A_kj − E_ki E_kj)/(u_i + u_j).
+/// rotation, A_ij = Ω_ij u_j + E_ij, in the principal frame at rest. Then δ²W = E : C : E + T : δ²U, and
+/// differentiating U² = FᵀF twice gives δ²U_ij = 2 Σ_k (A_ki A_kj − E_ki E_kj)/(u_i + u_j).
 fn stretch_tangent(stiffness: &Stiffness, f: &Matrix3<f64>, pressure: f64) -> Tangent {
     let polar = Polar::new(f);
     let (u, v) = (polar.stretch, polar.v);
@@ -263,7 +265,7 @@ fn stretch_tangent(stiffness: &Stiffness, f: &Matrix3<f64>, pressure: f64) -> Ta
         + Matrix3::identity() * pressure;
     let sum = Matrix3::from_fn(|i, j| stretch_sum(u[i], u[j]));
 
-    // E : C : E. Entry (r, c) of A strains one component of E alone, by `strains` in Voigt order.
+    // E : C : E. Entry (r, c) of A contributes to a single component of E, given by `strains` in Voigt order.
     let strains: [f64; 9] = std::array::from_fn(|rc| {
         let (r, c) = (rc / 3, rc % 3);
         if r == c { 1.0 } else { 2.0 * u[r] / sum[(r, c)] }
@@ -275,12 +277,12 @@ fn stretch_tangent(stiffness: &Stiffness, f: &Matrix3<f64>, pressure: f64) -> Ta
             in_frame[(a, b)] = strains[a] * c[VOIGT[a]][VOIGT[b]] * strains[b];
         }
     }
-    // T : δ²U on the diagonal: A² − E² = u_i Ω (A + E), whose factor u_i is that of T_ii / u_i.
+    // T : δ²U on the diagonal: A² − E² = u_i Ω (A + E), whose factor u_i cancels with that of T_ii / u_i.
     for i in 0..3 {
         for k in (0..3).filter(|&k| k != i) {
             let (here, there) = (3 * k + i, 3 * i + k);
             let turn = t[(i, i)] / sum[(k, i)];
-            // A_ki + E_ki over A_ki and A_ik.
+            // A_ki + E_ki in terms of A_ki and A_ik.
             let (own, other) = (1.0 + u[k] / sum[(k, i)], u[i] / sum[(k, i)]);
             in_frame[(here, here)] += turn * own;
             in_frame[(there, there)] -= turn * other;
@@ -309,7 +311,7 @@ fn stretch_tangent(stiffness: &Stiffness, f: &Matrix3<f64>, pressure: f64) -> Ta
     carried(&in_frame, &polar.q, &v)
 }
 
-/// The entries of A that E_ij is made of, at 3r + c, with their shares.
+/// The entries of A that contribute to E_ij, at 3r + c, with their weights.
 fn strained_by(i: usize, j: usize, u: &Vector3<f64>, sum: &Matrix3<f64>) -> [(usize, f64); 2] {
     if i == j {
         return [(4 * i, 0.5), (4 * i, 0.5)];
@@ -317,9 +319,10 @@ fn strained_by(i: usize, j: usize, u: &Vector3<f64>, sum: &Matrix3<f64>) -> [(us
     [(3 * i + j, u[i] / sum[(i, j)]), (3 * j + i, u[j] / sum[(i, j)])]
 }
 
-/// Derivatives by F from those by A = Qᵀ F V, one index after another.
+/// Derivatives with respect to F from those with respect to A = Qᵀ F V, one index after another.
 fn carried(in_frame: &Tangent, q: &Matrix3<f64>, v: &Matrix3<f64>) -> Tangent {
-    // Columns (t, u) to (k, l) by Q and V, twice: the form is symmetric, so its transpose is turned alike.
+    // Columns (t, u) to (k, l) by Q and V, twice: the form is symmetric, so its transpose is transformed in the
+    // same way.
     let turned = |h: &Tangent| {
         let mut half = Tangent::zeros();
         for t in 0..3 {
@@ -368,7 +371,7 @@ mod tests {
     use crate::mechanics::hyperelastic::flat;
     use crate::mechanics::material::{Elastic, FibreElastic, FibreLaw, Spencer};
 
-    /// Deformation gradients: at rest, sheared, turned by a right angle, squeezed, inverted.
+    /// Deformation gradients: at rest, sheared, rotated by a right angle, compressed, inverted.
     fn gradients() -> Vec<Matrix3<f64>> {
         let shear = Matrix3::new(1.2, 0.3, -0.1, 0.05, 0.9, 0.2, 0.1, -0.2, 1.1);
         let turn = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
@@ -452,7 +455,7 @@ mod tests {
                     let there = density.response(&(turn * f), kinematics, 0.3);
                     assert!((here.energy - there.energy).abs() < 1e-13 * here.energy.max(1.0));
                     assert!((turn * here.stress - there.stress).amax() < 1e-13);
-                    // Moments balance: P Fᵀ is symmetric.
+                    // Balance of moments: P Fᵀ is symmetric.
                     let moment = here.stress * f.transpose();
                     assert!((moment - moment.transpose()).amax() < 1e-13);
                 }

@@ -14,15 +14,15 @@ use crate::vector::{add, scaled};
 pub enum Element {
     /// Linear displacement on the corners: the mass-tensor model.
     Linear,
-    /// Linear displacement, the volumetric part averaged round each corner.
+    /// Linear displacement, with the volumetric part averaged around each corner.
     NodalPressure,
-    /// Quadratic displacement: corners and the middles of straight edges.
+    /// Quadratic displacement: corners and midpoints of straight edges.
     Quadratic,
 }
 
 /// Names of the elements.
 pub const ELEMENTS: &str = "p1, anp, p2";
-/// Most nodes of a tet.
+/// Maximum number of nodes of a tet.
 pub const MOST_NODES: usize = 10;
 /// Corners at the ends of each edge of a tet, in the order of its mid-edge nodes.
 pub const TET_EDGES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
@@ -57,8 +57,8 @@ impl Element {
     }
 }
 
-/// The nodes of an element on a mesh: the corners first, as the mesh numbers them, then one node in the
-/// middle of each edge where the element is quadratic.
+/// The nodes of an element on a mesh: the corners first, as the mesh numbers them, then the midpoint of each
+/// edge if the element is quadratic.
 #[derive(Debug, Clone)]
 pub struct ElementNodes {
     element: Element,
@@ -102,12 +102,12 @@ impl ElementNodes {
         self.middles.as_ref().map_or(self.mesh.nodes(), |m| &m.positions)
     }
 
-    /// Number of nodes, those in the middle of edges included.
+    /// Number of nodes, mid-edge nodes included.
     pub fn n_nodes(&self) -> usize {
         self.positions().len()
     }
 
-    /// Corners at the ends of each mid-edge node's edge; node i of these is number `n_corners + i`.
+    /// Corners at the ends of each mid-edge node's edge; its node i has number `n_corners + i`.
     pub fn mid_edges(&self) -> &[[u32; 2]] {
         self.middles.as_ref().map_or(&[], |m| &m.edges)
     }
@@ -129,8 +129,8 @@ impl ElementNodes {
 
     /// Shape gradients at quadrature point `point` of a tet with the corner gradients of `geometry`, 1/mm.
     ///
-    /// Linear: g_i. Quadratic, with barycentric coordinates λ: (4λ_i − 1) g_i at corners and
-    /// 4 (λ_i g_j + λ_j g_i) in the middle of edge ij.
+    /// Linear: g_i. Quadratic, with barycentric coordinates λ: (4λ_i − 1) g_i at corners and 4 (λ_i g_j + λ_j
+    /// g_i) at the midpoint of edge ij.
     pub fn gradients(&self, geometry: &TetGeometry, point: usize) -> Gradients {
         let g = geometry.gradients;
         let mut out = [[0.0; 3]; MOST_NODES];

@@ -1,4 +1,4 @@
-//! Which strain a solver takes: linear, corotational or of large deformation.
+//! The strain measure of a solver: linear, corotational or for large deformation.
 
 use std::sync::LazyLock;
 
@@ -12,9 +12,10 @@ pub enum Kinematics {
     /// Linear strain about the shape at rest (the paper).
     #[default]
     Linear,
-    /// Stretch without the rotation of each tet, with the constants of the linear law.
+    /// Stretch of each tet without its rotation, with the constants of the linear law.
     Corotational,
-    /// Large deformation with a law for the isotropic part of the tissue, and its fibres by their stretch.
+    /// Large deformation with a hyperelastic law for the isotropic part of the tissue, and its fibres by their
+    /// stretch.
     Hyperelastic(HyperelasticLaw),
 }
 
@@ -36,7 +37,7 @@ impl Kinematics {
     /// The kinematics called `name`.
     ///
     /// # Errors
-    /// [`MtmError::UnknownName`] with the names that there are.
+    /// [`MtmError::UnknownName`] with the available names.
     pub fn from_name(name: &str) -> Result<Self> {
         Self::all().find(|kinematics| kinematics.name() == name).ok_or_else(|| {
             MtmError::UnknownName {

@@ -1,5 +1,5 @@
-//! Tissue: isotropic, transversely isotropic and user-given linear elasticity, each proven positive
-//! definite when it is made; mixing of fat and muscle. Moduli in MPa.
+//! Tissue: isotropic, transversely isotropic and user-defined linear elasticity, each checked for positive
+//! definiteness at construction; mixing of fat and muscle. Moduli in MPa.
 
 use nalgebra::{Matrix6, SymmetricEigen};
 use rayon::prelude::*;
@@ -7,15 +7,15 @@ use rayon::prelude::*;
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::vector::{dot, norm};
 
-/// Smallest admissible eigenvalue of a stiffness over its largest. Rounding in the constants is near
+/// Smallest permitted eigenvalue of a stiffness over its largest. Rounding errors of the constants are near
 /// 1e-16; ν = 0.4999 with E_l/E_t = 1e3 is still at 1e-7.
 pub const DEFINITE_RATIO: f64 = 1e-12;
-/// Allowed deviation of a fibre direction from unit length; within it the direction is normalised.
+/// Permitted deviation of a fibre direction from unit length; within it the direction is normalised.
 pub const FIBRE_TOLERANCE: f64 = 1e-6;
-/// Allowed asymmetry of a user-given stiffness over its largest entry.
+/// Permitted asymmetry of a user-defined stiffness over its largest entry.
 const SYMMETRY_TOLERANCE: f64 = 1e-9;
-/// Smallest and largest modulus, MPa: far beyond any tissue (fat 0.003, enamel 1e5) and any unit of it, and
-/// far from where products overflow or vanish.
+/// Smallest and largest modulus, MPa: far beyond any tissue (fat 0.003, enamel 1e5) in any unit, and far from
+/// where products overflow or vanish.
 const SOFTEST: f64 = 1e-15;
 const STIFFEST: f64 = 1e12;
 
@@ -40,7 +40,7 @@ pub struct Elastic {
     pub poisson: f64,
 }
 
-/// Moduli along and across the fibre (MPa) and the one Poisson ratio of the paper.
+/// Moduli along and across the fibre (MPa) and the single Poisson ratio of the paper.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FibreElastic {
     /// Young's modulus along the fibre, MPa, positive.
@@ -67,23 +67,24 @@ pub struct Spencer {
     pub beta: f64,
 }
 
-/// How two moduli and one Poisson ratio become a stiffness.
+/// How two moduli and one Poisson ratio define a stiffness.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum FibreLaw {
-    /// Spencer's form from the engineering compliance, closed by the major-Poisson and Saint-Venant rules.
+    /// Spencer's form from the engineering compliance, completed by the major-Poisson and Saint-Venant rules.
     Spencer,
     /// C_iso(E_t) + (Δλ + 2Δμ) A⊗A of Picinbono, Delingette & Ayache (2003); indefinite for much softer fibres.
     Picinbono,
 }
 
-/// How fat and muscle share a tet.
+/// How fat and muscle are combined in a tet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Mixing {
-    /// Young's moduli and Poisson's ratio mix linearly with the muscle fraction (the paper, section 2.3).
+    /// Young's moduli and Poisson's ratio are interpolated linearly with the muscle fraction (the paper,
+    /// section 2.3).
     Moduli,
-    /// The stiffness itself mixes linearly.
+    /// The stiffness itself is interpolated linearly.
     Stiffness,
 }
 
@@ -117,7 +118,7 @@ enum Law {
         fibre: Vec<[f64; 3]>,
     },
     General(Vec<Voigt>),
-    /// `base` where the row of a tet is [`NO_ROW`].
+    /// A stiffness of `rows` for each tet, or `base` if its row is [`NO_ROW`].
     Composite {
         base: Lame,
         rows: Vec<Voigt>,
@@ -125,10 +126,10 @@ enum Law {
     },
 }
 
-/// Stands for the base material of a composite tissue.
+/// Marks the base material of a composite tissue.
 const NO_ROW: u32 = u32::MAX;
 
-/// Constants of one tet, as the tensor formulas take them.
+/// Constants of one tet, in the form used by the tensor formulas.
 #[derive(Debug, Clone, Copy)]
 pub enum TetMaterial<'a> {
     /// Isotropic.
@@ -229,7 +230,7 @@ impl Spencer {
         }
     }
 
-    /// Whether the fibre plays no part, so that the isotropic tensor serves.
+    /// Whether the fibre has no effect, so that the isotropic tensor can be used.
     pub fn is_isotropic(&self) -> bool {
         self.alpha == 0.0 && self.mu_difference == 0.0 && self.beta == 0.0
     }
@@ -249,7 +250,8 @@ impl Spencer {
         let c22_23 = 2.0 * (self.lambda_ + self.mu_across);
         let (mean, half) = (0.5 * (c11 + c22_23), 0.5 * (c11 - c22_23));
         let large = mean + half.hypot(std::f64::consts::SQRT_2 * c12);
-        // The smaller root from the product of the roots: the difference would cancel near ν = 0.5.
+        // The smaller root from the product of the roots: the difference would suffer cancellation near ν =
+        // 0.5.
         let small =
             if large > 0.0 { (c11 * c22_23 - 2.0 * c12 * c12) / large } else { 2.0 * mean - large };
         let shear = [2.0 * self.mu_across, 2.0 * mu_l];
@@ -340,11 +342,11 @@ impl Tissue {
         }
     }
 
-    /// Isotropic tissue of `n_tets` tets but for some: `rows[i]` is the stiffness of tet `tets[i]`.
+    /// Isotropic tissue of `n_tets` tets except for some: `rows[i]` is the stiffness of tet `tets[i]`.
     ///
     /// # Errors
     /// Those of [`Tissue::isotropic`] and [`Tissue::from_stiffness`], with the tet;
-    /// [`MtmError::IndexOutOfRange`] for a tet that is not there.
+    /// [`MtmError::IndexOutOfRange`] for a tet that does not exist.
     pub fn composite(base: Elastic, n_tets: usize, tets: &[u32], rows: Vec<Voigt>) -> Result<Self> {
         Self::isotropic(&[base])?;
         check_rows(n_tets)?;
@@ -369,8 +371,8 @@ impl Tissue {
         }
     }
 
-    /// Equivalent tissue of tets with muscle fraction `fraction` and unit `fibre` (ignored where the
-    /// fraction is 0), from the constants of `preset` (Kim et al. 2010, section 2.3; Uesu et al. 2005).
+    /// Equivalent tissue of tets with muscle fraction `fraction` and unit `fibre` (ignored if the fraction is
+    /// 0), from the constants of `preset` (Kim et al. 2010, section 2.3; Uesu et al. 2005).
     pub fn mixture(
         fraction: &[f64],
         fibre: &[[f64; 3]],
@@ -429,7 +431,7 @@ impl Tissue {
         }
     }
 
-    /// Largest λ/μ of any row, 2ν/(1−2ν) where it is isotropic: how nearly incompressible the tissue is.
+    /// Largest λ/μ of any row, 2ν/(1−2ν) if it is isotropic: how nearly incompressible the tissue is.
     pub fn largest_lame_ratio(&self) -> f64 {
         let ratio = |t: usize| match self.of_tet(t) {
             TetMaterial::Isotropic(l) => l.lambda_ / l.mu,
@@ -443,11 +445,11 @@ impl Tissue {
         (0..self.n_rows()).map(ratio).fold(0.0, f64::max)
     }
 
-    /// Stiffest over softest tet, by the mean resistance to shear; 1 where it is uniform.
+    /// Stiffest over softest tet, by the mean shear stiffness; 1 for a uniform tissue.
     pub fn contrast(&self) -> f64 {
         let shear = |t: usize| match self.of_tet(t) {
             TetMaterial::Isotropic(l) => l.mu,
-            // Two planes of shear hold the fibre, one lies across it.
+            // Two planes of shear contain the fibre, one is perpendicular to it.
             TetMaterial::Spencer(c, _) => c.mu_across + c.mu_difference * 2.0 / 3.0,
             TetMaterial::General(c) => (c[3][3] + c[4][4] + c[5][5]) / 3.0,
         };
@@ -577,7 +579,7 @@ fn describe(m: &FibreElastic, law: FibreLaw) -> String {
     )
 }
 
-/// `fibre` with every needed row scaled to length 1 exactly.
+/// `fibre` with every row that is needed scaled to exactly unit length.
 fn unit_fibres(fibre: &[[f64; 3]], needed: &[bool]) -> Result<Vec<[f64; 3]>> {
     if fibre.is_empty() {
         return Err(MtmError::Empty { what: "fibre", kind: ErrorKind::Material });
@@ -645,7 +647,7 @@ pub(crate) fn voigt_matrix(c: &Voigt) -> Matrix6<f64> {
     Matrix6::from_fn(|i, j| 0.5 * (c[i][j] + c[j][i]))
 }
 
-/// Extreme eigenvalues of C in Mandel form, where shears carry √2 and strain keeps its norm.
+/// Extreme eigenvalues of C in Mandel form, in which shears are multiplied by √2 and strain keeps its norm.
 pub(crate) fn voigt_eigenvalues(c: &Voigt) -> (f64, f64) {
     let weight = |i: usize| if i < 3 { 1.0 } else { std::f64::consts::SQRT_2 };
     let mandel = Matrix6::from_fn(|i, j| 0.5 * (c[i][j] + c[j][i]) * weight(i) * weight(j));

@@ -1,13 +1,13 @@
-//! Averaged nodal pressure: the volumetric strain of linear tets averaged round each corner, so that they
+//! Averaged nodal pressure: the volumetric strain of linear tets is averaged around each corner, so that they
 //! do not lock near ν = 0.5 (Bonet & Burton 1998; for several materials Joldes, Wittek & Miller 2009).
 //!
-//! A stiffness is split as C = C_r + κ I⊗I with C_r positive definite. Each tet keeps C_r; κ acts on the
-//! mean volumetric strain θ_a = Σ V_t θ_t / Σ V_t of the tets of one material round a corner a:
+//! A stiffness is split as C = C_r + κ I⊗I with C_r positive definite. Each tet keeps C_r; κ acts on the mean
+//! volumetric strain θ_a = Σ V_t θ_t / Σ V_t of the tets of one material around a corner a:
 //!
 //! W = Σ_t ½ V_t ε_t : C_r ε_t + Σ_a ½ w_a θ_a²,  w_a = Σ_t ¼ V_t κ_t.
 //!
-//! The second sum is never negative, so K is positive definite where C_r on the same mesh is. A quarter of
-//! each tet belongs to each corner, so that equal strain stores the energy of C.
+//! The second sum is never negative, so K is positive definite if C_r on the same mesh is. A quarter of each
+//! tet belongs to each corner, so that uniform strain stores the energy of C.
 
 use nalgebra::{Matrix3, Vector6};
 use rayon::prelude::*;
@@ -19,7 +19,7 @@ use crate::mechanics::material::{
 use crate::mesh::TetMesh;
 use crate::vector::add;
 
-/// κ of a material, MPa, and what is left of it.
+/// κ of a material, MPa, and the remaining stiffness.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Split {
     /// Stiffness against averaged volumetric strain.
@@ -28,7 +28,7 @@ pub(crate) struct Split {
     pub rest: Rest,
 }
 
-/// What a tet keeps of its material; lives as long as the tet is looked at.
+/// The remaining material of a tet; a temporary value.
 #[derive(Debug, Clone, Copy)]
 #[allow(clippy::large_enum_variant)]
 pub(crate) enum Rest {
@@ -38,7 +38,7 @@ pub(crate) enum Rest {
 }
 
 impl Rest {
-    /// As the tensor formulas take it.
+    /// In the form used by the tensor formulas.
     pub fn material(&self) -> TetMaterial<'_> {
         match self {
             Self::Isotropic(lame) => TetMaterial::Isotropic(*lame),
@@ -48,11 +48,11 @@ impl Rest {
     }
 }
 
-/// The volumetric split of a material: κ = K_R − e/3 with K_R = 1/(I : C⁻¹ : I) its bulk modulus under
-/// pressure and e the smallest eigenvalue of C; λ where the tissue is isotropic and λ ≥ 0.
+/// The volumetric split of a material: κ = K_R − e/3 with K_R = 1/(I : C⁻¹ : I) its bulk modulus under pressure
+/// and e the smallest eigenvalue of C; λ if the tissue is isotropic and λ ≥ 0.
 ///
-/// K_R is the largest κ that leaves C − κ I⊗I without a negative eigenvalue. The direction that it then
-/// leaves at zero, C⁻¹ I, is no shear: the e/3 kept back makes it positive. e ≤ 3 K_R, so κ ≥ 0.
+/// K_R is the largest κ for which C − κ I⊗I has no negative eigenvalue. The direction that then has a zero
+/// eigenvalue, C⁻¹ I, is not a shear: reducing κ by e/3 makes it positive. e ≤ 3 K_R, so κ ≥ 0.
 pub(crate) fn split(material: &TetMaterial<'_>) -> Split {
     match material {
         TetMaterial::Isotropic(l) => {
@@ -60,7 +60,7 @@ pub(crate) fn split(material: &TetMaterial<'_>) -> Split {
             Split { bulk, rest: Rest::Isotropic(Lame { lambda_: l.lambda_ - bulk, mu: l.mu }) }
         }
         TetMaterial::Spencer(c, a) => {
-            // In the fibre frame pressure meets C11, C12 and C22 + C23 alone.
+            // In the fibre frame pressure only involves C11, C12 and C22 + C23.
             let c12 = c.lambda_ + c.alpha;
             let c11 = c.lambda_ + 2.0 * (c.mu_across + c.alpha) + 4.0 * c.mu_difference + c.beta;
             let pair = 2.0 * (c.lambda_ + c.mu_across);
@@ -71,7 +71,7 @@ pub(crate) fn split(material: &TetMaterial<'_>) -> Split {
         }
         TetMaterial::General(c) => {
             let pressure = Vector6::new(1.0, 1.0, 1.0, 0.0, 0.0, 0.0);
-            // Proven positive definite when the tissue was made.
+            // Checked for positive definiteness when the tissue was constructed.
             let pressed = nalgebra::Cholesky::new(voigt_matrix(c))
                 .map_or(0.0, |l| 1.0 / pressure.dot(&l.solve(&pressure)));
             let bulk = (pressed - voigt_eigenvalues(c).0 / 3.0).max(0.0);
@@ -114,7 +114,7 @@ pub(crate) struct Patches {
     of_tet: Vec<[u32; 4]>,
 }
 
-/// Stands for "no patch": the tet has no volumetric stiffness to average.
+/// Means "no patch": the tet has no volumetric stiffness to average.
 const NO_PATCH: u32 = u32::MAX;
 
 /// ∂θ_a/∂u_j of one patch for each of its nodes, 1/mm, nodes ascending.
@@ -225,7 +225,7 @@ impl Patches {
                     parts.push((node, d.into()));
                 }
             }
-            // Stable: parts of one node stay in the order of their tets.
+            // Stable sort: parts of one node stay in the order of their tets.
             parts.sort_by_key(|part| part.0);
             for group in parts.chunk_by(|a, b| a.0 == b.0) {
                 out.nodes.push(group[0].0);
@@ -236,7 +236,7 @@ impl Patches {
         out
     }
 
-    /// Patches that hold corner `j`, ascending.
+    /// Patches that contain corner `j`, ascending.
     pub fn round(&self, mesh: &TetMesh, j: usize, out: &mut Vec<u32>) {
         out.clear();
         for &t in mesh.tets_of_node(j) {
@@ -278,7 +278,7 @@ impl Patches {
                 let Ok(at) = columns.binary_search(k) else { continue };
                 for r in 0..3 {
                     for c in 0..3 {
-                        // The product of both gradients first: K_kj is the transpose to the last bit.
+                        // The product of both gradients first: K_kj is then the transpose in every bit.
                         blocks[at][3 * r + c] += self.weights[p] * (dj[r] * dk[c]);
                     }
                 }
@@ -286,7 +286,7 @@ impl Patches {
         }
     }
 
-    /// Adds Σ_a w_a d⊗d to a matrix whose pattern holds all neighbours.
+    /// Adds Σ_a w_a d⊗d to a matrix whose pattern contains all neighbours.
     pub fn add_to(&self, mesh: &TetMesh, gradients: &PatchGradients, matrix: &mut BlockMatrix) {
         matrix.row_tasks().into_par_iter().for_each(|task| {
             let origin = task.start[0];

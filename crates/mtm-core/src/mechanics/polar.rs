@@ -1,11 +1,11 @@
-//! Rotation and stretch of a deformation gradient, defined for inverted tets too.
+//! Rotation and stretch of a deformation gradient, also defined for inverted tets.
 
 use nalgebra::{Matrix3, Vector3};
 
 /// F = Q Σ Vᵀ with rotations Q and V: R = Q Vᵀ is the rotation nearest to F, U = V Σ Vᵀ its stretch.
 ///
-/// Where F inverts, the smallest stretch is negative, and R still turns without mirroring (Irving, Teran &
-/// Fedkiw 2004).
+/// If F inverts, the smallest stretch is negative, and R is still a proper rotation (Irving, Teran & Fedkiw
+/// 2004).
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Polar {
     /// Principal directions after the deformation.
@@ -17,9 +17,9 @@ pub(crate) struct Polar {
 }
 
 impl Polar {
-    /// The decomposition of `f`; stretches that are no numbers where an entry of `f` is none.
+    /// The decomposition of `f`; the stretches are NaN if an entry of `f` is not finite.
     pub fn new(f: &Matrix3<f64>) -> Self {
-        // The singular value iteration would not end.
+        // The singular value iteration would not terminate.
         if f.iter().any(|x| !x.is_finite()) {
             let (q, v) = (Matrix3::identity(), Matrix3::identity());
             return Self { q, v, stretch: Vector3::repeat(f64::NAN) };

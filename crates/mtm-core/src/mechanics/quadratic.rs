@@ -71,7 +71,7 @@ pub fn quadratic_tensor(corners: &[[Block; 4]; 4], a: usize, b: usize) -> Block 
         }
     }
     if a == b {
-        // Symmetric in exact arithmetic; made so to the last bit.
+        // Symmetric in exact arithmetic; made symmetric in every bit.
         for (r, c) in [(0, 1), (0, 2), (1, 2)] {
             let mean = 0.5 * (out[3 * r + c] + out[3 * c + r]);
             out[3 * r + c] = mean;

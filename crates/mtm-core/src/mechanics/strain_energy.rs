@@ -1,5 +1,5 @@
-//! Strain energy of a body under large rotation: its value, its slope (the internal forces) and its
-//! curvature (the tangent stiffness), on the pattern of the tensors.
+//! Strain energy of a body under large rotation: its value, its first derivative (the internal forces) and its
+//! second derivative (the tangent stiffness), on the pattern of the tensors.
 
 use std::sync::Arc;
 
@@ -15,15 +15,15 @@ use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::nodal_pressure::split;
 use crate::mechanics::tensors::MassTensors;
 
-/// Nodes a thread takes at once.
+/// Nodes per parallel task.
 const NODES_PER_TASK: usize = 256;
 
-/// Which tangent stiffness is asked for.
+/// Which tangent stiffness is computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TangentKind {
     /// The second derivatives of the energy.
     Exact,
-    /// Without the negative curvature of single points: positive semi-definite, with smaller steps.
+    /// Without the negative curvature of individual points: positive semi-definite, with smaller steps.
     Definite,
 }
 
@@ -32,7 +32,7 @@ pub enum TangentKind {
 pub struct StrainEnergy {
     tensors: Arc<MassTensors>,
     kinematics: Kinematics,
-    /// Of each tet, or of all of them.
+    /// Energy density of each tet, or of all of them.
     densities: Vec<Density>,
 }
 
@@ -45,7 +45,7 @@ pub struct EnergyState {
     pub forces: Vec<[f64; 3]>,
 }
 
-/// Volumetric strain of every tet and what its averages exert.
+/// Volumetric strain of every tet, and the pressure from its averages.
 struct Averaged {
     slopes: Vec<Matrix3<f64>>,
     pressures: Vec<f64>,
@@ -53,7 +53,7 @@ struct Averaged {
 }
 
 impl StrainEnergy {
-    /// The energy of the body of `tensors` under `kinematics`, which is not linear.
+    /// The energy of the body of `tensors` under `kinematics`, which must not be linear.
     pub fn new(tensors: Arc<MassTensors>, kinematics: Kinematics) -> Self {
         let tissue = tensors.tissue();
         let densities = (0..tissue.n_rows())
@@ -102,7 +102,7 @@ impl StrainEnergy {
     /// Energy and forces under displacements of all nodes, mm.
     ///
     /// # Errors
-    /// Displacements of another number or not finite.
+    /// Displacements of the wrong number, or not finite.
     pub fn state(&self, u: &[[f64; 3]]) -> Result<EnergyState> {
         self.tensors.check_displacements(u)?;
         let nodes = self.nodes();
@@ -148,7 +148,7 @@ impl StrainEnergy {
     /// Tangent stiffness under displacements of all nodes, N/mm, on the pattern of the tensors.
     ///
     /// # Errors
-    /// Displacements of another number or not finite.
+    /// Displacements of the wrong number, or not finite.
     pub fn stiffness(&self, u: &[[f64; 3]], kind: TangentKind) -> Result<BlockMatrix> {
         self.tensors.check_displacements(u)?;
         let nodes = self.nodes();
@@ -183,7 +183,7 @@ impl StrainEnergy {
         Ok(matrix)
     }
 
-    /// Adds g_aᵀ H g_b of every tet round the rows of `task`.
+    /// Adds g_aᵀ H g_b of every tet around the rows of `task`.
     fn fill(&self, tangents: &[Vec<Tangent>], task: RowTask<'_>) {
         let nodes = self.nodes();
         let origin = task.start[0];

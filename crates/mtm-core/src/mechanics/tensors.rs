@@ -1,5 +1,5 @@
-//! Vertex and edge tensors of the mass-tensor model, in block rows: built once per patient, they serve
-//! every plan. Internal force = K u.
+//! Vertex and edge tensors of the mass-tensor model, in block rows: built once per patient and used for every
+//! plan. Internal force = K u.
 
 use std::sync::Arc;
 
@@ -14,7 +14,7 @@ use crate::mechanics::quadratic::quadratic_tensor;
 use crate::mesh::{TetGeometry, TetMesh};
 use crate::vector::dot;
 
-/// Nodes a thread assembles at once.
+/// Nodes per parallel assembly task.
 const NODES_PER_TASK: usize = 256;
 
 /// Tensors K_jj and K_jk of a mesh with its tissue (Cotin et al. 2000; Picinbono et al. 2003; Mollemans
@@ -40,11 +40,11 @@ pub struct EdgeTensors {
 impl MassTensors {
     /// The tensors of `mesh` filled with `tissue`, on linear tets.
     ///
-    /// Each row sums its tets in ascending order, so the bits do not depend on the number of threads,
-    /// and K_kj is bit for bit the transpose of K_jk.
+    /// Each row sums its tets in ascending order, so the result is bitwise identical for any number of threads,
+    /// and K_kj is bitwise the transpose of K_jk.
     ///
     /// # Errors
-    /// A tissue with another number of rows than the mesh has tets.
+    /// A tissue whose number of rows differs from the number of tets.
     pub fn new(mesh: Arc<TetMesh>, tissue: Arc<Tissue>) -> Result<Self> {
         Self::with_element(mesh, tissue, Element::Linear)
     }
@@ -154,7 +154,7 @@ impl MassTensors {
             .sum())
     }
 
-    /// Linear strain of each tet (its mean where it varies), Voigt with engineering shears.
+    /// Linear strain of each tet (its mean if it varies), Voigt with engineering shears.
     pub fn strain(&self, displacements: &[[f64; 3]]) -> Result<Vec<[f64; 6]>> {
         self.check_displacements(displacements)?;
         Ok((0..self.mesh().n_tets())
@@ -166,8 +166,8 @@ impl MassTensors {
             .collect())
     }
 
-    /// Stress C ε of each tet (its mean where it varies), with averaged pressure where the element has it;
-    /// Voigt, MPa.
+    /// Stress C ε of each tet (its mean if it varies), with averaged pressure if the element uses it; Voigt,
+    /// MPa.
     pub fn stress(&self, displacements: &[[f64; 3]]) -> Result<Vec<[f64; 6]>> {
         let mut rows = self.strain(displacements)?;
         let averages = self.patches.as_ref().map(|patches| {
@@ -192,7 +192,7 @@ impl MassTensors {
         Ok(rows)
     }
 
-    /// Relative volume change det(I + ∇u) − 1 of each tet, at its middle; −1 or less is a collapsed or
+    /// Relative volume change det(I + ∇u) − 1 of each tet, at its centre; −1 or less means a collapsed or
     /// inverted tet.
     pub fn volume_change(&self, displacements: &[[f64; 3]]) -> Result<Vec<f64>> {
         self.check_displacements(displacements)?;
@@ -295,8 +295,8 @@ fn assemble_row(
         let Some(a) = tet.iter().position(|&v| v as usize == j) else { continue };
         for (b, &k) in tet.iter().enumerate() {
             let Ok(at) = columns.binary_search(&k) else { continue };
-            // Both directions of an edge come from the tensor of its lower node, so that they are
-            // transposes to the last bit.
+            // Both directions of an edge are computed from the tensor of its lower node, so that they are
+            // transposes in every bit.
             let transposed = k < tet[a];
             let (lo, hi) = if transposed { (b, a) } else { (a, b) };
             let tensor = match &corners {
@@ -359,7 +359,7 @@ fn spencer_tensor(gj: [f64; 3], gk: [f64; 3], volume: f64, c: &Spencer, a: [f64;
 
 /// V B_jᵀ C B_k with B in Voigt order.
 fn general_tensor(gj: [f64; 3], gk: [f64; 3], volume: f64, c: &Voigt) -> Block {
-    // Rows of strain that direction i of a vertex with gradient g feeds: (row, value).
+    // Strain rows to which direction i of a vertex with gradient g contributes: (row, value).
     let strain = |g: [f64; 3]| {
         [
             [(0, g[0]), (4, g[2]), (5, g[1])],

@@ -1,4 +1,4 @@
-//! What a hyperelastic law consists of.
+//! What makes up a hyperelastic law.
 
 use nalgebra::{Matrix3, SMatrix};
 
@@ -16,12 +16,12 @@ pub(crate) struct PointResponse {
     pub stress: Matrix3<f64>,
 }
 
-/// ∂²W/∂F² at a point in two parts: the cofactor part is the same for every law.
+/// ∂²W/∂F² at a point in two parts: the cofactor part has the same form for every law.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PointTangent {
     /// Everything but the cofactor part, MPa.
     pub own: Tangent,
-    /// What multiplies ∂²J/∂F², MPa.
+    /// Factor of ∂²J/∂F², MPa.
     pub cofactor_stress: f64,
 }
 

@@ -1,4 +1,4 @@
-//! Hyperelastic laws of isotropic tissue. A new law is a file beside this one and a line in [`LAWS`].
+//! Hyperelastic laws of isotropic tissue. To add a law, add a file next to this one and a line in [`LAWS`].
 
 mod formulas;
 mod neo_hookean;
@@ -67,7 +67,7 @@ impl std::fmt::Debug for HyperelasticLaw {
 mod tests {
     use super::*;
 
-    /// Deformation gradients: at rest, sheared, squeezed, inverted.
+    /// Deformation gradients: at rest, sheared, compressed, inverted.
     fn gradients() -> [Matrix3<f64>; 4] {
         let shear = Matrix3::new(1.2, 0.3, -0.1, 0.05, 0.9, 0.2, 0.1, -0.2, 1.1);
         let squeeze = Matrix3::from_diagonal(&nalgebra::Vector3::new(1.4, 0.5, 0.8));

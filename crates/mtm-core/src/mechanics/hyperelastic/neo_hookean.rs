@@ -2,8 +2,8 @@
 //!
 //! W = ½ μ' (|F|² − 3) − ½ μ' ln((|F|² + 1)/4) + ½ λ' (J − 1)² − ¾ μ' (J − 1)
 //!
-//! Equal to that of the source but for a constant: λ' (J − α)²/2 with α = 1 + ¾ μ'/λ'. The constants
-//! μ' = 4/3 μ and λ' = λ + 5/6 μ make the linear limit that of the Lamé constants.
+//! Equal to that of the source up to a constant: λ' (J − α)²/2 with α = 1 + ¾ μ'/λ'. With the constants μ' =
+//! 4/3 μ and λ' = λ + 5/6 μ the linear limit is that of the Lamé constants.
 
 use nalgebra::Matrix3;
 

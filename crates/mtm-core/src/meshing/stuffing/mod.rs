@@ -1,8 +1,8 @@
 //! Isosurface stuffing: tets of good shape inside a level image (Labelle & Shewchuk 2007).
 //!
-//! A body-centred cubic lattice covers the image, finer where the tissue or a gap in it is thin. The zero
-//! set of the level cuts it; vertices near the cut move onto it, so that no sliver is left. Where cubes of
-//! two sizes meet on the surface the bound on the angles is lost, and `improve` wins it back.
+//! A body-centred cubic lattice covers the image, finer where the tissue or a gap in it is thin. The zero set
+//! of the level cuts it; vertices near the cut move onto it, so that no slivers remain. Where cubes of two
+//! sizes meet at the surface the bound on the angles does not hold, and `improve` restores it.
 
 pub mod cut;
 pub mod distance;
@@ -26,16 +26,16 @@ use parts::{Dropped, keep_bodies};
 
 /// Deepest refinement: edges an eighth of the edge length.
 pub const MAX_REFINEMENTS: u32 = 3;
-/// Most coarse cubes of a lattice; above, the edge length is a mistake of units.
+/// Maximum number of coarse cubes of a lattice; more than that means an edge length in the wrong units.
 const MAX_CUBES: f64 = 1e8;
-/// No point is farther from the lattice than √5/4 of its edge, so that a sheet thicker than twice that is
-/// found everywhere; a little more against unlucky places.
+/// No point is further from the lattice than √5/4 of its edge, so that a sheet thicker than twice that is
+/// always found; slightly more, as a margin for unfavourable positions.
 const THIN_RADIUS: f64 = 0.6;
-/// Edges and corners up to 90° are no sheets: a ball in them leaves √2 − 1 of its radius.
+/// Edges and corners of up to 90° are not sheets: a ball leaves √2 − 1 of its radius in them.
 const THIN_SLACK: f64 = 0.5;
-/// Shortest edge that refinement makes, in the mean size of a voxel.
+/// Shortest edge created by refinement, in units of the mean size of a voxel.
 const LEAST_EDGE_IN_VOXELS: f64 = 0.7;
-/// Steps along a normal that look for the surface, and halvings that then find it.
+/// Steps along a normal in search of the surface, and bisection steps that then locate it.
 const ERROR_STEPS: usize = 20;
 const ERROR_HALVINGS: usize = 12;
 
@@ -44,9 +44,9 @@ const ERROR_HALVINGS: usize = 12;
 pub struct StuffingOptions {
     /// Longest edge of the lattice, mm: the edge of its cubes.
     pub edge_length: f64,
-    /// How often the edge may be halved where the tissue or a gap is thin; 0 keeps one size.
+    /// How many times the edge may be halved where the tissue or a gap is thin; 0 keeps one size.
     pub refinements: u32,
-    /// Volume below which a body apart from the largest is a speck and is dropped, mm³.
+    /// Volume below which a body separate from the largest is a speck and is removed, mm³.
     pub least_body: f64,
 }
 
@@ -59,9 +59,9 @@ impl Default for StuffingOptions {
 /// How many times the edge is halved at each voxel of a level image, in the order of its values.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Halvings<'a> {
-    /// At most, for what is thin there; as the options say if none.
+    /// Maximum for thin places there; as in the options if none.
     pub allowed: Option<&'a [u8]>,
-    /// At least, thin or not, in the cubes that hold the voxel's centre; not at all if none.
+    /// Minimum, thin or not, in the cubes that contain the voxel's centre; none for no minimum.
     pub needed: Option<&'a [u8]>,
 }
 
