@@ -1,7 +1,7 @@
-//! The one numpy door: shape, order, finiteness and range are checked here and nowhere else.
+//! The only entry for numpy arrays: shape, order, finiteness and range are checked here and nowhere else.
 //!
-//! Any real dtype, order and stride is accepted: what is not C-ordered float64 already is copied by
-//! numpy first, so that Fortran-ordered arrays and strided views arrive as the user sees them.
+//! Any real dtype, order and stride is accepted: arrays that are not C-ordered float64 are first copied by
+//! numpy, so that Fortran-ordered arrays and strided views keep the values that the user sees.
 
 use std::ops::RangeInclusive;
 
@@ -16,7 +16,7 @@ use pyo3::types::{PyBool, PyDict};
 
 use crate::errors;
 
-/// What an argument is called, and whose error its faults are.
+/// Name of an argument, and the error family of its faults.
 #[derive(Clone, Copy)]
 pub struct Named<'a>(pub &'a str, pub ErrorKind);
 
@@ -26,7 +26,7 @@ impl Named<'_> {
     }
 }
 
-/// `value` as a numpy array in C order with the given dtype; refuses what has another kind.
+/// `value` as a numpy array in C order with the given dtype; rejects values of another kind.
 fn converted<'py>(
     value: &Bound<'py, PyAny>,
     name: Named<'_>,
@@ -52,7 +52,7 @@ fn converted<'py>(
     let options = PyDict::new(value.py());
     options.set_item("dtype", dtype)?;
     let array = numpy.call_method("ascontiguousarray", (array,), Some(&options))?;
-    // A view into packed records is contiguous and yet at an odd address: a copy is not.
+    // A view into packed records is contiguous but may be misaligned: a copy is not.
     if array.getattr("flags")?.getattr("aligned")?.extract()? {
         return Ok(array);
     }
@@ -70,7 +70,7 @@ fn floats(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<(Vec<usize>, Ve
         value.getattr("shape").ok().and_then(|s| s.extract::<Vec<usize>>().ok());
     let array = converted(value, name, "fiu", "float64", "real numbers")?;
     let array: PyReadonlyArrayDyn<'_, f64> = array.extract()?;
-    // ascontiguousarray turns a scalar into one entry: its own shape is ().
+    // ascontiguousarray turns a scalar into an array with one entry; the shape of the scalar is ().
     let shape = match shape {
         Some(shape) if shape.is_empty() => shape,
         _ if value.is_instance_of::<pyo3::types::PyFloat>()
@@ -94,7 +94,7 @@ fn floats(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<(Vec<usize>, Ve
     Ok((shape, values))
 }
 
-/// Rows of three finite values; `rows` fixes how many where it is known.
+/// Rows of three finite values; `rows` gives their number if it is known.
 pub fn points(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<[f64; 3]>> {
     let (shape, values) = floats(value, name)?;
     match shape[..] {
@@ -117,7 +117,7 @@ pub fn values(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<f64>> {
     }
 }
 
-/// An image of three axes, k fastest.
+/// An image with three axes, k fastest.
 pub enum Image {
     /// Whether each voxel is tissue.
     Labels([usize; 3], Vec<bool>),
@@ -125,7 +125,7 @@ pub enum Image {
     Level([usize; 3], Vec<f32>),
 }
 
-/// An image: labels if its values are bool or whole numbers, a level if they are real.
+/// An image: labels if its values are bool or integers, a level if they are real.
 pub fn image(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Image> {
     let (array, shape, kind) = three_axes(value, name)?;
     if "biu".contains(&kind) {
@@ -137,7 +137,7 @@ pub fn image(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Image> {
     Ok(Image::Level(shape, values.to_vec()))
 }
 
-/// Whether each voxel of an image of bool or whole numbers is not zero.
+/// Whether each voxel of an image of bool or integers is nonzero.
 pub fn labels(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<([usize; 3], Vec<bool>)> {
     let (array, shape, kind) = three_axes(value, name)?;
     if !"biu".contains(&kind) {
@@ -146,7 +146,7 @@ pub fn labels(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<([usize; 3]
     Ok((shape, non_zero(&array, name)?))
 }
 
-/// Small whole numbers of the voxels of an image.
+/// Small integers of the voxels of an image.
 pub fn counts(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<u8>> {
     let (array, _, kind) = three_axes(value, name)?;
     if !"biu".contains(&kind) {
@@ -186,7 +186,7 @@ fn non_zero(array: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<bool>> {
     Ok(values.to_vec())
 }
 
-/// An image of three axes for Python, k fastest.
+/// An image with three axes for Python, k fastest.
 pub fn volume(
     py: Python<'_>,
     shape: [usize; 3],
@@ -195,7 +195,7 @@ pub fn volume(
     values.into_pyarray(py).reshape(shape)
 }
 
-/// A 4×4 matrix, or nothing where the shape is another.
+/// A 4×4 matrix, or nothing if the shape is different.
 pub fn matrix4(value: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Option<[[f64; 4]; 4]>> {
     let array = converted(value, name, "fiu", "float64", "real numbers")?;
     let shape: Vec<usize> = array.getattr("shape")?.extract()?;
@@ -266,10 +266,10 @@ fn indices(value: &Bound<'_, PyAny>, name: Named<'_>, width: usize) -> PyResult<
         .collect()
 }
 
-/// Characters of a refused value that an error repeats.
+/// Number of characters of a rejected value that an error repeats.
 const SHOWN: usize = 40;
 
-/// A whole number of the `allowed` range; bool and real numbers are none.
+/// An integer in the `allowed` range; bool and real numbers are rejected.
 pub fn whole<T: TryFrom<i64>>(
     value: &Bound<'_, PyAny>,
     name: Named<'_>,
@@ -279,7 +279,7 @@ pub fn whole<T: TryFrom<i64>>(
         (least, i64::MAX) => format!("{least} or more, below 2^63"),
         (least, most) => format!("{least} to {most}"),
     };
-    // A number of thousands of digits has no text.
+    // Python refuses to convert a number with thousands of digits to text.
     let text = value.repr().map_or_else(|_| "very large".into(), |text| text.to_string());
     let shown: String = text.chars().take(SHOWN).collect();
     let dots = if text.chars().nth(SHOWN).is_some() { "..." } else { "" };
@@ -343,7 +343,7 @@ pub fn voigt(py: Python<'_>, rows: Vec<[[f64; 6]; 6]>) -> Bound<'_, PyArray3<f64
     flat.into_pyarray(py).reshape([m, 6, 6]).expect("m matrices of 36 fill m×6×6")
 }
 
-/// `array` with writing switched off: a view of something frozen.
+/// `array` as a read-only array: a view of data of a frozen class.
 pub fn frozen<'py, T: numpy::Element, D: numpy::ndarray::Dimension>(
     array: Bound<'py, numpy::PyArray<T, D>>,
 ) -> PyResult<Bound<'py, numpy::PyArray<T, D>>> {

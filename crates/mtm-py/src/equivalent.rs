@@ -19,7 +19,7 @@ use crate::running::{attempted, interruptible};
 
 const MATERIAL: ErrorKind = ErrorKind::Material;
 
-/// Muscle in a mesh, tet by tet; made by `sample_muscles`.
+/// Muscle in a mesh, tet by tet; returned by `sample_muscles`.
 #[pyclass(frozen, module = "cmfsim._core", name = "MuscleShares")]
 pub struct PyMuscleShares {
     core: Arc<MuscleShares>,
@@ -88,7 +88,7 @@ impl PyMuscleShares {
         arrays::rows(py, self.core.fibre.iter().map(|f| f.direction).collect())
     }
 
-    /// How far one direction leads in each tet, (m,) float64: 1 parallel, 0 not at all.
+    /// How clearly one direction dominates in each tet, (m,) float64: 1 if all are parallel, 0 if none does.
     #[getter]
     fn coherence<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         self.core.fibre.iter().map(|f| f.coherence).collect::<Vec<_>>().into_pyarray(py)
@@ -136,7 +136,7 @@ impl PyMuscleShares {
         )
     }
 
-    /// Work as a dict: `points`, `pairs`, `crossed`.
+    /// Work involved, as a dict: `points`, `pairs`, `crossed`.
     #[getter]
     fn counts<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let counts = &self.core.counts;
@@ -147,7 +147,7 @@ impl PyMuscleShares {
         Ok(out)
     }
 
-    /// Time as a dict, s: `trees`, `crossing`, `sampling`.
+    /// Time taken, as a dict, s: `trees`, `crossing`, `sampling`.
     #[getter]
     fn timings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let timings = &self.core.timings;

@@ -1,4 +1,4 @@
-//! The exception family: one class per kind, with a `ValueError` twin where the input is at fault.
+//! The exception family: one class per kind, with a twin that is also a `ValueError` if the input is at fault.
 
 use mtm_core::{ErrorKind, MtmError};
 use pyo3::exceptions::{PyException, PyKeyboardInterrupt, PyValueError};
@@ -6,7 +6,7 @@ use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyDict, PyTuple, PyType};
 
-/// Public names with their docs; each but the first stands under it.
+/// Public names with their docs; all are subclasses of the first.
 const FAMILY: [(&str, &str); 10] = [
     ("CmfsimError", "Any error of cmfsim."),
     ("MeshError", "Nodes, tets or surfaces cannot be used."),
@@ -20,7 +20,7 @@ const FAMILY: [(&str, &str); 10] = [
     ("ImageError", "An image cannot be used."),
 ];
 
-/// Classes by name, and for each its twin that is a `ValueError` too.
+/// Classes by name, each with its twin that is also a `ValueError`.
 struct Family {
     public: Vec<Py<PyType>>,
     input: Vec<Py<PyType>>,
@@ -37,7 +37,7 @@ fn family(py: Python<'_>) -> PyResult<&Family> {
                 None => py.get_type::<PyException>().into_any(),
             };
             let class = new_type(name, doc, PyTuple::new(py, [base])?)?;
-            // The same name for both: users see and catch one class.
+            // The same name for both: users see and catch a single class.
             let value_error = py.get_type::<PyValueError>().into_any();
             let both = PyTuple::new(py, [class.clone().into_any(), value_error])?;
             input.push(new_type(name, doc, both)?.unbind());
@@ -47,7 +47,8 @@ fn family(py: Python<'_>) -> PyResult<&Family> {
     })
 }
 
-/// `type(name, bases, {"__doc__": doc, "__module__": "cmfsim"})`: several bases need Python's own door.
+/// `type(name, bases, {"__doc__": doc, "__module__": "cmfsim"})`: several bases require a call to Python's
+/// `type`.
 fn new_type<'py>(
     name: &str,
     doc: &str,
@@ -88,7 +89,7 @@ fn raise(kind: ErrorKind, is_input: bool, message: String) -> PyErr {
     })
 }
 
-/// An error of the family `kind` that is the input's fault.
+/// An error of the family `kind` that is caused by the input.
 pub fn input(kind: ErrorKind, message: String) -> PyErr {
     raise(kind, true, message)
 }
@@ -114,7 +115,7 @@ impl From<Failure> for PyErr {
         }
         let raised = raise(error.kind(), error.is_input(), error.to_string());
         if let MtmError::IcpNotConverged { history, .. } = error {
-            // What was reached stays with the error, for a caller who looks at it.
+            // The values reached are attached to the error, for callers that examine it.
             let noted = Python::attach(|py| raised.value(py).setattr("rms_history", history));
             return noted.err().unwrap_or(raised);
         }

@@ -12,7 +12,7 @@ use crate::geometry::PySurface;
 use crate::running::{attempted, detached};
 
 const MESH: ErrorKind = ErrorKind::Mesh;
-/// Why kind and extents are known.
+/// Why kind and extents are known, for `expect`.
 const FROM_SURFACE: &str = "made from a surface";
 
 /// Fibre directions of one muscle, from oriented boxes of its surface (Kim et al. 2010, section 2.2) or
@@ -78,7 +78,7 @@ impl PyMuscleFibres {
         Ok(Self { core: Arc::new(core), lines })
     }
 
-    /// Unit directions at `points` ((k, 3), mm), (k, 3) float64; their sign means nothing.
+    /// Unit directions at `points` ((k, 3), mm), (k, 3) float64; their sign has no meaning.
     fn directions<'py>(
         &self,
         py: Python<'py>,
@@ -115,7 +115,7 @@ impl PyMuscleFibres {
         self.lines.iter().map(|line| arrays::rows(py, line.clone())).collect()
     }
 
-    /// What the muscle was taken for: "strap", "fan", "ring" or "sheet".
+    /// The kind of muscle that was assumed: "strap", "fan", "ring" or "sheet".
     #[getter]
     fn kind(&self) -> &'static str {
         self.core.kind().expect(FROM_SURFACE).name()
@@ -133,8 +133,8 @@ impl PyMuscleFibres {
         self.core.sheet_ratio().expect(FROM_SURFACE)
     }
 
-    /// Whether the outline hardly tells the direction: a sheet without known lines, or a strap whose
-    /// two longest extents are nearly equal.
+    /// Whether the outline hardly determines the direction: a sheet without known lines, or a strap whose two
+    /// longest extents are nearly equal.
     #[getter]
     fn is_sheet(&self) -> bool {
         self.core.is_sheet()

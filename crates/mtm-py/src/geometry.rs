@@ -234,13 +234,13 @@ impl PySurface {
         arrays::frozen(arrays::table(py, self.core.triangles().to_vec()))
     }
 
-    /// Unit normal of each vertex, weighted by angles, (v, 3) float64; zero where it has none.
+    /// Unit normal of each vertex, weighted by angles, (v, 3) float64; zero if it has none.
     #[getter]
     fn vertex_normals<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         arrays::frozen(arrays::rows(py, self.core.vertex_normals()))
     }
 
-    /// Whether every edge has exactly two triangles, oriented alike.
+    /// Whether every edge has exactly two triangles with consistent orientation.
     #[getter]
     fn is_closed(&self) -> bool {
         self.core.is_closed()
@@ -335,11 +335,11 @@ impl PySurface {
     }
 }
 
-/// The rigid matrix nearest to `matrix`, (4, 4) float64, mm: the one check of what counts as rigid.
+/// The rigid matrix nearest to `matrix`, (4, 4) float64, mm: the only check of whether a matrix is rigid.
 ///
-/// Every plan, transform and alignment passes it, so that what the solver uses is exactly rigid. The
-/// turn becomes the rotation nearest to it (its polar factor); the translation stays as given. A
-/// matrix that is rigid to rounding, such as one of `rigid_motion`, comes back bit for bit.
+/// Every plan, transform and alignment is checked by it, so that what the solver uses is exactly rigid. The
+/// rotation is replaced by the nearest exact rotation (its polar factor); the translation is kept. A matrix
+/// that is already rigid to rounding, such as one of `rigid_motion`, is returned unchanged in every bit.
 ///
 /// Parameters
 /// ----------

@@ -1,4 +1,5 @@
-//! `cmfsim._core`: the binding of mtm-core. It converts, detaches and maps errors; it decides nothing.
+//! `cmfsim._core`: the binding of mtm-core. It converts arguments, detaches and maps errors; it makes no
+//! decisions.
 
 mod arrays;
 mod equivalent;

@@ -17,15 +17,15 @@ use crate::running::{attempted, detached};
 
 const MATERIAL: ErrorKind = ErrorKind::Material;
 
-/// Elastic constants of every tet, or of all of them, in MPa; positive definite or refused.
+/// Elastic constants of every tet, or of all of them, in MPa; rejected unless positive definite.
 ///
-/// Made by `isotropic`, `transversely_isotropic`, `from_stiffness` or `preset`.
+/// Constructed by `isotropic`, `transversely_isotropic`, `from_stiffness` or `preset`.
 #[pyclass(frozen, module = "cmfsim", name = "Tissue")]
 pub struct PyTissue {
     pub core: Arc<Tissue>,
 }
 
-/// Values of one array at a row: one value serves all rows.
+/// Values of one array at a row: a single value applies to all rows.
 fn at(values: &[f64], row: usize) -> f64 {
     if values.len() == 1 { values[0] } else { values[row] }
 }
@@ -161,7 +161,7 @@ impl PyTissue {
         let preset = Preset::from_name(name).map_err(Failure)?;
         let mixing = Mixing::from_name(mixing).map_err(Failure)?;
         let fraction = arrays::values(fraction, Named("fraction", MATERIAL))?;
-        // Without directions a tet with muscle is refused for its zero fibre, by index.
+        // Without directions, a tet with muscle is rejected for its zero fibre, by index.
         let fibre = fibre.map_or(Ok(vec![[0.0; 3]; fraction.len()]), fibres)?;
         Ok(Self::wrap(attempted(py, || Tissue::mixture(&fraction, &fibre, preset, mixing))?))
     }
@@ -395,7 +395,7 @@ impl PyMassTensors {
         Ok(arrays::table(py, attempted(py, || self.core.stress(&u))?))
     }
 
-    /// Relative volume change det(I + grad u) - 1 of each tet, (m,) float64; -1 or less is collapsed.
+    /// Relative volume change det(I + grad u) - 1 of each tet, (m,) float64; -1 or less means a collapsed tet.
     fn volume_change<'py>(
         &self,
         py: Python<'py>,

@@ -19,9 +19,9 @@ use crate::running::{attempted, interruptible};
 
 const BOUNDARY: ErrorKind = ErrorKind::Boundary;
 const SOLVER: ErrorKind = ErrorKind::Solver;
-/// Most iterations that may be asked for; no body of tissue needs so many.
+/// Maximum number of iterations that may be requested; no tissue needs so many.
 const MOST_ITERATIONS: i64 = 1_000_000_000;
-/// Share of the free memory that a factor may take unless the caller says otherwise.
+/// Share of the free memory that a factorisation may take by default.
 const MEMORY_SHARE: f64 = 0.8;
 
 /// Kinds of the nodes: fixed, joined to a bone segment, sliding on one; all others are free.
@@ -182,7 +182,7 @@ impl PyBoundary {
         self.core.segments().iter().map(|s| s.name.clone()).collect()
     }
 
-    /// How many nodes were given two kinds and lost one (with `conflicts="resolve"`).
+    /// Number of nodes that were given two kinds, one of which was dropped (with `conflicts="resolve"`).
     #[getter]
     fn conflicts(&self) -> usize {
         self.core.conflicts()
@@ -267,7 +267,7 @@ fn obstacle_pairs(value: Option<&Bound<'_, PyAny>>) -> PyResult<Vec<TouchingPair
     entries.enumerate().map(pair).collect()
 }
 
-/// The segment called `name`, added where it is new.
+/// The segment called `name`, added if it is new.
 fn segment<'a>(segments: &'a mut Vec<Segment>, name: &str) -> &'a mut Segment {
     let at = segments.iter().position(|s| s.name == name).unwrap_or_else(|| {
         segments.push(Segment {
@@ -308,7 +308,7 @@ fn plan(value: &Bound<'_, PyAny>) -> PyResult<Plan> {
         .collect()
 }
 
-/// A patient's tensors and node kinds, ready for any plan; what a new plan does not change is kept.
+/// A patient's tensors and node kinds, ready for any plan; everything that does not depend on the plan is kept.
 ///
 /// Parameters
 /// ----------
@@ -428,7 +428,7 @@ impl PyStaticSolver {
         Ok(Self { core: Arc::new(core) })
     }
 
-    /// Displacements under a plan; depends on its arguments alone.
+    /// Displacements under a plan; depends only on its arguments.
     ///
     /// Parameters
     /// ----------
@@ -472,9 +472,9 @@ impl PyStaticSolver {
         PySolution::wrap(py, solution, self.core.tensors().mesh().n_nodes())
     }
 
-    /// Exact map from rigid plans to the displacements of `nodes` (all by default): 12 columns a segment.
+    /// Exact map from rigid plans to the displacements of `nodes` (all by default): 12 columns per segment.
     ///
-    /// With sliding nodes, contact is frozen as it settles under `plan` (at rest by default).
+    /// With sliding nodes, contact is frozen at its equilibrium under `plan` (at rest by default).
     #[pyo3(signature = (nodes = None, *, plan = None))]
     fn plan_operator(
         &self,
@@ -526,7 +526,7 @@ impl PyStaticSolver {
         self.core.factor_bytes()
     }
 
-    /// Seconds of each stage of the set-up; 0 for what the scene does not need.
+    /// Seconds of each stage of the set-up; 0 for stages that the scene does not need.
     #[getter]
     fn timings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         timings(py, self.core.timings())
@@ -562,8 +562,8 @@ impl PySolution {
         self.forces.corners.bind(py).clone()
     }
 
-    /// Displacement of every node of `MassTensors.nodes`, those in the middle of edges included, (n + e, 3)
-    /// float64, mm, read-only.
+    /// Displacement of every node of `MassTensors.nodes`, mid-edge nodes included, (n + e, 3) float64, mm,
+    /// read-only.
     #[getter]
     fn all_displacements<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
         self.displacements.all.bind(py).clone()
@@ -575,25 +575,25 @@ impl PySolution {
         self.forces.all.bind(py).clone()
     }
 
-    /// Force out of balance over the forces that the plan brings in.
+    /// Residual force relative to the forces that the plan introduces.
     #[getter]
     fn residual(&self) -> f64 {
         self.core.residual
     }
 
-    /// Estimate of the largest nodal error of the linear solve, mm; no bound.
+    /// Estimate of the largest nodal error of the linear solve, mm; not a bound.
     ///
-    /// By conjugate gradients from the residual and the spectrum that they saw, confirmed on a known
-    /// solution where stiff and soft tissue are mixed; for Cholesky a hundred times the error with which the
-    /// factor recovered a known solution, or ten times the largest gap of contact; with large rotations from
-    /// the last Newton step. Rounding of the stiffness itself is not in it. How often it is too small is
-    /// measured by `benches/error_estimate.rs`.
+    /// For conjugate gradients it follows from the residual and the observed spectrum, confirmed on a known
+    /// solution if stiff and soft tissue are mixed; for Cholesky it is a hundred times the error with which the
+    /// factorisation recovered a known solution, or ten times the largest gap of contact; with large rotations
+    /// it follows from the last Newton step. Rounding of the stiffness itself is not included.
+    /// `benches/error_estimate.rs` measures how often the estimate is too small.
     #[getter]
     fn error_estimate(&self) -> f64 {
         self.core.error_estimate
     }
 
-    /// Iterations of the linear solver, over all contact iterations; 0 for Cholesky.
+    /// Iterations of the linear solver, summed over all contact iterations; 0 for Cholesky.
     #[getter]
     fn iterations(&self) -> usize {
         self.core.iterations
@@ -605,19 +605,19 @@ impl PySolution {
         self.core.residual_history.clone().into_pyarray(py)
     }
 
-    /// Largest distance of a held sliding node from its place on the moved surface, mm; 0 without any.
+    /// Largest distance of a held sliding node from its position on the moved surface, mm; 0 if there are none.
     #[getter]
     fn contact_gap(&self) -> f64 {
         self.core.contact_gap()
     }
 
-    /// Outer iterations of the contact loop.
+    /// Outer iterations of the contact solver.
     #[getter]
     fn contact_iterations(&self) -> usize {
         self.core.contact_iterations
     }
 
-    /// The sliding nodes, (s,) uint32, segment by segment; with "p2" those in the middle of edges too.
+    /// The sliding nodes, (s,) uint32, segment by segment; with "p2" including mid-edge nodes.
     #[getter]
     fn contact_nodes<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u32>> {
         self.core.contact.nodes.clone().into_pyarray(py)
@@ -641,32 +641,33 @@ impl PySolution {
         self.core.contact.forces.clone().into_pyarray(py)
     }
 
-    /// Distance from the surface less the prescribed gap, (s,) float64, mm; positive where lifted off.
+    /// Distance from the surface minus the prescribed gap, (s,) float64, mm; positive where lifted off.
     #[getter]
     fn contact_gaps<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         self.core.contact.gaps.clone().into_pyarray(py)
     }
 
-    /// Largest way, mm, that the force along the contact surface would still move a sliding node by itself.
+    /// Largest distance, mm, by which the remaining tangential force would move a sliding node on its own.
     #[getter]
     fn contact_unbalanced(&self) -> f64 {
         self.core.contact.unbalanced
     }
 
-    /// Whether gaps and forces of the sliding nodes are within the tolerance. Where they are not, they are
-    /// below 0.02 mm: too small to show on a face.
+    /// Whether gaps and forces of the sliding nodes are within the tolerance. If not, they are below 0.02 mm:
+    /// too small to be visible on a face.
     #[getter]
     fn contact_converged(&self) -> bool {
         self.core.contact.converged
     }
 
-    /// Nodes that met what they may touch, (t,) uint32, pair by pair; a node may meet several surfaces.
+    /// Nodes in contact with a surface of their pair, (t,) uint32, pair by pair; a node may touch several
+    /// surfaces.
     #[getter]
     fn touching_nodes<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u32>> {
         self.core.touching.nodes.clone().into_pyarray(py)
     }
 
-    /// Distance of each from its surface, less what it has behind it at rest, (t,) float64, mm; negative where it
+    /// Distance of each from its surface, minus any penetration at rest, (t,) float64, mm; negative where it
     /// penetrates.
     #[getter]
     fn touching_gaps<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
@@ -679,31 +680,32 @@ impl PySolution {
         arrays::rows(py, self.core.touching.normals.clone())
     }
 
-    /// Force along the normal on each, (t,) float64, N; 0 where they are apart.
+    /// Force along the normal on each, (t,) float64, N; 0 where they are separated.
     #[getter]
     fn touching_forces<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         self.core.touching.forces.clone().into_pyarray(py)
     }
 
-    /// Rounds of the method of multipliers for what touches; 0 where nothing may.
+    /// Rounds of the method of multipliers for touching parts; 0 if nothing may touch.
     #[getter]
     fn touching_rounds(&self) -> usize {
         self.core.touching.rounds
     }
 
-    /// Whether what touches is at rest within 0.05 mm and no node went through; False where it is within 0.5 mm alone.
+    /// Whether touching parts are in equilibrium within 0.05 mm and no node went through; False if only within
+    /// 0.5 mm.
     #[getter]
     fn touching_converged(&self) -> bool {
         self.core.touching.converged || self.core.touching.rounds == 0
     }
 
-    /// Deepest that a node is behind what it touches, or in a deformed tet of other tissue, mm.
+    /// Largest depth of a node behind its surface, or inside a deformed tet of other tissue, mm.
     #[getter]
     fn penetration(&self) -> f64 {
         self.core.touching.penetration()
     }
 
-    /// Seconds of each stage, set-up included; exactly 0 for what the scene does not need.
+    /// Seconds of each stage, set-up included; exactly 0 for stages that the scene does not need.
     #[getter]
     fn timings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         timings(py, &self.core.timings)
@@ -726,7 +728,7 @@ impl PySolution {
         Ok(Self { core, n_nodes, displacements, forces })
     }
 
-    /// The solution with its displacements, which Python holds.
+    /// The solution, with its displacements held by Python.
     fn whole(&self, py: Python<'_>) -> PyResult<Solution> {
         let rows = self.displacements.all.bind(py);
         let displacements = arrays::points(rows.as_any(), Named("start", BOUNDARY))?;
@@ -734,7 +736,7 @@ impl PySolution {
     }
 }
 
-/// A field on all nodes and on those of the mesh; one array where these are the same.
+/// A field on all nodes and on those of the mesh; one array if these are the same.
 struct Field {
     all: Py<PyArray2<f64>>,
     corners: Py<PyArray2<f64>>,
@@ -771,7 +773,7 @@ impl PyPlanOperator {
         Ok(arrays::rows(py, attempted(py, || self.core.apply(&plan))?))
     }
 
-    /// The nodes it answers for, (k,) uint32.
+    /// The nodes whose displacements it returns, (k,) uint32.
     #[getter]
     fn nodes<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u32>> {
         self.core.nodes().to_vec().into_pyarray(py)
@@ -783,13 +785,13 @@ impl PyPlanOperator {
         self.core.segments().to_vec()
     }
 
-    /// Point of each segment that its columns are taken about, (segments, 3) float64, mm.
+    /// Point of each segment about which its columns are defined, (segments, 3) float64, mm.
     #[getter]
     fn centres<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
         arrays::rows(py, self.core.centres().to_vec())
     }
 
-    /// The columns, (3k, 12 * segments) float64: R - I row by row, then the shift of the centre.
+    /// The columns, (3k, 12 * segments) float64: R - I row by row, then the displacement of the centre.
     #[getter]
     fn matrix<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let shape = [3 * self.core.nodes().len(), 12 * self.core.segments().len()];
@@ -813,7 +815,7 @@ fn timings<'py>(py: Python<'py>, laps: &Timings) -> PyResult<Bound<'py, PyDict>>
     Ok(out)
 }
 
-/// Free memory of the machine in bytes, where the system tells.
+/// Free memory of the machine in bytes, if the system reports it.
 fn available_memory() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let line = text.lines().find(|l| l.starts_with("MemAvailable:"))?;

@@ -16,7 +16,7 @@ use crate::running::{attempted, detached, interruptible};
 
 const REGISTRATION: ErrorKind = ErrorKind::Registration;
 
-/// Smooth map that takes landmarks to landmarks with the least bending (thin-plate spline).
+/// Smooth map that takes landmarks to their targets with the least bending (thin-plate spline).
 ///
 /// Bookstein (1989) in three dimensions: kernel U(r) = r and an affine part. Called with points
 /// ((k, 3), mm) it gives their images, (k, 3) float64, mm. Affine maps are reproduced exactly.
@@ -97,7 +97,7 @@ impl PyThinPlateSpline {
         Ok(PyFolds { core: attempted(py, || self.core.folds(&points))? })
     }
 
-    /// Smallest determinant on the way to each landmark, over all directions.
+    /// Smallest determinant in the limit at each landmark, over all directions of approach.
     fn landmark_folds(&self, py: Python<'_>) -> PyResult<PyFolds> {
         Ok(PyFolds { core: detached(py, || self.core.landmark_folds())? })
     }
@@ -108,7 +108,7 @@ impl PyThinPlateSpline {
         arrays::frozen(arrays::rows(py, self.core.source().to_vec()))
     }
 
-    /// Landmarks that the map goes to, (n, 3) float64, mm, read-only.
+    /// Target landmarks, (n, 3) float64, mm, read-only.
     #[getter]
     fn target<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         arrays::frozen(arrays::rows(py, self.core.target().to_vec()))
