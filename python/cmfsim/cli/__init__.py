@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     arguments : sequence of str, optional
-        Words after the program's name; those of the process if left out.
+        Arguments after the program's name; by default those of the process.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def _command(words: Sequence[str]) -> int:
 
 
 def _parsed(words: Sequence[str]) -> argparse.Namespace | int:
-    """The options of a command line, or the exit code where it has none."""
+    """The options of a command line, or the exit code if it has none."""
     parser = make_parser()
     if "--json" not in words:
         options = parser.parse_args(words)
@@ -134,7 +134,7 @@ def _print_json(kind: str, text: str, code: int, more: Mapping[str, Any] | None 
 
 
 def _open_closed_streams() -> None:
-    """Gives a process that was started without standard output or error somewhere to write to."""
+    """Connects standard output and error to the null device if the process has none."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             stream = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115 (kept open)
@@ -142,7 +142,7 @@ def _open_closed_streams() -> None:
 
 
 def _output_is_closed() -> bool:
-    """Whether nobody reads standard output any more; true where the system does not tell."""
+    """Whether standard output is no longer read; true if the system does not report it."""
     try:
         poll = select.poll()
         poll.register(sys.stdout.fileno(), select.POLLOUT)
@@ -152,7 +152,7 @@ def _output_is_closed() -> bool:
 
 
 def _drop_output() -> None:
-    """Lets nothing more be written to a standard output that takes nothing."""
+    """Redirects a standard output that cannot be written to, to the null device."""
     with contextlib.suppress(OSError, ValueError):
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, sys.stdout.fileno())

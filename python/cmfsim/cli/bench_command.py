@@ -1,4 +1,4 @@
-"""`cmfsim bench`: what accuracy costs."""
+"""`cmfsim bench`: the cost of accuracy."""
 
 import argparse
 import json
@@ -27,12 +27,12 @@ from cmfsim.phantom.case_files import write_phantom_case
 __all__ = ["FRONTIER_FOLDER", "frontier"]
 
 FRONTIER_FOLDER = Path("cmfsim-frontier")
-# Of the made head's CT, mm.
+# Voxel size of the synthetic head's CT, mm.
 PHANTOM_SPACING = 1.0
 
 
 def frontier(options: argparse.Namespace) -> int:
-    """Sweeps a case, or the made head, and writes table, page and picture."""
+    """Sweeps a case, or the synthetic head, and writes table, page and picture."""
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         path = options.case
         if path is None:
@@ -78,14 +78,14 @@ def frontier(options: argparse.Namespace) -> int:
 
 
 def _base(case: Case, options: argparse.Namespace) -> Choice:
-    """The case's own choice, with what the command's words change."""
+    """The case's own choice, with the changes given on the command line."""
     own = case_choice(case)
     words = {"edge_length": options.edge_length, "model": options.model}
     return replace(own, **{name: value for name, value in words.items() if value is not None})
 
 
 def _text(found: Frontier) -> str:
-    """Base and front in a few lines; the page has the rest."""
+    """Base and front in a few lines; the rest is on the page."""
     lines = [
         f"{escaped(found.case)}: distance on the face from the reference, mm, and time",
         "  edge  element  kinematics      mean   P95   max   build s  solve s  peak MB",

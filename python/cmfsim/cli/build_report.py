@@ -1,4 +1,4 @@
-"""What `cmfsim build` prints at its end, as text."""
+"""The summary that `cmfsim build` prints at its end."""
 
 import textwrap
 from collections.abc import Mapping
@@ -50,7 +50,7 @@ def _nodes(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _contacts(summary: Mapping[str, Any], wide: int) -> list[str]:
-    """What nodes slide on, and how far it lies from the bone under them."""
+    """The surfaces that nodes slide on, and their distance from the bone beneath."""
     contacts = summary.get("contact", {})
     if not contacts:
         return []

@@ -34,7 +34,7 @@ __all__ = ["build", "case_of", "checked", "doctor", "print_findings"]
 
 
 def doctor(options: argparse.Namespace) -> int:
-    """Says what will go wrong with a case; bad input if anything is an error."""
+    """Reports the problems of a case; the exit code is bad input if any is an error."""
     case = Case.load(options.case)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         progress.stage(f"checking {case.name}")
@@ -86,7 +86,7 @@ def build(options: argparse.Namespace) -> int:
 
 
 def case_of(options: argparse.Namespace) -> Case:
-    """The case that a command names, with what its words change."""
+    """The case given to a command, with the changes given on the command line."""
     case = Case.load(options.case)
     if options.edge_length is not None:
         edge_length = as_positive("--edge-length", options.edge_length)
@@ -117,7 +117,7 @@ def _warn_of_other_state(case: Case, path: Path) -> None:
 def checked(
     case: Case, notices: Notices, models: Sequence[str] | None = None, *, quiet: bool
 ) -> tuple[Finding, ...]:
-    """What the doctor finds of a case for some models, with its warnings printed.
+    """The findings of the doctor for a case and some models; warnings are printed.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def _has_errors(findings: Sequence[Finding]) -> bool:
 
 
 def print_findings(findings: Sequence[Finding], stream: TextIO) -> None:
-    """On a terminal wrapped and coloured, in a pipe one line for each part."""
+    """Wrapped and coloured on a terminal; one line per part in a pipe."""
     width = columns() if stream.isatty() else 0
     text = findings_text(findings, colour=in_colour(stream), width=width, escape=escaped)
     print(text, file=stream)

@@ -96,5 +96,5 @@ def _work(
 
 
 def _someone_looks() -> bool:
-    """Whether someone sits in front of this: not in a pipe, not in CI, not without a display."""
+    """Whether the session is interactive: not in a pipe, in CI or without a display."""
     return sys.stdout.isatty() and not os.environ.get("CI") and has_screen()

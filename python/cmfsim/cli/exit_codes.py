@@ -1,4 +1,4 @@
-"""What the program's exit codes mean."""
+"""The exit codes of the program."""
 
 __all__ = ["BAD_INPUT", "CLOSED", "DONE", "FAILED"]
 

@@ -1,4 +1,4 @@
-"""`cmfsim init`: a commented case file from what lies in a folder."""
+"""`cmfsim init`: a commented case file for the files in a folder."""
 
 import argparse
 import json
@@ -12,7 +12,7 @@ __all__ = ["init"]
 
 
 def init(options: argparse.Namespace) -> int:
-    """Writes the case file, and states what each file was taken for."""
+    """Writes the case file, and reports the role assumed for each file."""
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         draft = init_case(options.folder, force=options.force, progress=progress.stage)
     folder = options.folder if options.folder.is_dir() else options.folder.parent

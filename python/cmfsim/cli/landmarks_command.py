@@ -1,4 +1,4 @@
-"""`cmfsim landmarks`: landmarks of a case without hand work, with a picture to confirm them."""
+"""`cmfsim landmarks`: automatic landmarks of a case, with a picture to confirm them."""
 
 import argparse
 import json
@@ -77,7 +77,7 @@ def landmarks(options: argparse.Namespace) -> int:
 def _write(
     folder: Path, head: _Head, found: ProposedLandmarks
 ) -> tuple[list[str], tuple[Finding, ...]]:
-    """The names of the files written, and what was noticed."""
+    """The names of the files written, and the findings."""
     folder.mkdir(parents=True, exist_ok=True)
     names, findings = [], []
     for kind, sites in (("skull", found.skull), ("skin", found.skin)):
@@ -127,7 +127,7 @@ def _values(found: ProposedLandmarks) -> dict[str, Any]:
 
 
 def _from_given(case: Case, found: ProposedLandmarks) -> dict[str, dict[str, float]]:
-    """How far proposed landmarks lie from those that the case gives, mm."""
+    """Distances of proposed landmarks from those given in the case, mm."""
     given, _ = read_case_landmarks(case)
     return {
         kind: {

@@ -1,4 +1,4 @@
-"""Findings of a command on the terminal: as they arise, and once more at its end."""
+"""Findings of a command on the terminal: as they arise, and again at its end."""
 
 import sys
 from collections.abc import Iterable, Sequence
@@ -16,7 +16,7 @@ COLOURS = {"error": "31;1", "warning": "33;1"}
 
 
 class FindingsError(Exception):
-    """The doctor found errors: no work was begun."""
+    """The doctor found errors, so the command did nothing else."""
 
     def __init__(self, findings: Sequence[Finding]) -> None:
         errors = [finding for finding in findings if finding.severity == "error"]
@@ -43,7 +43,7 @@ class Notices:
         return tuple(self._found)
 
     def add(self, findings: Iterable[Finding]) -> None:
-        """Takes findings, and prints those that are new and no notes."""
+        """Adds findings, and prints the new ones except notes."""
         new = [finding for finding in dict.fromkeys(findings) if finding not in self._found]
         self._found.update(dict.fromkeys(new))
         for group in grouped(new):
@@ -51,7 +51,7 @@ class Notices:
                 _print(f"cmfsim: {_head(group)}: {escaped(group.line)}")
 
     def summarise(self, where: str) -> None:
-        """Prints the list at the end: nothing where nothing was found.
+        """Prints the list at the end: nothing if there are no findings.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""The words of the command line."""
+"""The options of the command line."""
 
 import argparse
 from pathlib import Path
@@ -41,10 +41,10 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument(
-        "--json", action="store_true", help="print a JSON object, of errors as well"
+        "--json", action="store_true", help="print the result, or the error, as a JSON object"
     )
     common.add_argument(
-        "-q", "--quiet", action="store_true", help="no progress lines; warnings and errors stay"
+        "-q", "--quiet", action="store_true", help="print no progress, only warnings and errors"
     )
     _add_case_commands(commands, common)
     _add_scene_commands(commands, common)
@@ -58,7 +58,7 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     named.add_argument("case", metavar="CASE", type=Path, help="case.toml, or its folder")
 
     demo = commands.add_parser(
-        "demo", parents=[common], help="predict the face of an embedded case, and open its report"
+        "demo", parents=[common], help="predict the face of a built-in case, and open the report"
     )
     demo.add_argument(
         "folder",
@@ -66,10 +66,10 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="?",
         default=demo_command.DEMO_FOLDER,
-        help=f"new, empty or an earlier demo's (default {demo_command.DEMO_FOLDER})",
+        help=f"new, empty or from an earlier demo (default {demo_command.DEMO_FOLDER})",
     )
     demo.add_argument(
-        "--edge-length", metavar="H", type=float, default=6.0, help="of the tets, mm (default 6)"
+        "--edge-length", metavar="H", type=float, default=6.0, help="tet edges, mm (default 6)"
     )
     demo.add_argument("--no-open", action="store_true", help="do not open the report")
     demo.set_defaults(run=demo_command.demo, models=demo_command.DEMO_MODELS)
@@ -77,38 +77,38 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     init = commands.add_parser(
         "init",
         parents=[common],
-        help="write a commented case.toml for what lies in a folder, or in a 3D Slicer scene",
-        epilog="What is not clear becomes a line with a question mark, which doctor refuses.",
+        help="write a commented case.toml for the files in a folder, or for a 3D Slicer scene",
+        epilog="Anything unclear is written as a line with a question mark, which doctor rejects.",
     )
     init.add_argument(
-        "folder", metavar="FOLDER", type=Path, help="folder, or a scene of 3D Slicer (.mrml, .mrb)"
+        "folder", metavar="FOLDER", type=Path, help="folder, or 3D Slicer scene (.mrml, .mrb)"
     )
-    init.add_argument("--force", action="store_true", help="replace a case.toml that is there")
+    init.add_argument("--force", action="store_true", help="replace an existing case.toml")
     init.set_defaults(run=init_command.init)
 
     view = commands.add_parser(
-        "view", parents=[common], help="look at a prediction, model, scene, result or surface"
+        "view", parents=[common], help="display a prediction, model, scene, result or surface"
     )
     view.add_argument(
         "path",
         metavar="FOLDER_OR_FILE",
         type=Path,
-        help="what predict, build or demo wrote; case.toml, scene, result or surface",
+        help="folder written by predict, build or demo; case.toml, scene, result or surface",
     )
     view.add_argument(
         "--model",
         choices=MODELS,
-        help="of several predictions (default the last of H, M, H+S, M+S)",
+        help="which of several predictions (default: the last of H, M, H+S, M+S)",
     )
     view.add_argument(
-        "--screenshot", metavar="PNG", type=Path, help="write a picture; open no window"
+        "--screenshot", metavar="PNG", type=Path, help="write a picture, open no window"
     )
     view.set_defaults(run=view_command.view)
 
     doctor = commands.add_parser(
         "doctor",
         parents=[named],
-        help="report what will go wrong with a case, and how to fix it",
+        help="check a case, and report how to fix its problems",
         epilog="Exit codes: 0 no errors found, 2 errors found or the case file cannot be read.",
     )
     doctor.set_defaults(run=case_commands.doctor)
@@ -117,27 +117,29 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
 
     changed = argparse.ArgumentParser(add_help=False, parents=[named])
     changed.add_argument(
-        "-o", "--output", metavar="OUT", type=Path, help="folder instead of the case's own"
+        "-o", "--output", metavar="OUT", type=Path, help="output folder (default: that of the case)"
     )
     changed.add_argument(
-        "--edge-length", metavar="H", type=float, help="mm, instead of the case's own"
+        "--edge-length", metavar="H", type=float, help="tet edges, mm (default: those of the case)"
     )
-    changed.add_argument("--no-doctor", action="store_true", help="work without checks before")
+    changed.add_argument("--no-doctor", action="store_true", help="skip the checks of the case")
 
-    build = commands.add_parser("build", parents=[changed], help="build a case: image to scene")
+    build = commands.add_parser(
+        "build", parents=[changed], help="build the scene of a case from its images"
+    )
     build.set_defaults(run=case_commands.build)
 
     _add_study_commands(commands, common, changed)
 
     phantom = commands.add_parser(
-        "phantom", parents=[common], help="write the case of a head made by code"
+        "phantom", parents=[common], help="write the case of a synthetic head"
     )
-    phantom.add_argument("folder", metavar="FOLDER", type=Path, help="made if it is not there")
+    phantom.add_argument("folder", metavar="FOLDER", type=Path, help="output folder")
     phantom.add_argument(
-        "--person", metavar="N", type=int, help="another person; the same N is the same person"
+        "--person", metavar="N", type=int, help="number of the person; each N is a different one"
     )
     phantom.add_argument(
-        "--spacing", metavar="MM", type=float, default=1.0, help="of the CT (default 1)"
+        "--spacing", metavar="MM", type=float, default=1.0, help="CT voxel size (default 1)"
     )
     phantom.set_defaults(run=phantom_command.phantom)
 
@@ -145,25 +147,27 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         "virtual-patients",
         parents=[common],
         help="write virtual patients with the face after their operation (in silico)",
-        epilog="Patients who are there already, made with the same settings, are kept.",
+        epilog="Existing patients with the same settings are kept.",
     )
-    virtual.add_argument("folder", metavar="FOLDER", type=Path, help="made if it is not there")
+    virtual.add_argument("folder", metavar="FOLDER", type=Path, help="output folder")
     virtual.add_argument(
         "--patients",
         metavar="N",
         type=int,
         nargs="+",
         default=PATIENTS_WITH_JOINED_LIPS,
-        help="which of 1 to 6 (default 1 to 4; the lips of 5 and 6 meet, which takes long)",
+        help="patients, 1 to 6 (default 1 to 4; the lips of 5 and 6 touch, which takes longer)",
+    )
+    virtual.add_argument("--seed", metavar="N", type=int, default=0, help="random seed (default 0)")
+    virtual.add_argument(
+        "--edge-length",
+        metavar="H",
+        type=float,
+        default=6.0,
+        help="edge length of the true mesh, mm (default 6)",
     )
     virtual.add_argument(
-        "--seed", metavar="N", type=int, default=0, help="of all noise (default 0)"
-    )
-    virtual.add_argument(
-        "--edge-length", metavar="H", type=float, default=6.0, help="mm, true mesh (default 6)"
-    )
-    virtual.add_argument(
-        "--spacing", metavar="MM", type=float, default=2.0, help="of the CT (default 2)"
+        "--spacing", metavar="MM", type=float, default=2.0, help="CT voxel size (default 2)"
     )
     virtual.set_defaults(run=virtual_patients_command.virtual_patients)
 
@@ -176,21 +180,21 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     predict.add_argument(
         "--model",
         **models,
-        help="H, M, H+S or M+S: homogeneous or with muscles, without or with sliding; or all; may "
-        "be repeated (default M+S)",
+        help="H (homogeneous), M (muscles), H+S or M+S (with sliding), or all; may be repeated "
+        "(default M+S)",
     )
     predict.add_argument(
-        "--plan", metavar="PLAN", type=Path, help="plan.toml of the planning page, not the case's"
+        "--plan", metavar="PLAN", type=Path, help="plan.toml to use instead of the case's plan"
     )
     predict.set_defaults(run=study_commands.predict)
 
     plan = commands.add_parser(
         "plan",
         parents=[changed],
-        help="write a page in which bones are moved and the face follows",
-        epilog="The page is one file: it needs neither a server nor a network.",
+        help="write a page on which you move bones and see the face follow",
+        epilog="The page is a single file that needs neither a server nor a network.",
     )
-    plan.add_argument("--model", choices=MODELS, default="M+S", help="(default M+S)")
+    plan.add_argument("--model", choices=MODELS, default="M+S", help="model (default M+S)")
     plan.add_argument(
         "--trials",
         metavar="N",
@@ -203,76 +207,84 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         metavar="N",
         type=int,
         default=CORRECTIONS,
-        help="exact solutions that correct the face away from the case's plan, where tissue "
+        help="exact solutions that correct the face for other plans than the case's, if tissue "
         f"slides; 0 for none (default {CORRECTIONS})",
     )
     plan.add_argument(
         "--towards",
         metavar="FILE",
         type=Path,
-        help="find the plan whose face comes nearest to a surface, or to skin landmarks by name",
+        help="find the plan whose face is closest to a surface, or to named skin landmarks",
     )
     plan.add_argument(
         "--keep-bite",
         action="store_true",
-        help="with --towards: the mandible keeps its place to the maxilla, as the case plans it",
+        help="with --towards: keep the mandible in its planned position relative to the maxilla",
     )
     plan.add_argument(
         "--serve",
         action="store_true",
-        help="solve plans exactly while the page is open, on this machine alone, until Ctrl-C",
+        help="solve plans exactly while the page is open, on this machine only, until Ctrl-C",
     )
-    plan.add_argument(
-        "--port", metavar="N", type=int, default=0, help="of --serve (default one that is free)"
-    )
+    plan.add_argument("--port", metavar="N", type=int, default=0, help="port (default: a free one)")
     plan.add_argument("--no-open", action="store_true", help="do not open the page")
     plan.set_defaults(run=plan_command.plan)
 
     evaluate = commands.add_parser(
-        "evaluate", parents=[changed], help="predict, and compare with the face after it"
+        "evaluate", parents=[changed], help="predict the face, and compare it with the real one"
     )
     evaluate.add_argument("--model", **models, help="as in predict (default all)")
     # For a study's own processes: they end when what started them does.
     for command in (predict, evaluate):
-        command.add_argument("--no-report", action="store_true", help="make no report.html")
+        command.add_argument("--no-report", action="store_true", help="do not write report.html")
         command.add_argument(
-            "--slicer", action="store_true", help="write prediction.mrb for 3D Slicer as well"
+            "--slicer", action="store_true", help="also write prediction.mrb for 3D Slicer"
         )
     evaluate.set_defaults(run=study_commands.evaluate)
 
     sensitivity = commands.add_parser(
-        "sensitivity", parents=[changed], help="what the error of skull landmarks does to the face"
+        "sensitivity", parents=[changed], help="measure the effect of landmark errors on the face"
     )
-    sensitivity.add_argument("--model", choices=("M", "M+S"), default="M+S", help="(default M+S)")
+    sensitivity.add_argument(
+        "--model", choices=("M", "M+S"), default="M+S", help="model (default M+S)"
+    )
     sensitivity.add_argument("--trials", metavar="N", type=int, default=3, help="(default 3)")
     sensitivity.add_argument(
-        "--std", metavar="MM", type=float, default=2.0, help="of a landmark along each axis (2)"
+        "--std",
+        metavar="MM",
+        type=float,
+        default=2.0,
+        help="standard deviation of a landmark along each axis (default 2)",
     )
-    sensitivity.add_argument("--seed", type=int, default=0, help="of the trials (default 0)")
+    sensitivity.add_argument("--seed", type=int, default=0, help="random seed (default 0)")
     sensitivity.add_argument(
         "--landmarks",
         metavar="FILE",
         type=Path,
         action="append",
-        help="landmarks placed again, one file per trial, instead of drawn ones",
+        help="landmarks placed again by hand, one file per trial, instead of random ones",
     )
     sensitivity.set_defaults(run=study_commands.sensitivity)
 
     study = commands.add_parser(
-        "study", parents=[common], help="every case of a cohort by every model"
+        "study",
+        parents=[common],
+        help="predict and evaluate every case of a cohort with every model",
     )
     study.add_argument("cohort", metavar="COHORT", type=Path, help="cohort.toml, or its folder")
-    study.add_argument("--workers", metavar="N", type=int, help="cases at a time")
     study.add_argument(
-        "--scheduler", metavar="ADDRESS", help="of a Dask cluster that sees the same files"
+        "--workers", metavar="N", type=int, help="number of cases processed at a time"
     )
-    study.add_argument("--fresh", action="store_true", help="work on finished cases again")
+    study.add_argument(
+        "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
+    )
+    study.add_argument("--fresh", action="store_true", help="repeat finished cases")
     study.set_defaults(run=study_commands.study)
 
     report = commands.add_parser(
-        "report", parents=[common], help="make the report of a folder of results again"
+        "report", parents=[common], help="regenerate the report of a folder of results"
     )
-    report.add_argument("folder", metavar="FOLDER", type=Path, help="what predict wrote")
+    report.add_argument("folder", metavar="FOLDER", type=Path, help="folder written by predict")
     report.set_defaults(run=study_commands.report)
 
 
@@ -287,17 +299,20 @@ def _add_scene_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         metavar="OUT",
         type=Path,
         required=True,
-        help=f"result file, by its ending {' '.join(result_suffixes())}",
+        help=f"result file; its suffix sets the format: {' '.join(result_suffixes())}",
     )
-    solve.add_argument("--method", choices=METHODS, help="instead of the scene's own")
-    solve.add_argument("--contact", choices=CONTACTS, help="instead of the scene's own")
-    solve.add_argument("--tolerance", type=float, help="relative error, iterative methods")
+    solve.add_argument("--method", choices=METHODS, help="solver (default: that of the scene)")
+    solve.add_argument("--contact", choices=CONTACTS, help="contact (default: that of the scene)")
+    solve.add_argument("--tolerance", type=float, help="relative error of the iterative methods")
     solve.add_argument(
-        "--plan", metavar="PLAN", type=Path, help="plan.toml or plan.json instead of the scene's"
+        "--plan",
+        metavar="PLAN",
+        type=Path,
+        help="plan.toml or plan.json, instead of the scene's plan",
     )
     solve.set_defaults(run=scene_commands.solve)
 
-    info = commands.add_parser("info", parents=[common], help="say what a scene holds")
+    info = commands.add_parser("info", parents=[common], help="list the contents of a scene")
     info.set_defaults(run=scene_commands.info)
 
 
@@ -305,10 +320,10 @@ def _add_landmarks(commands: Any, named: argparse.ArgumentParser) -> None:
     landmarks = commands.add_parser(
         "landmarks",
         parents=[named],
-        help="find the landmarks of skull and skin, and draw them to be confirmed",
+        help="find the landmarks of skull and skin, and draw them for confirmation",
     )
     landmarks.add_argument(
-        "-o", "--output", metavar="OUT", type=Path, help="folder instead of the case's own"
+        "-o", "--output", metavar="OUT", type=Path, help="output folder (default: that of the case)"
     )
     landmarks.add_argument(
         "--template",
@@ -329,13 +344,13 @@ def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> No
         "template", metavar="TEMPLATE", help="folder, archive or name of a built-in template"
     )
 
-    listing = actions.add_parser("list", parents=[common], help="name the built-in templates")
+    listing = actions.add_parser("list", parents=[common], help="list the built-in templates")
     listing.set_defaults(run=template_commands.list_templates)
 
     check = actions.add_parser(
         "check",
         parents=[named],
-        help="say what is wrong with a template, and how to fix it",
+        help="report what is wrong with a template, and how to fix it",
         epilog="Exit codes: 0 no errors found, 2 errors found or there is no such template.",
     )
     check.set_defaults(run=template_commands.check)
@@ -343,59 +358,64 @@ def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> No
     imports = actions.add_parser(
         "import",
         parents=[common],
-        help="make a template of an atlas's files",
+        help="make a template from the files of an atlas",
         epilog=f"BodyParts3D: download the OBJ files from {WHERE}.",
     )
     imports.add_argument("atlas", choices=["bodyparts3d"], help="which atlas")
-    imports.add_argument("folder", metavar="FOLDER", type=Path, help="the atlas's files")
+    imports.add_argument("folder", metavar="FOLDER", type=Path, help="folder of the atlas files")
     imports.add_argument(
-        "--landmarks", metavar="FILE", type=Path, required=True, help="on its bones: .mrk.json"
+        "--landmarks", metavar="FILE", type=Path, required=True, help="on its bones (.mrk.json)"
     )
     imports.add_argument(
-        "-o", "--output", metavar="OUT", type=Path, required=True, help="folder, or .npz"
+        "-o", "--output", metavar="OUT", type=Path, required=True, help="folder, or .npz file"
     )
     imports.add_argument(
-        "--any-files", action="store_true", help="take files with other hashes than the known ones"
+        "--any-files", action="store_true", help="accept files with unknown hashes"
     )
     imports.set_defaults(run=template_commands.import_atlas)
 
     morph = actions.add_parser(
-        "morph", parents=[named], help="carry a template's muscles to a patient by landmarks"
+        "morph", parents=[named], help="map the muscles of a template to a patient by landmarks"
     )
     morph.add_argument(
-        "landmarks", metavar="LANDMARKS", type=Path, help="the patient's: .mrk.json or .fcsv"
+        "landmarks",
+        metavar="LANDMARKS",
+        type=Path,
+        help="landmarks of the patient, .mrk.json or .fcsv",
     )
     morph.add_argument(
-        "-o", "--output", metavar="OUT", type=Path, required=True, help="folder, or .npz"
+        "-o", "--output", metavar="OUT", type=Path, required=True, help="folder, or .npz file"
     )
     morph.add_argument(
-        "--smoothing", metavar="MM", type=float, default=0.0, help="0 (default) meets every one"
+        "--smoothing", metavar="MM", type=float, default=0.0, help="0 (default): exact landmarks"
     )
     morph.set_defaults(run=template_commands.morph)
 
     show = actions.add_parser("show", parents=[named], help="draw a template's muscles")
-    show.add_argument("-o", "--output", metavar="PNG", type=Path, required=True, help="picture")
     show.add_argument(
-        "--only", metavar="NAME", nargs="+", help="these muscles; without _L or _R on both sides"
+        "-o", "--output", metavar="PNG", type=Path, required=True, help="picture to write"
     )
     show.add_argument(
-        "--fibres", action="store_true", help="fibre boxes and directions instead of names"
+        "--only", metavar="NAME", nargs="+", help="only these muscles; without _L or _R, both sides"
+    )
+    show.add_argument(
+        "--fibres", action="store_true", help="draw fibre boxes and directions instead of names"
     )
     show.set_defaults(run=template_commands.show)
 
 
 def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
-    bench = commands.add_parser("bench", help="measure: error against run time")
+    bench = commands.add_parser("bench", help="benchmarks: error against run time")
     actions = bench.add_subparsers(dest="action", metavar="ACTION", required=True)
 
     frontier = actions.add_parser(
         "frontier",
         parents=[common],
-        help="what each choice of a prediction costs, and what it buys",
-        epilog="Finished runs are kept in the folder: a sweep that was stopped goes on.",
+        help="measure the cost and the accuracy of each choice in a prediction",
+        epilog="Finished runs are kept in the folder: an interrupted sweep is resumed.",
     )
     frontier.add_argument(
-        "case", metavar="CASE", type=Path, nargs="?", help="case.toml (default: a made head)"
+        "case", metavar="CASE", type=Path, nargs="?", help="case.toml (default: a synthetic head)"
     )
     frontier.add_argument(
         "-o",
@@ -403,14 +423,14 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         metavar="OUT",
         type=Path,
         default=bench_command.FRONTIER_FOLDER,
-        help=f"folder (default {bench_command.FRONTIER_FOLDER})",
+        help=f"output folder (default {bench_command.FRONTIER_FOLDER})",
     )
     frontier.add_argument(
-        "--edge-length", metavar="H", type=float, help="of the base, mm, instead of the case's own"
+        "--edge-length", metavar="H", type=float, help="of the base run, mm (default: the case's)"
     )
-    frontier.add_argument("--model", choices=MODELS, help="of the base (default M+S)")
+    frontier.add_argument("--model", choices=MODELS, help="model of the base run (default M+S)")
     frontier.add_argument(
-        "--edges", metavar="H", type=float, nargs="+", default=EDGES, help="of the grid, mm"
+        "--edges", metavar="H", type=float, nargs="+", default=EDGES, help="edges of the grid, mm"
     )
     for name, known in (("elements", ELEMENTS), ("kinematics", KINEMATICS)):
         frontier.add_argument(
@@ -422,23 +442,23 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         nargs="*",
         default=list(FACTORS),
         metavar="FACTOR",
-        help=f"varied one at a time, none if none is named (default {' '.join(FACTORS)})",
+        help=f"choices to vary one at a time, none if empty (default {' '.join(FACTORS)})",
     )
     frontier.add_argument(
-        "--reference-edge", metavar="H", type=float, help="mm (default the smallest of the sweep)"
+        "--reference-edge", metavar="H", type=float, help="mm (default: the smallest of the sweep)"
     )
     frontier.add_argument(
         "--reference-kinematics",
         choices=KINEMATICS,
         default="hyperelastic",
-        help="(default hyperelastic)",
+        help="kinematics of the reference (default hyperelastic)",
     )
     frontier.add_argument(
-        "--repeats", metavar="N", type=int, default=3, help="rounds of timing (default 3)"
+        "--repeats", metavar="N", type=int, default=3, help="timing rounds (default 3)"
     )
-    frontier.add_argument("--threads", metavar="N", type=int, help="(default all cores)")
+    frontier.add_argument("--threads", metavar="N", type=int, help="(default: all cores)")
     frontier.add_argument(
-        "--time-limit", metavar="S", type=float, default=600.0, help="of one job (default 600 s)"
+        "--time-limit", metavar="S", type=float, default=600.0, help="per job (default 600 s)"
     )
-    frontier.add_argument("--fresh", action="store_true", help="do finished runs again")
+    frontier.add_argument("--fresh", action="store_true", help="repeat finished runs")
     frontier.set_defaults(run=bench_command.frontier)

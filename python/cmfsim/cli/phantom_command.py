@@ -1,4 +1,4 @@
-"""`cmfsim phantom`: a made head to try things on."""
+"""`cmfsim phantom`: a synthetic head for trying things out."""
 
 import argparse
 import json
@@ -14,7 +14,7 @@ __all__ = ["phantom"]
 
 
 def phantom(options: argparse.Namespace) -> int:
-    """Writes the case of a made head: CT, landmarks and case file."""
+    """Writes the case of a synthetic head: CT, landmarks and case file."""
     spacing = as_positive("--spacing", options.spacing)
     parameters = HeadParameters()
     if options.person is not None:

@@ -45,7 +45,7 @@ TRIALS = 6
 
 @dataclass(frozen=True, eq=False)
 class _Made:
-    """What the command has computed."""
+    """The results of the command."""
 
     planning: PlanningModel
     content: PageContent
@@ -99,7 +99,7 @@ def plan(options: argparse.Namespace) -> int:
 
 
 def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
-    """Everything that the page is written from."""
+    """Everything that the page contains."""
     # Before any work: a file that is none would be found a minute later.
     targets = None if options.towards is None else read_targets(options.towards)
     models = (options.model,)
@@ -143,7 +143,7 @@ def _serve(options: argparse.Namespace, made: _Made, case_file: str) -> None:
 
 
 def _error_text(errors: ExpectedError) -> str:
-    """What exact solutions say about the page, in a line."""
+    """The error of the page as measured by exact solutions, in one line."""
     if not errors.slides:
         return "none: no tissue slides, and the page is exact for every plan"
     solved = [trial for trial in errors.trials if not trial.failed]
@@ -168,7 +168,7 @@ def _correction_text(correction: PlanCorrection) -> str:
 
 
 def _correction_values(correction: PlanCorrection | None) -> dict[str, Any] | None:
-    """What is known of the correction; None where there is none."""
+    """The figures of the correction; None if there is none."""
     if correction is None:
         return None
     return {
@@ -181,7 +181,7 @@ def _correction_values(correction: PlanCorrection | None) -> dict[str, Any] | No
 
 
 def _search(options: argparse.Namespace, planning: PlanningModel) -> FaceSearch:
-    """How the plan of a wished face is searched for."""
+    """The options of the search for the plan of a desired face."""
     if not options.keep_bite:
         return FaceSearch()
     upper = next((n for n in ("maxilla", "midface") if n in planning.segments), None)
@@ -206,7 +206,7 @@ def _towards_values(found: FacePlan) -> dict[str, Any]:
 
 
 def _towards_text(found: FacePlan, path: Path) -> str:
-    """The plan that was found, what it leaves of the wish, and what the wish leaves open."""
+    """The plan that was found, its error, and what the desired face leaves undetermined."""
     lines = [f"wish   {name}: {motion.text}" for name, motion in found.motions.items()]
     rms = [float(np.sqrt((row**2).mean())) for row in found.exact_residuals]
     lines.append(f"       solved exactly, it is off by {TARGET_STD * max(rms):.2f} mm RMS")

@@ -55,7 +55,7 @@ def solve(options: argparse.Namespace) -> int:
 
 
 def _check_output(output: Path, scene: Path) -> None:
-    """Finds before the work what would spoil its result."""
+    """Detects invalid options and outputs before the scene is solved."""
     if output.suffix not in result_suffixes():
         known = ", ".join(result_suffixes())
         raise CaseInputError(f"{output.name}: results end in {known}, not {output.suffix!r}")
@@ -87,7 +87,7 @@ def _read(path: Path) -> Scene:
 
 
 def info(options: argparse.Namespace) -> int:
-    """Says what a scene holds."""
+    """Lists the contents of a scene."""
     scene = _read(options.scene)
     nodes = np.asarray(scene.nodes)
     if options.json:

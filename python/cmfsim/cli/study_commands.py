@@ -32,7 +32,7 @@ __all__ = ["achieved_text", "evaluate", "models_of", "predict", "report", "sensi
 
 
 def models_of(given: Sequence[str] | None, default: Sequence[str]) -> tuple[str, ...]:
-    """The models that a command names, in the paper's order."""
+    """The models given to a command, in the paper's order."""
     named = set(given or default)
     return MODELS if "all" in named else tuple(m for m in MODELS if m in named)
 
@@ -85,7 +85,7 @@ def predict(options: argparse.Namespace) -> int:
 def _at_least_one(
     predictions: Iterable[Prediction], failed: Mapping[str, CmfsimError]
 ) -> Iterator[Prediction]:
-    """The predictions, or the first error where there is none."""
+    """The predictions, or the first error if there are none."""
     found = False
     for prediction in predictions:
         found = True
@@ -146,14 +146,14 @@ def evaluate(options: argparse.Namespace) -> int:
 
 
 def _end(notices: Notices, output: Path, written: WrittenResults) -> None:
-    """Prints what is doubtful once more, below the figures."""
+    """Prints doubtful findings again, below the figures."""
     place = written.predictions[0].place
     where = written.report or f"{place}/prediction.json".lstrip("/")
     notices.summarise(str(output / where))
 
 
 def sensitivity(options: argparse.Namespace) -> int:
-    """Reports what the error of skull landmarks does to muscles and face."""
+    """Reports the effect of errors of skull landmarks on muscles and face."""
     case = case_of(options)
     prepare(case)
     notices = Notices(quiet=options.quiet)
@@ -232,7 +232,7 @@ def study(options: argparse.Namespace) -> int:
 
 
 def report(options: argparse.Namespace) -> int:
-    """Makes the report of a folder of results again."""
+    """Regenerates the report of a folder of results."""
     folder: Path = options.folder
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         progress.stage("writing the report")
@@ -316,7 +316,7 @@ def _print_failed(failed: Mapping[str, str]) -> None:
 
 
 def achieved_text(achieved: Mapping[str, Any]) -> str:
-    """What the operation did to each segment, as Table 2 of Kim et al. (2010) writes it."""
+    """The motion of each segment in the operation, as in Table 2 of Kim et al. (2010)."""
     lines = ["achieved plan: motion of each segment's middle, mm (L, P, S), and turn about it"]
     for name, found in achieved["segments"].items():
         shift = " ".join(f"{c:+6.2f}" for c in found["translation_mm"])

@@ -32,7 +32,7 @@ WORST_SHOWN = 5
 
 
 def list_templates(options: argparse.Namespace) -> int:
-    """Names the templates that come with the package."""
+    """Lists the templates that come with the package."""
     entries = []
     for name in template_names():
         template = MuscleTemplate.load(name)
@@ -56,7 +56,7 @@ def list_templates(options: argparse.Namespace) -> int:
 
 
 def check(options: argparse.Namespace) -> int:
-    """Says what is wrong with a template; bad input if anything is an error."""
+    """Reports problems of a template; the exit code is bad input if any is an error."""
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         progress.stage(f"checking {options.template}")
         findings = check_template(options.template)
@@ -70,7 +70,7 @@ def check(options: argparse.Namespace) -> int:
 
 
 def import_atlas(options: argparse.Namespace) -> int:
-    """Makes a template of the files of an atlas, and writes it with what was repaired."""
+    """Makes a template from the files of an atlas, and writes it with a list of repairs."""
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         template = import_bodyparts3d(
             options.folder,
@@ -97,7 +97,7 @@ def import_atlas(options: argparse.Namespace) -> int:
 
 
 def morph(options: argparse.Namespace) -> int:
-    """Carries a template to a patient, and writes muscles, skull and what the landmarks say."""
+    """Maps a template to a patient, and writes muscles, skull and landmark errors."""
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         progress.stage(f"morphing {options.template}")
         template = MuscleTemplate.load(options.template)
@@ -141,7 +141,7 @@ def _beside(output: Path, report: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _chosen(template: MuscleTemplate, names: Sequence[str]) -> Musculature:
-    """The muscles of these names; a name without side means both."""
+    """The muscles with these names; a name without a side selects both."""
     known = {muscle.name for muscle in template.muscles}
     bare = {name.removesuffix("_L").removesuffix("_R") for name in known}
     for name in names:

@@ -76,7 +76,7 @@ class StageProgress:
             self._write(CLEAR_LINE)
 
     def stage(self, name: str) -> None:
-        """Says that a stage begins, and what the one before took."""
+        """Reports the start of a stage, and the time of the previous one."""
         with self._lock:
             now = time.perf_counter()
             self._stage, self._begun = name, now
@@ -108,7 +108,7 @@ def print_error(error: BaseException) -> None:
 
 
 def escaped(text: str) -> str:
-    """A text that cannot steer the terminal: names in files come from strangers."""
+    """A text without terminal control characters, since names in files are untrusted."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 

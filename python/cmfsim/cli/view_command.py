@@ -26,7 +26,7 @@ OVER_BONES = 0.45
 
 
 def view(options: argparse.Namespace) -> int:
-    """Shows what a folder or file holds, or writes a picture of it."""
+    """Shows the contents of a folder or file, or writes a picture of them."""
     path: Path = options.path
     parts = parts_of(path, options.model)
     view_parts(parts, title=f"{path.name} - cmfsim", screenshot=options.screenshot)
@@ -124,7 +124,7 @@ def _of_surface(path: Path) -> list[ViewPart]:
 
 
 def _of_archive(path: Path) -> list[ViewPart]:
-    """A scene or a result: both are archives, which say what they are."""
+    """A scene or a result: both are archives that state their own type."""
     with np.load(path, allow_pickle=False) as archive:
         names = set(archive.files)
     if "scene" in names:

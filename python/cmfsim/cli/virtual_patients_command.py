@@ -1,4 +1,4 @@
-"""`cmfsim virtual-patients`: made heads with the face after their operation, to test models on."""
+"""`cmfsim virtual-patients`: synthetic heads with their postoperative faces, to test models."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""Wished faces in files: a surface, or skin landmarks with the places where they should be."""
+"""Desired faces in files: a surface, or skin landmarks at their desired positions."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,14 +20,14 @@ TARGET_STD = 0.5
 
 
 def read_targets(path: Path) -> Callable[[PlanningModel], list[Target]]:
-    """What gives the targets in a file, once the patient is built.
+    """A function that returns the targets in a file, once the patient is built.
 
     Raises
     ------
     FileNotFoundError
         The file does not exist.
     CaseError, LandmarkError
-        (also `ValueError`) Another ending; a file that is not what its ending says.
+        (also `ValueError`) An unknown suffix; a file whose content does not match its suffix.
     """
     ending = path.suffix.lower()
     if ending in SURFACES:
