@@ -28,7 +28,7 @@ pub struct TetMesh {
     incident: Incidence,
 }
 
-/// Tets round each node, ascending.
+/// Tets around each node, ascending.
 #[derive(Debug, Clone)]
 pub(crate) struct Incidence {
     start: Vec<u32>,
@@ -238,7 +238,7 @@ impl Incidence {
         Self { start, tets: list }
     }
 
-    /// Tets round node `j`.
+    /// Tets around node `j`.
     pub(crate) fn of(&self, j: usize) -> &[u32] {
         &self.tets[self.start[j] as usize..self.start[j + 1] as usize]
     }

@@ -21,15 +21,15 @@ const FROM_SURFACE: &str = "made from a surface";
 /// Parameters
 /// ----------
 /// surface : Surface
-///     Of the muscle. Areas alone count: it may have holes and flipped triangles.
+///     Surface of the muscle. Only areas count: it may have holes and flipped triangles.
 /// kind : str, default "strap"
-///     "strap": along the muscle, as many boxes in series as it bends; "fan": lanes that converge to
-///     its narrow end; "ring": round the opening; "sheet": lanes along the longest axis.
+///     "strap": along the muscle, in boxes that follow its bends; "fan": lanes that converge to
+///     its narrow end; "ring": around the opening; "sheet": lanes along the longest axis.
 /// boxes : int or None
-///     How many boxes, 1 to 64: in series, side by side in a fan, round a ring (3 or more). None: as
-///     the shape needs.
+///     Number of boxes, 1 to 64: in series, side by side in a fan, around a ring (3 or more). None: as
+///     many as the shape needs.
 /// course : sequence of (n, 3) array_like, mm
-///     Known fibre lines; where there are any they are followed, not the boxes.
+///     Known fibre lines; if there are any, they are used instead of the boxes.
 ///
 /// Raises
 /// ------

@@ -193,7 +193,7 @@ fn degrees(radians: &[f64]) -> Vec<f64> {
 /// triangles : (t, 3) array_like of int
 ///     Outward by the right-hand rule.
 /// crease_angle : float, degrees, default 60
-///     Normals are continuous across edges that bend less, and jump across those that bend more.
+///     Normals are continuous across edges with a smaller angle between facets, and jump across others.
 ///
 /// Raises
 /// ------
@@ -344,14 +344,14 @@ impl PySurface {
 /// Parameters
 /// ----------
 /// matrix : (4, 4) float64, mm
-///     x ↦ R x + t. Every rotation written with four decimals or more passes.
+///     x ↦ R x + t. Every rotation written with four or more decimals is accepted.
 /// name : str
-///     What errors call the matrix.
+///     Name of the matrix in errors.
 ///
 /// Raises
 /// ------
 /// BoundaryError
-///     (also `ValueError`) Another shape, NaN or infinity, a bottom row other than 0 0 0 1, a mirror,
+///     (also `ValueError`) A wrong shape, NaN or infinity, a bottom row other than 0 0 0 1, a reflection,
 ///     RᵀR that differs from I by more than 2e-4 (scale or shear), with the figure.
 ///
 /// Examples
@@ -386,7 +386,7 @@ pub fn rigid_matrix<'py>(
 /// Raises
 /// ------
 /// BoundaryError, MeshError
-///     Another number of vertices, NaN or infinity.
+///     A different number of vertices, NaN or infinity.
 #[pyclass(frozen, module = "cmfsim", name = "SurfaceMotion")]
 pub struct PySurfaceMotion {
     pub core: Arc<SurfaceMotion>,

@@ -86,8 +86,8 @@ impl PyTissue {
     /// fibre : (3,) or (m, 3) array_like
     ///     Unit vectors.
     /// law : {"spencer", "picinbono"}
-    ///     Spencer (1984) closed by the major-Poisson and Saint-Venant rules, or Picinbono et al.
-    ///     (2003), which is refused where it is indefinite.
+    ///     Spencer (1984) completed by the major-Poisson and Saint-Venant rules, or Picinbono et al.
+    ///     (2003), which is rejected if it is indefinite.
     ///
     /// Raises
     /// ------
@@ -146,7 +146,7 @@ impl PyTissue {
     /// fraction : float or (m,) array_like
     ///     Muscle volume fraction, 0 to 1.
     /// fibre : (3,) or (m, 3) array_like, optional
-    ///     Unit vectors; needed where the fraction is positive.
+    ///     Unit vectors; required if the fraction is positive.
     /// mixing : {"moduli", "stiffness"}
     ///     Linear in Young's moduli and Poisson's ratio (the paper, 2.3), or in the stiffness.
     #[staticmethod]
@@ -218,13 +218,13 @@ fn fibres(value: &Bound<'_, PyAny>) -> PyResult<Vec<[f64; 3]>> {
 /// mesh : TetMesh
 /// tissue : Tissue
 /// element : {"p1", "anp", "p2"}
-///     Linear tets; linear tets whose volumetric strain is averaged round each corner, which do not lock
-///     near nu = 0.5; or quadratic tets on the same corners with a node in the middle of each edge.
+///     Linear tets; linear tets whose volumetric strain is averaged around each corner, which do not lock
+///     near nu = 0.5; or quadratic tets on the same corners with a node at the midpoint of each edge.
 ///
 /// Raises
 /// ------
 /// MaterialError
-///     A tissue with another number of rows than the mesh has tets.
+///     A tissue whose number of rows differs from the number of tets.
 /// MeshError
 ///     An unknown element.
 ///

@@ -37,16 +37,16 @@ const MEMORY_SHARE: f64 = 0.8;
 /// contact : dict of str to Surface, optional
 ///     Contact surface of each segment with sliding nodes, at rest, normals out of the bone.
 /// gap : dict of str to float, (k,) array_like or "rest", optional
-///     Distance that sliding nodes keep from the surface, mm, negative behind it; 0 puts them on it,
-///     "rest" keeps the offset that each has at rest, carried by its segment.
+///     Distance that sliding nodes keep from the surface, mm, negative behind it; 0 is on the surface,
+///     "rest" keeps the offset that each has at rest, moved with its segment.
 /// touching : sequence of (nodes, triangles), optional
-///     Nodes that may touch a part of the tissue's own boundary, and lift off again: (k,) int, and (m, 3) int, nodes
-///     of boundary triangles with outward normals. They may not enter the tissue behind the triangles; no friction.
+///     Nodes that may touch a part of the tissue's own boundary, and separate again: (k,) int, and (m, 3) int, the
+///     nodes of boundary triangles with outward normals. They may not enter the tissue behind these; no friction.
 /// obstacles : sequence of (nodes, segment, Surface), optional
-///     Nodes that may touch bone that they do not slide on: they may not go behind the surface, given at rest with
-///     normals out of the bone, which moves with the segment of that name; None for bone that stays.
+///     Nodes that may touch bone on which they do not slide: they may not go behind the surface. The surface is
+///     given at rest with normals out of the bone, and moves with the named segment; None for bone that is fixed.
 /// conflicts : {"error", "resolve"}
-///     A node of two kinds is an error, or fixed wins over joined and joined over sliding.
+///     A node of two kinds is an error, or fixed takes precedence over joined and joined over sliding.
 ///
 /// Raises
 /// ------
@@ -316,36 +316,36 @@ fn plan(value: &Bound<'_, PyAny>) -> PyResult<Plan> {
 /// boundary : Boundary
 /// method : {"auto", "cholesky", "pcg", "relaxation"}
 ///     Sparse Cholesky; conjugate gradients with multigrid, stopped by an error bound; the node-wise
-///     iteration of the literature; or by size and memory: Cholesky up to 100 000 unknowns, else
-///     conjugate gradients. Ask for "cholesky" where many plans of one large case follow.
+///     iteration of the literature; or chosen by size and memory: Cholesky up to 100 000 unknowns,
+///     otherwise conjugate gradients. Choose "cholesky" for many plans of one large case.
 /// contact : {"bilateral", "unilateral"}
 ///     Sliding nodes stay on the surface (the paper), or may lift off but never penetrate.
 /// tolerance : float
-///     Estimated error of the iterative methods over the largest prescribed displacement; contact settles to a
-///     tenth of it, where that is more than `contact_tolerance` asks for.
+///     Estimated error of the iterative methods over the largest prescribed displacement; contact converges to a
+///     tenth of it if that is larger than `contact_tolerance`.
 /// max_iterations : int, optional
 ///     Of the iterative methods.
 /// contact_tolerance : float
-///     Largest distance of a held node from its contact surface, mm; a tenth of it is the way that the force
-///     along the surface may still move any node by itself.
+///     Largest distance of a held node from its contact surface, mm. The tangential force remaining at any
+///     node must be too small to move that node, on its own, by more than a tenth of this.
 /// contact_iterations : int
-///     Newton steps of the contact solver. Where they run out above the tolerance, a state whose gaps and
-///     imbalance no face would show (0.02 mm) is handed out with `contact_converged` False.
+///     Maximum number of Newton steps of the contact solver. If they run out above the tolerance, a state with
+///     gaps and imbalance too small to be visible on a face (0.02 mm) is returned with `contact_converged` False.
 /// memory_limit : float, optional
-///     MB that a factor may take; 80 % of the free memory by default, where that is known.
+///     MB that a factorisation may take; by default 80 % of the free memory, if that is known.
 /// kinematics : {"linear", "corotational", "hyperelastic"}
 ///     Linear strain (the paper); stretch without rotation, with the constants of the tissue; or stable
 ///     neo-Hookean tissue with its fibres (Smith, de Goes & Kim 2018), equal to it for small strain. The
-///     latter two by Newton's method, not with "relaxation".
+///     latter two use Newton's method, and cannot be combined with "relaxation".
 ///
 /// Raises
 /// ------
 /// BoundaryError
-///     A node index past the mesh, a body that is not held (with its free rigid modes).
+///     A node index past the mesh, a body that is not constrained (with its free rigid modes).
 /// ContactError
 ///     An inverted contact surface.
 /// SolverError
-///     Options out of range, a factor that fails or does not fit.
+///     Options out of range, a factorisation that fails or does not fit in memory.
 #[pyclass(frozen, module = "cmfsim", name = "StaticSolver")]
 pub struct PyStaticSolver {
     core: Arc<StaticSolver>,
@@ -438,9 +438,9 @@ impl PyStaticSolver {
     /// loads : (n, 3) array_like, N, optional
     ///     Forces on the nodes of the mesh, or on all of `MassTensors.nodes`.
     /// start : Solution, optional
-    ///     Of this solver for a similar plan: sliding nodes begin where it has them on their segments, which
-    ///     takes fewer steps. Where there is one equilibrium, the result is the same within the tolerances.
-    ///     Large deformation begins at rest whatever the start.
+    ///     Solution of this solver for a similar plan: sliding nodes start at their positions on the segments
+    ///     in it, which takes fewer steps. If there is only one equilibrium, the result is the same within the
+    ///     tolerances. Large deformation always starts from rest.
     ///
     /// Returns
     /// -------
@@ -451,7 +451,7 @@ impl PyStaticSolver {
     /// BoundaryError
     ///     A plan that does not fit.
     /// ContactError
-    ///     Contact that does not converge, a node that slides past the border of an open surface.
+    ///     Contact that does not converge, a node that slides beyond the border of an open surface.
     /// SolverError
     ///     An iteration that does not converge.
     #[pyo3(signature = (plan, *, loads = None, start = None))]

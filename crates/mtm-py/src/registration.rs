@@ -24,17 +24,17 @@ const REGISTRATION: ErrorKind = ErrorKind::Registration;
 /// Parameters
 /// ----------
 /// source, target : (n, 3) array_like, mm
-///     Landmarks in the same order, four at least and not in one plane.
+///     Landmarks in the same order, at least four and not coplanar.
 /// smoothing : float, mm
-///     0: every source landmark goes to its target. λ above 0: it may stay away from it, by λ times
+///     0: every source landmark is mapped to its target. λ above 0: it may miss it, by λ times
 ///     its weight; the spline minimises Σ |y − f(s)|² + λ/8π · bending_energy. The `smoothing` of
 ///     scipy's `RBFInterpolator` with kernel "linear" and degree 1.
 ///
 /// Raises
 /// ------
 /// RegistrationError
-///     (also `ValueError`) Sets of different length, fewer than four landmarks, all in one plane,
-///     two at one place, NaN or infinity, a negative smoothing.
+///     (also `ValueError`) Sets of different length, fewer than four landmarks, all coplanar,
+///     two at the same position, NaN or infinity, a negative smoothing.
 ///
 /// Examples
 /// --------
@@ -194,22 +194,22 @@ impl PyFolds {
 /// Parameters
 /// ----------
 /// moving, fixed : (n, 3) array_like, mm
-///     Pairs in the same order, three at least and not in one line.
+///     Pairs in the same order, at least three and not collinear.
 /// weights : (n,) array_like, optional
 ///     Weight of each pair, 0 or more.
 /// scale : bool
-///     Whether a uniform scale is fitted too.
+///     Whether a uniform scale is fitted as well.
 ///
 /// Returns
 /// -------
 /// RigidFit
-///     `matrix` (4, 4), `scale`, `residuals` (n,) and weighted `rms`, mm. The rotation never mirrors.
+///     `matrix` (4, 4), `scale`, `residuals` (n,) and weighted `rms`, mm. The rotation is never a reflection.
 ///
 /// Raises
 /// ------
 /// RegistrationError
-///     (also `ValueError`) Sets of different length, fewer than three pairs, points in one line,
-///     several rotations that fit alike, NaN or infinity, negative weights.
+///     (also `ValueError`) Sets of different length, fewer than three pairs, collinear points,
+///     several rotations that fit equally well, NaN or infinity, negative weights.
 ///
 /// Notes
 /// -----
@@ -256,7 +256,7 @@ impl PyRigidFit {
         arrays::motion(py, &self.core.matrix)
     }
 
-    /// s; 1 unless it was asked for.
+    /// s; 1 unless a scale was requested.
     #[getter]
     fn scale(&self) -> f64 {
         self.core.scale
@@ -279,13 +279,13 @@ impl PyRigidFit {
     }
 }
 
-/// What moving points are brought to.
+/// What moving points are aligned with.
 enum Goal {
     Surface(Arc<Surface>),
     Points(PointTree),
 }
 
-/// Rigid motion that lays points on a surface or on points; `cmfsim.icp` says more.
+/// Rigid motion that aligns points with a surface or with points; see `cmfsim.icp` for details.
 ///
 /// `moving`: (n, 3) mm. `fixed`: a Surface or (k, 3) mm. `normals`: (n, 3), needed for `max_angle` (rad).
 #[pyfunction]
@@ -293,7 +293,7 @@ enum Goal {
     moving, fixed, *, initial, trim, method, max_iterations, tolerance, max_distance, max_angle,
     keep_border, normals
 ))]
-#[allow(clippy::too_many_arguments)] // as many as its Python caller names
+#[allow(clippy::too_many_arguments)] // one for each argument of its Python caller
 pub fn icp(
     py: Python<'_>,
     moving: &Bound<'_, PyAny>,
@@ -374,7 +374,7 @@ impl PyIcpFit {
         self.core.iterations
     }
 
-    /// Whether the points came to rest.
+    /// Whether the iteration converged.
     #[getter]
     fn converged(&self) -> bool {
         self.core.converged

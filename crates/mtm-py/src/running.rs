@@ -1,5 +1,5 @@
-//! How core calls run: without the GIL, in the thread pool of this process, and long ones on a thread
-//! of their own, so that Ctrl-C works. Whatever may work in parallel passes one of these doors.
+//! How core calls run: without the GIL, in the thread pool of this process, and long ones on a separate
+//! thread, so that Ctrl-C works. Everything that may run in parallel goes through one of these functions.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,7 +12,7 @@ use pyo3::prelude::*;
 
 use crate::errors::{self, Failure};
 
-/// How often signals are looked at while the core works.
+/// Interval at which signals are checked while the core works.
 const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
 /// Stack of the worker: factorisations recurse.
 const STACK_BYTES: usize = 16 << 20;
@@ -26,7 +26,7 @@ where
     Ok(py.detach(|| pool::run(work)).map_err(Failure)?)
 }
 
-/// The same of `work` that may fail.
+/// The same for `work` that may fail.
 pub fn attempted<T, W>(py: Python<'_>, work: W) -> PyResult<T>
 where
     T: Send,
@@ -35,10 +35,10 @@ where
     Ok(detached(py, work)?.map_err(Failure)?)
 }
 
-/// Result of `work`, run without the GIL; `work` is told through its argument when Python was interrupted.
+/// Result of `work`, run without the GIL; `work` learns from its argument whether Python was interrupted.
 ///
-/// The call returns at once on Ctrl-C. A step that cannot be stopped half-way (a numeric factorisation)
-/// ends in the background and its result is dropped.
+/// The call returns at once on Ctrl-C. A step that cannot be interrupted (a numeric factorisation)
+/// finishes in the background and its result is discarded.
 pub fn interruptible<T, W>(py: Python<'_>, work: W) -> PyResult<T>
 where
     T: Send + 'static,
@@ -51,12 +51,12 @@ where
         .name("cmfsim".into())
         .stack_size(STACK_BYTES)
         .spawn(move || {
-            // The receiver is gone after an interruption: then nobody wants the result.
+            // After an interruption the receiver no longer exists, and the result is not needed.
             let done = pool::run(|| work(&|| flag.load(Ordering::Relaxed)));
             let _ = sender.send(done.and_then(|result| result));
         })
         .map_err(|e| errors::internal(format!("no thread could be started: {e}")))?;
-    // `Receiver` is not `Sync`: it travels into the detached closure and back.
+    // `Receiver` is not `Sync`: it is moved into the detached closure and back.
     let mut receiver = receiver;
     loop {
         let (back, outcome) = py.detach(move || {

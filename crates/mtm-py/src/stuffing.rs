@@ -17,18 +17,18 @@ use crate::running::interruptible;
 
 const MESH: ErrorKind = ErrorKind::Mesh;
 
-/// Mesh of the tissue in a label image or inside a level image, and a dict of what its making says.
+/// Mesh of the tissue in a label image or inside a level image, and a dict of figures about it.
 ///
-/// `values`: (nx, ny, nz); bool or whole numbers are labels (non-zero is tissue), real numbers a level
-/// (positive inside). `spacing`, `origin`: (3,) mm. `allowed`, `needed`: (nx, ny, nz), how often the edge may
-/// be halved for what is thin there (`refinements` times if none), and how often it is at least (0 if none).
+/// `values`: (nx, ny, nz); bool or integers are labels (non-zero is tissue), real numbers a level
+/// (positive inside). `spacing`, `origin`: (3,) mm. `allowed`, `needed`: (nx, ny, nz), how many times the
+/// edge may be halved in thin places there (`refinements` if none), and how many times at least (0 if none).
 /// The dict has `dropped_parts`, `dropped_volume` (mm³),
 /// `dropped_tets`, `level_volume` (mm³), `boundary_error_mean` and `boundary_error_max` (mm).
 #[pyfunction]
 #[pyo3(signature = (
     values, spacing, edge_length, origin, *, refinements, least_body, allowed = None, needed = None
 ))]
-#[allow(clippy::too_many_arguments)] // as many as its Python caller names
+#[allow(clippy::too_many_arguments)] // one for each argument of its Python caller
 pub fn stuff_image<'py>(
     py: Python<'py>,
     values: &Bound<'py, PyAny>,
@@ -69,11 +69,10 @@ pub fn stuff_image<'py>(
     Ok((PyTetMesh::wrap(Arc::new(made.mesh)), report))
 }
 
-/// Part by which a squared distance may exceed the square of the greatest that is asked for: more than the
-/// rounding of float32.
+/// Relative margin on the square of the largest requested distance: more than the rounding of float32.
 const DISTANCE_MARGIN: f64 = 1e-6;
 
-/// Distance of every voxel centre to the nearest non-zero one, (nx, ny, nz) float32, mm; infinite without any,
+/// Distance of every voxel centre to the nearest non-zero one, (nx, ny, nz) float32, mm; infinite if there is none,
 /// and where it exceeds `within`.
 #[pyfunction]
 #[pyo3(signature = (targets, spacing, *, within=f64::INFINITY))]
@@ -111,7 +110,7 @@ pub fn signed_distance_image<'py>(
     arrays::volume(py, shape, level.into_values())
 }
 
-/// The mesh parted along an open surface, and the number of nodes doubled; (n,) tuple of mesh and count.
+/// The mesh split along an open surface, and the number of duplicated nodes; tuple of mesh and count.
 #[pyfunction]
 pub fn part_mesh(
     py: Python<'_>,

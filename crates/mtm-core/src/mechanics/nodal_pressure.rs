@@ -86,9 +86,9 @@ pub(crate) fn split(material: &TetMaterial<'_>) -> Split {
     }
 }
 
-/// Material of a tet as averaging knows it: the octaves of its bulk and shear stiffness. Strain is
-/// averaged over tets whose stiffnesses lie in the same octaves; across a jump it would let the soft side
-/// make up for the volume of the stiff one.
+/// Class of a tet's material for averaging: the octaves of its bulk and shear stiffness. Strain is averaged
+/// over tets whose stiffnesses lie in the same octaves; across a jump of stiffness, the soft side would
+/// compensate for volume changes of the stiff one.
 type Octaves = [i32; 2];
 
 fn octaves(split: &Split) -> Octaves {
@@ -100,7 +100,7 @@ fn octaves(split: &Split) -> Octaves {
     [split.bulk, shear].map(|stiffness| stiffness.log2().floor() as i32)
 }
 
-/// Tets of one material round a corner, for every corner and material.
+/// Tets of one material around a corner, for every corner and material.
 #[derive(Debug, Clone)]
 pub(crate) struct Patches {
     /// First tet of each patch; one more entry than patches.

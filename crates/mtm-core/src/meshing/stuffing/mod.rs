@@ -331,7 +331,7 @@ impl Cover {
     }
 }
 
-/// Smallest box round the voxel centres inside.
+/// Smallest box around the voxel centres inside.
 fn inside_bounds(level: &LevelImage) -> Option<([f64; 3], [f64; 3])> {
     let grid = level.grid();
     let [_, ny, nz] = grid.shape;

@@ -238,8 +238,8 @@ mod tests {
             .collect()
     }
 
-    /// A twentieth of a triangle from the surface and everywhere round it: what rounds to the right whole number
-    /// must be nearer to it than a quarter.
+    /// A twentieth of a triangle from the surface and everywhere around it: a winding number that rounds to the
+    /// right integer must be within a quarter of it.
     #[test]
     fn closed_surfaces_keep_whole_winding_numbers() {
         let long = |(vertices, triangles): Triangles| {
