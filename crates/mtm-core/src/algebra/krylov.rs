@@ -2,8 +2,8 @@
 //!
 //! At a material contrast of 1e6 a relative residual of 1e-6 can leave centimetres of error: a stiff muscle
 //! dominates the norm while the fat next to it is still wrong. The iteration here ends when the estimated
-//! errors in millimetres and in energy are both small enough, and both are confirmed with the true residual `b
-//! − A x` before a solution is returned. If the estimates are likely to miss a slow motion, [`trial`] first
+//! errors in millimetres and in energy are both small enough, and both are confirmed with the true residual
+//! `b − A x` before a solution is returned. If the estimates are likely to miss a slow motion, [`trial`] first
 //! measures them on a known solution.
 
 use rayon::prelude::*;
