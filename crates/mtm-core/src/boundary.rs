@@ -58,8 +58,8 @@ pub enum Against {
     },
 }
 
-/// Nodes that may touch a surface on which they do not slide, and separate from it again: without friction, and
-/// without force while separated.
+/// Nodes that may touch a surface other than that of a sliding node, and separate from it again: without
+/// friction, and without force while separated.
 #[derive(Debug, Clone)]
 pub struct TouchingPair {
     /// The nodes.

@@ -43,8 +43,8 @@ const MEMORY_SHARE: f64 = 0.8;
 ///     Nodes that may touch a part of the tissue's own boundary, and separate again: (k,) int, and (m, 3) int, the
 ///     nodes of boundary triangles with outward normals. They may not enter the tissue behind these; no friction.
 /// obstacles : sequence of (nodes, segment, Surface), optional
-///     Nodes that may touch bone on which they do not slide: they may not go behind the surface. The surface is
-///     given at rest with normals out of the bone, and moves with the named segment; None for bone that is fixed.
+///     Nodes that may touch bone without being sliding nodes of it: they may not go behind the surface, which is
+///     given at rest with normals out of the bone and moves with the named segment; None for fixed bone.
 /// conflicts : {"error", "resolve"}
 ///     A node of two kinds is an error, or fixed takes precedence over joined and joined over sliding.
 ///

@@ -35,7 +35,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="cmfsim",
         description="Soft tissue after cranio-maxillofacial surgery, by the mass-tensor model.",
-        epilog="Exit codes: 0 done, 1 failed, 2 bad input. Research software, not a medical device.",
+        epilog="Exit codes: 0 done, 1 failed, 2 bad input. For research, not a medical device.",
     )
     parser.add_argument("--version", action="version", version=f"cmfsim {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")

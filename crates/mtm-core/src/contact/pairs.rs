@@ -1,11 +1,11 @@
-//! Contact between surfaces that do not slide on each other: lip against lip, and each lip against the teeth of
+//! Contact of tissue with anything but its sliding surface: lip against lip, and each lip against the teeth of
 //! both jaws.
 //!
 //! A node of a pair may not enter the surface it faces; there is no friction:
 //! g(u) = φ(x + u) − min(φ at rest, 0) ≥ 0, where φ is the signed distance from the surface. The surface
-//! belongs to a bone, moved by the plan, or is a part of the boundary of the tissue itself, deformed with it. The problem is solved by the method of
-//! multipliers (Hestenes 1969, Powell 1969; for inequalities Rockafellar 1973; for contact Simo & Laursen
-//! 1992). Each round minimises
+//! belongs to a bone, moved by the plan, or is a part of the boundary of the tissue itself, deformed with it.
+//! The problem is solved by the method of multipliers (Hestenes 1969, Powell 1969; for inequalities
+//! Rockafellar 1973; for contact Simo & Laursen 1992). Each round minimises
 //!
 //! ```text
 //! E(u) + Σ ½ k (g(u) − λ/k)²     over the nodes with λ − k g > 0,
