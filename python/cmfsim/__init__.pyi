@@ -202,6 +202,9 @@ from cmfsim.values.finding import Finding as Finding
 from cmfsim.values.image_data import ImageData as ImageData
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS as SKULL_LANDMARKS
 from cmfsim.values.lip_region import LipRegion as LipRegion
+from cmfsim.values.moduli import FatModuli as FatModuli
+from cmfsim.values.moduli import MuscleModuli as MuscleModuli
+from cmfsim.values.moduli import TissueModuli as TissueModuli
 from cmfsim.values.motion import RigidMotion as RigidMotion
 from cmfsim.values.motion import decompose_motion as decompose_motion
 from cmfsim.values.motion import rigid_matrix as rigid_matrix

@@ -1,15 +1,24 @@
 """Whether the muscles of a case can be placed: its template, and the landmarks that carry it."""
 
+import difflib
 from collections.abc import Iterator
+from dataclasses import replace
 
+from cmfsim._core import PRESETS
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.errors import CmfsimError
+from cmfsim.muscles.mixing import moduli_findings
 from cmfsim.muscles.template import MuscleTemplate
 from cmfsim.muscles.template.morphing import missing_landmarks
 from cmfsim.registration import match_landmarks
+from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.finding import Finding
+from cmfsim.values.moduli import FatModuli
 
 __all__ = ["check_muscles"]
+
+# Where a case states moduli of all muscles.
+MUSCLE_KEYS = ("muscles.young_along", "muscles.young_across", "muscles.poisson")
 
 
 def check_muscles(evidence: Evidence) -> Iterator[Finding]:
@@ -29,6 +38,7 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
             fix='name a folder that "cmfsim template check" passes, or "default"',
         )
         return
+    yield from _moduli(evidence, given, template)
     if evidence.case.landmarks.proposed:
         # They are found when the case is built.
         return
@@ -54,3 +64,37 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
         return
     yield from (finding for finding in matched.findings if finding.code != "landmark-extra")
     yield from missing_landmarks(template, matched.names, evidence.case.where("landmarks.skull"))
+
+
+def _moduli(evidence: Evidence, given: CaseMuscles, template: MuscleTemplate) -> Iterator[Finding]:
+    """Moduli that the case sets: of muscles that are not there, or other than the preset's."""
+    case = evidence.case
+    names = [muscle.name for muscle in template.muscles]
+    for name in given.moduli.muscles:
+        if name not in names:
+            close = difflib.get_close_matches(name, names)
+            yield Finding.error(
+                "muscle-moduli-unknown",
+                f"moduli are given for the muscle {name!r}, which the template has not",
+                where=case.where(f"muscles.moduli.{name}"),
+                why="they would have no effect",
+                fix=f"use one of: {', '.join(close or names)}",
+            )
+    tissue = case.tissue
+    if tissue.kind == "preset" and tissue.preset not in PRESETS:
+        return  # `gather` reports it
+    place = next(
+        (k for k in ("muscles.moduli", *MUSCLE_KEYS, "tissue") if k in case.lines), "muscles"
+    )
+    try:
+        moduli = replace(given.moduli, fat=FatModuli.of(tissue))
+    except CmfsimError as error:
+        yield Finding.error(
+            "fat-moduli",
+            str(error),
+            where=case.where("tissue"),
+            why="the fat of [tissue] lies between the muscles",
+            fix="use a young (MPa) that fat can have, or leave out [tissue]",
+        )
+        return
+    yield from moduli_findings(moduli, given.preset, case.where(place))

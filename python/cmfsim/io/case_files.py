@@ -34,6 +34,7 @@ from cmfsim.values.case_parts import (
     Plane,
     Region,
 )
+from cmfsim.values.moduli import MOST_POISSON, YOUNG_RANGE, MuscleModuli, TissueModuli
 from cmfsim.values.motion import rigid_matrix, rigid_motion
 from cmfsim.values.solver_options import CONTACTS, SolverOptions
 from cmfsim.values.tissue_data import MIXINGS, TissueData
@@ -65,6 +66,8 @@ TABLES = (
     "postoperative",
     "output",
 )
+# What [muscles] and each table below [muscles.moduli] may set, as `MuscleModuli` has it.
+MODULI = ("young_along", "young_across", "poisson")
 # Points in a tet that a muscle's surface crosses.
 SAMPLES = (1, 100_000)
 # Edge lengths that make a mesh of a head, mm: below, more tets than any memory; above, no face.
@@ -109,7 +112,7 @@ class Case:
     node_kinds : mapping of str to plain values
         Options of the stage that classifies nodes.
     tissue : TissueData
-        Everywhere, in a homogeneous model.
+        Fat: everywhere in a homogeneous model, between the muscles in the others.
     muscles : CaseMuscles or None
         None leaves them out of what `cmfsim build` makes.
     solver : SolverOptions
@@ -631,7 +634,8 @@ def _tissue(table: Table) -> TissueData:
 
 def _muscles(table: Table, folder: Path) -> CaseMuscles:
     """A template's name is that of one in the package; a path leads to a folder."""
-    table.only("template", "smoothing", "preset", "mixing", "samples", "seed")
+    settings = ("template", "smoothing", "preset", "mixing", "samples", "seed")
+    table.only(*settings, *MODULI, "moduli")
     default = CaseMuscles()
     template: Path | str = table.text("template", str(default.template))
     if template != default.template:
@@ -644,7 +648,26 @@ def _muscles(table: Table, folder: Path) -> CaseMuscles:
         table.text("mixing", default.mixing, MIXINGS),
         table.whole("samples", default.samples, *SAMPLES),
         table.whole("seed", default.seed, 0, 2**63 - 1),
+        _muscle_moduli(table),
     )
+
+
+def _muscle_moduli(table: Table) -> TissueModuli:
+    """Moduli of all muscles from the table itself, of single ones from those below `moduli`."""
+    each = table.table("moduli")
+
+    def given(table: Table) -> MuscleModuli:
+        low, high = YOUNG_RANGE
+        along, across = (table.number(key, "MPa", low=low, high=high) for key in MODULI[:2])
+        poisson = table.number("poisson", above=-1.0, high=MOST_POISSON)
+        return MuscleModuli(along, across, poisson)
+
+    moduli = TissueModuli(
+        muscle=given(table), muscles={name: given(each.table(name).only(*MODULI)) for name in each}
+    )
+    with table.at("moduli" if "moduli" in table else None):
+        moduli.resolved(table.text("preset", CaseMuscles().preset, PRESETS))
+    return moduli
 
 
 def _postoperative(table: Table, folder: Path) -> CasePostoperative:

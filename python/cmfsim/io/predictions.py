@@ -40,6 +40,7 @@ from cmfsim.io.summaries import (
 )
 from cmfsim.io.surfaces import write_surface
 from cmfsim.io.vtk import write_tets, write_triangles
+from cmfsim.values.moduli import MOST_POISSON, YOUNG_RANGE
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.surface_data import SurfaceData
 
@@ -92,6 +93,8 @@ _SOLUTION = table(
     dict.fromkeys(("error_bound", "error_estimate"), optional(number(0.0, 1e12))),
 )
 _FIT = table({"rms_mm": number(0.0, 1e6), "worst_mm": number(0.0, 1e6), "share": number(0.0, 1.0)})
+_YOUNG, _POISSON = number(*YOUNG_RANGE), number(-1.0, MOST_POISSON)
+_MUSCLE = table({"young_along": _YOUNG, "young_across": _YOUNG, "poisson": _POISSON})
 _PREDICTION = table(
     {
         "case": text,
@@ -113,7 +116,20 @@ _PREDICTION = table(
         "note": text,
         "left_out": listing(text),
         "achieved": table({"segments": mapping(_FIT, most=1000)}),
-        "muscles": table({}, {"volumes": mapping(number(0.0, 1e12)), "template": text}),
+        "muscles": table(
+            {},
+            {
+                "volumes": mapping(number(0.0, 1e12)),
+                "template": text,
+                "moduli": table(
+                    {
+                        "fat": table({"young": _YOUNG, "poisson": _POISSON}),
+                        "muscle": _MUSCLE,
+                        "muscles": mapping(_MUSCLE, most=1000),
+                    }
+                ),
+            },
+        ),
         "refined": flag,
     },
 )

@@ -18,7 +18,9 @@ from cmfsim import _core
 from cmfsim._core import PRESETS, MuscleFibres, Surface, TetMesh, Tissue
 from cmfsim.checks import Floats, check_instance, check_one_of, frozen
 from cmfsim.errors import MaterialInputError, MeshError, MeshInputError
+from cmfsim.muscles.mixing import check_muscle_names, mixed_tissue, moduli_findings
 from cmfsim.values.finding import Finding
+from cmfsim.values.moduli import TissueModuli
 from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.tissue_data import MIXINGS, TissueData
@@ -88,7 +90,7 @@ class Mixture:
     findings : tuple of Finding
         Muscles that are inside out, open, outside the mesh, sheets.
     summary : mapping
-        Preset, mixing, inside test, seed, samples per crossed tet, counts of work.
+        Preset, mixing, moduli, inside test, seed, samples per crossed tet, counts of work.
     timings : mapping of str to float, s
     """
 
@@ -103,10 +105,14 @@ class Mixture:
     summary: Mapping[str, Any]
     timings: Mapping[str, float]
     shares: _core.MuscleShares
+    # The arrays of the tissue where moduli that are not the preset's are mixed one by one.
+    mixed: TissueData | None = None
 
     @cached_property
     def tissue_data(self) -> TissueData:
         """The tissue as a `Scene` takes it."""
+        if self.mixed is not None:
+            return self.mixed
         if self.summary["mixing"] == "stiffness":
             return TissueData("stiffness", stiffness=self.tissue.stiffness())
         return TissueData(
@@ -144,6 +150,7 @@ def equivalent_material(
     seed: int = 0,
     mixing: str = "moduli",
     inside: str = "winding",
+    moduli: TissueModuli | None = None,
 ) -> Mixture:
     """The tissue of every tet, fat and muscle mixed by volume.
 
@@ -174,6 +181,8 @@ def equivalent_material(
         "winding": the generalised winding number exceeds ½, right also for surfaces that overlap or
         have small holes or a few flipped triangles; "normal": the closest normal points away (the
         paper), right for closed surfaces that do not overlap themselves.
+    moduli : TissueModuli, optional
+        Moduli (MPa) of fat, of all muscles or of single ones instead of the preset's.
 
     Returns
     -------
@@ -182,7 +191,8 @@ def equivalent_material(
     Raises
     ------
     MaterialError
-        (also `ValueError`) Unknown preset, mixing or inside test; samples or seed out of range.
+        (also `ValueError`) Unknown preset, mixing or inside test; samples or seed out of range;
+        moduli for a muscle that is not there.
     MeshError
         (also `ValueError`) A muscle that is no surface, has degenerate triangles or no direction,
         with its name.
@@ -207,14 +217,21 @@ def equivalent_material(
     check_one_of("preset", preset, PRESETS, MaterialInputError)
     check_one_of("mixing", mixing, MIXINGS, MaterialInputError)
     check_one_of("inside", inside, INSIDE_TESTS, MaterialInputError)
+    given = TissueModuli() if moduli is None else moduli
+    check_instance("moduli", given, TissueModuli)
     start = time.perf_counter()
     named = _named(muscles)
+    check_muscle_names(given, list(named))
     with ThreadPoolExecutor() as pool:  # most of the work is the core's, without the GIL
         ready = list(pool.map(_ready, named, named.values()))
     surfaces_done = time.perf_counter()
     shares = _core.sample_muscles(mesh, ready, samples=samples, seed=seed, inside=inside)
     tissue_start = time.perf_counter()
-    tissue = shares.tissue(preset, mixing=mixing)
+    mixed: TissueData | None = None
+    if given.is_preset(preset):
+        tissue = shares.tissue(preset, mixing=mixing)
+    else:
+        tissue, mixed = mixed_tissue(shares, list(named), given.resolved(preset), mixing)
     end = time.perf_counter()
     columns = shares.volumes
     volumes = {
@@ -229,11 +246,15 @@ def equivalent_material(
         tissue=tissue,
         volumes=MappingProxyType(volumes),
         samples=shares.counts["points"],
-        findings=tuple(_findings(volumes, columns["was_turned"], ready)),
+        findings=(
+            *_findings(volumes, columns["was_turned"], ready),
+            *moduli_findings(given, preset),
+        ),
         summary=MappingProxyType(
             {
                 "preset": preset,
                 "mixing": mixing,
+                "moduli": given.resolved(preset).as_dict(),
                 "inside": inside,
                 "samples_per_crossed_tet": int(samples),
                 "seed": int(seed),
@@ -253,6 +274,7 @@ def equivalent_material(
             }
         ),
         shares=shares,
+        mixed=mixed,
     )
     for finding in mixture.findings:
         _log.debug("%s: %s", finding.severity, finding.what)

@@ -327,11 +327,32 @@ def _muscle_section(
     used = entry["muscles"]
     figures = Table.of_pairs(labelled(used, MUSCLES), "How the muscles were placed and sampled.")
     blocks: list[Note | Table | Figure] = [*_picture("muscles", pictures), figures]
+    blocks += _moduli(used)
     volumes = used.get("volumes")
     if isinstance(volumes, Mapping) and volumes:
         rows = tuple((name, number(v / 1000.0)) for name, v in volumes.items() if v > 0.0)
         blocks.append(Table(("muscle", "cm³"), rows, "Volume of each muscle within the tissue."))
     return [Section("Muscles", tuple(blocks))]
+
+
+def _moduli(used: Values) -> list[Note | Table | Figure]:
+    """The moduli of fat and muscle, with the muscles that have their own."""
+    moduli = used.get("moduli")
+    if not isinstance(moduli, Mapping):
+        return []  # of an earlier version
+    fat = moduli["fat"]
+    rows = [("fat", fat["young"], fat["young"], fat["poisson"])]
+    rows += [
+        (name, m["young_along"], m["young_across"], m["poisson"])
+        for name, m in {"muscle": moduli["muscle"], **moduli["muscles"]}.items()
+    ]
+    return [
+        Table(
+            ("tissue", "along fibres, MPa", "across, MPa", "Poisson's ratio"),
+            tuple((name, *(f"{value:g}" for value in values)) for name, *values in rows),
+            "Moduli of fat and muscle, before they are mixed in a tet.",
+        )
+    ]
 
 
 def _model_section(

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from cmfsim.checks import Floats, as_point, as_rows, as_text, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.values.frozen import Frozen
+from cmfsim.values.moduli import TissueModuli
 
 __all__ = [
     "DIRECTIONS",
@@ -408,6 +409,8 @@ class CaseMuscles:
     samples : int
         Points in a tet that a muscle's surface crosses.
     seed : int
+    moduli : TissueModuli
+        Of muscles, instead of the preset's; those of fat come from the case's `[tissue]`.
 
     Examples
     --------
@@ -422,6 +425,7 @@ class CaseMuscles:
     mixing: str = "moduli"
     samples: int = 64
     seed: int = 0
+    moduli: TissueModuli = field(default_factory=TissueModuli)
 
 
 @dataclass(frozen=True)

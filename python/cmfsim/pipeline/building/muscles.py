@@ -8,8 +8,10 @@ from cmfsim._core import TetMesh
 from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
 from cmfsim.muscles.equivalent import equivalent_material
+from cmfsim.muscles.mixing import MODULI_CODES
 from cmfsim.muscles.template import MuscleTemplate
 from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.moduli import FatModuli
 from cmfsim.values.patient_model import PatientModel
 
 __all__ = ["with_muscles"]
@@ -42,7 +44,9 @@ def with_muscles(
     LandmarkError
         (also `ValueError`) The patient has no skull landmarks, or they do not fit the template's.
     CaseError
-        (also `ValueError`) There is no such template.
+        (also `ValueError`) There is no such template; the patient's fat is not one fat.
+    MaterialError
+        (also `ValueError`) Moduli for a muscle that the template has not.
 
     Examples
     --------
@@ -66,6 +70,7 @@ def with_muscles(
         mixing=given.mixing,
         samples=given.samples,
         seed=given.seed,
+        moduli=replace(given.moduli, fat=FatModuli.of(patient.fat)),
     )
     timings = {
         **patient.summary.get("timings", {}),
@@ -73,9 +78,10 @@ def with_muscles(
         "sampling the muscles": time.perf_counter() - placed,
     }
     # What the doctor found already has the line of the case.
-    known = {f.code for f in patient.findings} & {"template-landmarks-missing"}
-    more = [f for f in muscles.findings if f.code not in known]
-    findings = tuple(dict.fromkeys([*patient.findings, *more, *mixture.findings]))
+    repeated = {"template-landmarks-missing", *MODULI_CODES}
+    known = {f.code for f in patient.findings} & repeated
+    more = [f for f in (*muscles.findings, *mixture.findings) if f.code not in known]
+    findings = tuple(dict.fromkeys([*patient.findings, *more]))
     summary = {
         **patient.summary,
         "timings": timings,
