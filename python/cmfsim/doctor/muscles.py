@@ -83,9 +83,8 @@ def _moduli(evidence: Evidence, given: CaseMuscles, template: MuscleTemplate) ->
     tissue = case.tissue
     if tissue.kind == "preset" and tissue.preset not in PRESETS:
         return  # `gather` reports it
-    place = next(
-        (k for k in ("muscles.moduli", *MUSCLE_KEYS, "tissue") if k in case.lines), "muscles"
-    )
+    stated = (k for k in case.lines if k in MUSCLE_KEYS or k.startswith("muscles.moduli."))
+    place = next(stated, "tissue")
     try:
         moduli = replace(given.moduli, fat=FatModuli.of(tissue))
     except CmfsimError as error:
