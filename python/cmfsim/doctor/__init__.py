@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from cmfsim.doctor.after import check_after
+from cmfsim.doctor.automatic import check_automatic
 from cmfsim.doctor.ends import check_ends
 from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.lips import check_lips
@@ -106,6 +107,7 @@ def examine(case: CaseOrPath, models: Sequence[str] | None = None) -> Examinatio
     case = as_case(case)
     evidence = gather(case)
     findings = [*evidence.findings, *check_cuts(evidence), *check_lips(evidence)]
+    findings += check_automatic(evidence)
     placement = check_placement(evidence)
     findings += placement
     findings += [*check_image(evidence), *check_surfaces(evidence)]

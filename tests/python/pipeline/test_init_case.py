@@ -275,6 +275,28 @@ def test_a_ct_that_is_not_in_hounsfield_units_is_a_question(tmp_path):
     assert "[1, -1024]" in refusal(tmp_path)
 
 
+def test_without_landmarks_a_head_gets_those_that_are_found_and_muscles(head):
+    for name in ("skull", "skin"):
+        (head / f"{name}.mrk.json").unlink()
+    init_case(head)
+    case = cmfsim.Case.load(head)
+    assert case.landmarks.proposed
+    assert case.muscles is not None
+    assert "cmfsim landmarks case.toml" in text_of(head)
+    assert [f.severity for f in cmfsim.diagnose(case) if f.code == "landmarks-automatic"] == [
+        "note"
+    ]
+
+
+def test_with_landmarks_of_the_skin_alone_muscles_wait_for_those_of_the_skull(head):
+    (head / "skull.mrk.json").unlink()
+    init_case(head)
+    case = cmfsim.Case.load(head)
+    assert case.muscles is None
+    assert not case.landmarks.proposed
+    assert "add an empty [muscles]" in re.sub(r"\s*\n# +", " ", text_of(head))
+
+
 def test_landmarks_without_a_frame_are_read_where_the_head_is(head):
     file = head / "skull.mrk.json"
     document = json.loads(file.read_text(encoding="utf-8"))

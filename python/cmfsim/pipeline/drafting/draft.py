@@ -307,9 +307,16 @@ def _surface_path(draft: _Draft, find: SurfaceFind, name: str) -> str:
 def _write_landmarks(draft: _Draft) -> None:
     text, marks = draft.text, draft.marks
     if not marks.skull and not marks.skin and not marks.questions:
-        text.lines.append("")
-        text.comment("No landmarks were found: [landmarks] skull = ..., skin = ... (.mrk.json).")
-        text.comment("Cuts by procedures and muscles are placed from those of the skull.")
+        text.table("landmarks", "no file of landmarks is there")
+        if not _shows_skull(draft):
+            text.comment("Cuts by procedures and muscles are placed from those of the skull:")
+            text.comment(
+                "skull = ..., skin = ... (.mrk.json). They are not found without a cranium."
+            )
+            return
+        text.value("automatic", "true", "they will be found on bone and skin")
+        text.comment('"cmfsim landmarks case.toml" shows them, with the error to be expected, and')
+        text.comment("writes files to correct and name here: skull = ..., skin = ... (.mrk.json).")
         return
     text.table("landmarks")
     for key in ("skull", "skin"):
@@ -324,6 +331,11 @@ def _write_landmarks(draft: _Draft) -> None:
         text.ask("frame", *marks.questions["frame"])
     elif marks.frame is not None:
         text.value("frame", quoted(marks.frame), "read so they lie in the head, and not otherwise")
+
+
+def _shows_skull(draft: _Draft) -> bool:
+    """Whether landmarks of the skull can be found: by a CT, or a cranium as a surface."""
+    return draft.by_image or "cranium" in draft.anatomy.bones
 
 
 def _landmark_path(draft: _Draft, find: LandmarkFind, key: str) -> str:
@@ -382,9 +394,11 @@ def _write_motion(text: Text, name: str, motion: DraftMotion) -> None:
 
 def _write_muscles(draft: _Draft) -> None:
     text = draft.text
-    if draft.marks.skull is None:
+    given = draft.marks.skin is not None or draft.marks.questions
+    if draft.marks.skull is None and (given or not _shows_skull(draft)):
         text.lines.append("")
-        text.comment("Muscles are placed from skull landmarks; with these, add an empty [muscles].")
+        text.comment("Muscles are placed from landmarks of the skull: name their file, and add")
+        text.comment("an empty [muscles]. Landmarks are found only where none are given.")
         return
     text.table("muscles", "the package's own template, carried over by the skull landmarks")
 

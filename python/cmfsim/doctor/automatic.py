@@ -1,0 +1,30 @@
+"""That landmarks will be found when the case is built, and what cannot be checked before."""
+
+from collections.abc import Iterator
+
+from cmfsim.doctor.evidence import Evidence
+from cmfsim.values.finding import Finding
+
+__all__ = ["check_automatic"]
+
+
+def check_automatic(evidence: Evidence) -> Iterator[Finding]:
+    """A note for a case without landmarks, with the checks that are left to the build."""
+    case = evidence.case
+    if not case.landmarks.proposed:
+        return
+    left = [
+        *(f"the cut {cut.procedure}" for cut in case.osteotomies if cut.procedure),
+        *(["the muscles"] if case.muscles is not None else []),
+        "the region that is meshed",
+    ]
+    yield Finding.note(
+        "landmarks-automatic",
+        "no landmarks are given: they are found when the case is built; not checked here: "
+        + ", ".join(left),
+        where=case.where("landmarks"),
+        why="what is placed from landmarks can be checked only once they are known, and a build "
+        "stops where they do not suffice",
+        fix='run "cmfsim landmarks case.toml" to see them with their expected errors, and name its '
+        "files under [landmarks]: the doctor then checks all of it",
+    )
