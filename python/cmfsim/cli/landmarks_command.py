@@ -5,7 +5,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +20,14 @@ from cmfsim.io.landmarks import write_landmarks
 from cmfsim.pictures import picture_landmarks
 from cmfsim.pipeline.building.inputs import read_anatomy, read_case_landmarks
 from cmfsim.pipeline.preparation import prepare
-from cmfsim.pipeline.proposing import head_surfaces, propose_landmarks, read_template_head
+from cmfsim.pipeline.proposing import BY_SHAPE, ProposedHead, proposed_head
 from cmfsim.registration.proposed import ProposedLandmarks, ProposedSite
 from cmfsim.values.finding import Finding
-from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["landmarks"]
 
 PICTURE = "landmarks.png"
 FILES = {"skull": "skull_landmarks.mrk.json", "skin": "skin_landmarks.mrk.json"}
-
-
-@dataclass(frozen=True, eq=False)
-class _Head:
-    bones: Mapping[str, SurfaceData]
-    skin: SurfaceData | None
-    findings: tuple[Finding, ...]
 
 
 def landmarks(options: argparse.Namespace) -> int:
@@ -44,19 +36,17 @@ def landmarks(options: argparse.Namespace) -> int:
     if options.output is not None:
         case = replace(case, output=options.output)
     prepare(case, {*FILES.values(), PICTURE}.__contains__)
-    templates = [*case.landmarks.templates, *(options.template or ())]
     begun = time.perf_counter()
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         anatomy, noticed = read_anatomy(case, {}, progress.stage)
-        progress.stage("drawing the surfaces")
-        head = _Head(*head_surfaces(anatomy), noticed)
         progress.stage("finding the landmarks")
-        found = propose_landmarks(
-            head.bones, head.skin, templates=[read_template_head(folder) for folder in templates]
-        )
+        head = proposed_head(case, anatomy, progress.stage, options.template or ())
+        found = head.landmarks
+        if head.anatomy is not anatomy:
+            noticed = tuple(finding for finding in noticed if finding.code != BY_SHAPE)
         progress.stage("writing the landmarks")
-        written, noticed = _write(case.output, head, found)
-    findings = (*head.findings, *found.findings, *noticed)
+        written, unwritten = _write(case.output, head)
+    findings = (*noticed, *head.findings, *found.findings, *unwritten)
     report = {
         "case": case.name,
         "output": str(case.output),
@@ -74,10 +64,9 @@ def landmarks(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _write(
-    folder: Path, head: _Head, found: ProposedLandmarks
-) -> tuple[list[str], tuple[Finding, ...]]:
+def _write(folder: Path, head: ProposedHead) -> tuple[list[str], tuple[Finding, ...]]:
     """The names of the files written, and the findings."""
+    found = head.landmarks
     folder.mkdir(parents=True, exist_ok=True)
     names, findings = [], []
     for kind, sites in (("skull", found.skull), ("skin", found.skin)):

@@ -2,18 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.phantom.average_head import average_head
-from cmfsim.registration.proposed import ProposedLandmarks, TemplateHead, landmarks_from
+from cmfsim.pipeline.building.inputs import read_anatomy
+from cmfsim.registration.proposed import (
+    ProposedLandmarks,
+    ProposedSite,
+    TemplateHead,
+    landmarks_from,
+)
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["head_surfaces", "propose_landmarks", "proposed_for_case", "read_template_head"]
+__all__ = [
+    "BY_SHAPE",
+    "ProposedHead",
+    "head_surfaces",
+    "propose_landmarks",
+    "proposed_head",
+    "read_template_head",
+]
+
+# The finding of a segmentation that separated the jaws without landmarks.
+BY_SHAPE = "jaws-parted-by-shape"
+# A site that moves by more when the jaws are separated again is doubtful, mm.
+MOVED = 5.0
 
 # What a template head keeps its surfaces in.
 SURFACE_SUFFIXES = (".ply", ".stl", ".obj", ".vtp")
@@ -93,11 +115,127 @@ def head_surfaces(anatomy: Anatomy) -> tuple[dict[str, SurfaceData], SurfaceData
     return found, skin
 
 
-def proposed_for_case(case: Case, anatomy: Anatomy) -> ProposedLandmarks:
-    """The landmarks of a case's head, with the template heads that the case names."""
+@dataclass(frozen=True, eq=False)
+class ProposedHead:
+    """A head with the landmarks that were found on it.
+
+    Attributes
+    ----------
+    anatomy : Anatomy
+        The one given, or the one with the jaws separated again.
+    bones : mapping of str to SurfaceData
+    skin : SurfaceData or None
+    landmarks : ProposedLandmarks
+    findings : tuple of Finding
+        What was noticed beyond those of anatomy and landmarks.
+    """
+
+    anatomy: Anatomy
+    bones: Mapping[str, SurfaceData]
+    skin: SurfaceData | None
+    landmarks: ProposedLandmarks
+    findings: tuple[Finding, ...] = ()
+
+
+def proposed_head(
+    case: Case,
+    anatomy: Anatomy,
+    stage: Callable[[str], None],
+    templates: Sequence[Path] = (),
+    *,
+    is_read: bool = True,
+) -> ProposedHead:
+    """The landmarks of a case's head, with its jaws separated by them where shape alone did it.
+
+    Where a CT's jaws were separated by shape, the landmarks that do not rest on that separate them
+    once more, and all are found again: a site that this moves is doubtful. If the second jaw is
+    worse, the first one stays.
+
+    Parameters
+    ----------
+    case : Case
+    anatomy : Anatomy
+    stage : callable
+        Called with the name of each stage.
+    templates : sequence of Path, optional
+        Folders of template heads besides those that the case names.
+    is_read : bool
+        Whether the anatomy is what `read_anatomy` makes of the case: any other keeps its jaws.
+    """
+    heads = [read_template_head(folder) for folder in (*case.landmarks.templates, *templates)]
+    first = _proposed(anatomy, heads)
+    by_shape = any(finding.code == BY_SHAPE for finding in anatomy.findings)
+    if case.image is None or not (is_read and by_shape and first.landmarks.separation):
+        return first
+    stage("separating the jaws by the landmarks found")
+    again, _ = read_anatomy(case, first.landmarks.separation, stage)
+    stage("finding the landmarks again")
+    second = _proposed(again, heads)
+    if "mandible" not in again.bones or _is_worse(second.landmarks, first.landmarks):
+        return replace(first, findings=(_not_separated_again(),))
+    apart = _apart(first.landmarks.skull, second.landmarks.skull)
+    sites = _with_moves(second.landmarks.skull, apart)
+    found = replace(second.landmarks, skull=sites)
+    return replace(second, landmarks=found, findings=(_separated_again(apart),))
+
+
+def _proposed(anatomy: Anatomy, heads: Sequence[TemplateHead]) -> ProposedHead:
     bones, skin = head_surfaces(anatomy)
-    templates = [read_template_head(folder) for folder in case.landmarks.templates]
-    return propose_landmarks(bones, skin, templates=templates)
+    return ProposedHead(anatomy, bones, skin, propose_landmarks(bones, skin, templates=heads))
+
+
+def _is_worse(second: ProposedLandmarks, first: ProposedLandmarks) -> bool:
+    if bool(second.impossible_jaw) != bool(first.impossible_jaw):
+        return bool(second.impossible_jaw)
+    return bool(second.doubtful_jaw) and not first.doubtful_jaw
+
+
+def _apart(
+    first: Mapping[str, ProposedSite], second: Mapping[str, ProposedSite]
+) -> dict[str, float]:
+    return {
+        name: float(np.linalg.norm(site.point - first[name].point))
+        for name, site in second.items()
+        if name in first
+    }
+
+
+def _with_moves(
+    sites: Mapping[str, ProposedSite], apart: Mapping[str, float]
+) -> dict[str, ProposedSite]:
+    """The sites, those doubtful that the second separation of the jaws has moved."""
+    result = dict(sites)
+    for name, moved in apart.items():
+        if moved > MOVED:
+            site = sites[name]
+            reason = f"it moved by {moved:.1f} mm when the jaws were separated by landmarks"
+            doubt = "; ".join(filter(None, (site.doubt, reason)))
+            result[name] = replace(site, error=max(site.error, 0.5 * moved), doubt=doubt)
+    return result
+
+
+def _separated_again(apart: Mapping[str, float]) -> Finding:
+    name = max(apart, key=lambda site: apart[site])
+    return Finding.note(
+        "jaws-separated-again",
+        "the mandible was told from the skull by shape, and again by the landmarks found: they "
+        f"moved by {np.mean(list(apart.values())):.1f} mm on average, {apart[name]:.1f} mm at most "
+        f"({name})",
+        where="bone",
+        why="shape alone leaves the cut between the tooth rows some millimetres off",
+        fix="give skull landmarks placed by hand where a millimetre counts",
+    )
+
+
+def _not_separated_again() -> Finding:
+    return Finding.warning(
+        "jaws-not-separated-again",
+        "the landmarks found separate the jaws worse than their shape does: they do not agree",
+        where="bone",
+        why="the cut between the tooth rows may be some millimetres off, and with it the landmarks "
+        "of teeth and jaw",
+        fix="place the landmarks of the skull by hand and name the file under [landmarks]",
+    )
 
 
 def read_template_head(folder: Path) -> TemplateHead:

@@ -204,7 +204,7 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         stages.add(noticed)
     proposed = None
     if case.landmarks.proposed and not landmarks:
-        proposed = found_landmarks(case, anatomy, stages)
+        proposed, anatomy = found_landmarks(case, anatomy, stages, is_read=options.anatomy is None)
         landmarks = {} if proposed is None else proposed.points
     head = _Head(case, landmarks, anatomy, proposed)
     bones, procedures = _bones(head, stages, options.after)

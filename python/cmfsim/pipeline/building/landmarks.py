@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from cmfsim.errors import LandmarkError
+from cmfsim.errors import LandmarkError, LandmarkInputError
 from cmfsim.io import Case
 from cmfsim.pipeline.building.stages import Stages
 from cmfsim.registration.proposed import ProposedLandmarks
@@ -12,17 +12,33 @@ from cmfsim.values.finding import Finding
 __all__ = ["found_landmarks", "landmark_summary"]
 
 
-def found_landmarks(case: Case, anatomy: Anatomy, stages: Stages) -> ProposedLandmarks | None:
-    """The landmarks found on a head, with findings; None, with a warning, where it shows no face.
+def found_landmarks(
+    case: Case, anatomy: Anatomy, stages: Stages, *, is_read: bool
+) -> tuple[ProposedLandmarks | None, Anatomy]:
+    """The landmarks found on a head, and the head, of which the jaws may be separated by them.
 
-    What cannot do without landmarks (muscles, standard procedures) is refused where it is reached.
+    None, with a warning, where it shows no face: what cannot do without landmarks (muscles,
+    standard procedures) is refused where it is reached.
+
+    Parameters
+    ----------
+    case : Case
+    anatomy : Anatomy
+    stages : Stages
+    is_read : bool
+        Whether the anatomy was made of the case's own files: the jaws of another one stay.
+
+    Raises
+    ------
+    LandmarkError
+        (also `ValueError`) What was taken for the mandible in the image cannot be one.
     """
     # A case with landmarks loads nothing of the synthetic heads that others are compared with.
-    from cmfsim.pipeline.proposing import proposed_for_case  # noqa: PLC0415
+    from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head  # noqa: PLC0415
 
     stages.begin("finding the landmarks")
     try:
-        found = proposed_for_case(case, anatomy)
+        head = proposed_head(case, anatomy, stages.begin, is_read=is_read)
     except LandmarkError as error:
         stages.add(
             [
@@ -36,9 +52,20 @@ def found_landmarks(case: Case, anatomy: Anatomy, stages: Stages) -> ProposedLan
                 )
             ]
         )
-        return None
+        return None, anatomy
+    found = head.landmarks
+    if found.impossible_jaw and case.image is not None:
+        raise LandmarkInputError(
+            f"{case.where('image.file')}: the jaws of the image could not be separated: what was "
+            f"taken for the mandible is none: {found.impossible_jaw}. Place the landmarks of the "
+            "skull by hand (menton, gonion, supradentale, infradentale, occlusal_line, ...) and "
+            "name the file under [landmarks], or give surfaces of both bones"
+        )
+    if head.anatomy is not anatomy:
+        stages.drop({BY_SHAPE})
+    stages.add(head.findings)
     stages.add(found.findings)
-    return found
+    return found, head.anatomy
 
 
 def landmark_summary(found: ProposedLandmarks) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 from cmfsim.checks import Floats
 from cmfsim.registration.reference import REFERENCE_PLACES
 
-__all__ = ["JAW_SITES", "misfits"]
+__all__ = ["FAR_JAW", "JAW_SITES", "jaw_distance", "misfits"]
 
 # Sites of the lower jaw.
 JAW_SITES = (
@@ -45,6 +45,20 @@ def misfits(skull: Mapping[str, Floats], skin: Mapping[str, Floats]) -> dict[str
             return {"skull": {**found, **away}, "skin": _own(skin, "skin")}
     found.update(_own(lower, "skull"))
     return {"skull": found, "skin": _own(skin, "skin")}
+
+
+def jaw_distance(skull: Mapping[str, Floats]) -> float:
+    """How far the sites of a jaw lie from where the cranium puts those of a closed mouth.
+
+    The median, average-head mm; 0 where too few sites are known.
+    """
+    upper = {n: p for n, p in skull.items() if not n.startswith(JAW_SITES)}
+    lower = {n: p for n, p in skull.items() if n.startswith(JAW_SITES)}
+    of_cranium = _fit(upper, REFERENCE_PLACES["skull"])
+    if of_cranium is None or not lower:
+        return 0.0
+    away = _distances(lower, REFERENCE_PLACES["skull"], of_cranium)
+    return float(np.median(list(away.values())))
 
 
 Similarity = tuple[Floats, Floats, float]

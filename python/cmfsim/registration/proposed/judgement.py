@@ -1,7 +1,7 @@
 """How far a proposed landmark may be off, what speaks against it, and what the image leaves out."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
@@ -64,10 +64,18 @@ SUPPORT: Mapping[str, str] = MappingProxyType(
 
 @dataclass(frozen=True)
 class MissingSites:
-    """Sites that were not found, with the reason."""
+    """Sites that were not found, with the reason.
+
+    Attributes
+    ----------
+    skull, skin : mapping of str to str
+    misfits : mapping of str to float, mm
+        Sites of the skull that were found, but where the others of no average head put them.
+    """
 
     skull: Mapping[str, str]
     skin: Mapping[str, str]
+    misfits: Mapping[str, float] = field(default_factory=dict)
 
 
 def missing_sites(
@@ -104,7 +112,8 @@ def missing_sites(
         elif SUPPORT.get(name) in gone:
             lost[name] = gone[SUPPORT[name]]
     _impossible(off["skin"], lost)
-    return MissingSites(gone, lost)
+    strange = {name: size for name, size in off["skull"].items() if size > IMPOSSIBLE}
+    return MissingSites(gone, lost, strange)
 
 
 def _own(points: Mapping[str, Floats], pose: Pose) -> dict[str, Floats]:

@@ -11,6 +11,12 @@ from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
 from cmfsim.registration.proposed.detection import Detected, biases, detect, is_lower, joined
 from cmfsim.registration.proposed.groups import JAW_SITES
+from cmfsim.registration.proposed.jaw_evidence import (
+    JawEvidence,
+    jaw_evidence,
+    separation_points,
+    weakened,
+)
 from cmfsim.registration.proposed.judgement import judged, missing_sites
 from cmfsim.registration.proposed.limits import cut_planes
 from cmfsim.registration.proposed.pose import (
@@ -97,13 +103,22 @@ def landmarks_from(
     )
     cuts = cut_planes([*([] if skin is None else [skin]), parts.upper])
     gone = missing_sites(placed, on_skin, cuts, pose, has_jaw=parts.lower is not None)
+    evidence = JawEvidence("", ())
+    if parts.lower is not None:
+        edges = {name: place for name, place in found.skull.items() if name.startswith("_")}
+        strange = {n: size for n, size in gone.misfits.items() if n.startswith(JAW_SITES)}
+        evidence = jaw_evidence({**skull, **edges}, parts.lower, pose, strange)
     placed = {name: placed[name] for name in SKULL_LANDMARKS if name in placed.keys() - gone.skull}
     on_skin = {name: on_skin[name] for name in SKIN_LANDMARKS if name in on_skin.keys() - gone.skin}
+    sites = judged("skull", placed, pose, max(likeness))
     return ProposedLandmarks(
-        judged("skull", placed, pose, max(likeness)),
+        weakened(sites, evidence, pose.size),
         judged("skin", on_skin, pose, max(likeness)),
         gone.skull,
         gone.skin if skin is not None else dict.fromkeys(SKIN_LANDMARKS, "no skin is given"),
+        evidence.impossible,
+        evidence.reason,
+        separation_points(sites, pose),
     )
 
 

@@ -40,15 +40,24 @@ class ProposedLandmarks:
         are absent.
     missing_skull, missing_skin : mapping of str to str
         The sites that were not found, with the reason.
+    impossible_jaw : str
+        Why what is taken for the mandible cannot be one; empty where it can.
+    doubtful_jaw : str
+        All that speaks against it, doubts included; empty where nothing does.
+    separation : mapping of str to (3,) float64, mm
+        What the jaws of an image can be separated by again; empty where that is not known.
     """
 
     skull: Mapping[str, ProposedSite]
     skin: Mapping[str, ProposedSite]
     missing_skull: Mapping[str, str] = field(default_factory=dict)
     missing_skin: Mapping[str, str] = field(default_factory=dict)
+    impossible_jaw: str = ""
+    doubtful_jaw: str = ""
+    separation: Mapping[str, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("skull", "skin", "missing_skull", "missing_skin"):
+        for name in ("skull", "skin", "missing_skull", "missing_skin", "separation"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
     @property
@@ -78,6 +87,16 @@ class ProposedLandmarks:
             fix='"cmfsim landmarks case.toml" writes them with a picture: check them in 3D Slicer '
             "and name the files under [landmarks]",
         )
+        if self.doubtful_jaw:
+            verdict = "is none" if self.impossible_jaw else "is doubtful"
+            yield Finding.warning(
+                "jaw-impossible" if self.impossible_jaw else "jaw-doubtful",
+                f"what was taken for the mandible {verdict}: {self.doubtful_jaw}",
+                where="landmarks.skull",
+                why="landmarks of jaws and teeth lie on it, and segments are cut from it",
+                fix="place the landmarks of the skull by hand and name the file under [landmarks]: "
+                "the jaws are then separated by them",
+            )
         for kind, sites in (("skull", self.skull), ("skin", self.skin)):
             for name, site in sites.items():
                 if site.doubt:

@@ -1,0 +1,191 @@
+"""What the sites of jaws and tooth rows rest on: whether the lower jaw can be what is taken for it.
+
+A mandible that was told from the skull by shape alone may hold a part of the maxilla, or be the
+maxilla. Its sites are then found where they are not, each with its usual error: what gives this
+away is looked for here.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cmfsim.checks import Floats
+from cmfsim.registration.proposed.groups import FAR_JAW, jaw_distance
+from cmfsim.registration.proposed.pose import Pose
+from cmfsim.registration.proposed.proposed_landmarks import ProposedSite
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = ["JawEvidence", "jaw_evidence", "separation_points", "weakened"]
+
+# How far the plane of the tooth rows rises to the back against the Frankfort plane, degrees: Downs
+# (1948) measured 1.5 to 14 with a mean of 9.3; synthetic heads have −2.5, the two real ones 6 to 9.
+# A row of which the back belongs to the other jaw has 14 and more.
+RISE = (-5.0, 13.5)
+# The rise that is expected where the rows show none that can be trusted, degrees.
+USUAL_RISE = 7.0
+# Incisors of an open mouth are so far apart that the molars tell little of each other, and no
+# mouth opens farther; lower ones stand above the edge of upper ones by this much in a deep bite at
+# most, average-head mm.
+WIDE, WIDEST, DEEPEST_BITE = 12.0, 50.0, 9.0
+# Volumes of mandibles, filled, cm³ of the average head: those of two real heads and synthetic ones
+# are 53 to 82, that of one cut off at the chin 38. Outside the first range it is doubtful, outside
+# the second it is none.
+VOLUMES, POSSIBLE_VOLUMES = (33.0, 100.0), (15.0, 140.0)
+# Error that sites are expected to have on such a jaw, mm of the average head: those of the molars
+# and the ramus were off by up to 10 mm, the others by up to 4.
+WEAK_ERROR, WEAK_FRONT_ERROR = 10.0, 5.0
+BACK_SITES = ("sub_m2", "supra_m2", "occlusal_line", "gonion")
+FRONT_SITES = ("infradentale", "supradentale", "mid_philtrum", "supramentale", "pogonion", "menton")
+# The end of the tooth rows beside and behind the incisors, average-head mm.
+ROW_SIDE, ROW_BACK = 50.0, 52.0
+
+
+@dataclass(frozen=True)
+class JawEvidence:
+    """What speaks against the jaw of a head.
+
+    Attributes
+    ----------
+    impossible : str
+        Why it cannot be a lower jaw; empty where it can.
+    doubts : tuple of str
+        Why its sites, and those of the upper tooth row, may be wrong.
+    """
+
+    impossible: str
+    doubts: tuple[str, ...]
+
+    @property
+    def reason(self) -> str:
+        """All that speaks against it; empty where nothing does."""
+        return "; ".join(filter(None, (self.impossible, *self.doubts)))
+
+
+def jaw_evidence(
+    sites: Mapping[str, Floats],
+    lower: SurfaceData,
+    pose: Pose,
+    left_out: Mapping[str, float],
+) -> JawEvidence:
+    """What speaks against a jaw.
+
+    Parameters
+    ----------
+    sites : mapping of str to (3,) float64
+        Of the skull, in the frame and size of the average head, with the edges of the incisors as
+        "_upper_edge" and "_lower_edge".
+    lower : SurfaceData
+        The mandible, mm.
+    pose : Pose
+    left_out : mapping of str to float
+        Sites of the jaw that do not fit the others, with how far they are off, average-head mm.
+    """
+    volume = _volume(lower) / pose.size**3
+    impossible = "; ".join(_impossible(sites, volume, pose.size))
+    return JawEvidence(impossible, tuple(_doubts(sites, volume, pose.size, left_out)))
+
+
+def _impossible(sites: Mapping[str, Floats], volume: float, size: float) -> Iterator[str]:
+    distance = jaw_distance({n: p for n, p in sites.items() if not n.startswith("_")})
+    if distance > FAR_JAW:
+        yield (
+            f"its sites lie {size * distance:.0f} mm from those of a closed mouth (up to "
+            f"{size * FAR_JAW:.0f} mm for an open one)"
+        )
+    opening = _opening(sites)
+    if opening < -DEEPEST_BITE:
+        yield f"its incisors stand {-size * opening:.0f} mm above the edge of the upper ones"
+    elif opening > WIDEST:
+        yield f"its incisors stand {size * opening:.0f} mm below the upper ones"
+    low, high = POSSIBLE_VOLUMES
+    if not low <= volume <= high:
+        yield (
+            f"it has {size**3 * volume:.0f} cm³ ({size**3 * low:.0f} to {size**3 * high:.0f} cm³ "
+            "in a cranium of this size)"
+        )
+
+
+def _doubts(
+    sites: Mapping[str, Floats], volume: float, size: float, left_out: Mapping[str, float]
+) -> Iterator[str]:
+    rise = _rise(sites)
+    if rise is not None and not RISE[0] <= rise <= RISE[1]:
+        yield (
+            f"the tooth rows rise by {rise:.0f}° to the back against the Frankfort plane "
+            f"({RISE[0]:g}° to {RISE[1]:g}° expected)"
+        )
+    opening = _opening(sites)
+    if opening > WIDE:
+        yield f"the tooth rows are {size * opening:.0f} mm apart at the incisors"
+    low, high = VOLUMES
+    if not low <= volume <= high:
+        yield (
+            f"the mandible has {size**3 * volume:.0f} cm³ ({size**3 * low:.0f} to "
+            f"{size**3 * high:.0f} cm³ expected with a cranium of this size)"
+        )
+    if left_out:
+        worst = max(left_out, key=lambda name: left_out[name])
+        yield (
+            f"sites of the jaw do not fit one another ({worst} by {size * left_out[worst]:.0f} mm)"
+        )
+
+
+def _opening(sites: Mapping[str, Floats]) -> float:
+    """How far the lower incisors stand below the upper ones; 0 where one of them is unknown."""
+    upper, lower = sites.get("_upper_edge"), sites.get("_lower_edge")
+    return 0.0 if upper is None or lower is None else float(upper[2] - lower[2])
+
+
+def _rise(sites: Mapping[str, Floats]) -> float | None:
+    """The angle of the tooth rows to the horizontal of a levelled head, degrees.
+
+    The average head lies in its Frankfort plane to within 1°.
+    """
+    ends = [sites[n] for n in ("occlusal_line_L", "occlusal_line_R") if n in sites]
+    if not ends or not {"supradentale", "infradentale"} <= sites.keys():
+        return None
+    along = np.mean(ends, axis=0) - 0.5 * (sites["supradentale"] + sites["infradentale"])
+    return float(np.degrees(np.arctan2(along[2], along[1])))
+
+
+def _volume(surface: SurfaceData) -> float:
+    """The volume that a surface encloses, cm³."""
+    points = np.asarray(surface.vertices)
+    corners = (points - points.mean(axis=0))[np.asarray(surface.triangles).astype(np.int64)]
+    sixfold = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    return abs(float(sixfold)) / 6000.0
+
+
+def weakened(
+    sites: Mapping[str, ProposedSite], evidence: JawEvidence, size: float
+) -> dict[str, ProposedSite]:
+    """The sites of the skull, doubtful and with a large error where they rest on weak evidence."""
+    if not evidence.reason:
+        return dict(sites)
+    result = {}
+    for name, site in sites.items():
+        least = WEAK_ERROR if name.startswith(BACK_SITES) else WEAK_FRONT_ERROR
+        if name.startswith((*BACK_SITES, *FRONT_SITES)):
+            doubt = "; ".join(filter(None, (site.doubt, f"its jaw: {evidence.reason}")))
+            site = replace(site, error=max(site.error, size * least), doubt=doubt)  # noqa: PLW2901
+        result[name] = site
+    return result
+
+
+def separation_points(sites: Mapping[str, ProposedSite], pose: Pose) -> dict[str, Floats]:
+    """What jaws can be separated by again: sites that do not rest on how they were the first time.
+
+    Sites of cranium, incisors and chin, and the ends of the tooth rows where the cranium's pose and
+    the incisors put them. Empty where the incisors are not known.
+    """
+    points = {n: s.point for n, s in sites.items() if not n.startswith(BACK_SITES)}
+    if not {"supradentale", "infradentale"} <= points.keys():
+        return {}
+    middle = 0.5 * (points["supradentale"] + points["infradentale"])
+    across, back, height = pose.into(middle[None])[0] / pose.size
+    rise = ROW_BACK * float(np.tan(np.radians(USUAL_RISE)))
+    for letter, side in (("L", 1.0), ("R", -1.0)):
+        end = np.array([across + side * ROW_SIDE, back + ROW_BACK, height + rise])
+        points[f"occlusal_line_{letter}"] = pose.out(pose.size * end[None])[0]
+    return points

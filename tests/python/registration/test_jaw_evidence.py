@@ -1,0 +1,108 @@
+"""Jaws that were taken for what they are not: their sites are doubtful, and a build stops."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import cmfsim
+from cmfsim.phantom.average_head import average_head
+from cmfsim.pipeline.building.inputs import read_anatomy
+from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head
+
+pytest.importorskip("scipy")
+
+BACK = ("sub_m2", "supra_m2", "occlusal_line", "gonion")
+CASE = """format = "cmfsim-case"
+version = 1
+name = "head"
+
+[image]
+file = "ct.nrrd"
+
+[mesh]
+edge_length = 8.0
+
+[plan.mandible]
+translation = [0, -4, 0]
+"""
+
+
+def proposed(change):
+    """The landmarks of the average head with another mandible: its vertices, mm, are changed."""
+    head = average_head()
+    jaw = head.bones["mandible"]
+    vertices = change(np.array(jaw.vertices, dtype=float))
+    return cmfsim.propose_landmarks(
+        {**head.bones, "mandible": dataclasses.replace(jaw, vertices=vertices)}
+    )
+
+
+def raised_behind(points):
+    """The tooth row rises to the back, as where a part of the maxilla belongs to the mandible."""
+    rise = 22.0 * np.clip((points[:, 1] + 85.0) / 35.0, 0.0, 1.0)
+    return points + np.where(points[:, 2] > -64.0, rise, 0.0)[:, None] * [0.0, 0.0, 1.0]
+
+
+def test_nothing_speaks_against_the_jaw_of_a_sound_head():
+    found = proposed(lambda points: points)
+    assert not found.impossible_jaw
+    assert not found.doubtful_jaw
+    assert not any(site.doubt for site in found.skull.values())
+
+
+def test_tooth_rows_that_rise_too_steeply_make_their_sites_doubtful():
+    found = proposed(raised_behind)
+    assert "Frankfort" in found.doubtful_jaw
+    assert not found.impossible_jaw
+    back = {name: site for name, site in found.skull.items() if name.startswith(BACK)}
+    assert {"occlusal_line_L", "sub_m2_R"} <= set(back)
+    for name, site in back.items():
+        assert site.error >= 9.0, name
+        assert "jaw" in site.doubt, name
+    assert found.skull["infradentale"].error >= 4.5
+    assert not found.skull["nasion"].doubt
+    assert [f.severity for f in found.findings if f.code == "jaw-doubtful"] == ["warning"]
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda points: points + [0.0, 0.0, 40.0], "above the edge of the upper ones"),
+        (lambda points: points - [0.0, 0.0, 60.0], "below the upper ones"),
+        (lambda points: (points - points.mean(axis=0)) * 0.45 + points.mean(axis=0), "cm³"),
+    ],
+)
+def test_a_jaw_that_cannot_be_one_is_named_so(change, why):
+    found = proposed(change)
+    assert why in found.impossible_jaw
+    assert [f.severity for f in found.findings if f.code == "jaw-impossible"] == ["warning"]
+
+
+def test_a_build_stops_where_the_maxilla_was_taken_for_the_mandible(tmp_path):
+    pytest.importorskip("SimpleITK")
+    pytest.importorskip("skimage")
+    child = cmfsim.make_head(cmfsim.HeadParameters(scale=0.85, lip_gap=8.0, bite_gap=6.0))
+    cmfsim.write_image(child.ct(3.0), tmp_path / "ct.nrrd")
+    (tmp_path / "case.toml").write_text(CASE, encoding="utf-8")
+    with pytest.raises(cmfsim.LandmarkError, match=r"mandible is none.*by hand"):
+        cmfsim.build_case(tmp_path / "case.toml")
+
+
+def test_jaws_separated_by_shape_are_separated_again_by_the_landmarks_found(tmp_path):
+    pytest.importorskip("SimpleITK")
+    pytest.importorskip("skimage")
+    head = cmfsim.make_head()
+    cmfsim.write_image(head.ct(2.5), tmp_path / "ct.nrrd")
+    (tmp_path / "case.toml").write_text(CASE, encoding="utf-8")
+    case = cmfsim.Case.load(tmp_path)
+    anatomy, _ = read_anatomy(case, {}, lambda _: None)
+    assert BY_SHAPE in [f.code for f in anatomy.findings]
+    found = proposed_head(case, anatomy, lambda _: None)
+    assert [f.code for f in found.findings] == ["jaws-separated-again"]
+    assert BY_SHAPE not in [f.code for f in found.anatomy.findings]
+    for name in ("sub_m2_L", "supra_m2_R", "gonion_L", "menton"):
+        site = found.landmarks.skull[name]
+        assert np.linalg.norm(site.point - head.skull_landmarks[name]) < 5.0, name
+    kept = proposed_head(case, anatomy, lambda _: None, is_read=False)
+    assert kept.anatomy is anatomy
