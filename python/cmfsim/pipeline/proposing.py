@@ -35,7 +35,7 @@ __all__ = [
 # The finding of a segmentation that separated the jaws without landmarks.
 BY_SHAPE = "jaws-parted-by-shape"
 # A site that moves by more when the jaws are separated again is doubtful, mm.
-MOVED = 5.0
+MOVED = 3.5
 
 # What a template head keeps its surfaces in.
 SURFACE_SUFFIXES = (".ply", ".stl", ".obj", ".vtp")
@@ -210,7 +210,7 @@ def _with_moves(
             site = sites[name]
             reason = f"it moved by {moved:.1f} mm when the jaws were separated by landmarks"
             doubt = "; ".join(filter(None, (site.doubt, reason)))
-            result[name] = replace(site, error=max(site.error, 0.5 * moved), doubt=doubt)
+            result[name] = replace(site, error=max(site.error, moved), doubt=doubt)
     return result
 
 
