@@ -147,9 +147,9 @@ def proposed_head(
 ) -> ProposedHead:
     """The landmarks of a case's head, with its jaws separated by them where shape alone did it.
 
-    Where a CT's jaws were separated by shape, the landmarks that do not rest on that separate them
-    once more, and all are found again: a site that this moves is doubtful. If the second jaw is
-    worse, the first one stays.
+    Where a CT's jaws were separated by shape and the lower one is doubtful, the landmarks that do
+    not rest on that separate them once more, and all are found again: a site that this moves is
+    doubtful. If the second jaw is worse, the first one stays.
 
     Parameters
     ----------
@@ -164,19 +164,20 @@ def proposed_head(
     """
     heads = [read_template_head(folder) for folder in (*case.landmarks.templates, *templates)]
     first = _proposed(anatomy, heads)
+    found = first.landmarks
     by_shape = any(finding.code == BY_SHAPE for finding in anatomy.findings)
-    if case.image is None or not (is_read and by_shape and first.landmarks.separation):
+    is_doubtful = bool(found.doubtful_jaw or found.impossible_jaw)
+    if case.image is None or not (is_read and by_shape and is_doubtful and found.separation):
         return first
     stage("separating the jaws by the landmarks found")
-    again, _ = read_anatomy(case, first.landmarks.separation, stage)
+    again, _ = read_anatomy(case, found.separation, stage)
     stage("finding the landmarks again")
     second = _proposed(again, heads)
-    if "mandible" not in again.bones or _is_worse(second.landmarks, first.landmarks):
+    if "mandible" not in again.bones or _is_worse(second.landmarks, found):
         return replace(first, findings=(_not_separated_again(),))
-    apart = _apart(first.landmarks.skull, second.landmarks.skull)
-    sites = _with_moves(second.landmarks.skull, apart)
-    found = replace(second.landmarks, skull=sites)
-    return replace(second, landmarks=found, findings=(_separated_again(apart),))
+    apart = _apart(found.skull, second.landmarks.skull)
+    moved = replace(second.landmarks, skull=_with_moves(second.landmarks.skull, apart))
+    return replace(second, landmarks=moved, findings=(_separated_again(apart),))
 
 
 def _proposed(anatomy: Anatomy, heads: Sequence[TemplateHead]) -> ProposedHead:

@@ -89,7 +89,7 @@ def test_a_build_stops_where_the_maxilla_was_taken_for_the_mandible(tmp_path):
         cmfsim.build_case(tmp_path / "case.toml")
 
 
-def test_jaws_separated_by_shape_are_separated_again_by_the_landmarks_found(tmp_path):
+def test_doubtful_jaws_are_separated_again_by_the_landmarks_found(tmp_path, monkeypatch):
     pytest.importorskip("SimpleITK")
     pytest.importorskip("skimage")
     head = cmfsim.make_head()
@@ -98,6 +98,11 @@ def test_jaws_separated_by_shape_are_separated_again_by_the_landmarks_found(tmp_
     case = cmfsim.Case.load(tmp_path)
     anatomy, _ = read_anatomy(case, {}, lambda _: None)
     assert BY_SHAPE in [f.code for f in anatomy.findings]
+    good = proposed_head(case, anatomy, lambda _: None)
+    assert good.anatomy is anatomy
+    assert good.findings == ()
+    # Tooth rows that rise as these do count as doubtful.
+    monkeypatch.setattr("cmfsim.registration.proposed.jaw_evidence.RISE", (30.0, 40.0))
     found = proposed_head(case, anatomy, lambda _: None)
     assert [f.code for f in found.findings] == ["jaws-separated-again"]
     assert BY_SHAPE not in [f.code for f in found.anatomy.findings]
