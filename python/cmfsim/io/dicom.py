@@ -1,24 +1,13 @@
-"""A CT from a folder of DICOM files, or a file of several frames, by what each slice states.
+"""A CT from a folder of DICOM files, or a file of several frames: which series is meant."""
 
-The order of slices, their distances and their shifts come from the position and orientation of each
-slice, never from file names, instance numbers or a reader's sorting.
-"""
-
-import itertools
-import math
-from collections import Counter
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
-from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
-from cmfsim.io.dicom_headers import DicomHeader, dicom_header, numbers_of
-from cmfsim.io.image_grids import aligned, of_slices, turn_of, upright
+from cmfsim.io.dicom_headers import DicomHeader, dicom_header
+from cmfsim.io.dicom_stack import counted, is_localizer, listed, slices_of, volume_of
 from cmfsim.io.image_headers import check_shape
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
@@ -31,61 +20,8 @@ MOST_FILES = 20_000
 LEAST_VOLUME = 10
 # The largest series is meant where no other has more than this part of its slices.
 CLEARLY_LARGEST = 0.5
-# Slices of another orientation than the rest, up to this many, are scouts.
-MOST_SCOUTS = 3
-# Direction cosines of parallel slices agree up to this.
-PARALLEL = 1e-3
-# Two slices this near are at one place, mm: positions are often written to a tenth.
-ONE_PLACE = 0.02
-# Positions off an even, straight row by less than this are so by rounding, mm.
-ROUNDED = 0.06
-# Slices between these parts of the usual distance are resampled; others are missing or too many.
-LEAST_STEP, MOST_STEP = 0.5, 1.5
-# A step this near to a multiple of the usual one, as a part of it, is that of missing slices.
-MULTIPLE = 0.1
-# Largest error of the skin between tilted slices over their distance: 0.18 and 0.44 mm on a head
-# phantom's CT, written as tilted slices 1 and 2 mm apart.
-SKIN_SHARE = 0.22
-# Tilts that the geometry shows and that the header states differ by less than this, degrees.
-TILTS_AGREE = 1.0
-# Voxels farther apart than this lose thin bone, lips and lids, mm.
-COARSE_SLICES = 2.5
-# Position and spacing as the pixel reader finds them agree with the header's to this, mm.
-READERS_AGREE = 0.01
-# Kinds of value that say HU, or nothing.
-UNSTATED_SCALES = frozenset({"", "HU", "US"})
 # What a DICOMDIR is.
 DIRECTORY = "1.2.840.10008.1.3.10"
-
-
-@dataclass(frozen=True)
-class Slice:
-    """One slice: where it lies, and the file and frame of its pixels."""
-
-    header: DicomHeader
-    frame: int
-    tags: Mapping[str, str | int]
-
-    @property
-    def name(self) -> str:
-        """The file's name, and the frame's number where it has several."""
-        frames = len(self.header.frames)
-        return self.header.path.name + (f" frame {self.frame + 1}" if frames else "")
-
-    def text(self, key: str) -> str:
-        """A value of the frame, or of its file."""
-        return str(self.tags.get(key, self.header.text(key)))
-
-    def numbers(self, key: str, count: int) -> NDArray[np.float64]:
-        """The numbers of a value that a slice must have."""
-        found = numbers_of(self.text(key), count)
-        if found is None:
-            tag = {"position": "0020,0032", "orientation": "0020,0037"}.get(key, "0028,0030")
-            raise ImageInputError(
-                f"{self.name}: does not state its {key.replace('_', ' ')} (DICOM tag {tag} is "
-                f"{self.text(key)[:60]!r}): export the series again as it was scanned"
-            )
-        return found
 
 
 @dataclass(frozen=True)
@@ -150,8 +86,8 @@ def read_dicom_folder(
     headers, findings = _headers(folder)
     chosen, more = _chosen(folder, _series(headers), series)
     findings += more
-    slices = [s for header in chosen.headers for s in _slices(header)]
-    return _volume(folder.name, slices, chosen.modality, findings)
+    slices = [s for header in chosen.headers for s in slices_of(header)]
+    return volume_of(folder.name, slices, chosen.modality, findings)
 
 
 def read_dicom_file(path: Path) -> tuple[ImageData, str, tuple[Finding, ...]]:
@@ -168,11 +104,11 @@ def read_dicom_file(path: Path) -> tuple[ImageData, str, tuple[Finding, ...]]:
             f"{path.name}: is no image that can be read; NRRD, NIfTI, MetaImage or DICOM is needed"
         )
     _check_modality(path.name, {header.text("modality")})
-    slices = _slices(header)
+    slices = slices_of(header)
     if len(slices) < 2:
         size = [int(header.tags.get(k, 0)) for k in ("columns", "rows")]
         check_shape(path.name, [*size, 1])
-    return _volume(path.name, slices, header.text("modality"), [])
+    return volume_of(path.name, slices, header.text("modality"), [])
 
 
 def _check_modality(name: str, found: set[str]) -> None:
@@ -181,9 +117,6 @@ def _check_modality(name: str, found: set[str]) -> None:
             f"{name}: DICOM modality is {', '.join(sorted(found))!r}: a CT is needed, for "
             "thresholds are in HU"
         )
-
-
-# What is in a folder ---------------------------------------------------------------------------
 
 
 def _headers(folder: Path) -> tuple[list[DicomHeader], list[Finding]]:
@@ -212,7 +145,7 @@ def _headers(folder: Path) -> tuple[list[DicomHeader], list[Finding]]:
         findings.append(
             Finding.note(
                 "dicom-other-files",
-                f"skipped {_count(len(others), 'file')} not in DICOM: {_listed(others)}",
+                f"skipped {counted(len(others), 'file')} not in DICOM: {listed(others)}",
                 where=folder.name,
                 why="a slice that was damaged in its first bytes would be among them",
             )
@@ -247,7 +180,7 @@ def _chosen(folder: Path, found: list[Series], wanted: str | None) -> tuple[Seri
         return meant[0], []
     _check_modality(folder.name, {s.modality for s in found})
     cts = [s for s in found if s.modality in {"", "CT"}]
-    volumes = [s for s in cts if not all(_is_localizer(h) for h in s.headers)] or cts
+    volumes = [s for s in cts if not all(is_localizer(h) for h in s.headers)] or cts
     volumes.sort(key=lambda s: (-s.count, s.uid))
     first, rest = volumes[0], volumes[1:]
     rivals = [s for s in rest if s.count > CLEARLY_LARGEST * first.count]
@@ -272,471 +205,3 @@ def _chosen(folder: Path, found: list[Series], wanted: str | None) -> tuple[Seri
         fix=how,
     )
     return first, [finding]
-
-
-def _is_localizer(header: DicomHeader) -> bool:
-    return "LOCALIZER" in header.text("image_type").upper()
-
-
-# Slices ----------------------------------------------------------------------------------------
-
-
-def _slices(header: DicomHeader) -> list[Slice]:
-    """The slices of a file."""
-    stated = numbers_of(header.text("n_frames") or "1", 1)
-    count = 1 if stated is None else int(stated[0])
-    if count == 1 and not header.frames:
-        return [Slice(header, 0, {})]
-    if len(header.frames) != count:
-        raise ImageInputError(
-            f"{header.path.name}: has {count} frames and states the places of "
-            f"{len(header.frames)}: export the series as one file per slice"
-        )
-    return [Slice(header, n, frame.tags) for n, frame in enumerate(header.frames)]
-
-
-@dataclass(frozen=True, eq=False)
-class _Stack:
-    """Parallel slices in ascending order along their normal."""
-
-    slices: tuple[Slice, ...]
-    positions: NDArray[np.float64]
-    axes: NDArray[np.float64]
-    spacing: tuple[float, float]
-
-    @property
-    def heights(self) -> NDArray[np.float64]:
-        return np.asarray(self.positions @ np.cross(*self.axes))
-
-    def kept(self, which: Sequence[int]) -> "_Stack":
-        chosen = list(which)
-        slices = tuple(self.slices[i] for i in chosen)
-        return _Stack(slices, self.positions[chosen], self.axes, self.spacing)
-
-
-def _volume(
-    name: str, slices: list[Slice], modality: str, findings: list[Finding]
-) -> tuple[ImageData, str, tuple[Finding, ...]]:
-    slices, more = _without_scouts(name, slices)
-    findings += more
-    stack = _stack(name, slices)
-    values = _pixels(name, stack)
-    kept, more = _without_copies(name, stack, values)
-    findings += more
-    if len(kept) < len(stack.slices):
-        stack, values = stack.kept(kept), values[kept]
-    _check_acquisitions(name, stack)
-    uneven = _check_steps(name, stack)
-    image, more = _placed(name, stack, values, uneven)
-    findings += [*more, *_rescale_findings(name, stack)]
-    return image, modality, tuple(findings)
-
-
-def _without_scouts(name: str, slices: list[Slice]) -> tuple[list[Slice], list[Finding]]:
-    """The slices without localizers and with one orientation; what was left out."""
-    scouts = [s for s in slices if _is_localizer(s.header)]
-    rest = [s for s in slices if not _is_localizer(s.header)]
-    if not rest:
-        rest, scouts = scouts, []
-    groups: list[list[Slice]] = []
-    for one in rest:
-        across = one.numbers("orientation", 6)
-        group = next(
-            (g for g in groups
-             if np.abs(g[0].numbers("orientation", 6) - across).max() <= PARALLEL),
-            None,
-        )  # fmt: skip
-        if group is None:
-            groups.append([one])
-        else:
-            group.append(one)
-    groups.sort(key=len, reverse=True)
-    others = [s for g in groups[1:] for s in g]
-    if len(others) > min(MOST_SCOUTS, len(groups[0]) - 1):
-        text = "; ".join(
-            f"{len(g)} slices along {g[0].text('orientation')}, such as {g[0].name}"
-            for g in groups[:4]
-        )
-        raise ImageInputError(
-            f"{name}: the series has slices of {len(groups)} orientations: {text}; keep those of "
-            "one volume in the folder"
-        )
-    left = sorted(s.name for s in [*scouts, *others])
-    if not left:
-        return groups[0], []
-    finding = Finding(
-        severity="note" if not others else "warning",
-        code="dicom-scouts",
-        what=f"skipped {_count(len(left), 'scout')} (localisers, or slices of another "
-        "orientation): "
-        f"{_listed(left)}",
-        where=name,
-        why="they show the head from elsewhere",
-        fix="" if not others else "see whether these are no slices of the volume",
-    )
-    return groups[0], [finding]
-
-
-def _stack(name: str, slices: list[Slice]) -> _Stack:
-    """The slices in the order of their places, of one size and spacing."""
-    sizes = Counter((s.text("columns"), s.text("rows")) for s in slices)
-    spacings = [s.numbers("pixel_spacing", 2) for s in slices]
-    usual = np.median(spacings, axis=0)
-    if len(sizes) > 1:
-        common = sizes.most_common(1)[0][0]
-        odd = [s for s in slices if (s.text("columns"), s.text("rows")) != common]
-        raise ImageInputError(
-            f"{name}: {len(odd)} of {len(slices)} slices have another size than "
-            f"{' × '.join(common)} pixels, such as {odd[0].name} with {odd[0].text('columns')} × "
-            f"{odd[0].text('rows')}: keep the slices of one volume in the folder"
-        )
-    odd = [
-        s
-        for s, spacing in zip(slices, spacings, strict=True)
-        if np.abs(spacing - usual).max() > 1e-4 * float(usual.max())
-    ]
-    if odd:
-        raise ImageInputError(
-            f"{name}: {len(odd)} of {len(slices)} slices have another pixel spacing than "
-            f"{usual.tolist()} mm, such as {odd[0].name} with {odd[0].text('pixel_spacing')}: keep "
-            "the slices of one volume in the folder"
-        )
-    if (usual <= 0.0).any() or (usual > 100.0).any():
-        raise ImageInputError(f"{name}: pixel spacing is {usual.tolist()} mm")
-    for key, what in (("photometric", "kinds of pixel"), ("frame_of_reference", "frames")):
-        stated = {s.text(key) for s in slices}
-        if len(stated) > 1:
-            raise ImageInputError(
-                f"{name}: the series mixes {what} ({', '.join(sorted(stated))}): keep the slices "
-                "of one volume in the folder"
-            )
-    if slices[0].text("photometric") not in {"", "MONOCHROME2"}:
-        raise ImageInputError(
-            f"{name}: pixels are {slices[0].text('photometric')}: a CT has MONOCHROME2"
-        )
-    columns, rows = (int(n) for n in next(iter(sizes)))
-    check_shape(name, [columns, rows, len(slices)])
-    across = np.mean([s.numbers("orientation", 6) for s in slices], axis=0).reshape(2, 3)
-    lengths = np.linalg.norm(across, axis=1)
-    if (np.abs(lengths - 1.0) > PARALLEL).any() or abs(float(across[0] @ across[1])) > PARALLEL:
-        raise ImageInputError(
-            f"{name}: the orientation {slices[0].text('orientation')} is no pair of perpendicular "
-            "unit vectors"
-        )
-    axes = across / lengths[:, None]
-    positions = np.array([s.numbers("position", 3) for s in slices])
-    if float(np.abs(positions).max()) > 1e5:
-        raise ImageInputError(f"{name}: a slice lies {np.abs(positions).max():g} mm away")
-    heights = positions @ np.cross(axes[0], axes[1])
-    # Copies of a slice stand in the order of their names, on any system.
-    order = sorted(range(len(slices)), key=lambda i: (float(heights[i]), slices[i].name))
-    sorted_slices = tuple(slices[i] for i in order)
-    # Pixel spacing states rows first: the distance between rows, then between columns.
-    return _Stack(sorted_slices, positions[order], axes, (float(usual[1]), float(usual[0])))
-
-
-def _pixels(name: str, stack: _Stack) -> NDArray[Any]:
-    """The pixels of all slices, axes slice, row, column, by the third-party reader."""
-    files = list(dict.fromkeys(s.header.path for s in stack.slices))
-    size = sum(path.stat().st_size for path in files)
-    columns, rows = (int(stack.slices[0].text(k)) for k in ("columns", "rows"))
-    voxels = columns * rows * len(stack.slices)
-    limits = ReadLimits(20.0 + (size + 2 * voxels) / 5e6, 4 * 2**30 + 16 * voxels)
-    try:
-        if all(not s.header.frames for s in stack.slices):
-            return _of_files(stack, limits)
-        parts = {path: _of_frames(path, limits) for path in files}
-    except ReaderError as error:
-        raise ImageInputError(f"{name}: {error}") from error
-    _check_scales(name, stack)
-    return np.stack([parts[s.header.path][s.frame] for s in stack.slices])
-
-
-def _of_files(stack: _Stack, limits: ReadLimits) -> NDArray[Any]:
-    paths = [str(s.header.path.absolute()) for s in stack.slices]
-    answer = read_in_child("cmfsim.io.image_reading:read_slices", limits, paths=paths)
-    places = np.array(answer.values["places"])
-    expected = np.column_stack([stack.positions, np.tile(stack.spacing, (len(paths), 1))])
-    off = np.abs(places - expected).max(axis=1)
-    if off.max() > READERS_AGREE:
-        worst = int(np.argmax(off))
-        raise ImageInputError(
-            f"{stack.slices[worst].name}: two readings of its place disagree: "
-            f"{expected[worst].tolist()} and {places[worst].tolist()} (position and pixel spacing "
-            "in mm): export the series again"
-        )
-    return answer.arrays["values"]
-
-
-def _of_frames(path: Path, limits: ReadLimits) -> NDArray[Any]:
-    answer = read_in_child("cmfsim.io.image_reading:read_frames", limits, path=str(path.absolute()))
-    values = answer.arrays["values"]
-    return values if values.ndim == 3 else values[None]
-
-
-def _check_scales(name: str, stack: _Stack) -> None:
-    """Refuses frames with several slopes: the reader applies one of them to all."""
-    scales = {(s.text("slope"), s.text("intercept")) for s in stack.slices}
-    if len(scales) > 1:
-        raise ImageInputError(
-            f"{name}: its frames have {len(scales)} different rescale slopes and intercepts: "
-            "export the series as one file per slice"
-        )
-
-
-def _without_copies(
-    name: str, stack: _Stack, values: NDArray[Any]
-) -> tuple[list[int], list[Finding]]:
-    """The slices without those that are there twice; an error where two at one place differ."""
-    kept, copies = [0], []
-    heights = stack.heights
-    for i in range(1, len(stack.slices)):
-        before = kept[-1]
-        if heights[i] - heights[before] > ONE_PLACE:
-            kept.append(i)
-            continue
-        one, other = stack.slices[before], stack.slices[i]
-        shift = float(np.linalg.norm(stack.positions[i] - stack.positions[before]))
-        if shift > ONE_PLACE or not np.array_equal(values[i], values[before]):
-            count = int(np.count_nonzero(np.diff(heights) <= ONE_PLACE))
-            raise ImageInputError(
-                f"{name}: {one.name} and {other.name} lie at one place ({_place(stack, i)}) with "
-                f"different pixels, as {_count(count, 'pair')} of slices do: more than one scan, "
-                "reconstruction or time in the series; keep one of them in the folder"
-            )
-        copies.append(other.name)
-    if not copies:
-        return kept, []
-    finding = Finding.note(
-        "dicom-copies",
-        f"skipped {_count(len(copies), 'copy')} of slices with the same place and pixels: "
-        f"{_listed(copies)}",
-        where=name,
-        why="the image is the same without them",
-    )
-    return kept, [finding]
-
-
-def _place(stack: _Stack, i: int) -> str:
-    text = ", ".join(f"{x:.2f}" for x in stack.positions[i])
-    return f"first pixel at {text} mm"
-
-
-def _check_acquisitions(name: str, stack: _Stack) -> None:
-    """Refuses slices of several scans that lie between one another."""
-    ranges: dict[str, list[float]] = {}
-    for one, height in zip(stack.slices, stack.heights, strict=True):
-        ranges.setdefault(one.text("acquisition_number"), []).append(float(height))
-    # One run after the other is how a scanner steps; two runs over one place are two scans.
-    spans = sorted((min(h), max(h), number) for number, h in ranges.items())
-    for (_, high, first), (low, _, second) in itertools.pairwise(spans):
-        if low < high:
-            raise ImageInputError(
-                f"{name}: the slices of acquisitions {first or '-'} and {second or '-'} lie "
-                f"between one another ({low:.2f} to {high:.2f} mm along the normal): two scans or "
-                "times in one series; keep the slices of one acquisition in the folder"
-            )
-
-
-def _check_steps(name: str, stack: _Stack) -> list[int]:
-    """The uneven steps of a stack; an error where slices are missing or too many."""
-    heights = stack.heights
-    steps = np.diff(heights)
-    usual = float(np.median(steps))
-    even = heights[0] + np.arange(len(heights)) * (heights[-1] - heights[0]) / len(steps)
-    wide = np.flatnonzero(steps >= MOST_STEP * usual)
-    if len(wide):
-        multiples = steps[wide] / usual
-        whole = np.abs(multiples - np.round(multiples)) < MULTIPLE
-        lost = int(np.sum(np.round(multiples[whole]) - 1))
-        what = (
-            f"{_count(lost, 'slice')} missing"
-            if whole.all()
-            else "slices missing or unevenly spaced"
-        )
-        raise ImageInputError(
-            f"{name}: {what}: slices are {usual:.3g} mm apart, but {_steps(stack, wide)}; export "
-            "the whole series again (nothing is interpolated over a gap of more than "
-            f"{MOST_STEP:g} times the usual distance)"
-        )
-    narrow = np.flatnonzero(steps <= LEAST_STEP * usual)
-    if len(narrow):
-        raise ImageInputError(
-            f"{name}: slices too near one another: they are {usual:.3g} mm apart, but "
-            f"{_steps(stack, narrow)}: more than one scan or reconstruction in the series; keep "
-            "one in the folder"
-        )
-    if float(np.abs(heights - even).max()) <= ROUNDED:
-        return []
-    return [int(i) for i in np.flatnonzero(np.abs(steps - usual) > 0.01 * usual)] or [0]
-
-
-def _steps(stack: _Stack, which: Sequence[int] | NDArray[np.intp]) -> str:
-    """Steps with the slices that they lie between."""
-    heights = stack.heights
-    texts = [
-        f"{heights[i + 1] - heights[i]:.3g} mm between {heights[i]:.2f} and {heights[i + 1]:.2f} "
-        f"mm ({stack.slices[i].name}, {stack.slices[i + 1].name})"
-        for i in list(which)[:4]
-    ]
-    more = f" and {len(which) - 4} more" if len(which) > 4 else ""
-    return ", ".join(texts) + more
-
-
-# The image -------------------------------------------------------------------------------------
-
-
-def _placed(
-    name: str, stack: _Stack, values: NDArray[Any], uneven: list[int]
-) -> tuple[ImageData, list[Finding]]:
-    """The image of a stack on axes of the patient, resampled where its slices ask for it."""
-    heights, normal = stack.heights, np.cross(*stack.axes)
-    shifts = stack.positions - np.outer(heights, normal)
-    along = (shifts - shifts[0]) @ stack.axes.T
-    # Slices in one straight, even row, as far as positions are written exactly.
-    straight = float(np.abs(along - along[0]).max()) <= ROUNDED
-    findings = _tilt_findings(name, stack, along, straight=straight)
-    if uneven:
-        findings.append(_uneven(name, stack, uneven))
-    if straight and not uneven:
-        gap = float(heights[-1] - heights[0]) / (len(heights) - 1)
-        affine = np.column_stack(
-            [
-                stack.axes[0] * stack.spacing[0],
-                stack.axes[1] * stack.spacing[1],
-                normal * gap,
-                stack.positions[0],
-            ]
-        )
-        voxels = values.transpose(2, 1, 0)
-        image = aligned(voxels, affine)
-        if image is None:
-            image = upright(voxels, affine, name)
-            findings.append(_oblique(name, turn_of(affine)))
-        return image, findings
-    gap = float(np.median(np.diff(heights)))
-    if gap > COARSE_SLICES:
-        findings.append(_coarse(name, gap))
-    return of_slices(values, stack.positions, stack.axes, stack.spacing, name), findings
-
-
-def _tilt_findings(
-    name: str,
-    stack: _Stack,
-    along: NDArray[np.float64],
-    *,
-    straight: bool,
-) -> list[Finding]:
-    """Findings on slices that are shifted against one another, and on a tilt that is not there."""
-    heights = stack.heights - stack.heights[0]
-    gap = float(np.median(np.abs(np.diff(heights))))
-    slope = along.T @ heights / float(heights @ heights)
-    angle = math.degrees(math.atan(float(np.linalg.norm(slope))))
-    stated = numbers_of(stack.slices[0].text("gantry_tilt") or "0", 1)
-    tilt = 0.0 if stated is None else float(stated[0])
-    off = float(np.linalg.norm(along - np.outer(heights, slope), axis=1).max())
-    findings = []
-    if not straight:
-        signed = math.copysign(angle, tilt) if tilt else angle
-        what = f"gantry tilt {signed:.1f}°".replace("-", "−")
-        if off > max(ROUNDED, 0.01 * float(np.linalg.norm(along[-1]))):
-            what = (
-                f"slices shifted against one another by up to {np.ptp(along, axis=0).max():.1f} mm"
-            )
-        findings.append(
-            Finding.warning(
-                "dicom-tilted",
-                f"{what}, resampled by each slice's own position "
-                f"({np.linalg.norm(along[-1]):.1f} mm from first to last slice)",
-                where=name,
-                why="stacked at right angles the head would be sheared; between slices "
-                f"{gap:.1f} mm apart the skin is known to {SKIN_SHARE * gap:.1f} mm; outside the "
-                "slices there is air, so that the neck may end on an oblique plane, where nothing "
-                "is fixed",
-                fix=f"check the skin by eye; {_whole_heights(stack)}",
-            )
-        )
-    if abs(abs(tilt) - angle) > TILTS_AGREE:
-        findings.append(
-            Finding.warning(
-                "dicom-tilt-unclear",
-                f"the header states a gantry tilt of {tilt:g}°, the positions of the slices one of "
-                f"{angle:.1f}°; the positions were used",
-                where=name,
-                why="if another program wrote the positions without the tilt, the head is sheared",
-                fix="export the series from the scanner or archive as it was made, and check the "
-                "head's shape by eye",
-            )
-        )
-    return findings
-
-
-def _whole_heights(stack: _Stack) -> str:
-    """Between which heights every slice position was scanned, as the region of a case has them."""
-    columns, rows = (int(stack.slices[0].text(k)) for k in ("columns", "rows"))
-    across = np.array([0.0, (columns - 1) * stack.spacing[0] * stack.axes[0, 2]])
-    down = np.array([0.0, (rows - 1) * stack.spacing[1] * stack.axes[1, 2]])
-    corners = np.add.outer(across, down).ravel()
-    first, last = stack.positions[0, 2] + corners, stack.positions[-1, 2] + corners
-    low, high = (first, last) if first.mean() < last.mean() else (last, first)
-    return (
-        f"the head is scanned from front to back between z = {low.max():.1f} and "
-        f"{high.min():.1f} mm: lower = {low.max():.1f} in [region] ends the tissue on a plane that "
-        "fixes it, where the face allows that"
-    )
-
-
-def _uneven(name: str, stack: _Stack, uneven: list[int]) -> Finding:
-    steps = np.diff(stack.heights)
-    return Finding.warning(
-        "dicom-uneven",
-        f"slices are {np.median(steps):.3g} mm apart, from {steps.min():.3g} to "
-        f"{steps.max():.3g} mm: {_steps(stack, uneven)}; resampled by their positions",
-        where=name,
-        why="between slices farther apart than the others, shapes are less certain",
-        fix="use a reconstruction with even slices if there is one",
-    )
-
-
-def _oblique(name: str, angle: float) -> Finding:
-    return Finding.note(
-        "image-oblique",
-        f"the image's axes are turned by {angle:.1f}° from the patient's; it was resampled",
-        where=name,
-        why="everything works on a grid along the patient's axes",
-    )
-
-
-def _coarse(name: str, gap: float) -> Finding:
-    return Finding.warning(
-        "ct-spacing-coarse",
-        f"slices are {gap:.3g} mm apart",
-        where=name,
-        why="thin bone, lips and lids vanish between slices further apart than "
-        f"{COARSE_SLICES:g} mm; surfaces are a millimetre worse",
-        fix="use the thin-slice reconstruction of the same scan",
-    )
-
-
-def _rescale_findings(name: str, stack: _Stack) -> list[Finding]:
-    kinds = {s.text("rescale_type").upper() for s in stack.slices} - UNSTATED_SCALES
-    if not kinds:
-        return []
-    return [
-        Finding.warning(
-            "dicom-not-hu",
-            f"the header states that values are {', '.join(sorted(kinds))!r}, not HU",
-            where=name,
-            why="thresholds of skin and bone are in HU",
-            fix="check skin and bone by eye, or set skin_threshold and bone_threshold",
-        )
-    ]
-
-
-def _count(number: int, what: str) -> str:
-    many = f"{what[:-1]}ies" if what.endswith("y") else f"{what}s"
-    return f"{number} {what if number == 1 else many}"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
