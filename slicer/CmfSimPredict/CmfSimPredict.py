@@ -7,6 +7,7 @@ execution model has it. It works from a shell as well.
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -54,7 +55,15 @@ def main(words=None):
 def _predict(command, bundle, face):
     print(f"<filter-start>\n<filter-name>{NAME}</filter-name>\n</filter-start>", flush=True)
     with tempfile.TemporaryFile() as answer:
-        process = subprocess.Popen(command, stdout=answer, stderr=subprocess.PIPE, text=True)
+        # Whatever the locale of Slicer is: names of patients and units are no ASCII.
+        process = subprocess.Popen(
+            command,
+            stdout=answer,
+            stderr=subprocess.PIPE,
+            encoding="utf-8",
+            errors="replace",
+            env={**os.environ, "PYTHONUTF8": "1"},
+        )
         for line in process.stderr:
             text = line.strip().removeprefix("cmfsim: ")
             share = next((part for start, part in STAGES if text.startswith(start)), None)

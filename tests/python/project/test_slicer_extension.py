@@ -150,7 +150,11 @@ def test_the_command_line_module_predicts_and_states_progress(ran, tmp_path):
     script = ROOT / "CmfSimPredict" / "CmfSimPredict.py"
     words = [sys.executable, str(script), str(folder), str(tmp_path / "face.vtp"), "--model", "H"]
     ended = subprocess.run(
-        [*words, "--edge-length", "22"], capture_output=True, text=True, timeout=120, check=False
+        [*words, "--edge-length", "22"],
+        capture_output=True,
+        encoding="utf-8",
+        timeout=120,
+        check=False,
     )
     assert ended.returncode == 0, ended.stderr
     shares = [float(s) for s in re.findall(r"<filter-progress>([^<]*)<", ended.stdout)]
