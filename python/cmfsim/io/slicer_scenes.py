@@ -18,6 +18,7 @@ import numpy as np
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.files import check_readable, is_below, is_there, named
+from cmfsim.io.strict_xml import strict_parser
 from cmfsim.io.transforms import motion_in_lps, read_transform_file
 from cmfsim.values.motion import rigid_matrix
 
@@ -244,9 +245,7 @@ def _file(name: str, folder: Path) -> tuple[Path | None, str]:
 
 def _elements(text: bytes) -> list[tuple[str, dict[str, str]]]:
     """Name and attributes of each element of a scene."""
-    if b"\0" in text:
-        raise CaseInputError("is not XML in UTF-8: it holds zero bytes")
-    parser = expat.ParserCreate("UTF-8")
+    parser = strict_parser(text)
     found: list[tuple[str, dict[str, str]]] = []
     depth = 0
 
@@ -262,13 +261,8 @@ def _elements(text: bytes) -> list[tuple[str, dict[str, str]]]:
         del name
         depth -= 1
 
-    def refuse(*_: object) -> None:
-        raise CaseInputError("XML with a document type or entities is not read")
-
     parser.StartElementHandler = start
     parser.EndElementHandler = end
-    parser.StartDoctypeDeclHandler = refuse
-    parser.EntityDeclHandler = refuse
     try:
         parser.Parse(text, True)  # noqa: FBT003 (its signature)
     except expat.ExpatError as error:

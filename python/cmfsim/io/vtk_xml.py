@@ -21,6 +21,7 @@ from cmfsim.io.blocks import UNPACKERS
 from cmfsim.io.plain_mesh import Cells, PlainMesh
 from cmfsim.io.polygons import triangles_of
 from cmfsim.io.stated_frames import stated_in_field
+from cmfsim.io.strict_xml import strict_parser
 from cmfsim.io.vtk_cells import cells_by_type
 from cmfsim.io.words import real_numbers, shown, whole_numbers
 
@@ -416,10 +417,7 @@ def _parsed(data: bytes) -> tuple[_Element, _Arrays]:
 
 
 def _tree(text: bytes) -> _Element:
-    # The encoding is UTF-8 whatever the text states: nothing hides behind another one.
-    if b"\0" in text:
-        raise CaseInputError("is not XML in UTF-8: it holds zero bytes")
-    parser = expat.ParserCreate("UTF-8", " ")
+    parser = strict_parser(text, " ")
     parser.buffer_text = True
     parser.buffer_size = 2**20
     top = _Element("", {})
@@ -443,14 +441,9 @@ def _tree(text: bytes) -> _Element:
         if stack[-1].name in {"DataArray", "Array"}:
             stack[-1].text.append(part)
 
-    def refuse(*_: object) -> None:
-        raise CaseInputError("XML with a document type is not read")
-
     parser.StartElementHandler = start
     parser.EndElementHandler = end
     parser.CharacterDataHandler = text_of
-    parser.StartDoctypeDeclHandler = refuse
-    parser.EntityDeclHandler = refuse
     try:
         parser.Parse(text, True)  # noqa: FBT003 (its signature)
     except expat.ExpatError as error:
