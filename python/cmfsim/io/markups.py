@@ -115,7 +115,7 @@ def markup_of(
     points: Iterable[tuple[str, Floats]],
     descriptions: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """A markup as Slicer writes it, LPS mm, with what is said of points by label."""
+    """A markup as Slicer writes it, LPS mm, with a description of each point by label."""
     said = descriptions or {}
     return {
         "type": kind,

@@ -78,7 +78,7 @@ def test_two_mandibles_are_a_question_that_doctor_repeats(head, capsys):
 
 
 def test_a_slicer_transform_is_inverted_and_stated_in_words(head):
-    """Among files that Slicer saved, an ITK file is taken as from-parent; the case says so."""
+    """Among files that Slicer saved, an ITK file is from-parent, and the case states it."""
     ply = head / "mandible.ply"
     ply.write_bytes(ply.read_bytes().replace(b"comment LPS mm\n", b"comment SPACE=LPS\n"))
     path = head / "mandible_move.tfm"

@@ -165,7 +165,7 @@ def _box_of(anatomy: Anatomy) -> Floats | None:
 
 
 def _taken(draft: _Draft) -> list[Taken]:
-    """What everything was taken for; what the case does not use is said as well."""
+    """What each file was taken for, those that the case does not use included."""
     surfaces = draft.anatomy.taken
     if draft.by_image:
         surfaces = [_beside_image(draft, taken) for taken in surfaces]
@@ -281,7 +281,7 @@ def _candidate_path(draft: _Draft, find: SurfaceFind) -> str:
 
 
 def _has_copy(draft: _Draft, find: SurfaceFind) -> bool:
-    """Whether a surface is written anew: its file is packed, is voxels, or lies elsewhere."""
+    """Whether a surface needs a copy: its file is packed, holds voxels, or is elsewhere."""
     moved = not np.allclose(draft.reference, np.eye(4), rtol=0.0, atol=SAME)
     return (find.in_scene and (moved or find.path.is_relative_to(draft.unpacked))) or find.is_made
 
