@@ -21,6 +21,7 @@ use rayon::prelude::*;
 
 use crate::boundary::{Against, Boundary, Motion};
 use crate::contact::links::Link;
+use crate::contact::overlap::Overlap;
 use crate::contact::planes::{Meeting, Plane, Planes};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::motion::RigidMotion;
@@ -88,6 +89,8 @@ pub(crate) struct Pairs {
     walls: Vec<Wall>,
     positions: Vec<[f64; 3]>,
     row_of: Vec<u32>,
+    /// The candidates that lie in no other tissue at rest.
+    pub overlap: Overlap,
 }
 
 /// Contact forces, carried from one round to the next.
@@ -153,12 +156,7 @@ impl Pairs {
         if boundary.touching().is_empty() {
             return Ok(None);
         }
-        let mut out = Self {
-            candidates: Vec::new(),
-            walls: Vec::new(),
-            positions: places.to_vec(),
-            row_of: row_of.to_vec(),
-        };
+        let (mut candidates, mut walls) = (Vec::new(), Vec::new());
         let outside = Outside::new(mesh);
         for (p, pair) in boundary.touching().iter().enumerate() {
             let wall = match &pair.against {
@@ -190,22 +188,19 @@ impl Pairs {
                 if behind < -DEEPEST * mean_edge {
                     continue;
                 }
-                out.candidates.push(Candidate {
+                candidates.push(Candidate {
                     node,
-                    wall: out.walls.len(),
+                    wall: walls.len(),
                     allowed: behind,
                     stiffness: LINK_STIFFNESS * stiffness(node as usize),
                     at_rest: distance.map(|d| d - behind),
                 });
             }
-            out.walls.push(wall);
+            walls.push(wall);
         }
-        Ok(Some(out))
-    }
-
-    /// The nodes that may touch something, one for each surface.
-    pub fn nodes(&self) -> Vec<u32> {
-        self.candidates.iter().map(|c| c.node).collect()
+        let overlap = Overlap::new(mesh, candidates.iter().map(|c| c.node).collect());
+        let (positions, row_of) = (places.to_vec(), row_of.to_vec());
+        Ok(Some(Self { candidates, walls, positions, row_of, overlap }))
     }
 
     /// No forces yet.

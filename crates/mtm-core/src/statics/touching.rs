@@ -10,7 +10,6 @@
 use std::sync::Arc;
 
 use crate::boundary::Motion;
-use crate::contact::overlap::Overlap;
 use crate::contact::pairs::{Left, Pairs, Round, Touching};
 use crate::contact::planes::Planes;
 use crate::contact::{ContactStart, ContactState, Sliding, SlidingNode};
@@ -436,7 +435,7 @@ impl Path<'_> {
         for link in &done.round.links {
             link.add_force(&pose.rows, &mut forces);
         }
-        let overlap = Overlap::new(self.mesh, self.pairs.nodes()).deepest(self.mesh, &pose.u);
+        let overlap = self.pairs.overlap.deepest(self.mesh, &pose.u);
         let converged = done.converged && overlap <= THROUGH * self.close();
         let result = TouchResult {
             nodes: met.iter().map(|m| m.node).collect(),
