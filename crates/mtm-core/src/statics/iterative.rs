@@ -8,18 +8,18 @@ use std::sync::OnceLock;
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::krylov::{
-    Enough, Operator, PcgOptions, PcgOutcome, Preconditioner, Problem, Reached, Spectrum, Trial,
-    pcg_near, trial,
+    Enough, Operator, PcgOptions, PcgOutcome, Preconditioner, Reached, Spectrum, Trial,
 };
 use crate::algebra::multigrid::{Multigrid, MultigridOptions};
 use crate::algebra::relaxation::{RelaxationOptions, relax};
-use crate::contact::Spring;
 use crate::contact::links::Link;
 use crate::error::{MtmError, Result, Shortfall};
+use crate::statics::confirmed::{Confirmed, is_doubtful};
 use crate::statics::effort::Solve;
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::projected_product::ProjectedProduct;
 use crate::statics::row_conditions::RowConditions;
+use crate::statics::unstable::{at_fault, carry_on};
 use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Over-relaxation of the node-wise iteration.
@@ -30,122 +30,6 @@ const MAX_SWEEPS: usize = 200_000;
 const MEASURED_SHARE: f64 = 0.1;
 /// λ/μ above which a stronger smoother pays: at ν = 0.499 it takes 113 iterations instead of 186. ν = 0.48.
 const NEARLY_INCOMPRESSIBLE: f64 = 24.0;
-
-/// Ratio of the stiffest tissue to the softest above which estimates are not trusted without a trial. The
-/// tissue of a face stays below 300.
-const DOUBTFUL_CONTRAST: f64 = 1e3;
-/// Accuracy, as a share of the tolerance, to which a trial is solved.
-const TRIAL_SHARE: f64 = 0.1;
-/// Multiple of the error of a trial that is taken as the error of any solution, as for a factorisation.
-const TRIAL_SAFETY: f64 = 10.0;
-
-/// Multiple of the estimate at the end of the iteration that is reported: in `benches/error_estimate.rs` about
-/// one estimate in a thousand was up to 2.2 times too small.
-const REPORT_SAFETY: f64 = 4.0;
-
-/// Share of the stiffness of the body along a direction that springs may cancel: if they cancel more, some of
-/// them are left out of the step.
-const LEFT_SHARE: f64 = 0.5;
-
-/// Whether estimates for tissue of such `contrast` need a trial.
-pub(crate) fn is_doubtful(contrast: f64) -> bool {
-    contrast.is_nan() || contrast > DOUBTFUL_CONTRAST
-}
-
-/// Conjugate gradients whose estimate is confirmed by a trial if it is in doubt.
-struct Confirmed<'a> {
-    a: &'a dyn Operator,
-    preconditioner: &'a dyn Preconditioner,
-    /// Cache of the trial.
-    trial: &'a OnceLock<Trial>,
-    /// Whether a trial is needed whatever the spectrum shows.
-    doubtful: bool,
-    /// Tolerance over the length of the motion.
-    relative: f64,
-    interrupted: Interrupt<'a>,
-}
-
-impl Confirmed<'_> {
-    /// The trial, run on first use.
-    fn trial(&self, options: &PcgOptions) -> Result<&Trial> {
-        if let Some(made) = self.trial.get() {
-            return Ok(made);
-        }
-        let goal = TRIAL_SHARE * self.relative;
-        let most = options.max_iterations;
-        let made = trial(self.a, self.preconditioner, goal, most, self.interrupted)?;
-        Ok(self.trial.get_or_init(|| made))
-    }
-
-    /// The solution of A x = `b`, or, if `enough` is given, a step towards it (see [`pcg_near`]).
-    ///
-    /// # Errors
-    /// Those of [`pcg_near`]; `NotConverged` if the error on a known solution is too large.
-    fn solve(
-        &self,
-        b: &[[f64; 3]],
-        start: &[[f64; 3]],
-        options: &PcgOptions,
-        enough: Option<Enough>,
-        seen: &mut Spectrum,
-    ) -> Result<Reached> {
-        let Self { a, preconditioner, interrupted, .. } = *self;
-        let problem = Problem { a, b, preconditioner, interrupted };
-        let near = |start: &[[f64; 3]], seen: &mut Spectrum| {
-            pcg_near(&problem, start, options, enough, seen)
-        };
-        let known = |seen: &mut Spectrum| -> Result<f64> {
-            let trial = self.trial(options)?;
-            if trial.error * TRIAL_SAFETY > options.slack * self.relative {
-                return Err(not_confirmed(trial, options, self.relative));
-            }
-            seen.learn(&trial.seen);
-            Ok(trial.error)
-        };
-        let mut error = None;
-        if self.doubtful {
-            error = Some(known(seen)?);
-        }
-        let mut reached = near(start, seen)?;
-        if enough.is_some() && seen.is_wide() {
-            // An intermediate step needs no trial, but does not count as a solution.
-            return Ok(match reached {
-                Reached::Solution(found) => Reached::Step(found),
-                other => other,
-            });
-        }
-        if let (true, None, Reached::Solution(found)) = (seen.is_wide(), error, &reached) {
-            let start = found.solution.clone();
-            error = Some(known(seen)?);
-            reached = near(&start, seen)?;
-        }
-        let (Reached::Solution(found) | Reached::Step(found)) = &mut reached else {
-            return Ok(reached);
-        };
-        found.error_estimate_mm *= REPORT_SAFETY;
-        if let Some(error) = error {
-            let size = found.solution.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
-            found.error_estimate_mm = found.error_estimate_mm.max(TRIAL_SAFETY * error * size);
-        }
-        Ok(reached)
-    }
-}
-
-/// The error for a known solution that was recovered with an error above the tolerance.
-fn not_confirmed(trial: &Trial, options: &PcgOptions, relative: f64) -> MtmError {
-    MtmError::NotConverged {
-        method: "pcg",
-        iterations: trial.iterations,
-        shortfall: Shortfall {
-            quantity: "the error with which a known solution came back",
-            value: trial.error,
-            limit: options.slack / TRIAL_SAFETY * relative,
-            unit: " of the displacements",
-        },
-        advice: "stiff and soft tissue, or slender parts, are beyond conjugate gradients: use \
-                 method=\"cholesky\", or allow a larger tolerance",
-    }
-}
 
 /// Results kept between the solves of one plan, whose constraints differ only a little.
 #[derive(Default)]
@@ -504,119 +388,7 @@ fn gave_up(error: MtmError, sweeps: usize) -> MtmError {
     }
 }
 
-/// Removes from `springs` those that make the body unstable along `direction`: the strongest first, until the
-/// rest cancel at most half of the stiffness of the body.
-fn at_fault(
-    matrix: &BlockMatrix,
-    springs: &mut Vec<(usize, Spring)>,
-    direction: &[[f64; 3]],
-) -> Vec<(usize, Spring)> {
-    let work = |(row, s): &(usize, Spring)| s.stiffness * dot(s.axis, direction[*row]).powi(2);
-    let mut product = vec![[0.0; 3]; direction.len()];
-    matrix.multiply_into(direction, &mut product);
-    let mut held: f64 = direction.iter().zip(&product).map(|(d, p)| dot(*d, *p)).sum();
-    held += springs.iter().map(|s| work(s).max(0.0)).sum::<f64>();
-    let mut order: Vec<usize> =
-        (0..springs.len()).filter(|&k| springs[k].1.stiffness < 0.0).collect();
-    order.sort_by(|&a, &b| work(&springs[a]).total_cmp(&work(&springs[b])));
-    let mut carried: f64 = -order.iter().map(|&k| work(&springs[k])).sum::<f64>();
-    let mut out = vec![false; springs.len()];
-    for k in order {
-        if carried <= LEFT_SHARE * held && out.contains(&true) {
-            break;
-        }
-        carried += work(&springs[k]);
-        out[k] = true;
-    }
-    let mut kept = out.iter().map(|out| !out);
-    let taken = springs.iter().zip(&out).filter(|(_, out)| **out).map(|(s, _)| *s).collect();
-    springs.retain(|_| kept.next().unwrap_or(true));
-    taken
-}
-
-/// Adds to x the multiple of each of `directions` that decreases ½ xᵀ A x − bᵀ x the most, moving no node by
-/// more than `reach`; returns whether there is no minimum along one of them.
-fn carry_on(
-    a: &dyn Operator,
-    b: &[[f64; 3]],
-    directions: &[Vec<[f64; 3]>],
-    reach: f64,
-    x: &mut [[f64; 3]],
-) -> bool {
-    let work =
-        |u: &[[f64; 3]], f: &[[f64; 3]]| -> f64 { u.iter().zip(f).map(|(u, f)| dot(*u, *f)).sum() };
-    let mut product = vec![[0.0; 3]; b.len()];
-    let mut is_carried = false;
-    for direction in directions {
-        a.multiply_into(x, &mut product);
-        let slope = work(direction, &product) - work(direction, b);
-        a.multiply_into(direction, &mut product);
-        let curvature = work(direction, &product);
-        let largest = direction.iter().fold(0.0_f64, |m, d| m.max(norm(*d)));
-        let way = way_along(slope, curvature, reach / largest);
-        is_carried |= curvature <= 0.0;
-        for (x, d) in x.iter_mut().zip(direction) {
-            *x = add(*x, scaled(*d, way));
-        }
-    }
-    is_carried
-}
-
-/// How far to go along a direction, given the `slope` and `curvature` of the energy at its start: to the
-/// minimum, or by `most` downhill if there is none.
-fn way_along(slope: f64, curvature: f64, most: f64) -> f64 {
-    if curvature > 0.0 {
-        return (-slope / curvature).clamp(-most, most);
-    }
-    if slope > 0.0 { -most } else { most }
-}
-
 /// Whether there is no load at all: any iteration would divide by its norm.
 fn is_zero(b: &[[f64; 3]]) -> bool {
     b.iter().flatten().all(|&v| v == 0.0)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn spring(row: usize, stiffness: f64) -> (usize, Spring) {
-        (row, Spring { node: row, axis: [1.0, 0.0, 0.0], stiffness, goal: 0.0 })
-    }
-
-    /// Three independent rows, each with a stiffness of 1 N/mm.
-    fn unit() -> BlockMatrix {
-        let mut matrix = BlockMatrix::from_pattern(vec![0, 1, 2, 3], vec![0, 1, 2]);
-        for block in &mut matrix.blocks {
-            *block = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
-        }
-        matrix
-    }
-
-    #[test]
-    fn the_strongest_springs_are_left_out_of_a_direction_that_gives_way() {
-        let mut springs = vec![spring(0, -0.3), spring(1, -2.5), spring(2, 0.5), spring(2, -0.1)];
-        let out = at_fault(&unit(), &mut springs, &[[1.0, 0.0, 0.0]; 3]);
-        assert_eq!(out.iter().map(|(row, _)| *row).collect::<Vec<_>>(), [1]);
-        assert_eq!(springs.len(), 3);
-    }
-
-    #[test]
-    fn a_body_is_carried_on_to_its_minimum_or_as_far_as_springs_reach() {
-        let (matrix, along_x) = (unit(), vec![[1.0, 0.0, 0.0], [0.0; 3], [0.0; 3]]);
-        let b = vec![[0.3, 0.0, 0.0], [0.0; 3], [0.0; 3]];
-        let mut x = vec![[0.0; 3]; 3];
-        let held = [spring(0, -0.4)];
-        let product = ProjectedProduct::new(&matrix, &[], &held);
-        assert!(!carry_on(&product, &b, std::slice::from_ref(&along_x), 2.0, &mut x));
-        assert!((x[0][0] - 0.5).abs() < 1e-14, "{x:?}");
-        // Beyond the top of a hill, downhill is ahead; before it, downhill is back.
-        let unheld = [spring(0, -1.4)];
-        let product = ProjectedProduct::new(&matrix, &[], &unheld);
-        for (start, end) in [(-0.7, 1.3), (-0.8, -2.8)] {
-            x[0][0] = start;
-            assert!(carry_on(&product, &b, std::slice::from_ref(&along_x), 2.0, &mut x));
-            assert!((x[0][0] - end).abs() < 1e-14, "{x:?}");
-        }
-    }
 }

@@ -1,5 +1,6 @@
 //! Equilibrium of a body under a plan: options, linear solves, Newton's method, plan operators.
 
+pub(crate) mod confirmed;
 pub(crate) mod effort;
 pub(crate) mod frozen;
 pub(crate) mod iterative;
@@ -11,7 +12,9 @@ pub(crate) mod reduction;
 pub mod replan;
 pub mod restraint;
 pub(crate) mod row_conditions;
+pub(crate) mod settling;
 pub mod solution;
 pub mod solver;
 pub(crate) mod system;
 pub(crate) mod touching;
+pub(crate) mod unstable;

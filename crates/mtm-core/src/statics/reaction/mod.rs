@@ -11,15 +11,19 @@
 //! and less memory, but springs and second walls, which the matrix at rest does not include, can require a
 //! hundred of them.
 
-use nalgebra::{DMatrix, DVector, SymmetricEigen};
+mod krylov;
+mod rows;
 
 use crate::algebra::cholesky::{
-    Begun, DenseSymmetric, Factor, Moved, NormalFactor, NormalForces, Precision, Preconditioner,
-    Progress, ROUGH, Reach, RowKey, TailFlexibility, Wanted, conjugate_gradients, hopeless,
+    Begun, Factor, Moved, NormalFactor, NormalForces, Precision, Preconditioner, Progress, ROUGH,
+    Reach, RowKey, TailFlexibility, Wanted, conjugate_gradients, hopeless,
 };
 use crate::contact::{Constraints, ContactRow, Sliding, Spring};
 use crate::error::{MtmError, Result, Shortfall};
-use crate::vector::{add, dot, norm, scaled, sub};
+use crate::vector::{add, dot, scaled, sub};
+use krylov::{Krylov, length};
+pub(crate) use rows::Rows;
+use rows::pushes;
 
 /// Maximum number of steps with sweeps: ten are needed on smooth bone, a hundred on teeth.
 const MOST_SWEEPS: usize = 1000;
@@ -30,10 +34,6 @@ const DOUBT_SHARE: f64 = 0.1;
 const LOAD_SHARE: f64 = 1e-5;
 /// Maximum number of conjugate gradient steps for these loads.
 const MOST_LOAD_STEPS: usize = 60;
-/// Softness of unstable springs above which they have practically no effect.
-const MOST_SOFTNESS: f64 = 1e6;
-/// Number of bisections in the search for the softness.
-const SOFTENINGS: usize = 30;
 /// Relative error of the response to a trial direction that is allowed in a step.
 const PROBE_ERROR: f64 = 1e-3;
 /// Size of trial loads relative to the contact forces: large enough for their effect to exceed rounding errors
@@ -500,172 +500,6 @@ impl Pose {
     }
 }
 
-/// Constraint rows, followed by one row for each spring: a spring of stiffness k adds a column along its axis,
-/// with 1/k on the diagonal.
-pub(crate) struct Rows {
-    pub rows: Vec<ContactRow>,
-    /// Prescribed displacement of each row, mm.
-    goals: Vec<f64>,
-    /// Softness added to the diagonal, mm/N.
-    pub softness: Vec<f64>,
-    pub keys: Vec<RowKey>,
-}
-
-impl Rows {
-    pub fn new(c: &Constraints<'_>) -> Self {
-        let (mut rows, mut goals) = (c.rows.to_vec(), c.offsets.to_vec());
-        let mut softness = vec![0.0; rows.len()];
-        for spring in c.springs.iter().filter(|s| s.stiffness > 0.0) {
-            rows.push(ContactRow { node: spring.node, normal: spring.axis, point: [0.0; 3] });
-            goals.push(spring.goal);
-            softness.push(1.0 / spring.stiffness);
-        }
-        let most = rows.iter().map(|r| r.node + 1).max().unwrap_or(0);
-        let mut count = vec![0; most];
-        let key = |r: &ContactRow| {
-            count[r.node] += 1;
-            (r.node, count[r.node] - 1)
-        };
-        let keys = rows.iter().map(key).collect();
-        Self { rows, goals, softness, keys }
-    }
-
-    /// Displacements that contact forces have to add to `free`, mm.
-    pub fn missing(&self, free: &[[f64; 3]]) -> Vec<f64> {
-        self.rows.iter().zip(&self.goals).map(|(r, g)| g - dot(r.normal, free[r.node])).collect()
-    }
-
-    /// Displacement along each row if the nodes move by `nodes` and the forces along the rows are `forces`.
-    fn along(&self, nodes: &[[f64; 3]], forces: &[f64]) -> Vec<f64> {
-        let along = |((r, s), f): ((&ContactRow, &f64), &f64)| dot(r.normal, nodes[r.node]) + s * f;
-        self.rows.iter().zip(&self.softness).zip(forces).map(along).collect()
-    }
-
-    /// Nᵀ S⁻¹ N with the softness.
-    fn flexibility(&self, tail: &TailFlexibility) -> DenseSymmetric {
-        let nodes: Vec<usize> = self.rows.iter().map(|r| r.node).collect();
-        let normals: Vec<[f64; 3]> = self.rows.iter().map(|r| r.normal).collect();
-        tail.normal_flexibility(&nodes, &normals, &self.softness)
-    }
-
-    /// The factor of the flexibility.
-    fn factor(&self, tail: &TailFlexibility) -> Result<NormalFactor> {
-        NormalFactor::new(self.flexibility(tail), self.keys.clone())
-            .map_err(|at| self.singular(tail, at))
-    }
-
-    fn singular(&self, tail: &TailFlexibility, at: usize) -> MtmError {
-        singular(tail.row(self.rows[at].node) as u32)
-    }
-}
-
-/// Loads y of unstable springs in the space spanned by their products: ((1 + μ) I − G) y = b, where G is the
-/// flexibility between the springs, each scaled by the root of its stiffness. μ softens all springs equally, so
-/// that the body is stable with them and no node moves beyond their reach (a trust region; Gould, Lucidi, Roma
-/// & Toint 1999).
-struct Krylov {
-    /// Length of b.
-    size: f64,
-    /// Orthonormal directions, the first along b.
-    basis: Vec<Vec<f64>>,
-    /// Displacements of the sliding nodes under loads along them, mm.
-    moved: Vec<Vec<[f64; 3]>>,
-    /// G between them.
-    flexibility: DMatrix<f64>,
-    /// Part of the last product that lies outside them.
-    rest: f64,
-    /// y along each.
-    solution: DVector<f64>,
-    /// μ.
-    softness: f64,
-    /// Length of b − ((1 + μ) I − G) y.
-    left: f64,
-}
-
-impl Krylov {
-    fn new(size: f64) -> Self {
-        Self {
-            size,
-            basis: Vec::new(),
-            moved: Vec::new(),
-            flexibility: DMatrix::zeros(0, 0),
-            rest: 0.0,
-            solution: DVector::zeros(0),
-            softness: 0.0,
-            left: size,
-        }
-    }
-
-    /// Adds a direction with its product and the displacements it causes; returns the next direction.
-    fn push(&mut self, direction: Vec<f64>, answer: Vec<f64>, moved: Vec<[f64; 3]>) -> Vec<f64> {
-        let m = self.basis.len();
-        self.basis.push(direction);
-        self.moved.push(moved);
-        let mut flexibility = std::mem::take(&mut self.flexibility).resize(m + 1, m + 1, 0.0);
-        let mut next = answer;
-        // Two passes are enough against rounding (Parlett 1980).
-        for _ in 0..2 {
-            for (k, q) in self.basis.iter().enumerate() {
-                let along: f64 = q.iter().zip(&next).map(|(a, b)| a * b).sum();
-                flexibility[(k, m)] += along;
-                for (n, q) in next.iter_mut().zip(q) {
-                    *n -= along * q;
-                }
-            }
-        }
-        for k in 0..m {
-            flexibility[(m, k)] = flexibility[(k, m)];
-        }
-        self.flexibility = flexibility;
-        self.rest = length(&next);
-        next.iter().map(|v| v / self.rest.max(f64::MIN_POSITIVE)).collect()
-    }
-
-    /// The solution with the smallest softness for which no node moves further than `reach`, mm.
-    fn soften(&mut self, reach: f64) {
-        let m = self.basis.len();
-        let eigen = SymmetricEigen::new(self.flexibility.clone());
-        let start = eigen.eigenvectors.row(0).transpose() * self.size;
-        let solution = |softness: f64| -> DVector<f64> {
-            let held = eigen.eigenvalues.map(|g| 1.0 + softness - g);
-            &eigen.eigenvectors * start.component_div(&held)
-        };
-        let farthest = |y: &DVector<f64>| {
-            let moved = (0..self.moved[0].len()).map(|i| {
-                let sum = (0..m).fold([0.0; 3], |sum, k| add(sum, scaled(self.moved[k][i], y[k])));
-                norm(sum)
-            });
-            moved.fold(0.0, f64::max)
-        };
-        let most = eigen.eigenvalues.max();
-        self.softness = 0.0;
-        self.solution = solution(0.0);
-        if most >= 1.0 || farthest(&self.solution) > reach {
-            // Above the limit of stability, displacements decrease as the softness grows.
-            let least = (most - 1.0).max(0.0);
-            let (mut low, mut high) = (least, least + 1.0);
-            while farthest(&solution(high)) > reach && high < MOST_SOFTNESS {
-                high = least + 4.0 * (high - least);
-            }
-            for _ in 0..SOFTENINGS {
-                let middle = 0.5 * (low + high);
-                if farthest(&solution(middle)) > reach {
-                    low = middle;
-                } else {
-                    high = middle;
-                }
-            }
-            self.softness = high;
-            self.solution = solution(high);
-        }
-        self.left = self.rest * self.solution[m - 1].abs();
-    }
-}
-
-fn length(v: &[f64]) -> f64 {
-    v.iter().map(|v| v * v).sum::<f64>().sqrt()
-}
-
 /// The error for contact forces that drive nodes by more than the body can resist.
 pub(crate) fn unheld() -> MtmError {
     MtmError::NotPositiveDefinite {
@@ -679,67 +513,5 @@ pub(crate) fn singular(row: u32) -> MtmError {
     MtmError::NotPositiveDefinite {
         node: row as usize,
         detail: "the flexibility of the sliding nodes is singular".into(),
-    }
-}
-
-/// Force vector of each of `n` sliding nodes from the forces along the rows.
-fn pushes(n: usize, rows: &[ContactRow], forces: &[f64]) -> Vec<[f64; 3]> {
-    let mut out = vec![[0.0; 3]; n];
-    for (r, &force) in rows.iter().zip(forces) {
-        out[r.node] = add(out[r.node], scaled(r.normal, force));
-    }
-    out
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Loads of springs on three nodes that move along x, y and z alone: G is diagonal in the basis.
-    fn solved(flexibility: [f64; 3], b: [f64; 3], reach: f64) -> (Krylov, [f64; 3]) {
-        let size = length(&b);
-        let mut krylov = Krylov::new(size);
-        let mut next: Vec<f64> = b.iter().map(|v| v / size).collect();
-        for _ in 0..3 {
-            let answer: Vec<f64> = next.iter().zip(flexibility).map(|(v, g)| v * g).collect();
-            let moved = (0..3).map(|i| [0, 1, 2].map(|j| if i == j { answer[i] } else { 0.0 }));
-            next = krylov.push(next.clone(), answer.clone(), moved.collect());
-            krylov.soften(reach);
-        }
-        let mut y = [0.0; 3];
-        for (share, q) in krylov.solution.iter().zip(&krylov.basis) {
-            for (y, q) in y.iter_mut().zip(q) {
-                *y += share * q;
-            }
-        }
-        (krylov, y)
-    }
-
-    #[test]
-    fn springs_that_the_body_holds_are_not_softened() {
-        let (flexibility, b) = ([0.2, 0.5, 0.9], [1.0, -2.0, 0.5]);
-        let (krylov, y) = solved(flexibility, b, f64::INFINITY);
-        assert_eq!(krylov.softness, 0.0);
-        assert!(krylov.left < 1e-13, "{}", krylov.left);
-        for i in 0..3 {
-            assert!((y[i] * (1.0 - flexibility[i]) - b[i]).abs() < 1e-13, "{y:?}");
-        }
-    }
-
-    #[test]
-    fn springs_that_the_body_does_not_hold_carry_nodes_as_far_as_they_reach() {
-        // The last one takes more than the body holds, or nearly as much.
-        for last in [1.3, 0.999] {
-            let (flexibility, b) = ([0.2, 0.5, last], [1.0, -2.0, 0.5]);
-            let (krylov, y) = solved(flexibility, b, 3.0);
-            assert!(krylov.softness > last - 1.0 && krylov.softness > 0.0);
-            let mu = krylov.softness;
-            let mut farthest = 0.0_f64;
-            for i in 0..3 {
-                assert!((y[i] * (1.0 + mu - flexibility[i]) - b[i]).abs() < 1e-12, "{y:?}");
-                farthest = farthest.max((y[i] * flexibility[i]).abs());
-            }
-            assert!((farthest - 3.0).abs() < 1e-6, "{farthest}");
-        }
     }
 }

@@ -1,0 +1,75 @@
+//! Conditions of contact as rows of the normal system.
+
+use super::singular;
+use crate::algebra::cholesky::{DenseSymmetric, NormalFactor, RowKey, TailFlexibility};
+use crate::contact::{Constraints, ContactRow};
+use crate::error::{MtmError, Result};
+use crate::vector::{add, dot, scaled};
+
+/// Constraint rows, followed by one row for each spring: a spring of stiffness k adds a column along its axis,
+/// with 1/k on the diagonal.
+pub(crate) struct Rows {
+    pub rows: Vec<ContactRow>,
+    /// Prescribed displacement of each row, mm.
+    goals: Vec<f64>,
+    /// Softness added to the diagonal, mm/N.
+    pub softness: Vec<f64>,
+    pub keys: Vec<RowKey>,
+}
+
+impl Rows {
+    pub fn new(c: &Constraints<'_>) -> Self {
+        let (mut rows, mut goals) = (c.rows.to_vec(), c.offsets.to_vec());
+        let mut softness = vec![0.0; rows.len()];
+        for spring in c.springs.iter().filter(|s| s.stiffness > 0.0) {
+            rows.push(ContactRow { node: spring.node, normal: spring.axis, point: [0.0; 3] });
+            goals.push(spring.goal);
+            softness.push(1.0 / spring.stiffness);
+        }
+        let most = rows.iter().map(|r| r.node + 1).max().unwrap_or(0);
+        let mut count = vec![0; most];
+        let key = |r: &ContactRow| {
+            count[r.node] += 1;
+            (r.node, count[r.node] - 1)
+        };
+        let keys = rows.iter().map(key).collect();
+        Self { rows, goals, softness, keys }
+    }
+
+    /// Displacements that contact forces have to add to `free`, mm.
+    pub fn missing(&self, free: &[[f64; 3]]) -> Vec<f64> {
+        self.rows.iter().zip(&self.goals).map(|(r, g)| g - dot(r.normal, free[r.node])).collect()
+    }
+
+    /// Displacement along each row if the nodes move by `nodes` and the forces along the rows are `forces`.
+    pub(super) fn along(&self, nodes: &[[f64; 3]], forces: &[f64]) -> Vec<f64> {
+        let along = |((r, s), f): ((&ContactRow, &f64), &f64)| dot(r.normal, nodes[r.node]) + s * f;
+        self.rows.iter().zip(&self.softness).zip(forces).map(along).collect()
+    }
+
+    /// Nᵀ S⁻¹ N with the softness.
+    pub(super) fn flexibility(&self, tail: &TailFlexibility) -> DenseSymmetric {
+        let nodes: Vec<usize> = self.rows.iter().map(|r| r.node).collect();
+        let normals: Vec<[f64; 3]> = self.rows.iter().map(|r| r.normal).collect();
+        tail.normal_flexibility(&nodes, &normals, &self.softness)
+    }
+
+    /// The factor of the flexibility.
+    pub(super) fn factor(&self, tail: &TailFlexibility) -> Result<NormalFactor> {
+        NormalFactor::new(self.flexibility(tail), self.keys.clone())
+            .map_err(|at| self.singular(tail, at))
+    }
+
+    pub(super) fn singular(&self, tail: &TailFlexibility, at: usize) -> MtmError {
+        singular(tail.row(self.rows[at].node) as u32)
+    }
+}
+
+/// Force vector of each of `n` sliding nodes from the forces along the rows.
+pub(super) fn pushes(n: usize, rows: &[ContactRow], forces: &[f64]) -> Vec<[f64; 3]> {
+    let mut out = vec![[0.0; 3]; n];
+    for (r, &force) in rows.iter().zip(forces) {
+        out[r.node] = add(out[r.node], scaled(r.normal, force));
+    }
+    out
+}

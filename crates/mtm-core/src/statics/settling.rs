@@ -1,0 +1,193 @@
+//! The body of the contact problem: its response to constraints by a kept flexibility or by iteration.
+
+use crate::algebra::cholesky::Factor;
+use crate::algebra::row_sums::in_pool;
+use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
+use crate::error::Result;
+use crate::statics::effort::Solve;
+use crate::statics::iterative::{Advance, Trail};
+use crate::statics::reaction::{Answer, Answers, ContactFactor};
+use crate::statics::solution::Clock;
+use crate::statics::system::{Linked, Settle, Settled, Unfactored};
+use crate::vector::{between, dot, norm, sub};
+
+/// Multiple of a factorisation's trial error that is taken as the error of any solution by it. A factor of ten
+/// was too small for one solution in 300 of `benches/error_estimate.rs`, most of them with contact.
+const TRIAL_SAFETY: f64 = 100.0;
+
+/// Multiple of the largest remaining contact gap that is taken as the error of a solution with contact.
+const GAP_SAFETY: f64 = 10.0;
+
+/// Displacements of the rows at contact equilibrium, found from the flexibility of the sliding nodes.
+pub(crate) fn settled_by_flexibility(
+    factor: &Factor,
+    contact: &ContactFactor,
+    b: &[[f64; 3]],
+    settle: &Settle<'_>,
+    solve: &mut Solve<'_>,
+) -> Result<Settled> {
+    let clock = Clock::new();
+    let Settle { sliding, motions, begin, options, .. } = settle;
+    let first = begin.as_ref().map(|b| &b.contact);
+    // Run on a thread of the pool, so that inner loops start without a hand-over; but one at a time, since
+    // interrupts must be checked on the calling thread.
+    let answers = in_pool(|| contact.answers(factor, b));
+    let tolerance = sliding.gap_limit(&options.contact) / sliding.diagonal;
+    let mut body = Flexible { answers, tolerance, last: None, is_known: false };
+    let state = sliding.solve(motions, first, &options.contact, solve.interrupted, &mut body)?;
+    let contact_seconds = clock.total();
+    let rows = in_pool(|| body.answers.of_all(&state.reactions));
+    solve.effort.error_estimate = direct_error(factor, &rows).max(left_by(&state));
+    Ok(Settled { rows, contact: state, contact_seconds })
+}
+
+/// The body reduced to its sliding nodes: every other node follows them exactly.
+struct Flexible<'a> {
+    answers: Answers<'a>,
+    tolerance: f64,
+    last: Option<Step>,
+    /// Whether the forces at the start of the last step are known.
+    is_known: bool,
+}
+
+/// A step of some rows with the residual forces at its ends, N.
+pub(crate) struct Step {
+    from: Vec<[f64; 3]>,
+    pub to: Vec<[f64; 3]>,
+    forces_from: Vec<[f64; 3]>,
+    forces_to: Vec<[f64; 3]>,
+}
+
+impl Step {
+    /// Slopes of the energy along the step, at its start and at its end.
+    fn slopes(&self) -> (f64, f64) {
+        let (mut first, mut last) = (0.0, 0.0);
+        let forces = self.forces_from.iter().zip(&self.forces_to);
+        for ((a, b), (f, g)) in self.from.iter().zip(&self.to).zip(forces) {
+            let way = sub(*b, *a);
+            first += dot(*f, way);
+            last += dot(*g, way);
+        }
+        (first, last)
+    }
+
+    /// Shortens the step to `share` of its length; the energy is quadratic, the forces are linear.
+    fn shorten(&mut self, share: f64) {
+        self.to = between(&self.from, &self.to, share);
+        self.forces_to = between(&self.forces_from, &self.forces_to, share);
+    }
+}
+
+impl Body for Flexible<'_> {
+    fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
+        let Self { answers, tolerance, .. } = self;
+        let Answer { displacements, forces, solved, is_carried } =
+            in_pool(|| answers.respond(c, *tolerance))?;
+        let before = self.last.take().map(|last| (last.to, last.forces_to));
+        self.is_known = before.is_some();
+        let (from, forces_from) = before.unwrap_or_else(|| (displacements.clone(), forces.clone()));
+        let step = Step { from, to: displacements.clone(), forces_from, forces_to: forces.clone() };
+        let slopes = self.is_known.then(|| step.slopes());
+        self.last = Some(step);
+        Ok(Response { displacements, reactions: forces, slopes, solved, is_carried })
+    }
+
+    fn shorten(&mut self, share: f64) {
+        if !self.is_known {
+            // The response after a shortened step depends on the forces at its start.
+            self.last = None;
+        } else if let Some(step) = &mut self.last {
+            step.shorten(share);
+        }
+    }
+
+    fn restart(&mut self) {
+        self.last = None;
+    }
+}
+
+/// The body with all its rows, those of held nodes projected.
+pub(crate) struct Projected<'a, 'i> {
+    pub system: &'a Unfactored,
+    pub b: &'a [[f64; 3]],
+    pub linked: Linked<'a>,
+    pub sliding: &'a Sliding,
+    pub trail: Trail,
+    pub solve: &'a mut Solve<'i>,
+    pub last: Option<Step>,
+}
+
+impl Projected<'_, '_> {
+    /// Residual forces of all rows, A x − b minus those of the links.
+    fn forces(&self, x: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let mut out = self.system.matrix().multiply(x);
+        for (f, b) in out.iter_mut().zip(self.b) {
+            *f = sub(*f, *b);
+        }
+        for link in self.linked.links {
+            link.take_force(x, &mut out);
+        }
+        out
+    }
+}
+
+impl Body for Projected<'_, '_> {
+    fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
+        let (from, forces_from) = match self.last.take() {
+            Some(last) => (last.to, last.forces_to),
+            None => {
+                let mut rows = std::mem::take(&mut self.trail.rows);
+                rows.resize(self.b.len(), [0.0; 3]);
+                for (node, &u) in self.sliding.nodes().iter().zip(c.about) {
+                    rows[node.row as usize] = u;
+                }
+                let forces = self.forces(&rows);
+                (rows, forces)
+            }
+        };
+        self.trail.rows.clone_from(&from);
+        let nodes = (self.sliding, self.linked);
+        let found = self.system.solve_projected(self.b, nodes, c, &mut self.trail, self.solve);
+        let Advance { rows: x, solved, is_carried } = match found {
+            Ok(found) => found,
+            Err(error) => {
+                let (to, forces_to) = (from.clone(), forces_from.clone());
+                self.last = Some(Step { from, to, forces_from, forces_to });
+                return Err(error);
+            }
+        };
+        let forces = self.forces(&x);
+        let of = |rows: &[[f64; 3]]| {
+            self.sliding.nodes().iter().map(|n| rows[n.row as usize]).collect::<Vec<_>>()
+        };
+        let (displacements, reactions) = (of(&x), of(&forces));
+        let step = Step { from, to: x, forces_from, forces_to: forces };
+        let slopes = Some(step.slopes());
+        self.last = Some(step);
+        // An approximate round is solved once it is as accurate as requested.
+        let solved = solved || self.linked.share.is_some();
+        Ok(Response { displacements, reactions, slopes, solved, is_carried })
+    }
+
+    fn shorten(&mut self, share: f64) {
+        if let Some(step) = &mut self.last {
+            step.shorten(share);
+        }
+    }
+
+    fn restart(&mut self) {
+        if let Some(last) = self.last.take() {
+            self.trail.rows = last.to;
+        }
+    }
+}
+
+/// Error left by contact, mm.
+pub(crate) fn left_by(state: &ContactState) -> f64 {
+    GAP_SAFETY * state.largest_gap().max(state.unbalanced)
+}
+
+/// Estimate of the largest nodal error of a solution by factorisation, mm.
+pub(crate) fn direct_error(factor: &Factor, x: &[[f64; 3]]) -> f64 {
+    TRIAL_SAFETY * factor.trial_error() * x.iter().fold(0.0_f64, |m, v| m.max(norm(*v)))
+}
