@@ -65,6 +65,12 @@ class Moduli:
         return np.array([lambda_, mu_across, alpha, difference, beta])
 
 
+# Tissue that is crushed below this share of its volume stiffens: most of it is water. At J = 0 the
+# added pressure is so many times that of λ̂ (J − 1), enough that no tet of the truth turns inside
+# out where the corners of the mouth fold.
+CRUSHED = 0.2
+CRUSHED_PRESSURE = 10.0
+
 # Fat of Table 1 of Kim et al. (2010); muscle with the table's moduli exchanged, stiffer along the
 # fibre as passive muscle is. The default preset of the tested models has them as printed.
 FAT = Moduli(0.003, 0.003, 0.46)
@@ -78,11 +84,12 @@ class HyperelasticTissue:
     With J = det F, C = Fᵀ F, i₄ = a·C a − 1 and λ̂ = λ + μ the energy per undeformed volume is
 
         ψ = μ/2 (F:F − 3) − μ (J − 1) + λ̂/2 (J − 1)²
-            + α/2 (J − 1) i₄ + β/8 i₄² + d/2 |(C − I) a|².
+            + α/2 (J − 1) i₄ + β/8 i₄² + d/2 |(C − I) a|²
+            + p λ̂ / (3 J₀²) max(J₀ − J, 0)³.
 
     The first line is the neo-Hookean energy of Smith, de Goes & Kim (2018), a polynomial that
     turning inside out does not break, the second adds fibres in the invariants of Bonet & Burton
-    (1998). For small strain ε it is Spencer's law λ/2 (tr ε)² + μ ε:ε + α tr ε (a·ε a)
+    (1998), the third resists collapse: J₀ is `CRUSHED` and p `CRUSHED_PRESSURE`. For small strain ε it is Spencer's law λ/2 (tr ε)² + μ ε:ε + α tr ε (a·ε a)
     + 2 d |ε a|² + β/2 (a·ε a)². Energies of fat and muscle in one tet add by volume.
 
     Attributes
@@ -172,6 +179,7 @@ class HyperelasticTissue:
         growth = det - 1.0
         psi = 0.5 * self.mu * ((gradient * gradient).sum(axis=(0, 1)) - 3.0) - self.mu * growth
         psi += 0.5 * (self.lambda_ + self.mu) * growth**2
+        psi += self._crushing() / 3.0 * np.maximum(CRUSHED - det, 0.0) ** 3
         psi += (0.5 * self.alpha * growth + 0.125 * self.beta * i4) * i4
         psi += 0.5 * self.difference * (c * c).sum(axis=0)
         return np.asarray(psi)
@@ -213,7 +221,8 @@ class HyperelasticTissue:
         for i, k, p, sign in PERMUTATIONS:
             for j, n, q, other in PERMUTATIONS:
                 tangent[i, j, k, n] += (sign * other) * pressure * f[p, q]
-        volume = (self.lambda_ + self.mu) * cof
+        bulk = self.lambda_ + self.mu + 2.0 * self._crushing() * np.maximum(CRUSHED - det, 0.0)
+        volume = bulk * cof
         if self.fibrous.any():
             m, c, i4 = self._fibre_strain(f)
             ma = m[:, None] * a[None]
@@ -243,7 +252,12 @@ class HyperelasticTissue:
     def _pressure(self, det: Floats, i4: Floats) -> Floats:
         """∂ψ/∂J, (m,) MPa."""
         change = (self.lambda_ + self.mu) * (det - 1.0) - self.mu + 0.5 * self.alpha * i4
+        change -= self._crushing() * np.maximum(CRUSHED - det, 0.0) ** 2
         return np.asarray(change)
+
+    def _crushing(self) -> Floats:
+        """p λ̂ / J₀², (m,) MPa."""
+        return np.asarray(CRUSHED_PRESSURE / CRUSHED**2 * (self.lambda_ + self.mu))
 
     def _fibre_strain(self, gradient: Floats) -> tuple[Floats, Floats, Floats]:
         """Of the fibre: m = F a and c = (C − I) a, (3, m), and i₄ = a·c, (m,)."""

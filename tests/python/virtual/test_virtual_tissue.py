@@ -9,7 +9,13 @@ from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.virtual.body import HyperelasticBody
 from cmfsim.virtual.bone_contact import ONSET, BoneContact, SmoothDistance
 from cmfsim.virtual.equilibrium import EquilibriumOptions, find_equilibrium
-from cmfsim.virtual.hyperelastic import FAT, MUSCLE, HyperelasticTissue
+from cmfsim.virtual.hyperelastic import (
+    CRUSHED,
+    CRUSHED_PRESSURE,
+    FAT,
+    MUSCLE,
+    HyperelasticTissue,
+)
 from cmfsim.virtual.operation import screw
 
 TIGHT = EquilibriumOptions(steps=1, tolerance=1e-10, loose=1e-4)
@@ -45,6 +51,30 @@ def test_stress_is_the_derivative_of_energy():
     difference = (tissue.energy(f + step * way) - tissue.energy(f - step * way)) / (2.0 * step)
     work = (tissue.stress(f) * way).sum(axis=(0, 1))
     assert np.abs(work - difference).max() < 1e-7 * np.abs(work).max()
+
+
+def test_stress_and_tangent_are_derivatives_where_tissue_is_crushed():
+    """J from −0.3 to 0.5, on both sides of `CRUSHED`, against central differences."""
+    tissue, f = mixture(50), gradients(50, 0.05, seed=7)
+    f[2] *= np.linspace(-0.3, 0.5, 50)
+    det = np.linalg.det(f.transpose(2, 0, 1))
+    assert det.min() < 0.0 < CRUSHED < det.max()
+    way, step = np.random.default_rng(8).normal(size=f.shape), 1e-6
+    difference = (tissue.energy(f + step * way) - tissue.energy(f - step * way)) / (2.0 * step)
+    work = (tissue.stress(f) * way).sum(axis=(0, 1))
+    assert np.abs(work - difference).max() < 1e-7 * np.abs(work).max()
+    difference = (tissue.stress(f + step * way) - tissue.stress(f - step * way)) / (2.0 * step)
+    change = np.einsum("tij,jt->it", tissue.tangent(f), way.reshape(9, -1))
+    assert np.abs(change - difference.reshape(9, -1)).max() < 1e-6 * np.abs(change).max()
+
+
+def test_crushed_tissue_is_several_times_as_stiff():
+    """Fat pressed flat along one axis: the pressure at J = 0 against the law without the term."""
+    tissue = HyperelasticTissue.mixed(np.zeros(1), np.ones((1, 3)))
+    flat = np.diag([1.0, 1.0, 0.0])[:, :, None]
+    bulk = tissue.lambda_ + tissue.mu
+    expected = -(1.0 + CRUSHED_PRESSURE) * bulk - tissue.mu
+    assert tissue.stress(flat)[2, 2] == pytest.approx(expected, rel=1e-12)
 
 
 def test_stiffness_is_the_derivative_of_forces():
