@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from cmfsim._core import StaticSolver, rigid_fit
 from cmfsim.checks import check_one_of
 from cmfsim.errors import CaseInputError
-from cmfsim.solving.simulation import solve_scene
+from cmfsim.solving.simulation import solve_scene, told
 from cmfsim.values.clinical_motion import clinical_motion
+from cmfsim.values.finding import Finding
 from cmfsim.values.motion import decompose_motion
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
@@ -113,7 +114,11 @@ def predict_patient(
             "p95": float(np.percentile(moved, 95)),
             "largest": float(moved.max()),
         },
-        "findings": [*patient.summary.get("findings", []), *result.summary["findings"]],
+        "findings": [
+            *patient.summary.get("findings", []),
+            *_lip_findings(patient, model),
+            *result.summary["findings"],
+        ],
         "solution": dict(result.summary),
         "timings": timings,
         "left_out": _left_out(patient, scene, model),
@@ -192,6 +197,21 @@ def _rigid_numbers(matrix: NDArray[np.float64], centre: NDArray[np.float64]) -> 
         "axis": parts.axis.tolist(),
         "centre": parts.centre.tolist(),
     }
+
+
+def _lip_findings(patient: PatientModel, model: str) -> list[dict[str, str]]:
+    """That separate lips do not touch, in a model without contact."""
+    if not patient.lips or model.endswith("+S"):
+        return []
+    found = Finding.warning(
+        "lips-without-contact",
+        f"the lips are separate, and model {model} has no contact between them",
+        where="[lips]",
+        why="they follow their teeth and may pass through each other, which a prediction with the "
+        "lips in one piece cannot do",
+        fix=f"use model {model}+S, or set contact = false in [lips]",
+    )
+    return [told(found)]
 
 
 def _left_out(patient: PatientModel, scene: Scene, model: str) -> list[str]:

@@ -218,7 +218,7 @@ def _inverted(solver: StaticSolver, solution: Solution) -> tuple[int | None, lis
     from cmfsim.solving.inversion import inversion_finding  # noqa: PLC0415
 
     count, found = inversion_finding(solver.tensors, solution.all_displacements)
-    return count, [] if found is None else [_told(found)]
+    return count, [] if found is None else [told(found)]
 
 
 def _touching(scene: Scene, solution: Solution) -> dict[str, dict[str, Any]]:
@@ -249,7 +249,7 @@ def _contact_findings(solution: Solution) -> list[dict[str, str]]:
             fix="allow more contact_iterations or a larger contact_tolerance, or smooth the "
             "surface",
         )
-        findings.append(_told(found))
+        findings.append(told(found))
     if not solution.touching_converged:
         found = Finding.warning(
             "touching-stopped",
@@ -259,11 +259,11 @@ def _contact_findings(solution: Solution) -> list[dict[str, str]]:
             why="what touches may have changed had it gone on",
             fix="look at the lips in the result; a smaller motion or a smoother surface converges",
         )
-        findings.append(_told(found))
+        findings.append(told(found))
     return findings
 
 
-def _told(found: Finding) -> dict[str, str]:
+def told(found: Finding) -> dict[str, str]:
     """The finding as results hold it, after a warning: the command line prints findings itself."""
     words = (found.code, found.what, found.where, found.why, found.fix)
     _log.warning("%s: %s, %s: %s; %s", *words, extra={"is_finding": True})

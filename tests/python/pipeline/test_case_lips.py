@@ -149,6 +149,30 @@ def test_models_without_sliding_have_the_lips_attached(model):
     assert len(with_sliding.touching) == 2
 
 
+def test_a_prediction_without_contact_warns_that_lips_may_pass_through_each_other(model, whole):
+    codes = {
+        name: [found["code"] for found in cmfsim.predict_patient(some, "H").summary["findings"]]
+        for name, some in (("separate", model), ("whole", whole))
+    }
+    assert "lips-without-contact" in codes["separate"]
+    assert "lips-without-contact" not in codes["whole"]
+
+
+def test_lips_press_on_each_other_and_do_not_pass(model):
+    """From the case file to equilibrium: what was separated touches, pushes and never pulls."""
+    result = cmfsim.predict_patient(model, "H+S").result
+    touching = result.summary["touching"]
+    assert touching["pressed"] > 10
+    assert touching["penetration"] < 0.2
+    without = cmfsim.solve_scene(
+        dataclasses.replace(cmfsim.model_scene(model, "H+S"), touching=(), obstacles=())
+    )
+    moved = np.linalg.norm(result.displacements - without.displacements, axis=1)
+    lips = np.concatenate([region.nodes for region in model.lips.values()])
+    assert moved[lips].max() > 0.5
+    assert np.median(moved) < 0.05 * moved[lips].max()
+
+
 def test_teeth_that_stay_are_an_obstacle_too(lower_jaw):
     """The cranium bears the upper teeth where no osteotomy makes a maxilla."""
     names = {obstacle.segment for obstacle in lower_jaw.scene.obstacles}

@@ -36,10 +36,11 @@ impl Overlap {
         out
     }
 
-    /// Largest depth of such a node inside a tet of another part under displacements `u` of all nodes, mm;
-    /// limited by the size of the tet.
-    pub fn deepest(&self, mesh: &TetMesh, u: &[[f64; 3]]) -> f64 {
-        self.depths(mesh, u).into_iter().fold(0.0, f64::max)
+    /// Such nodes that lie inside a tet of another part under displacements `u` of all nodes, ascending, each
+    /// with its depth, mm, which is limited by the size of the tet.
+    pub fn inside(&self, mesh: &TetMesh, u: &[[f64; 3]]) -> Vec<(u32, f64)> {
+        let each = self.nodes.iter().copied().zip(self.depths(mesh, u));
+        each.filter(|(_, depth)| *depth > 0.0).collect()
     }
 
     fn depths(&self, mesh: &TetMesh, u: &[[f64; 3]]) -> Vec<f64> {
@@ -121,11 +122,13 @@ mod tests {
         let Ok(mesh) = mesh else { unreachable!("a valid mesh") };
         let overlap = Overlap::new(&mesh, (0..8).collect());
         let mut u = vec![[0.0; 3]; 8];
-        assert_eq!(overlap.deepest(&mesh, &u), 0.0);
+        assert_eq!(overlap.inside(&mesh, &u), []);
         for u in &mut u[4..] {
             *u = [-1.9, 0.2, 0.3];
         }
         // Node 4 is at (0.1, 0.2, 0.3).
-        assert!((overlap.deepest(&mesh, &u) - 0.1).abs() < 1e-12);
+        let inside = overlap.inside(&mesh, &u);
+        assert_eq!(inside.iter().map(|(node, _)| *node).collect::<Vec<_>>(), [4]);
+        assert!((inside[0].1 - 0.1).abs() < 1e-12);
     }
 }

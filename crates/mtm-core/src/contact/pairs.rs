@@ -114,6 +114,8 @@ pub(crate) struct Round {
 pub(crate) struct Left {
     /// Largest depth of a node behind its surface, mm.
     pub penetration: f64,
+    /// The same for surfaces of bone alone.
+    pub in_bone: f64,
     /// Largest gap under a force, mm.
     pub gap: f64,
 }
@@ -122,6 +124,13 @@ impl Left {
     /// The larger of penetration and gap, mm.
     pub fn distance(&self) -> f64 {
         self.penetration.max(self.gap)
+    }
+
+    /// The larger of penetration of bone and gap, mm: where tissue meets tissue, the closest point of a node
+    /// that has slid past the border of the other part may lie on its far side, and only deformed tets show
+    /// whether it is inside.
+    pub fn beside_tissue(&self) -> f64 {
+        self.in_bone.max(self.gap)
     }
 }
 
@@ -136,6 +145,8 @@ pub(crate) struct Met {
     pub normal: [f64; 3],
     /// Force along it, N, zero or positive.
     pub force: f64,
+    /// Whether the surface is that of a bone.
+    pub is_bone: bool,
 }
 
 impl Pairs {
@@ -382,11 +393,14 @@ impl Pairs {
         rows: &[[f64; 3]],
         gap: impl Fn(&Plane) -> f64,
     ) -> Left {
-        let mut left = Left { penetration: 0.0, gap: 0.0 };
-        for (plane, number) in planes.at.iter().zip(&round.number) {
+        let mut left = Left { penetration: 0.0, in_bone: 0.0, gap: 0.0 };
+        for ((c, plane), number) in self.candidates.iter().zip(&planes.at).zip(&round.number) {
             let Some(plane) = plane else { continue };
             let gap = gap(plane);
             left.penetration = left.penetration.max(-gap);
+            if matches!(self.walls[c.wall], Wall::Bone { .. }) {
+                left.in_bone = left.in_bone.max(-gap);
+            }
             if number.is_some_and(|k| round.links[k as usize].pull(rows) > 0.0) {
                 left.gap = left.gap.max(gap);
             }
@@ -411,7 +425,8 @@ impl Pairs {
         let each = self.candidates.iter().zip(&planes.at).zip(&round.number);
         each.filter_map(|((c, plane), number)| {
             let Plane { gap, normal, .. } = plane.as_ref()?;
-            Some(Met { node: c.node, gap: *gap, normal: *normal, force: force(*number) })
+            let is_bone = matches!(self.walls[c.wall], Wall::Bone { .. });
+            Some(Met { node: c.node, gap: *gap, normal: *normal, force: force(*number), is_bone })
         })
         .collect()
     }

@@ -26,7 +26,7 @@ use crate::vector::{add, between, dot, norm, scaled, sub};
 /// Motion of the bones in one step, over the mean edge of the tissue that may be touched.
 const STEP_EDGES: f64 = 0.25;
 /// Depth, over the same edge, that a node may reach in a step; if it goes deeper, the step is halved.
-const DEEP_EDGES: f64 = 0.5;
+const DEEP_EDGES: f64 = 0.75;
 /// Shortest step, as a share of the plan.
 const SHORTEST_STEP: f64 = 1.0 / 512.0;
 /// Largest accepted distance between a node and the surface that it presses on, mm, and the same over the
@@ -142,7 +142,13 @@ impl Path<'_> {
         let (mut pose, mut here, mut rounds) = (self.rest(), 0.0, 0);
         loop {
             let there = if here + 1.5 * step >= 1.0 { 1.0 } else { here + step };
-            match self.advance(&pose, (here, there), solve)? {
+            let shorter = step > SHORTEST_STEP;
+            let next = match self.advance(&pose, (here, there), solve) {
+                // Sliding nodes may find no equilibrium with what touches them after a long step.
+                Err(MtmError::ContactNotConverged { .. }) if shorter => None,
+                other => other?,
+            };
+            match next {
                 Some((next, done)) if there == 1.0 => {
                     rounds += done.rounds;
                     let (mut solved, touch) = self.end(next, &done, rounds, solve)?;
@@ -153,7 +159,7 @@ impl Path<'_> {
                     rounds += done.rounds;
                     (pose, here) = (next, there);
                 }
-                None if step > SHORTEST_STEP => step *= 0.5,
+                None if shorter => step *= 0.5,
                 None => return Err(self.lost(&pose, rounds, DEEP_EDGES * self.pairs.mean_edge())),
             }
         }
@@ -272,7 +278,7 @@ impl Path<'_> {
                 pose.touching.gaps = met.gaps();
                 let rounds = before + count;
                 let left = self.pairs.left(&met, &round, &pose.rows, |plane| plane.gap);
-                let converged = converged && left.distance() <= LOOSE * self.close();
+                let converged = converged && left.beside_tissue() <= LOOSE * self.close();
                 return Ok((pose, Done { planes: met, round, left, rounds, change, converged }));
             }
             planes = met;
@@ -422,7 +428,9 @@ impl Path<'_> {
         rounds: usize,
         solve: &mut Solve<'_>,
     ) -> Result<(Solved, Touch)> {
-        let open = done.left.distance();
+        let inside = self.pairs.overlap.inside(self.mesh, &pose.u);
+        let overlap = inside.iter().fold(0.0, |m: f64, (_, depth)| m.max(*depth));
+        let open = done.left.beside_tissue().max(overlap);
         if !done.converged && open > SEEN * self.close() {
             return Err(self.lost(&pose, rounds, open));
         }
@@ -430,12 +438,14 @@ impl Path<'_> {
         // least its error.
         let error = open.max(done.change);
         solve.effort.error_estimate = solve.effort.error_estimate.max(error);
-        let met = self.pairs.met(&done.planes, &done.round, &pose.rows);
+        let mut met = self.pairs.met(&done.planes, &done.round, &pose.rows);
+        // A node that has slid past the border of the other part may have its closest point on the far side.
+        let is_inside = |node: u32| inside.binary_search_by_key(&node, |(j, _)| *j).is_ok();
+        met.retain(|m| m.is_bone || m.force > 0.0 || m.gap >= -self.close() || is_inside(m.node));
         let mut forces = vec![[0.0; 3]; pose.rows.len()];
         for link in &done.round.links {
             link.add_force(&pose.rows, &mut forces);
         }
-        let overlap = self.pairs.overlap.deepest(self.mesh, &pose.u);
         let converged = done.converged && overlap <= THROUGH * self.close();
         let result = TouchResult {
             nodes: met.iter().map(|m| m.node).collect(),
