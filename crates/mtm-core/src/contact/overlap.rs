@@ -43,6 +43,19 @@ impl Overlap {
         each.filter(|(_, depth)| *depth > 0.0).collect()
     }
 
+    /// Whether each of `asked` is known to lie in no tet of another part under displacements `u` of all nodes;
+    /// not for nodes that lie in one at rest.
+    pub fn are_outside(&self, mesh: &TetMesh, u: &[[f64; 3]], asked: &[u32]) -> Vec<bool> {
+        let mut nodes: Vec<u32> = asked.to_vec();
+        nodes.sort_unstable();
+        nodes.dedup();
+        nodes.retain(|node| self.nodes.binary_search(node).is_ok());
+        let some = Self { nodes, cell: self.cell };
+        let depths = some.depths(mesh, u);
+        let depth = |node: &u32| some.nodes.binary_search(node).ok().map(|i| depths[i]);
+        asked.iter().map(|node| depth(node) == Some(0.0)).collect()
+    }
+
     fn depths(&self, mesh: &TetMesh, u: &[[f64; 3]]) -> Vec<f64> {
         let place = |j: u32| add(mesh.nodes()[j as usize], u[j as usize]);
         let key = |x: [f64; 3]| x.map(|v| (v / self.cell).floor() as i64);

@@ -242,6 +242,7 @@ impl Pairs {
     /// A triangle of the tissue that has collapsed.
     fn meetings(
         &self,
+        mesh: &TetMesh,
         u: &[[f64; 3]],
         motions: &[&Motion],
         before: &[Option<f64>],
@@ -272,7 +273,31 @@ impl Pairs {
             let deepest = through.min(-ROUND_SHARE * edge);
             self.meet(c, &moved[c.wall], there(c.node)).filter(|m| m.gap >= deepest)
         };
-        Ok(self.candidates.par_iter().zip(before).with_min_len(64).map(meet).collect())
+        let mut found: Vec<Option<Meeting>> =
+            self.candidates.par_iter().zip(before).with_min_len(64).map(meet).collect();
+        self.leave_out_passed(mesh, u, &mut found);
+        Ok(found)
+    }
+
+    /// Removes the meetings of nodes deep behind tissue that lie in no tet of it: they have slid past its
+    /// border, and their closest point is on its far side.
+    fn leave_out_passed(&self, mesh: &TetMesh, u: &[[f64; 3]], found: &mut [Option<Meeting>]) {
+        let is_deep = |c: &Candidate, meeting: &Option<Meeting>| {
+            let wall = &self.walls[c.wall];
+            let least = -ROUND_SHARE * wall.surface().mean_edge_length();
+            matches!(wall, Wall::Tissue { .. }) && meeting.as_ref().is_some_and(|m| m.gap < least)
+        };
+        let deep: Vec<usize> =
+            (0..found.len()).filter(|&i| is_deep(&self.candidates[i], &found[i])).collect();
+        if deep.is_empty() {
+            return;
+        }
+        let nodes: Vec<u32> = deep.iter().map(|&i| self.candidates[i].node).collect();
+        for (i, is_outside) in deep.into_iter().zip(self.overlap.are_outside(mesh, u, &nodes)) {
+            if is_outside {
+                found[i] = None;
+            }
+        }
     }
 
     /// The position of candidate `c` at `place` relative to its surface; nothing beyond the border of the
@@ -310,11 +335,12 @@ impl Pairs {
     /// A triangle of the tissue that has collapsed.
     pub fn planes(
         &self,
+        mesh: &TetMesh,
         u: &[[f64; 3]],
         motions: &[&Motion],
         touching: &Touching,
     ) -> Result<Planes> {
-        let meetings = self.meetings(u, motions, &touching.gaps)?;
+        let meetings = self.meetings(mesh, u, motions, &touching.gaps)?;
         Ok(self.linearised(&meetings, u))
     }
 
@@ -325,11 +351,12 @@ impl Pairs {
     /// A triangle of the tissue that has collapsed.
     pub fn planes_ahead(
         &self,
+        mesh: &TetMesh,
         u: &[[f64; 3]],
         (from, to): (&[&Motion], &[&Motion]),
         touching: &Touching,
     ) -> Result<Planes> {
-        let mut meetings = self.meetings(u, from, &touching.gaps)?;
+        let mut meetings = self.meetings(mesh, u, from, &touching.gaps)?;
         for (c, meeting) in self.candidates.iter().zip(&mut meetings) {
             let Wall::Bone { segment: Some(s), .. } = &self.walls[c.wall] else { continue };
             if let Some(meeting) = meeting {

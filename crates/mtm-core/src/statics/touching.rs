@@ -193,10 +193,11 @@ impl Path<'_> {
         let prescribed = self.body.prescribed(&motions)?;
         let b = self.forces(&prescribed, to);
         let goal = Goal { motions: &motions, prescribed: &prescribed, b: &b };
-        let ahead = self.pairs.planes_ahead(&pose.u, (&before, &motions), &pose.touching)?;
+        let ahead =
+            self.pairs.planes_ahead(self.mesh, &pose.u, (&before, &motions), &pose.touching)?;
         let contact = self.carried(pose, &before, &motions);
         let (pose, rounds) = self.go_ahead(pose, &ahead, contact, &goal, solve)?;
-        let planes = self.pairs.planes(&pose.u, &motions, &pose.touching)?;
+        let planes = self.pairs.planes(self.mesh, &pose.u, &motions, &pose.touching)?;
         if planes.deepest() > DEEP_EDGES * self.pairs.mean_edge() {
             return Ok(None);
         }
@@ -263,7 +264,7 @@ impl Path<'_> {
             let next = self.moved(&pose, &rows, contact, share, goal);
             let change = largest_change(&pose.u, &next.u);
             pose = next;
-            let mut met = self.pairs.planes(&pose.u, goal.motions, &pose.touching)?;
+            let mut met = self.pairs.planes(self.mesh, &pose.u, goal.motions, &pose.touching)?;
             if count > SHARP_ROUNDS {
                 met.steady(&planes, &pose.u);
             }
