@@ -186,6 +186,24 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     predict.add_argument(
         "--plan", metavar="PLAN", type=Path, help="plan.toml to use instead of the case's plan"
     )
+    predict.add_argument(
+        "--band",
+        action="store_true",
+        help="state how far to trust the face: a band in report, files and on the terminal",
+    )
+    predict.add_argument(
+        "--calibration",
+        metavar="FILE",
+        type=Path,
+        help="calibration of the band, from cases whose outcome is known; without one it is "
+        "uncalibrated, and named so",
+    )
+    predict.add_argument(
+        "--coverage", metavar="SHARE", type=float, help="of the band (default 0.9, 90 %%)"
+    )
+    predict.add_argument(
+        "--group", metavar="NAME", help="use the calibration cases of this group alone"
+    )
     predict.set_defaults(run=study_commands.predict)
 
     plan = commands.add_parser(

@@ -7,12 +7,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cmfsim.cli.band_text import band_lines
 from cmfsim.cli.case_commands import case_of, checked
 from cmfsim.cli.exit_codes import DONE, FAILED
 from cmfsim.cli.notices import Notices
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.errors import CmfsimError
-from cmfsim.io import Cohort, read_landmark_file, replacing
+from cmfsim.io import Case, Cohort, read_landmark_file, replacing
+from cmfsim.io.calibrations import read_calibration
+from cmfsim.pipeline.banding import BandOptions
 from cmfsim.pipeline.evaluating import evaluate as evaluate_case
 from cmfsim.pipeline.outputs import (
     WrittenPrediction,
@@ -41,6 +44,9 @@ def predict(options: argparse.Namespace) -> int:
     """Predicts the face of a case by one model or by several."""
     case = case_of(options)
     models = models_of(options.model, ("M+S",))
+    band = _band_of(options, case)
+    if band is not None:
+        band.check(models)
     prepare(case, report=not options.no_report)
     notices = Notices(quiet=options.quiet)
     findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
@@ -54,6 +60,7 @@ def predict(options: argparse.Namespace) -> int:
             findings=findings,
             failed=failed,
             on_findings=notices.add,
+            band=band,
         )
         written = write_results(
             case.output,
@@ -80,6 +87,20 @@ def predict(options: argparse.Namespace) -> int:
     _end(notices, case.output, written)
     _print_failed({model: str(error) for model, error in failed.items()})
     return FAILED if failed else DONE
+
+
+def _band_of(options: argparse.Namespace, case: Case) -> BandOptions | None:
+    """The band that the command line or the case asks for; the command line comes first."""
+    given = (options.calibration, options.coverage, options.group)
+    if not (options.band or case.band.asked or any(value is not None for value in given)):
+        return None
+    file = case.band.calibration if options.calibration is None else options.calibration
+    return BandOptions(
+        coverage=case.band.coverage if options.coverage is None else options.coverage,
+        calibration=None if file is None else read_calibration(file),
+        group=case.band.group if options.group is None else options.group,
+        source="" if file is None else file.name,
+    )
 
 
 def _at_least_one(
@@ -256,6 +277,7 @@ def _figures(entry: WrittenPrediction, output: Path) -> dict[str, Any]:
         "contact_gap": solution["contact_gap"],
         "plan": {name: m["clinical"] for name, m in entry.summary["plan"].items()},
         "skin": dict(entry.summary["skin"]),
+        "band": entry.summary.get("band"),
         "timings": dict(entry.summary["timings"]),
         "output": str(output / entry.place),
         "files": entry.files,
@@ -279,6 +301,7 @@ def _prediction_text(entry: dict[str, Any]) -> str:
         gap = "unknown" if entry["contact_gap"] is None else f"{entry['contact_gap']:.1e} mm"
         lines.append(f"  contact     {entry['contact_iterations']} iterations, largest gap {gap}")
     lines += [
+        *band_lines(entry["band"]),
         f"  skin moves  {skin['mean']:.2f} mm on average, {skin['largest']:.2f} mm at most",
         f"  time        {sum(entry['timings'].values()):.1f} s from the files to the face",
         f"  written     {escaped(entry['output'])}: {', '.join(entry['files'])}",

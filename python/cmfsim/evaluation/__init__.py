@@ -1,6 +1,12 @@
 """Predictions against the post-operative skin: partners, distances, regions, tests (paper 3.2)."""
 
 from cmfsim.evaluation.comparison import MATCHINGS, SkinComparison, compare_skins
+from cmfsim.evaluation.conformal import (
+    calibrate,
+    cases_needed,
+    covered_interval,
+    region_scores,
+)
 from cmfsim.evaluation.models import (
     NO_CHANGE,
     WHOLE,
@@ -26,10 +32,14 @@ __all__ = [
     "ModelComparison",
     "PairedTest",
     "SkinComparison",
+    "calibrate",
+    "cases_needed",
     "compare_models",
     "compare_skins",
+    "covered_interval",
     "distance_statistics",
     "error_table",
+    "region_scores",
     "skin_regions",
     "wilcoxon_test",
 ]

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cmfsim.errors import CaseInputError
+from cmfsim.report.band import band_section
 from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
 from cmfsim.report.labels import MESH, MUSCLES, labelled
 from cmfsim.values.clinical_motion import plan_lines
@@ -23,6 +24,8 @@ MODEL_NAMES: Mapping[str, str] = {
 # Pictures in the order of a report, with what they show. The names are those of the files.
 PICTURES: Mapping[str, str] = {
     "prediction": "The face before the operation and as predicted after it, and how far it moves.",
+    "band": "Half the width of the band around the predicted skin, mm; grey where no calibration "
+    "case says anything.",
     "plan": "The plan: bone segments where they are moved to, and before as outlines.",
     "muscles": "The muscles, carried from the template to the skull by its landmarks.",
     "anatomy": "Skin and bone segments.",
@@ -79,6 +82,7 @@ def case_document(
     sections = [
         *_note_section(entry),
         _prediction_section(predictions, entry, pictures),
+        *_band_sections(entry, pictures),
         _plan_section(entry, pictures),
         *_evaluation_sections(evaluation, figures),
         *_muscle_section(entry, predictions, pictures),
@@ -141,6 +145,11 @@ def _facts(prediction: Values, evaluation: Values | None) -> dict[str, str]:
         f"{model}: tets": number(prediction["solution"]["n_tets"]),
         f"{model}: from files to face": f"{sum(prediction['timings'].values()):.0f} s",
     }
+    if "band" in prediction:
+        region = prediction["band"]["regions"]
+        face = region.get("face") or next(iter(region.values()))
+        state = prediction["band"]["state"]
+        facts[f"{model}: band of the face, {state}"] = f"± {face['half_width_mean_mm']:.1f} mm"
     if evaluation is not None and model in evaluation["models"]:
         face = evaluation["models"][model]["regions"]["whole"]
         facts[f"{model}: mean error of the face"] = f"{face['mean_mm']:.2f} mm"
@@ -195,6 +204,11 @@ def _prediction_section(
         for figure in _picture("prediction", pictures)
     ]
     return Section("Prediction", (*(drawn or (Note(NO_PICTURES, "warning"),)), table))
+
+
+def _band_sections(shown: Values, pictures: Mapping[str, bytes]) -> list[Section]:
+    """How far to trust the model that is shown, where that was asked for."""
+    return [band_section(shown["band"], _picture("band", pictures))] if "band" in shown else []
 
 
 def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:

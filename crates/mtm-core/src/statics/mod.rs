@@ -1,5 +1,6 @@
-//! Equilibrium of a body under a plan: options, linear solves, Newton's method, plan operators.
+//! Equilibrium of a body under a plan: options, linear solves, Newton's method, plan operators, first-order changes.
 
+pub(crate) mod about;
 pub(crate) mod effort;
 pub(crate) mod frozen;
 pub(crate) mod iterative;
@@ -9,6 +10,7 @@ pub(crate) mod projected_product;
 pub(crate) mod reaction;
 pub(crate) mod reduction;
 pub mod replan;
+pub mod response;
 pub mod restraint;
 pub(crate) mod row_conditions;
 pub mod solution;

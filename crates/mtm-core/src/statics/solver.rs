@@ -341,7 +341,7 @@ impl StaticSolver {
     }
 
     /// `loads` for every node, mid-edge nodes included.
-    fn checked_loads(&self, loads: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
+    pub(crate) fn checked_loads(&self, loads: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
         let n = self.tensors.element_nodes().n_nodes();
         let corners = self.tensors.mesh().n_nodes();
         if loads.len() != n && loads.len() != corners {
@@ -440,8 +440,39 @@ impl StaticSolver {
         if sum == 0.0 { 0.0 } else { (sum / scale.max(f64::MIN_POSITIVE)).sqrt() }
     }
 
+    /// Tolerance of iterative solves, relative to the length of the prescribed field.
+    pub(crate) fn tolerance(&self) -> f64 {
+        self.options.tolerance
+    }
+
+    /// Rejects kinematics and boundaries without a linear map from what drives the body to its displacements:
+    /// `kinematics` and `boundary` are what the error calls them.
+    pub(crate) fn check_linear(
+        &self,
+        kinematics: &'static str,
+        boundary: &'static str,
+    ) -> Result<()> {
+        if self.kinematics() != Kinematics::Linear {
+            return Err(MtmError::UnknownName {
+                what: kinematics,
+                found: self.kinematics().name().into(),
+                known: "linear (no linear map gives the others; use solve)",
+                kind: ErrorKind::Solver,
+            });
+        }
+        if !self.node_kinds.touching().is_empty() {
+            return Err(MtmError::UnknownName {
+                what: boundary,
+                found: "touching pairs".into(),
+                known: "one without (what touches changes with the plan; use solve)",
+                kind: ErrorKind::Solver,
+            });
+        }
+        Ok(())
+    }
+
     /// Rejects a starting solution of another mesh or boundary.
-    fn check_start(&self, start: &Solution) -> Result<()> {
+    pub(crate) fn check_start(&self, start: &Solution) -> Result<()> {
         let n = self.tensors.element_nodes().n_nodes();
         let nodes = self.sliding.as_ref().map_or(0, |s| s.nodes().len());
         let counts = [
@@ -477,6 +508,8 @@ impl StaticSolver {
             at_rest,
             converged: state.converged,
             active: state.active,
+            rows: state.rows,
+            springs: state.springs,
         }
     }
 
