@@ -70,8 +70,10 @@ from cmfsim.evaluation import compare_skins as compare_skins
 from cmfsim.evaluation import covered_interval as covered_interval
 from cmfsim.evaluation import distance_statistics as distance_statistics
 from cmfsim.evaluation import error_table as error_table
+from cmfsim.evaluation import fitted_thickness as fitted_thickness
 from cmfsim.evaluation import region_scores as region_scores
 from cmfsim.evaluation import skin_regions as skin_regions
+from cmfsim.evaluation import unmoved_regions as unmoved_regions
 from cmfsim.evaluation import wilcoxon_test as wilcoxon_test
 from cmfsim.imaging import AlignmentOptions as AlignmentOptions
 from cmfsim.imaging import SegmentOptions as SegmentOptions

@@ -252,6 +252,12 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         "evaluate", parents=[changed], help="predict the face, and compare it with the real one"
     )
     evaluate.add_argument("--model", **models, help="as in predict (default all)")
+    evaluate.add_argument(
+        "--fit-thickness",
+        action="store_true",
+        help="fit one change of thickness (swelling, weight) where nothing was operated on, and "
+        "state the errors with it as well",
+    )
     # For a study's own processes: they end when what started them does.
     for command in (predict, evaluate):
         command.add_argument("--no-report", action="store_true", help="do not write report.html")

@@ -9,6 +9,7 @@ from typing import Any
 
 from cmfsim.cli.band_text import band_lines
 from cmfsim.cli.case_commands import case_of, checked
+from cmfsim.cli.causes_text import not_operated_line, thickness_lines
 from cmfsim.cli.exit_codes import DONE, FAILED
 from cmfsim.cli.notices import Notices
 from cmfsim.cli.terminal import StageProgress, escaped
@@ -130,6 +131,7 @@ def evaluate(options: argparse.Namespace) -> int:
             check=False,
             findings=findings,
             on_findings=notices.add,
+            fit_thickness=options.fit_thickness,
         )
         written = write_results(
             case.output,
@@ -151,6 +153,7 @@ def evaluate(options: argparse.Namespace) -> int:
     if achieved is not None:
         print(achieved_text(achieved))
     print(_plan_text(found.predictions[0].summary))
+    print(not_operated_line(values["not_operated"]))
     print(f"{escaped(case.name)}: distance from the face after the operation, mm")
     print("  model        mean     SD   95 %    max   < 2 mm")
     for name, entry in [*values["models"].items(), ("no change", values["no_change"])]:
@@ -160,6 +163,8 @@ def evaluate(options: argparse.Namespace) -> int:
             f"{figures['p95_mm']:6.2f} {figures['max_mm']:6.2f} "
             f"{100 * figures['within']['2 mm']:6.0f} %"
         )
+    for line in thickness_lines(values.get("thickness")):
+        print(line)
     _print_report(case.output, written.report)
     _end(notices, case.output, written)
     _print_failed(found.failed)

@@ -126,6 +126,7 @@ _BAND = table(
             table({"sd": number(0.0, 1e6), "unit": text, "reference": text}), most=1000
         ),
         "not_covered": listing(text),
+        "notes": listing(text),
         "calibration": optional(
             table({"file": text, "note": text, "n": _COUNT}, {"group": optional(text)})
         ),

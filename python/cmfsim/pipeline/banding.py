@@ -14,6 +14,7 @@ from cmfsim._core import Surface
 from cmfsim.checks import Floats
 from cmfsim.errors import CalibrationError
 from cmfsim.evaluation import SKIN_LANDMARKS, calibrate, skin_regions
+from cmfsim.pipeline.face_regions import FaceLandmarks, face_landmarks
 from cmfsim.solving.models import solved_patient
 from cmfsim.solving.rates import SkinRates, skin_rates
 from cmfsim.solving.uncertainty import ADDED, NOT_COVERED, band_sources
@@ -171,14 +172,26 @@ def band_settings(prediction: Prediction) -> dict[str, Any]:
 
 
 def band_regions(patient: PatientModel) -> dict[str, NDArray[np.bool_]]:
-    """The vertices of a patient's skin in each region that a band holds; none without landmarks.
+    """The vertices of a patient's skin in each region that a band holds.
 
-    They are placed on the skin before the operation, as those of an evaluation.
+    They are placed on the skin before the operation, as those of an evaluation, by the skin
+    landmarks of the case or by proposed ones; none where neither are there.
+
+    Parameters
+    ----------
+    patient : PatientModel
+
+    Returns
+    -------
+    dict of str to (k,) bool
     """
-    landmarks = patient.landmarks.get("skin", {})
-    if not all(name in landmarks for name in SKIN_LANDMARKS):
+    return _placed(patient, face_landmarks(patient))
+
+
+def _placed(patient: PatientModel, landmarks: FaceLandmarks) -> dict[str, NDArray[np.bool_]]:
+    if not landmarks.points:
         return {}
-    found = skin_regions(patient.skin.vertices, landmarks)
+    found = skin_regions(patient.skin.vertices, landmarks.points)
     return {name: found[name] for name in BAND_REGIONS if found[name].any()}
 
 
@@ -194,7 +207,8 @@ def _band(prediction: Prediction, rates: SkinRates, options: BandOptions) -> Ski
         scale = depth if source.unit == "share" else np.ones(len(depth))
         parts[source.name] = source.sd * scale
     sd = np.sqrt(sum(np.square(part) for part in parts.values()))
-    settings, regions = band_settings(prediction), band_regions(prediction.patient)
+    landmarks = face_landmarks(prediction.patient)
+    settings, regions = band_settings(prediction), _placed(prediction.patient, landmarks)
     factors: Mapping[str, BandFactor] = {}
     if options.calibration is not None:
         _check_settings(options.calibration, settings)
@@ -211,6 +225,7 @@ def _band(prediction: Prediction, rates: SkinRates, options: BandOptions) -> Ski
         about={
             "sources": {name: source.as_dict() for name, source in sources.items()},
             "not_covered": [*rates.left_out, *NOT_COVERED],
+            "notes": [finding.what for finding in landmarks.findings],
             "calibration": _calibration_values(options),
         },
     )

@@ -43,7 +43,9 @@ def band_section(band: Values, figures: list[Figure]) -> Section:
         note = f" ({used['note']})" if used["note"] else ""
         statement = Note(CALIBRATED.format(percent=percent, file=used["file"], note=note))
     missing = Note("Not covered by the sources: " + "; ".join(band["not_covered"]) + ".")
-    blocks = (statement, *figures, _widths(band), _effects(band), _priors(band), missing)
+    notes = [Note(f"{text}.") for text in band["notes"]]
+    tables = (_widths(band), _effects(band), _priors(band))
+    blocks = (statement, *notes, *figures, *tables, missing)
     return Section(f"How far to trust it ({band['state']})", blocks)
 
 

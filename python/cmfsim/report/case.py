@@ -5,6 +5,7 @@ from typing import Any
 
 from cmfsim.errors import CaseInputError
 from cmfsim.report.band import band_section
+from cmfsim.report.causes import not_operated_blocks, statistics_table, thickness_blocks
 from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
 from cmfsim.report.labels import MESH, MUSCLES, labelled
 from cmfsim.values.clinical_motion import plan_lines
@@ -269,7 +270,12 @@ def _achieved(achieved: Values | None) -> list[Note | Table | Figure]:
 def _evaluation_sections(evaluation: Values | None, figures: Sequence[Figure]) -> list[Section]:
     if evaluation is None:
         return []
-    blocks: list[Note | Table | Figure] = [_mean_table(evaluation), *figures]
+    blocks: list[Note | Table | Figure] = [
+        *not_operated_blocks(evaluation),
+        _mean_table(evaluation),
+        *thickness_blocks(evaluation),
+        *figures,
+    ]
     for model, entry in evaluation["models"].items():
         blocks.append(
             statistics_table(
@@ -306,29 +312,6 @@ def _mean_table(evaluation: Values) -> Table:
     )
     caption = "Mean distance from the face after the operation, mm, by region and model."
     return Table(("region", *entries), rows, caption)
-
-
-def statistics_table(regions: Mapping[str, Values], caption: str) -> Table:
-    """Statistics of signed distances by region.
-
-    Parameters
-    ----------
-    regions : mapping of str to mapping
-        `DistanceStatistics.as_dict()` by region.
-    caption : str
-    """
-    columns = ("region", "mean", "SD", "median", "RMS", "90 %", "95 %", "max", "signed", "< 2 mm")
-    keys = ("mean_mm", "std_mm", "median_mm", "rms_mm", "p90_mm", "p95_mm", "max_mm")
-    rows = tuple(
-        (
-            name,
-            *(number(values[key]) for key in keys),
-            f"{values['signed_mean_mm']:+.2f}",
-            f"{100 * values['within']['2 mm']:.0f} %",
-        )
-        for name, values in regions.items()
-    )
-    return Table(columns, rows, caption)
 
 
 def _muscle_section(

@@ -24,7 +24,7 @@ def settings_digest(settings: Mapping[str, Any]) -> str:
     ----------
     settings : mapping of str to plain values
     """
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(dict(settings), sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,9 @@ class Calibration:
             seen.add(case.case)
         if self.coverage is not None and not 0.0 < as_number("coverage", self.coverage) < 1.0:
             raise CalibrationError(f"coverage is {self.coverage!r}: allowed is above 0, below 1")
-        object.__setattr__(self, "settings", MappingProxyType(dict(self.settings)))
+        # As a file gives them back: tuples are lists.
+        settings = json.loads(json.dumps(dict(self.settings)))
+        object.__setattr__(self, "settings", MappingProxyType(settings))
         object.__setattr__(self, "digest", settings_digest(self.settings))
 
     @property
