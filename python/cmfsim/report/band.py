@@ -45,7 +45,7 @@ def band_section(band: Values, figures: list[Figure]) -> Section:
     missing = Note("Not covered by the sources: " + "; ".join(band["not_covered"]) + ".")
     notes = [Note(f"{text}.") for text in band["notes"]]
     tables = (_widths(band), _effects(band), _priors(band))
-    blocks = (statement, *notes, *figures, *tables, missing)
+    blocks: tuple[Note | Table | Figure, ...] = (statement, *notes, *figures, *tables, missing)
     return Section(f"How far to trust it ({band['state']})", blocks)
 
 

@@ -371,10 +371,12 @@ impl System {
             Kept::Factor(factor) => flexible(factor, &ContactFactor::by_sweeps(factor, sliding)?),
             Kept::Flexible { factor, contact } => flexible(factor, contact),
             Kept::Matrix(system) => {
+                // All columns have the same constraints, so one trial serves them.
+                let mut trail = Trail::default();
                 let solve = |((k, b), &scale): ((usize, &Rows), &f64)| {
                     let mut solve = Solve::new(scale, interrupted);
                     conditions(k, &mut |c| {
-                        let mut trail = Trail::default();
+                        trail.begin_again();
                         let nodes = (sliding, Linked::default());
                         let found = system.solve_projected(b, nodes, c, &mut trail, &mut solve);
                         found.map(|found| found.rows)
