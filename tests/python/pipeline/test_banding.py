@@ -136,7 +136,7 @@ def test_a_calibration_without_a_region_of_the_face_is_refused(patient, plain):
         cmfsim.predict_with_band(patient, "M+S", cmfsim.BandOptions(0.9, found))
 
 
-def test_the_case_file_asks_for_a_band(made, tmp_path):
+def test_the_case_file_asks_for_a_band(made):
     text = made.case.file.read_text(encoding="utf-8")
     path = made.case.file.with_name("banded.toml")
     path.write_text(f'{text}\n[band]\ncalibration = "c.json"\ncoverage = 0.8\n', encoding="utf-8")
