@@ -536,7 +536,7 @@ impl PyStaticSolver {
     ///     Per unit of a parameter, (n, 3) array_like, N: forces on the nodes; or dict of str to (4, 4)
     ///     array_like: the change of the motion x' = R x + t of a segment, its last row zero.
     /// accuracy : float
-    ///     Error that an iterative solve may leave in a displacement, mm.
+    ///     Error that an iterative solve may leave, in the energy norm, as a share of the change; above 0, below 1.
     ///
     /// Returns
     /// -------

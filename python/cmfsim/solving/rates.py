@@ -28,9 +28,9 @@ __all__ = ["SkinRates", "skin_rates"]
 # Difference of forces, in standard deviations: small enough for its error of first order to be
 # 1e-4 of it, far above rounding. Downwards, away from ν = 0.5 and from a fraction of 1.
 STEP = -1e-4
-# Error that an iterative solve may leave in a displacement by one standard deviation, mm: a
-# hundredth of the smallest source that is added without a solve.
-ACCURACY = 2e-3
+# Error that an iterative solve may leave in a derivative, as a share of it in the energy norm: a
+# tenth of the 1 % that is asked of derivatives.
+ACCURACY = 1e-3
 # Unit axes to the left, back and up (LPS).
 AXES = np.eye(3)
 

@@ -133,9 +133,9 @@ impl StaticSolver {
                     springs: &state.springs,
                     goals: &goals,
                 };
-                self.solve_columns(fields, &scales, Some(frozen), interrupted)?
+                self.solve_columns(fields, (&scales, None), Some(frozen), interrupted)?
             }
-            _ => self.solve_columns(fields, &scales, None, interrupted)?,
+            _ => self.solve_columns(fields, (&scales, None), None, interrupted)?,
         };
 
         let kinds = self.node_kinds.kinds(n)?;

@@ -37,7 +37,7 @@ impl StaticSolver {
     /// The displacement of every node that each of `changes` adds to `solution`, the solution for `plan`, to
     /// first order, mm. The set of held sliding nodes stays as it is.
     ///
-    /// `accuracy`: error that an iterative solve may leave in a displacement, mm.
+    /// `accuracy`: error that an iterative solve may leave, in the energy norm, as a share of the change.
     ///
     /// # Errors
     /// Large deformation, parts that may touch; a solution of another solver; loads or rates that do not fit; a
@@ -85,10 +85,9 @@ impl StaticSolver {
         let goals: Vec<Vec<f64>> = posed.iter().map(|p| p.slope.goals.clone()).collect();
         let frozen =
             Frozen { rows: about.rows, offsets: &offsets, springs: about.springs, goals: &goals };
-        // An iterative solve stops at its tolerance times the length of the prescribed field.
-        let scales = vec![accuracy / self.tolerance(); fields.len()];
+        let scales = vec![0.0; fields.len()];
         let frozen = self.sliding.is_some().then_some(frozen);
-        let solved = self.solve_columns(fields, &scales, frozen, interrupted)?;
+        let solved = self.solve_columns(fields, (&scales, Some(accuracy)), frozen, interrupted)?;
         let filled = posed.iter().zip(&solved);
         Ok(filled.map(|(p, rows)| self.reduction.filled(&p.prescribed, rows)).collect())
     }
@@ -135,13 +134,13 @@ impl StaticSolver {
     }
 
     fn check_accuracy(&self, accuracy: f64) -> Result<()> {
-        if accuracy.is_finite() && accuracy > 0.0 {
+        if accuracy > 0.0 && accuracy < 1.0 {
             return Ok(());
         }
         Err(MtmError::UnknownName {
             what: "accuracy of a first-order change",
             found: accuracy.to_string(),
-            known: "a positive length, mm",
+            known: "a share above 0 and below 1",
             kind: ErrorKind::Solver,
         })
     }

@@ -440,11 +440,6 @@ impl StaticSolver {
         if sum == 0.0 { 0.0 } else { (sum / scale.max(f64::MIN_POSITIVE)).sqrt() }
     }
 
-    /// Tolerance of iterative solves, relative to the length of the prescribed field.
-    pub(crate) fn tolerance(&self) -> f64 {
-        self.options.tolerance
-    }
-
     /// Rejects kinematics and boundaries without a linear map from what drives the body to its displacements:
     /// `kinematics` and `boundary` are what the error calls them.
     pub(crate) fn check_linear(
@@ -530,11 +525,12 @@ impl StaticSolver {
         Ok(self.solve_rows(&posed, &mut Solve::new(scale, interrupted))?.0.contact)
     }
 
-    /// Unknown rows for several right-hand sides, with contact frozen if there is any.
+    /// Unknown rows for several right-hand sides, with contact frozen if there is any; see
+    /// [`System::solve_columns`].
     pub(crate) fn solve_columns(
         &self,
         columns: Vec<Vec<[f64; 3]>>,
-        scales: &[f64],
+        accuracy: (&[f64], Option<f64>),
         frozen: Option<Frozen<'_>>,
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
@@ -542,7 +538,7 @@ impl StaticSolver {
             unreachable!("plan operators of other kinematics are refused before they get here")
         };
         system
-            .solve_columns(columns, scales, self.sliding.as_ref().zip(frozen), interrupted)
+            .solve_columns(columns, accuracy, self.sliding.as_ref().zip(frozen), interrupted)
             .map_err(|e| by_node(e, &self.reduction.unknowns))
     }
 }

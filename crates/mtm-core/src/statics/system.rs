@@ -319,11 +319,12 @@ impl System {
         Ok(iterative.solve_projected(b, conditions, leave, &mut trail, solve)?.rows)
     }
 
-    /// Rows for several right-hand sides; `scales` are the lengths of their prescribed fields, mm.
+    /// Rows for several right-hand sides; `scales` are the lengths of their prescribed fields, mm. With a
+    /// `share`, iterative solves may leave that error relative to the solution, in the energy norm.
     pub fn solve_columns(
         &self,
         mut columns: Vec<Vec<[f64; 3]>>,
-        scales: &[f64],
+        (scales, share): (&[f64], Option<f64>),
         sliding: Option<(&Sliding, Frozen<'_>)>,
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
@@ -332,8 +333,17 @@ impl System {
                 factor.solve_many(&mut columns);
                 return Ok(columns);
             }
-            let each = columns.iter().zip(scales);
-            return each.map(|(b, &s)| self.solve(b, &mut Solve::new(s, interrupted))).collect();
+            let linked = Linked { share, ..Linked::default() };
+            let solve = |(b, &scale): (&Rows, &f64)| {
+                let mut solve = Solve::new(scale, interrupted);
+                match (&self.kept, share) {
+                    (Kept::Matrix(Unfactored::Iterative(_)), Some(_)) => {
+                        self.solve_linked(b, linked, &[], &mut solve)
+                    }
+                    _ => self.solve(b, &mut solve),
+                }
+            };
+            return columns.iter().zip(scales).map(solve).collect();
         };
         let still = vec![[0.0; 3]; sliding.nodes().len()];
         let conditions = |k: usize, solve: &mut dyn FnMut(&Constraints<'_>) -> Result<Rows>| {
@@ -377,7 +387,7 @@ impl System {
                     let mut solve = Solve::new(scale, interrupted);
                     conditions(k, &mut |c| {
                         trail.begin_again();
-                        let nodes = (sliding, Linked::default());
+                        let nodes = (sliding, Linked { share, ..Linked::default() });
                         let found = system.solve_projected(b, nodes, c, &mut trail, &mut solve);
                         found.map(|found| found.rows)
                     })
