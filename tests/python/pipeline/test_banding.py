@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import cmfsim
+from cmfsim.cli import main
 from cmfsim.io.predictions import read_prediction
 from cmfsim.phantom.demo import write_demo_case
 from cmfsim.pipeline.building.stages import BuildOptions
@@ -147,3 +148,31 @@ def test_the_case_file_asks_for_a_band(made):
     with pytest.raises(cmfsim.CaseError, match=r"coverage.*90"):
         cmfsim.Case.load(path)
     assert not made.case.band.asked
+
+
+def test_the_command_line_refuses_a_band_before_any_work(made, plain, tmp_path, capsys):
+    case, path = str(made.case.file), tmp_path / "calibration.json"
+    assert main(["predict", case, "--calibration", str(tmp_path / "none.json"), "-q"]) == 2
+    assert "none.json" in capsys.readouterr().err
+    assert main(["predict", case, "--coverage", "90", "-q"]) == 2
+    assert "coverage is 90" in capsys.readouterr().err
+    cmfsim.write_calibration(path, calibration_for(plain))
+    assert main(["predict", case, "--calibration", str(path), "--model", "H", "-q"]) == 2
+    assert "calibration is of model M+S" in capsys.readouterr().err
+    assert not made.case.output.exists()
+
+
+def test_the_command_line_states_a_band_and_what_it_is_worth(made, plain, tmp_path, capsys):
+    path = tmp_path / "calibration.json"
+    cmfsim.write_calibration(path, calibration_for(plain))
+    output = tmp_path / "out"
+    command = ["predict", str(made.case.file), "-o", str(output), "--no-report", "--no-doctor"]
+    assert main([*command, "--calibration", str(path), "-q"]) == 0
+    text = capsys.readouterr().out
+    assert "90 % by region, calibrated by calibration.json (made up)" in text
+    assert "n = 19, holds 77 to 98 % of further cases" in text
+    assert read_prediction(output)["band"]["state"] == "calibrated"
+    assert main([*command, "--band", "--json", "-q"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["predictions"][0]["band"]["state"] == "uncalibrated"
+    assert "band_sd_mm_uncalibrated" in (output / "prediction.vtp").read_bytes().decode("latin-1")
