@@ -142,7 +142,6 @@ from cmfsim.phantom import Muscle as Muscle
 from cmfsim.phantom import PhantomHead as PhantomHead
 from cmfsim.phantom import make_head as make_head
 from cmfsim.phantom.case_files import write_phantom_case as write_phantom_case
-from cmfsim.pipeline.banding import BandOptions as BandOptions
 from cmfsim.pipeline.banding import band_regions as band_regions
 from cmfsim.pipeline.banding import band_settings as band_settings
 from cmfsim.pipeline.banding import predict_with_band as predict_with_band
@@ -206,6 +205,7 @@ from cmfsim.surfaces.repair import RepairOptions as RepairOptions
 from cmfsim.surfaces.repair import repair_surface as repair_surface
 from cmfsim.values.anatomy import Anatomy as Anatomy
 from cmfsim.values.anatomy import BoneSegment as BoneSegment
+from cmfsim.values.band_options import BandOptions as BandOptions
 from cmfsim.values.calibration import BandFactor as BandFactor
 from cmfsim.values.calibration import Calibration as Calibration
 from cmfsim.values.calibration import CalibrationCase as CalibrationCase

@@ -16,7 +16,6 @@ from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.errors import CmfsimError
 from cmfsim.io import Case, Cohort, read_landmark_file, replacing
 from cmfsim.io.calibrations import read_calibration
-from cmfsim.pipeline.banding import BandOptions
 from cmfsim.pipeline.evaluating import evaluate as evaluate_case
 from cmfsim.pipeline.outputs import (
     WrittenPrediction,
@@ -29,6 +28,7 @@ from cmfsim.pipeline.preparation import prepare
 from cmfsim.study import CaseOutcome, StudyReport, run_study
 from cmfsim.study import sensitivity as landmark_sensitivity
 from cmfsim.study.outputs import write_study_report
+from cmfsim.values.band_options import BandOptions
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import MODELS, Prediction
 

@@ -1,10 +1,9 @@
 """The band around a prediction: derivatives and priors, regions of the face, a calibration."""
 
-import math
 import statistics
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,12 +18,13 @@ from cmfsim.solving.models import solved_patient
 from cmfsim.solving.rates import SkinRates, skin_rates
 from cmfsim.solving.uncertainty import ADDED, NOT_COVERED, band_sources
 from cmfsim.surfaces.depth import tissue_depth
+from cmfsim.values.band_options import BandOptions
 from cmfsim.values.calibration import BandFactor, Calibration, settings_digest
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import WHOLE_FACE, SkinBand
 
-__all__ = ["BandOptions", "band_regions", "band_settings", "predict_with_band"]
+__all__ = ["band_regions", "band_settings", "predict_with_band"]
 
 # Regions of `skin_regions` that a band holds simultaneously, each by itself.
 BAND_REGIONS = (
@@ -36,61 +36,6 @@ BAND_REGIONS = (
     "left cheek",
     "right cheek",
 )
-
-
-@dataclass(frozen=True)
-class BandOptions:
-    """What a band is asked for.
-
-    Attributes
-    ----------
-    coverage : float
-        Share of cases that are to lie within it, region by region: above 0, below 1.
-    calibration : Calibration or None
-        None makes an uncalibrated band.
-    group : str or None
-        The calibration cases to use; None uses all of them.
-    source : str
-        Where the calibration comes from, for the report: the name of its file.
-    """
-
-    coverage: float = 0.9
-    calibration: Calibration | None = None
-    group: str | None = None
-    source: str = ""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.coverage < 1.0:
-            raise CalibrationError(
-                f"coverage is {self.coverage!r}: allowed is above 0, below 1 (90 % is 0.9)"
-            )
-
-    def check(self, models: Sequence[str]) -> None:
-        """Refuses a calibration that is not of the models, or not for the coverage.
-
-        Parameters
-        ----------
-        models : sequence of str
-
-        Raises
-        ------
-        CalibrationError
-            (also `ValueError`)
-        """
-        found = self.calibration
-        if found is None:
-            return
-        for model in models:
-            if found.model != model:
-                raise CalibrationError(
-                    f"the calibration is of model {found.model}, and the prediction of {model}: "
-                    f"predict with --model {found.model}, or calibrate with {model}"
-                )
-        if found.coverage is not None and not math.isclose(found.coverage, self.coverage):
-            raise CalibrationError(
-                f"the calibration is for a coverage of {found.coverage:g}, and {self.coverage:g} "
-                "is asked for"
-            )
 
 
 def predict_with_band(

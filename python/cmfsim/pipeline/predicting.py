@@ -7,13 +7,13 @@ from dataclasses import replace
 from cmfsim.checks import check_one_of
 from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
 from cmfsim.io import Case, CaseOrPath, as_case
-from cmfsim.pipeline.banding import BandOptions, predict_with_band
 from cmfsim.pipeline.building import Postoperative, case_key, input_hashes, plan_key
 from cmfsim.pipeline.building.case_model import model_of
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.progress import Progress
 from cmfsim.solving.models import predict_patient
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.band_options import BandOptions
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
@@ -159,6 +159,9 @@ def predictions_of(
             if band is None:
                 prediction = predict_patient(patient, model)
             else:
+                # Regions and proposed landmarks: a prediction without a band does not load them.
+                from cmfsim.pipeline.banding import predict_with_band  # noqa: PLC0415
+
                 prediction = predict_with_band(patient, model, band)
         except (ContactError, SolverError) as error:
             if failed is None:
