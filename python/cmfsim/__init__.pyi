@@ -47,6 +47,7 @@ from cmfsim.doctor import Examination as Examination
 from cmfsim.doctor import diagnose as diagnose
 from cmfsim.doctor import examine as examine
 from cmfsim.errors import BoundaryError as BoundaryError
+from cmfsim.errors import CalibrationError as CalibrationError
 from cmfsim.errors import CaseError as CaseError
 from cmfsim.errors import CmfsimError as CmfsimError
 from cmfsim.errors import ContactError as ContactError
@@ -62,11 +63,17 @@ from cmfsim.evaluation import Improvement as Improvement
 from cmfsim.evaluation import ModelComparison as ModelComparison
 from cmfsim.evaluation import PairedTest as PairedTest
 from cmfsim.evaluation import SkinComparison as SkinComparison
+from cmfsim.evaluation import calibrate as calibrate
+from cmfsim.evaluation import cases_needed as cases_needed
 from cmfsim.evaluation import compare_models as compare_models
 from cmfsim.evaluation import compare_skins as compare_skins
+from cmfsim.evaluation import covered_interval as covered_interval
 from cmfsim.evaluation import distance_statistics as distance_statistics
 from cmfsim.evaluation import error_table as error_table
+from cmfsim.evaluation import fitted_thickness as fitted_thickness
+from cmfsim.evaluation import region_scores as region_scores
 from cmfsim.evaluation import skin_regions as skin_regions
+from cmfsim.evaluation import unmoved_regions as unmoved_regions
 from cmfsim.evaluation import wilcoxon_test as wilcoxon_test
 from cmfsim.imaging import AlignmentOptions as AlignmentOptions
 from cmfsim.imaging import SegmentOptions as SegmentOptions
@@ -96,6 +103,8 @@ from cmfsim.io import write_scene as write_scene
 from cmfsim.io import write_slicer_bundle as write_slicer_bundle
 from cmfsim.io import write_surface as write_surface
 from cmfsim.io import write_transform as write_transform
+from cmfsim.io.calibrations import read_calibration as read_calibration
+from cmfsim.io.calibrations import write_calibration as write_calibration
 from cmfsim.lips import LipSeam as LipSeam
 from cmfsim.lips import lip_regions as lip_regions
 from cmfsim.lips import lip_seam as lip_seam
@@ -133,6 +142,9 @@ from cmfsim.phantom import Muscle as Muscle
 from cmfsim.phantom import PhantomHead as PhantomHead
 from cmfsim.phantom import make_head as make_head
 from cmfsim.phantom.case_files import write_phantom_case as write_phantom_case
+from cmfsim.pipeline.banding import band_regions as band_regions
+from cmfsim.pipeline.banding import band_settings as band_settings
+from cmfsim.pipeline.banding import predict_with_band as predict_with_band
 from cmfsim.pipeline.building import build_case as build_case
 from cmfsim.pipeline.building import build_model as build_model
 from cmfsim.pipeline.building import with_muscles as with_muscles
@@ -193,6 +205,10 @@ from cmfsim.surfaces.repair import RepairOptions as RepairOptions
 from cmfsim.surfaces.repair import repair_surface as repair_surface
 from cmfsim.values.anatomy import Anatomy as Anatomy
 from cmfsim.values.anatomy import BoneSegment as BoneSegment
+from cmfsim.values.band_options import BandOptions as BandOptions
+from cmfsim.values.calibration import BandFactor as BandFactor
+from cmfsim.values.calibration import Calibration as Calibration
+from cmfsim.values.calibration import CalibrationCase as CalibrationCase
 from cmfsim.values.case_parts import CaseMuscles as CaseMuscles
 from cmfsim.values.clinical_motion import ClinicalMotion as ClinicalMotion
 from cmfsim.values.clinical_motion import clinical_motion as clinical_motion
@@ -218,6 +234,7 @@ from cmfsim.values.prediction import Prediction as Prediction
 from cmfsim.values.scene import Scene as Scene
 from cmfsim.values.scene import SceneResult as SceneResult
 from cmfsim.values.scene import SegmentData as SegmentData
+from cmfsim.values.skin_band import SkinBand as SkinBand
 from cmfsim.values.solver_options import SolverOptions as SolverOptions
 from cmfsim.values.surface_data import MovedSurface as MovedSurface
 from cmfsim.values.surface_data import SurfaceData as SurfaceData

@@ -274,6 +274,14 @@ class StaticSolver:
     def solve(
         self, plan: _Plan, *, loads: ArrayLike | None = None, start: Solution | None = None
     ) -> Solution: ...
+    def responses(
+        self,
+        solution: Solution,
+        plan: _Plan,
+        changes: Sequence[ArrayLike | Mapping[str, ArrayLike]],
+        *,
+        accuracy: float = 1e-4,
+    ) -> list[_Floats]: ...
     def plan_operator(
         self, nodes: ArrayLike | None = None, *, plan: _Plan | None = None
     ) -> PlanOperator: ...

@@ -20,6 +20,7 @@ from cmfsim._core import (
 __all__ = [
     "BoundaryError",
     "BoundaryInputError",
+    "CalibrationError",
     "CaseError",
     "CaseInputError",
     "CmfsimError",
@@ -44,6 +45,10 @@ class BoundaryInputError(BoundaryError, ValueError):
 
 class CaseInputError(CaseError, ValueError):
     """A scene or case, in memory or on disk, that cannot be meant."""
+
+
+class CalibrationError(CaseInputError):
+    """A calibration that does not fit the prediction, or that is too small for what is asked."""
 
 
 class MaterialInputError(MaterialError, ValueError):

@@ -27,7 +27,7 @@
 //! | `muscles` | fibre directions and the share of muscle in each tet |
 //! | `registration` | rigid fits, ICP, thin-plate splines |
 //! | `contact` | sliding nodes, their surfaces and the contact solver |
-//! | `statics` | the solvers: linear, Newton's method, plan operators |
+//! | `statics` | the solvers: linear, Newton's method, plan operators, first-order changes |
 //!
 //! # Units and signs
 //!
@@ -121,5 +121,6 @@ pub use registration::rigid::{RigidFit, RigidFitOptions, rigid_fit};
 pub use registration::thin_plate::{Folds, ThinPlateSpline};
 pub use statics::options::{Interrupt, Method, StaticOptions};
 pub use statics::replan::PlanOperator;
+pub use statics::response::Change;
 pub use statics::solution::{ContactResult, Solution, Timings, TouchResult};
 pub use statics::solver::StaticSolver;

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use mtm_core::{
-    Against, Boundary, Conflicts, ContactMode, ContactOptions, ErrorKind, Gap, Kinematics, Method,
-    Motion, MtmError, Plan, PlanOperator, RigidMotion, Segment, Solution, StaticOptions,
+    Against, Boundary, Change, Conflicts, ContactMode, ContactOptions, ErrorKind, Gap, Kinematics,
+    Method, Motion, MtmError, Plan, PlanOperator, RigidMotion, Segment, Solution, StaticOptions,
     StaticSolver, Timings, TouchingPair,
 };
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods};
@@ -308,6 +308,39 @@ fn plan(value: &Bound<'_, PyAny>) -> PyResult<Plan> {
         .collect()
 }
 
+/// Changes of what drives a body: forces on nodes, or rates of motions by segment.
+fn changes(value: &Bound<'_, PyAny>) -> PyResult<Vec<Change>> {
+    let wrong = |i: usize| {
+        errors::input(
+            BOUNDARY,
+            format!("changes[{i}] must be (n, 3) forces, N, or a dict of rates"),
+        )
+    };
+    let change = |(i, entry): (usize, PyResult<Bound<'_, PyAny>>)| {
+        let entry = entry?;
+        if !entry.is_instance_of::<PyDict>() {
+            let what = format!("changes[{i}]");
+            return Ok(Change::Loads(arrays::points(&entry, Named(&what, BOUNDARY))?));
+        }
+        let rate = |(name, matrix): (String, Bound<'_, PyAny>)| {
+            let what = format!("changes[{i}][\"{name}\"]");
+            let found = arrays::matrix4(&matrix, Named(&what, BOUNDARY))?;
+            let [x, y, z, last] = found.ok_or_else(|| wrong(i))?;
+            if last != [0.0; 4] {
+                let problem = format!("{what}: the last row of a rate is zero, not {last:?}");
+                return Err(errors::input(BOUNDARY, problem));
+            }
+            Ok((name, [x, y, z]))
+        };
+        let rates = entries(Some(&entry), &format!("changes[{i}]"))?.into_iter().map(rate);
+        Ok(Change::Rates(rates.collect::<PyResult<_>>()?))
+    };
+    let listed = value.try_iter().map_err(|_| {
+        errors::input(BOUNDARY, "changes must be a sequence of forces and of dicts".to_owned())
+    })?;
+    listed.enumerate().map(change).collect()
+}
+
 /// A patient's tensors and node kinds, ready for any plan; everything that does not depend on the plan is kept.
 ///
 /// Parameters
@@ -488,6 +521,55 @@ impl PyStaticSolver {
         let operator =
             interruptible(py, move |stop| core.plan_operator(nodes, plan.as_ref(), stop))?;
         Ok(PyPlanOperator { core: operator })
+    }
+
+    /// Displacements that small changes add to a solution, to first order: one linear solve for each, with
+    /// contact continued to first order and the set of held sliding nodes unchanged.
+    ///
+    /// Parameters
+    /// ----------
+    /// solution : Solution
+    ///     Of this solver.
+    /// plan : dict
+    ///     The plan that it solves.
+    /// changes : sequence
+    ///     Per unit of a parameter, (n, 3) array_like, N: forces on the nodes; or dict of str to (4, 4)
+    ///     array_like: the change of the motion x' = R x + t of a segment, its last row zero.
+    /// accuracy : float
+    ///     Error that an iterative solve may leave, in the energy norm, as a share of the change; above 0, below 1.
+    ///
+    /// Returns
+    /// -------
+    /// list of (n, 3) float64, mm
+    ///     Displacements of the nodes of the mesh.
+    ///
+    /// Raises
+    /// ------
+    /// BoundaryError
+    ///     Loads or rates that do not fit.
+    /// SolverError
+    ///     Large deformation, touching pairs, a linear solve that fails.
+    #[pyo3(signature = (solution, plan, changes, *, accuracy = 1e-4))]
+    fn responses<'py>(
+        &self,
+        py: Python<'py>,
+        solution: PyRef<'_, PySolution>,
+        plan: &Bound<'_, PyAny>,
+        changes: &Bound<'_, PyAny>,
+        accuracy: f64,
+    ) -> PyResult<Vec<Bound<'py, PyArray2<f64>>>> {
+        let (plan, solution) = (self::plan(plan)?, solution.whole(py)?);
+        let changes = self::changes(changes)?;
+        let core = self.core.clone();
+        let found = interruptible(py, move |stop| {
+            core.responses((&plan, &solution), &changes, accuracy, stop)
+        })?;
+        let n_nodes = self.core.tensors().mesh().n_nodes();
+        let corners = |mut rows: Vec<[f64; 3]>| {
+            rows.truncate(n_nodes);
+            arrays::rows(py, rows)
+        };
+        Ok(found.into_iter().map(corners).collect())
     }
 
     /// The method in use.

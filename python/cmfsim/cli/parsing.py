@@ -186,6 +186,24 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     predict.add_argument(
         "--plan", metavar="PLAN", type=Path, help="plan.toml to use instead of the case's plan"
     )
+    predict.add_argument(
+        "--band",
+        action="store_true",
+        help="state how far to trust the face: a band in report, files and on the terminal",
+    )
+    predict.add_argument(
+        "--calibration",
+        metavar="FILE",
+        type=Path,
+        help="calibration of the band, from cases whose outcome is known; without one it is "
+        "uncalibrated, and named so",
+    )
+    predict.add_argument(
+        "--coverage", metavar="SHARE", type=float, help="of the band (default 0.9, 90 %%)"
+    )
+    predict.add_argument(
+        "--group", metavar="NAME", help="use the calibration cases of this group alone"
+    )
     predict.set_defaults(run=study_commands.predict)
 
     plan = commands.add_parser(
@@ -234,6 +252,12 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         "evaluate", parents=[changed], help="predict the face, and compare it with the real one"
     )
     evaluate.add_argument("--model", **models, help="as in predict (default all)")
+    evaluate.add_argument(
+        "--fit-thickness",
+        action="store_true",
+        help="fit one change of thickness (swelling, weight) where nothing was operated on, and "
+        "state the errors with it as well",
+    )
     # For a study's own processes: they end when what started them does.
     for command in (predict, evaluate):
         command.add_argument("--no-report", action="store_true", help="do not write report.html")

@@ -7,12 +7,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cmfsim.cli.band_text import band_lines
 from cmfsim.cli.case_commands import case_of, checked
+from cmfsim.cli.causes_text import not_operated_line, thickness_lines
 from cmfsim.cli.exit_codes import DONE, FAILED
 from cmfsim.cli.notices import Notices
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.errors import CmfsimError
-from cmfsim.io import Cohort, read_landmark_file, replacing
+from cmfsim.io import Case, Cohort, read_landmark_file, replacing
+from cmfsim.io.calibrations import read_calibration
 from cmfsim.pipeline.evaluating import evaluate as evaluate_case
 from cmfsim.pipeline.outputs import (
     WrittenPrediction,
@@ -25,6 +28,7 @@ from cmfsim.pipeline.preparation import prepare
 from cmfsim.study import CaseOutcome, StudyReport, run_study
 from cmfsim.study import sensitivity as landmark_sensitivity
 from cmfsim.study.outputs import write_study_report
+from cmfsim.values.band_options import BandOptions
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import MODELS, Prediction
 
@@ -41,6 +45,9 @@ def predict(options: argparse.Namespace) -> int:
     """Predicts the face of a case by one model or by several."""
     case = case_of(options)
     models = models_of(options.model, ("M+S",))
+    band = _band_of(options, case)
+    if band is not None:
+        band.check(models)
     prepare(case, report=not options.no_report)
     notices = Notices(quiet=options.quiet)
     findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
@@ -54,6 +61,7 @@ def predict(options: argparse.Namespace) -> int:
             findings=findings,
             failed=failed,
             on_findings=notices.add,
+            band=band,
         )
         written = write_results(
             case.output,
@@ -80,6 +88,20 @@ def predict(options: argparse.Namespace) -> int:
     _end(notices, case.output, written)
     _print_failed({model: str(error) for model, error in failed.items()})
     return FAILED if failed else DONE
+
+
+def _band_of(options: argparse.Namespace, case: Case) -> BandOptions | None:
+    """The band that the command line or the case asks for; the command line comes first."""
+    given = (options.calibration, options.coverage, options.group)
+    if not (options.band or case.band.asked or any(value is not None for value in given)):
+        return None
+    file = case.band.calibration if options.calibration is None else options.calibration
+    return BandOptions(
+        coverage=case.band.coverage if options.coverage is None else options.coverage,
+        calibration=None if file is None else read_calibration(file),
+        group=case.band.group if options.group is None else options.group,
+        source="" if file is None else file.name,
+    )
 
 
 def _at_least_one(
@@ -109,6 +131,7 @@ def evaluate(options: argparse.Namespace) -> int:
             check=False,
             findings=findings,
             on_findings=notices.add,
+            fit_thickness=options.fit_thickness,
         )
         written = write_results(
             case.output,
@@ -130,6 +153,7 @@ def evaluate(options: argparse.Namespace) -> int:
     if achieved is not None:
         print(achieved_text(achieved))
     print(_plan_text(found.predictions[0].summary))
+    print(not_operated_line(values["not_operated"]))
     print(f"{escaped(case.name)}: distance from the face after the operation, mm")
     print("  model        mean     SD   95 %    max   < 2 mm")
     for name, entry in [*values["models"].items(), ("no change", values["no_change"])]:
@@ -139,6 +163,8 @@ def evaluate(options: argparse.Namespace) -> int:
             f"{figures['p95_mm']:6.2f} {figures['max_mm']:6.2f} "
             f"{100 * figures['within']['2 mm']:6.0f} %"
         )
+    for line in thickness_lines(values.get("thickness")):
+        print(line)
     _print_report(case.output, written.report)
     _end(notices, case.output, written)
     _print_failed(found.failed)
@@ -256,6 +282,7 @@ def _figures(entry: WrittenPrediction, output: Path) -> dict[str, Any]:
         "contact_gap": solution["contact_gap"],
         "plan": {name: m["clinical"] for name, m in entry.summary["plan"].items()},
         "skin": dict(entry.summary["skin"]),
+        "band": entry.summary.get("band"),
         "timings": dict(entry.summary["timings"]),
         "output": str(output / entry.place),
         "files": entry.files,
@@ -279,6 +306,7 @@ def _prediction_text(entry: dict[str, Any]) -> str:
         gap = "unknown" if entry["contact_gap"] is None else f"{entry['contact_gap']:.1e} mm"
         lines.append(f"  contact     {entry['contact_iterations']} iterations, largest gap {gap}")
     lines += [
+        *band_lines(entry["band"]),
         f"  skin moves  {skin['mean']:.2f} mm on average, {skin['largest']:.2f} mm at most",
         f"  time        {sum(entry['timings'].values()):.1f} s from the files to the face",
         f"  written     {escaped(entry['output'])}: {', '.join(entry['files'])}",

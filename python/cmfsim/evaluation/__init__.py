@@ -1,6 +1,12 @@
 """Predictions against the post-operative skin: partners, distances, regions, tests (paper 3.2)."""
 
 from cmfsim.evaluation.comparison import MATCHINGS, SkinComparison, compare_skins
+from cmfsim.evaluation.conformal import (
+    calibrate,
+    cases_needed,
+    covered_interval,
+    region_scores,
+)
 from cmfsim.evaluation.models import (
     NO_CHANGE,
     WHOLE,
@@ -8,10 +14,17 @@ from cmfsim.evaluation.models import (
     ModelComparison,
     compare_models,
 )
-from cmfsim.evaluation.regions import REGIONS, SKIN_LANDMARKS, skin_regions
+from cmfsim.evaluation.regions import (
+    REGIONS,
+    SKIN_LANDMARKS,
+    UNMOVED_REGIONS,
+    skin_regions,
+    unmoved_regions,
+)
 from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
 from cmfsim.evaluation.statistics import LIMITS, DistanceStatistics, distance_statistics
 from cmfsim.evaluation.tables import ErrorTable, error_table
+from cmfsim.evaluation.unmoved import ThicknessChange, compare_unmoved, fitted_thickness
 
 __all__ = [
     "LIMITS",
@@ -19,6 +32,7 @@ __all__ = [
     "NO_CHANGE",
     "REGIONS",
     "SKIN_LANDMARKS",
+    "UNMOVED_REGIONS",
     "WHOLE",
     "DistanceStatistics",
     "ErrorTable",
@@ -26,10 +40,18 @@ __all__ = [
     "ModelComparison",
     "PairedTest",
     "SkinComparison",
+    "ThicknessChange",
+    "calibrate",
+    "cases_needed",
     "compare_models",
     "compare_skins",
+    "compare_unmoved",
+    "covered_interval",
     "distance_statistics",
     "error_table",
+    "fitted_thickness",
+    "region_scores",
     "skin_regions",
+    "unmoved_regions",
     "wilcoxon_test",
 ]

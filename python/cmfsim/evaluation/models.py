@@ -20,6 +20,7 @@ from cmfsim.evaluation.comparison import (
 from cmfsim.evaluation.regions import SKIN_LANDMARKS, skin_regions
 from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
+from cmfsim.evaluation.unmoved import thickened
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["NO_CHANGE", "WHOLE", "Improvement", "ModelComparison", "compare_models"]
@@ -126,7 +127,7 @@ class ModelComparison:
         }
 
 
-def compare_models(
+def compare_models(  # noqa: PLR0913 (options by name)
     preoperative: SurfaceData | Surface,
     predictions: Mapping[str, ArrayLike],
     postoperative: SurfaceData | Surface,
@@ -134,6 +135,8 @@ def compare_models(
     landmarks: tuple[Landmarks, Landmarks] | None = None,
     method: str | None = None,
     mask: Choice = None,
+    regions: Mapping[str, NDArray[np.bool_]] | None = None,
+    thickening: Floats | None = None,
     exclude_borders: bool = True,
     max_distance: float | None = None,
 ) -> ModelComparison:
@@ -151,6 +154,12 @@ def compare_models(
     method, mask, exclude_borders, max_distance
         As in `compare_skins`. Regions and the mask "face" are placed on the pre-operative skin, so
         that they hold the same vertices for every model.
+    regions : mapping of str to (v,) bool, optional
+        Parts of the pre-operative skin; default: `skin_regions` where the landmarks have their
+        names.
+    thickening : (v,) float64, mm, optional
+        How far each vertex is moved outward, along its normal, before anything is compared: in
+        every prediction, and where nothing changes (`fitted_thickness`).
 
     Returns
     -------
@@ -184,9 +193,11 @@ def compare_models(
                 f"prediction {name!r} has {len(moved[name])} vertices, the pre-operative skin "
                 f"{len(skin.vertices)}: the same are needed, in the same order"
             )
+    if thickening is not None:
+        moved = {name: thickened(skin, at, thickening) for name, at in moved.items()}
     names = landmarks[0] if landmarks is not None else None
-    parts: dict[str, NDArray[np.bool_]] = {}
-    if isinstance(names, Mapping) and all(n in names for n in SKIN_LANDMARKS):
+    parts: dict[str, NDArray[np.bool_]] = dict(regions or {})
+    if regions is None and isinstance(names, Mapping) and all(n in names for n in SKIN_LANDMARKS):
         parts = skin_regions(skin.vertices, names)
     chosen = parts[mask] if isinstance(mask, str) and mask in parts else mask
     after = postoperative if isinstance(postoperative, Surface) else _core(postoperative)

@@ -1,7 +1,7 @@
 """Regions of the face, placed from the landmarks of the skin: the one place that defines them."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
@@ -11,18 +11,27 @@ from cmfsim.checks import Floats, as_floats, as_rows
 from cmfsim.errors import LandmarkInputError
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 
-__all__ = ["REGIONS", "SKIN_LANDMARKS", "skin_regions"]
+__all__ = ["REGIONS", "SKIN_LANDMARKS", "UNMOVED_REGIONS", "skin_regions", "unmoved_regions"]
 
 PAIRS = ("exocanthion", "endocanthion", "alare", "cheilion")
 REGIONS: Mapping[str, str] = MappingProxyType(
     {
         "face": "from the brow to below the chin, a little wider than the eyes",
+        "lower face": "the same from below the lower eyelids on: what jaws move, without the eyes",
         "nose": "from nasion to subnasale, with the wings",
         "upper lip": "from subnasale to the line of the mouth, between its corners",
         "lower lip": "from the line of the mouth half way down to pogonion",
         "chin": "from there to below pogonion",
         "left cheek": "from below the eye to the height of the lower lip, beside nose and mouth",
         "right cheek": "its mirror image",
+    }
+)
+# Where no operation on the jaws moves anything: what differs there has another cause.
+UNMOVED_REGIONS: Mapping[str, str] = MappingProxyType(
+    {
+        "forehead": "above the brows, below the hair, as wide as the eyes",
+        "left temple": "beside the eye and above it",
+        "right temple": "its mirror image",
     }
 )
 # Proportions, each a factor on a distance between landmarks (no unit). They put the borders into
@@ -35,6 +44,9 @@ CHIN = 0.75  # the chin ends this far below pogonion, on labiale inferius to pog
 CHIN_WIDTH = 0.9  # on the distance of cheilion from the midline
 SIDE = 1.15  # the face ends at the side, on the distance of exocanthion from the midline
 BROW = 0.5  # the face begins this far above the eyes, on eyes to subnasale
+FOREHEAD = (0.75, 1.4)  # its lower and upper end above the eyes, on eyes to subnasale
+TEMPLE = (0.1, 1.1)  # the same of the temples
+TEMPLE_WIDTH = 1.7  # they end at the side, on the distance of exocanthion from the midline
 DEPTH = 1.0  # and reaches this far behind cheilion, on exocanthion from the midline
 
 
@@ -53,8 +65,8 @@ def skin_regions(
     Returns
     -------
     dict of str to (n,) bool
-        "face", "nose", "upper lip", "lower lip", "chin", "left cheek", "right cheek". All but the
-        first are apart from each other.
+        "face", "lower face", "nose", "upper lip", "lower lip", "chin", "left cheek", "right cheek".
+        All but the first two are apart from each other.
 
     Raises
     ------
@@ -73,6 +85,39 @@ def skin_regions(
     >>> regions = cmfsim.skin_regions(skin.vertices, landmarks)  # doctest: +SKIP
     >>> regions["chin"].sum()  # doctest: +SKIP
     """
+    return _regions(points, landmarks, _outlines)
+
+
+def unmoved_regions(
+    points: ArrayLike, landmarks: Mapping[str, ArrayLike]
+) -> dict[str, NDArray[np.bool_]]:
+    """Which points of a skin lie where operations on the jaws move nothing.
+
+    Parameters
+    ----------
+    points : (n, 3) float64, mm
+    landmarks : mapping of str to (3,) float64, mm
+        As `skin_regions` takes them.
+
+    Returns
+    -------
+    dict of str to (n,) bool
+        "forehead", "left temple", "right temple", apart from each other and from the face's.
+
+    Raises
+    ------
+    LandmarkError
+        (also `ValueError`) As `skin_regions`.
+    """
+    return _regions(points, landmarks, _unmoved_outlines)
+
+
+def _regions(
+    points: ArrayLike,
+    landmarks: Mapping[str, ArrayLike],
+    outlines: Callable[[Mapping[str, Floats]], dict[str, list[tuple[float, float]]]],
+) -> dict[str, NDArray[np.bool_]]:
+    """The points within each outline in the view from the front."""
     missing = [name for name in SKIN_LANDMARKS if name not in landmarks]
     if missing:
         raise LandmarkInputError(
@@ -90,9 +135,7 @@ def skin_regions(
     view = np.stack([left, up], axis=1)
     reach = DEPTH * 0.5 * (at["exocanthion_L"][0] - at["exocanthion_R"][0])
     near = front > 0.5 * (at["cheilion_L"][2] + at["cheilion_R"][2]) - reach
-    return {
-        name: near & _inside(view, np.array(outline)) for name, outline in _outlines(at).items()
-    }
+    return {name: near & _inside(view, np.array(outline)) for name, outline in outlines(at).items()}
 
 
 def _face_frame(named: Mapping[str, Floats]) -> tuple[Floats, Floats]:
@@ -186,12 +229,38 @@ def _outlines(at: Mapping[str, Floats]) -> dict[str, list[tuple[float, float]]]:
             (side_right[0], bottom),
             (side_right[0], brow),
         ],
+        "lower face": [
+            (side_left[0], lid),
+            (side_left[0], bottom),
+            (side_right[0], bottom),
+            (side_right[0], lid),
+        ],
         "nose": [root_left, wing_left, base_left, base_right, wing_right, root_right],
         "upper lip": [base_left, corner_left, line, corner_right, base_right],
         "lower lip": [corner_left, fold_left, fold_right, corner_right, line],
         "chin": [fold_left, *both("cheilion", CHIN_WIDTH, float(bottom)), fold_right],
         "left cheek": cheek("L"),
         "right cheek": cheek("R"),
+    }
+
+
+def _unmoved_outlines(at: Mapping[str, Floats]) -> dict[str, list[tuple[float, float]]]:
+    """The outlines of `UNMOVED_REGIONS` in the view from the front: (left, up), mm."""
+    middle, base = at["subnasale"][0], at["subnasale"][1]
+    eyes = float(
+        np.mean([at[f"{p}_{s}"][1] for p in ("exocanthion", "endocanthion") for s in "LR"])
+    )
+    left, right = (float(at[f"exocanthion_{side}"][0] - middle) for side in "LR")
+
+    def box(inner: float, outer: float, heights: tuple[float, float]) -> list[tuple[float, float]]:
+        low, high = (eyes + share * (eyes - base) for share in heights)
+        near, far = middle + inner, middle + outer
+        return [(near, low), (near, high), (far, high), (far, low)]
+
+    return {
+        "forehead": box(left, right, FOREHEAD),
+        "left temple": box(SIDE * left, TEMPLE_WIDTH * left, TEMPLE),
+        "right temple": box(SIDE * right, TEMPLE_WIDTH * right, TEMPLE),
     }
 
 

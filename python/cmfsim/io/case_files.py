@@ -14,6 +14,7 @@ from cmfsim.checks import as_text
 from cmfsim.errors import CaseInputError
 from cmfsim.io.case_plans import is_achieved, osteotomies_of, plan_of
 from cmfsim.io.case_tables import (
+    band_of,
     image_of,
     landmarks_of,
     lips_of,
@@ -30,6 +31,7 @@ from cmfsim.io.case_tables import (
 from cmfsim.io.files import FORMAT_VERSION, is_there
 from cmfsim.io.tables import read_tables
 from cmfsim.values.case_parts import (
+    CaseBand,
     CaseImage,
     CaseLandmarks,
     CaseLips,
@@ -66,6 +68,7 @@ TABLES = (
     "tissue",
     "muscles",
     "solver",
+    "band",
     "postoperative",
     "output",
 )
@@ -102,6 +105,7 @@ class Case:
     muscles : CaseMuscles or None
         None leaves them out of what `cmfsim build` makes.
     solver : SolverOptions
+    band : CaseBand
     postoperative : CasePostoperative or None
     note : str
         What readers of its report should know, such as that the patient is made by code.
@@ -130,6 +134,7 @@ class Case:
     tissue: TissueData = field(default_factory=lambda: TissueData("preset", fraction=0.0))
     muscles: CaseMuscles | None = None
     solver: SolverOptions = field(default_factory=SolverOptions)
+    band: CaseBand = field(default_factory=CaseBand)
     postoperative: CasePostoperative | None = None
     note: str = ""
     lines: Mapping[str, int] = field(default_factory=dict)
@@ -271,6 +276,7 @@ def _read(path: Path) -> Case:
         tissue=tissue_of(document.table("tissue")),
         muscles=muscles_of(document.table("muscles"), folder) if "muscles" in document else None,
         solver=solver_of(document.table("solver")),
+        band=band_of(document, folder),
         postoperative=(
             postoperative_of(document.table("postoperative"), folder)
             if "postoperative" in document

@@ -11,6 +11,7 @@ from cmfsim.values.case_parts import (
     FRAMES,
     LIP_SEAMS,
     UNITS,
+    CaseBand,
     CaseImage,
     CaseLandmarks,
     CaseLips,
@@ -26,6 +27,7 @@ from cmfsim.values.solver_options import CONTACTS, SolverOptions
 from cmfsim.values.tissue_data import MIXINGS, TissueData
 
 __all__ = [
+    "band_of",
     "checked_name",
     "file_of",
     "file_or_none",
@@ -55,6 +57,8 @@ MOST_CLEFT = 20.0
 # How far the seam between the lips may go on past the teeth, and lips may reach from it, mm.
 MOST_LIP_DEPTH = 20.0
 LIP_HEIGHTS = (3.0, 30.0)
+# Coverages of a band that a calibration of up to a thousand cases can give.
+COVERAGES = (0.001, 0.999)
 # CT values above this are clipped, HU.
 MOST_HU = 4000.0
 # What takes the values of an image to HU: images from 0 to 1 have a slope of some 4000.
@@ -253,6 +257,19 @@ def lips_of(document: Table, folder: Path) -> CaseLips:
         seam,
         default.depth if depth is None else depth,
         default.height if height is None else height,
+    )
+
+
+def band_of(document: Table, folder: Path) -> CaseBand:
+    """Whether a band is asked for, and by which calibration."""
+    table = document.table("band").only("calibration", "coverage", "group")
+    low, high = COVERAGES
+    coverage = table.number("coverage", low=low, high=high)
+    return CaseBand(
+        asked="band" in document,
+        calibration=file_or_none(table, "calibration", folder),
+        coverage=CaseBand().coverage if coverage is None else coverage,
+        group=table.text("group") if "group" in table else None,
     )
 
 

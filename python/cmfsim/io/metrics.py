@@ -82,6 +82,17 @@ _EVALUATION = table(
         "files": listing(_file_name),
     },
     {
+        "not_operated": optional(table({"regions": mapping(_STATISTICS, most=100)})),
+        "thickness": table(
+            {
+                "share_of_depth": number(-1.0, 1.0),
+                "vertices": whole(),
+                **dict.fromkeys(
+                    ("mean_depth_mm", "mean_before_mm", "mean_after_mm"), number(0, 1e6)
+                ),
+                "mean_mm": mapping(mapping(number(0.0, 1e6), most=100), most=10),
+            }
+        ),
         "no_change": _regions,
         "wilcoxon": mapping(table({"p": optional(_SHARE)})),
         "notes": listing(text),

@@ -60,7 +60,7 @@ PREDICTION_FILE = "prediction.json"
 AGAIN = "run cmfsim predict again"
 PREDICTION_FILES = re.compile(
     r"prediction\.(vtp|stl|vtu|npz|png|json|mrb)|face\.(vtp|stl)|(bones|muscles)\.vtp"
-    r"|(plan|muscles)\.png|timings\.json"
+    r"|(plan|muscles|band)\.png|timings\.json"
 )
 
 
@@ -95,6 +95,44 @@ _SOLUTION = table(
 _FIT = table({"rms_mm": number(0.0, 1e6), "worst_mm": number(0.0, 1e6), "share": number(0.0, 1.0)})
 _YOUNG, _POISSON = number(*YOUNG_RANGE), number(-1.0, MOST_POISSON)
 _MUSCLE = table({"young_along": _YOUNG, "young_across": _YOUNG, "poisson": _POISSON})
+_WIDTH, _SHARE = number(0.0, 1e6), number(0.0, 1.0)
+_FACTOR = table(
+    {
+        "factor": number(0.0, 1e9),
+        "n": _COUNT,
+        "rank": _COUNT,
+        **dict.fromkeys(("coverage", "coverage_5_percent", "coverage_95_percent"), _SHARE),
+    }
+)
+_BAND_REGION = table(
+    {
+        **dict.fromkeys(
+            ("half_width_mean_mm", "half_width_p95_mm", "half_width_largest_mm", "sd_mean_mm"),
+            _WIDTH,
+        ),
+        "calibration": optional(_FACTOR),
+        "sources_rms_mm": mapping(_WIDTH, most=1000),
+    }
+)
+_BAND = table(
+    {
+        "state": one_of("calibrated", "uncalibrated"),
+        "coverage": _SHARE,
+        "factor_uncalibrated": optional(number(0.0, 1e3)),
+        "settings_digest": text,
+        "settings": mapping(plain),
+        "regions": mapping(_BAND_REGION, most=100),
+        "sources": mapping(
+            table({"sd": number(0.0, 1e6), "unit": text, "reference": text}), most=1000
+        ),
+        "not_covered": listing(text),
+        "notes": listing(text),
+        "calibration": optional(
+            table({"file": text, "note": text, "n": _COUNT}, {"group": optional(text)})
+        ),
+        "seconds": number(0.0, 1e9),
+    }
+)
 _PREDICTION = table(
     {
         "case": text,
@@ -131,6 +169,7 @@ _PREDICTION = table(
             },
         ),
         "refined": flag,
+        "band": _BAND,
     },
 )
 
@@ -285,8 +324,9 @@ def write_prediction(
 ) -> list[str]:
     """The names of the files that a prediction is written as, in a folder that is made if need be.
 
-    `prediction.vtp` (the mesh's skin at rest with its `displacement`), `prediction.stl` (the same
-    where it goes), `face.vtp` and `face.stl` (likewise the whole skin in full detail),
+    `prediction.vtp` (the mesh's skin at rest with its `displacement`, and with its band where it
+    has one), `prediction.stl` (the same where it goes), `face.vtp` and `face.stl` (likewise the
+    whole skin in full detail),
     `prediction.vtu` (tissue with `displacement`, `force`, muscle `fraction` and `fibre`),
     `prediction.npz` (everything, for `read_result`), `bones.vtp` (segments before the operation,
     with their `displacement`) and `muscles.vtp`, each vertex with the number of its `part` (the
@@ -337,6 +377,7 @@ def fill_prediction(
         moved = {
             "displacement": prediction.skin_displacements,
             "node": prediction.skin_nodes.astype(np.int64),
+            **({} if prediction.band is None else prediction.band.arrays()),
         }
         write_triangles(file, skin.vertices, skin.triangles, moved)
     write_surface(fresh / names[1], prediction.skin)

@@ -29,6 +29,7 @@ __all__ = [
     "one_of",
     "optional",
     "plain",
+    "plain_json",
     "read_summary",
     "table",
     "text",
@@ -92,7 +93,7 @@ def read_summary(path: Path, check: Check, again: str) -> dict[str, Any]:
         another; a value of another type or out of range, with its place.
     """
     try:
-        content = _content(path)
+        content = plain_json(path)
         if "digest" not in content:
             raise CaseInputError("has no digest: an older version or another program wrote it")
         if content.pop("digest") != _digest(content):
@@ -134,7 +135,16 @@ def checked_file(folder: Path, summary: Mapping[str, Any], name: str, again: str
     return path
 
 
-def _content(path: Path) -> dict[str, Any]:
+def plain_json(path: Path) -> dict[str, Any]:
+    """The table of names and values in a JSON file that is no link and not too large.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Anything else; without the file's name.
+    OSError
+        It cannot be opened.
+    """
     mode = path.lstat().st_mode
     if not stat.S_ISREG(mode):
         raise CaseInputError("is no file" if not stat.S_ISLNK(mode) else "is a link")

@@ -9,6 +9,7 @@ from cmfsim.pictures.anatomy import (
     picture_segments,
     segment_colours,
 )
+from cmfsim.pictures.bands import picture_band
 from cmfsim.pictures.charts import MODEL_COLOURS, chart_errors
 from cmfsim.pictures.distances import DISTANCE_LIMIT, distance_colour, picture_distances
 from cmfsim.pictures.faces import picture_plan, picture_prediction
@@ -27,6 +28,7 @@ __all__ = [
     "distance_colour",
     "has_screen",
     "picture_anatomy",
+    "picture_band",
     "picture_distances",
     "picture_landmarks",
     "picture_muscles",

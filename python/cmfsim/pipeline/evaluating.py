@@ -9,14 +9,27 @@ from typing import Any
 import numpy as np
 
 from cmfsim.checks import Floats
-from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.evaluation import NO_CHANGE, WHOLE, ModelComparison, compare_models
+from cmfsim.errors import CaseInputError, CmfsimError, RegistrationError
+from cmfsim.evaluation import (
+    NO_CHANGE,
+    WHOLE,
+    ModelComparison,
+    SkinComparison,
+    ThicknessChange,
+    compare_models,
+    compare_unmoved,
+    fitted_thickness,
+    skin_regions,
+    unmoved_regions,
+)
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.io.metrics import EVALUATION_FILE
 from cmfsim.pipeline.building import Postoperative, case_key, read_postoperative
 from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline.face_regions import face_landmarks
 from cmfsim.pipeline.predicting import named_models, predictions_of
 from cmfsim.progress import Progress
+from cmfsim.surfaces.depth import tissue_depth
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.finding_groups import grouped
@@ -44,6 +57,15 @@ class CaseEvaluation:
         Of everything that the result depends on: inputs, models, version.
     failed : mapping of str to str
         Why a model has no prediction, by its name.
+    unmoved : SkinComparison or None
+        The face before against the face after where nothing was operated on; None where the scans
+        do not show it.
+    thickness : ThicknessChange or None
+        The change of the soft tissue's thickness that was fitted there, where that was asked for.
+    fitted : ModelComparison or None
+        The comparison with that change applied to every prediction, and to no change.
+    notes : tuple of Finding
+        How regions were placed; why something is missing.
     """
 
     predictions: tuple[Prediction, ...]
@@ -51,6 +73,10 @@ class CaseEvaluation:
     comparison: ModelComparison
     key: str
     failed: Mapping[str, str] = field(default_factory=dict)
+    unmoved: SkinComparison | None = None
+    thickness: ThicknessChange | None = None
+    fitted: ModelComparison | None = None
+    notes: tuple[Finding, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON: errors by model and region, tests, key."""
@@ -72,6 +98,7 @@ class CaseEvaluation:
             "key": self.key,
             # That of the predictions: what is shown together must have the same.
             "case_key": first.summary["case_key"],
+            **self._causes(),
             "models": errors,
             "failed": dict(self.failed),
             "no_change": still,
@@ -86,7 +113,25 @@ class CaseEvaluation:
     def findings(self) -> tuple[Finding, ...]:
         """What was noticed of the face after the operation, and of the comparison with it."""
         compared = [f for c in self.comparison.comparisons.values() for f in c.findings]
-        return tuple(dict.fromkeys([*self.postoperative.findings, *compared]))
+        return tuple(dict.fromkeys([*self.postoperative.findings, *self.notes, *compared]))
+
+    def _causes(self) -> dict[str, Any]:
+        """What is no error of any model: where nothing was operated on, and the thickness."""
+        found: dict[str, Any] = {"not_operated": None}
+        if self.unmoved is not None:
+            regions = {n: s.as_dict() for n, s in self.unmoved.regions.items()}
+            whole = self.unmoved.statistics.as_dict()
+            found["not_operated"] = {"regions": {WHOLE: whole, **regions}}
+        if self.thickness is not None and self.fitted is not None:
+            means = {
+                name: {
+                    WHOLE: statistics.mean,
+                    **{r: t[name].mean for r, t in self.fitted.regions.items()},
+                }
+                for name, statistics in self.fitted.statistics.items()
+            }
+            found["thickness"] = {**self.thickness.as_dict(), "mean_mm": means}
+        return found
 
     def _warnings(self) -> list[str]:
         """Errors and warnings of everything that led to the figures, one line for each kind."""
@@ -113,6 +158,7 @@ def evaluate(
     findings: Iterable[Finding] = (),
     anatomy: Anatomy | None = None,
     on_findings: OnFindings | None = None,
+    fit_thickness: bool = False,
 ) -> CaseEvaluation:
     """The predictions of several models for a case, compared with what came after.
 
@@ -130,6 +176,9 @@ def evaluate(
     anatomy : Anatomy, optional
     on_findings : callable, optional
         As for `predict_models`.
+    fit_thickness : bool
+        Whether one change of the soft tissue's thickness is fitted where nothing was operated on,
+        and every prediction is compared with it applied as well.
 
     Returns
     -------
@@ -172,27 +221,86 @@ def evaluate(
         raise next(iter(failed.values()))
     if progress is not None:
         progress("comparing the faces")
-    comparison = _compare(predictions, postoperative.skin, postoperative.landmarks)
+    landmarks = face_landmarks(predictions[0].patient)
+    compared = _Compared(predictions, postoperative.skin, postoperative.landmarks, landmarks.points)
+    comparison = compared.models()
+    unmoved, why = compared.unmoved()
+    notes = (*landmarks.findings, *why)
+    thickness = fitted = None
+    if fit_thickness:
+        if unmoved is None:
+            raise CaseInputError(
+                "a change of thickness is fitted where nothing was operated on, and "
+                f"{why[0].what if why else 'there is no such place'}: leave out --fit-thickness"
+            )
+        depth = compared.depth()
+        thickness = fitted_thickness(unmoved.signed, depth[unmoved.vertices])
+        fitted = compared.models(thickness.share * depth)
     reasons = {model: str(error) for model, error in failed.items()}
-    found = CaseEvaluation(predictions, postoperative, comparison, key, reasons)
+    found = CaseEvaluation(
+        predictions, postoperative, comparison, key, reasons, unmoved, thickness, fitted, notes
+    )
     if on_findings is not None and found.findings:
         on_findings(found.findings)
     return found
 
 
-def _compare(
-    predictions: Sequence[Prediction], skin: SurfaceData, landmarks: Mapping[str, Floats]
-) -> ModelComparison:
-    before = predictions[0].skin_before
-    ours = predictions[0].patient.landmarks.get("skin", {})
-    both = bool(ours) and bool(landmarks)
-    moved = {p.model: np.asarray(p.skin.vertices) for p in predictions}
-    return compare_models(
-        before,
-        moved,
-        skin,
-        landmarks=(ours, landmarks) if both else None,
-        mask="face" if both else None,
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """Predictions of one patient, the face after, and landmarks that place the regions."""
+
+    predictions: Sequence[Prediction]
+    after: SurfaceData
+    after_landmarks: Mapping[str, Floats]
+    landmarks: Mapping[str, Floats]
+
+    def models(self, thickening: Floats | None = None) -> ModelComparison:
+        """Every model against the face after, by regions; distances by landmarks of both."""
+        before = self.predictions[0].skin_before
+        ours = self.predictions[0].patient.landmarks.get("skin", {})
+        theirs = self.after_landmarks
+        both = bool(ours) and bool(theirs)
+        regions = skin_regions(before.vertices, self.landmarks) if self.landmarks else {}
+        regions = {name: part for name, part in regions.items() if part.any()}
+        return compare_models(
+            before,
+            {p.model: np.asarray(p.skin.vertices) for p in self.predictions},
+            self.after,
+            landmarks=(ours, theirs) if both else None,
+            mask="face" if "face" in regions else None,
+            regions=regions,
+            thickening=thickening,
+        )
+
+    def unmoved(self) -> tuple[SkinComparison | None, tuple[Finding, ...]]:
+        """The comparison where nothing was operated on, or why there is none."""
+        if not self.landmarks:
+            return None, ()
+        before = self.predictions[0].skin_before
+        sizes = [np.linalg.norm(p.skin_displacements, axis=1) for p in self.predictions]
+        regions = unmoved_regions(before.vertices, self.landmarks)
+        try:
+            found = compare_unmoved(before, self.after, regions, np.max(sizes, axis=0))
+        except RegistrationError as error:
+            return None, (_not_shown(str(error)),)
+        if found is None:
+            return None, (_not_shown("the tissue that was simulated ends below the forehead"),)
+        return found, ()
+
+    def depth(self) -> Floats:
+        """Depth of the soft tissue under each vertex of the skin before, mm."""
+        first = self.predictions[0]
+        bones = [segment.surface for segment in first.patient.segments]
+        return tissue_depth(first.skin_before.vertices, bones)
+
+
+def _not_shown(reason: str) -> Finding:
+    return Finding.note(
+        "not-operated-none",
+        f"the error where nothing was operated on is not known: {reason}",
+        where="postoperative",
+        why="Errors of registration, swelling and weight cannot be told from those of a model.",
+        fix="Have both scans show forehead and temples.",
     )
 
 

@@ -37,6 +37,7 @@ from cmfsim.io.summaries import write_summary
 from cmfsim.muscles.template import joined_surface
 from cmfsim.pictures import (
     chart_errors,
+    picture_band,
     picture_distances,
     picture_muscles,
     picture_plan,
@@ -59,7 +60,7 @@ __all__ = [
 _log = logging.getLogger(__name__)
 
 # Pictures of a case's report, in the folder of its prediction and in its own.
-PREDICTION_PICTURES = ("prediction", "plan", "muscles")
+PREDICTION_PICTURES = ("prediction", "band", "plan", "muscles")
 BOXES_CAPTION = (
     "Sizes of the errors by region: quartiles, median, mean (diamond), whiskers to 1.5 boxes, and "
     "beyond them each outlier, with their number above (as the paper's Figure 9)."
@@ -223,6 +224,8 @@ def _draw(prediction: Prediction, folder: Path) -> list[str]:
 def _pictures_of(prediction: Prediction) -> Iterator[tuple[str, Callable[[Path], None]]]:
     yield "prediction.png", partial(picture_prediction, prediction=prediction)
     yield "plan.png", partial(picture_plan, prediction=prediction)
+    if prediction.band is not None:
+        yield "band.png", partial(picture_band, prediction=prediction)
     if prediction.muscles is not None:
         segments = prediction.patient.segments
         yield (

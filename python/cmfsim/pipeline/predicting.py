@@ -13,6 +13,7 @@ from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.progress import Progress
 from cmfsim.solving.models import predict_patient
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.band_options import BandOptions
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
@@ -31,7 +32,12 @@ _log = logging.getLogger(__name__)
 
 
 def predict(
-    case: CaseOrPath, *, model: str = "M+S", progress: Progress | None = None, check: bool = True
+    case: CaseOrPath,
+    *,
+    model: str = "M+S",
+    progress: Progress | None = None,
+    check: bool = True,
+    band: BandOptions | None = None,
 ) -> Prediction:
     """The face that a model predicts for a case; nothing is written.
 
@@ -47,6 +53,8 @@ def predict(
         Called with the name of each stage as it begins.
     check : bool
         Whether the doctor looks at the case first; an error that it finds ends the work.
+    band : BandOptions, optional
+        Makes a band around the face, which is the prediction's `band`; without, there is none.
 
     Returns
     -------
@@ -64,7 +72,7 @@ def predict(
     >>> prediction.skin.vertices.shape  # doctest: +SKIP
     (19840, 3)
     """
-    return next(predict_models(case, model, progress=progress, check=check))
+    return next(predict_models(case, model, progress=progress, check=check, band=band))
 
 
 def predict_models(  # noqa: PLR0913 (options by name)
@@ -78,6 +86,7 @@ def predict_models(  # noqa: PLR0913 (options by name)
     after: Postoperative | None = None,
     failed: dict[str, CmfsimError] | None = None,
     on_findings: OnFindings | None = None,
+    band: BandOptions | None = None,
 ) -> Iterator[Prediction]:
     """The predictions of several models for one case, which is built once.
 
@@ -99,6 +108,8 @@ def predict_models(  # noqa: PLR0913 (options by name)
         is put there with its error, and the others go on.
     on_findings : callable, optional
         Called with new findings as the stages of building and each solution notice them.
+    band : BandOptions, optional
+        As for `predict`.
 
     Yields
     ------
@@ -124,7 +135,7 @@ def predict_models(  # noqa: PLR0913 (options by name)
         after=after,
         on_findings=on_findings,
     )
-    yield from predictions_of(as_case(case), named_models(models), options, failed)
+    yield from predictions_of(as_case(case), named_models(models), options, failed, band=band)
 
 
 def predictions_of(
@@ -132,15 +143,26 @@ def predictions_of(
     models: Sequence[str],
     options: BuildOptions,
     failed: dict[str, CmfsimError] | None = None,
+    *,
+    band: BandOptions | None = None,
 ) -> Iterator[Prediction]:
     """The predictions of several models for one case, as `predict_models` makes them."""
+    if band is not None:
+        # Before a case is built for a minute.
+        band.check(models)
     patient = build_patient(case, models, options)
     known = set(patient.findings)
     for model in models:
         if options.progress is not None:
             options.progress(f"solving {model}")
         try:
-            prediction = predict_patient(patient, model)
+            if band is None:
+                prediction = predict_patient(patient, model)
+            else:
+                # Regions and proposed landmarks: a prediction without a band does not load them.
+                from cmfsim.pipeline.banding import predict_with_band  # noqa: PLC0415
+
+                prediction = predict_with_band(patient, model, band)
         except (ContactError, SolverError) as error:
             if failed is None:
                 raise

@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cmfsim.errors import CaseInputError
+from cmfsim.report.band import band_section
+from cmfsim.report.causes import not_operated_blocks, statistics_table, thickness_blocks
 from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
 from cmfsim.report.labels import MESH, MUSCLES, labelled
 from cmfsim.values.clinical_motion import plan_lines
@@ -23,6 +25,8 @@ MODEL_NAMES: Mapping[str, str] = {
 # Pictures in the order of a report, with what they show. The names are those of the files.
 PICTURES: Mapping[str, str] = {
     "prediction": "The face before the operation and as predicted after it, and how far it moves.",
+    "band": "Half the width of the band around the predicted skin, mm; grey where no calibration "
+    "case says anything.",
     "plan": "The plan: bone segments where they are moved to, and before as outlines.",
     "muscles": "The muscles, carried from the template to the skull by its landmarks.",
     "anatomy": "Skin and bone segments.",
@@ -79,6 +83,7 @@ def case_document(
     sections = [
         *_note_section(entry),
         _prediction_section(predictions, entry, pictures),
+        *_band_sections(entry, pictures),
         _plan_section(entry, pictures),
         *_evaluation_sections(evaluation, figures),
         *_muscle_section(entry, predictions, pictures),
@@ -141,6 +146,11 @@ def _facts(prediction: Values, evaluation: Values | None) -> dict[str, str]:
         f"{model}: tets": number(prediction["solution"]["n_tets"]),
         f"{model}: from files to face": f"{sum(prediction['timings'].values()):.0f} s",
     }
+    if "band" in prediction:
+        region = prediction["band"]["regions"]
+        face = region.get("face") or next(iter(region.values()))
+        state = prediction["band"]["state"]
+        facts[f"{model}: band of the face, {state}"] = f"± {face['half_width_mean_mm']:.1f} mm"
     if evaluation is not None and model in evaluation["models"]:
         face = evaluation["models"][model]["regions"]["whole"]
         facts[f"{model}: mean error of the face"] = f"{face['mean_mm']:.2f} mm"
@@ -195,6 +205,11 @@ def _prediction_section(
         for figure in _picture("prediction", pictures)
     ]
     return Section("Prediction", (*(drawn or (Note(NO_PICTURES, "warning"),)), table))
+
+
+def _band_sections(shown: Values, pictures: Mapping[str, bytes]) -> list[Section]:
+    """How far to trust the model that is shown, where that was asked for."""
+    return [band_section(shown["band"], _picture("band", pictures))] if "band" in shown else []
 
 
 def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
@@ -255,7 +270,12 @@ def _achieved(achieved: Values | None) -> list[Note | Table | Figure]:
 def _evaluation_sections(evaluation: Values | None, figures: Sequence[Figure]) -> list[Section]:
     if evaluation is None:
         return []
-    blocks: list[Note | Table | Figure] = [_mean_table(evaluation), *figures]
+    blocks: list[Note | Table | Figure] = [
+        *not_operated_blocks(evaluation),
+        _mean_table(evaluation),
+        *thickness_blocks(evaluation),
+        *figures,
+    ]
     for model, entry in evaluation["models"].items():
         blocks.append(
             statistics_table(
@@ -292,29 +312,6 @@ def _mean_table(evaluation: Values) -> Table:
     )
     caption = "Mean distance from the face after the operation, mm, by region and model."
     return Table(("region", *entries), rows, caption)
-
-
-def statistics_table(regions: Mapping[str, Values], caption: str) -> Table:
-    """Statistics of signed distances by region.
-
-    Parameters
-    ----------
-    regions : mapping of str to mapping
-        `DistanceStatistics.as_dict()` by region.
-    caption : str
-    """
-    columns = ("region", "mean", "SD", "median", "RMS", "90 %", "95 %", "max", "signed", "< 2 mm")
-    keys = ("mean_mm", "std_mm", "median_mm", "rms_mm", "p90_mm", "p95_mm", "max_mm")
-    rows = tuple(
-        (
-            name,
-            *(number(values[key]) for key in keys),
-            f"{values['signed_mean_mm']:+.2f}",
-            f"{100 * values['within']['2 mm']:.0f} %",
-        )
-        for name, values in regions.items()
-    )
-    return Table(columns, rows, caption)
 
 
 def _muscle_section(

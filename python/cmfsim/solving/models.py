@@ -3,16 +3,16 @@
 import hashlib
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim._core import StaticSolver, rigid_fit
+from cmfsim._core import Solution, StaticSolver, rigid_fit
 from cmfsim.checks import check_one_of
 from cmfsim.errors import CaseInputError
-from cmfsim.solving.simulation import solve_scene, told
+from cmfsim.solving.simulation import scene_solver, solved_scene, told
 from cmfsim.values.clinical_motion import clinical_motion
 from cmfsim.values.finding import Finding
 from cmfsim.values.motion import decompose_motion
@@ -21,7 +21,7 @@ from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.scene import Scene, SegmentData
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["model_scene", "predict_patient"]
+__all__ = ["SolvedPatient", "model_scene", "predict_patient", "solved_patient"]
 
 
 def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
@@ -99,9 +99,43 @@ def predict_patient(
     >>> prediction = cmfsim.predict_patient(patient, "H")  # doctest: +SKIP
     >>> prediction.skin.vertices  # doctest: +SKIP
     """
+    return solved_patient(patient, model, solver=solver).prediction
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedPatient:
+    """A prediction with what solved it, for whoever goes on from there.
+
+    Attributes
+    ----------
+    prediction : Prediction
+    scene : Scene
+    solver : StaticSolver
+    solution : Solution
+    """
+
+    prediction: Prediction
+    scene: Scene
+    solver: StaticSolver
+    solution: Solution
+
+
+def solved_patient(
+    patient: PatientModel, model: str, *, solver: StaticSolver | None = None
+) -> SolvedPatient:
+    """The prediction of `predict_patient`, with its solver and solution.
+
+    Parameters
+    ----------
+    patient : PatientModel
+    model : str
+    solver : StaticSolver, optional
+        As for `predict_patient`.
+    """
     scene = model_scene(patient, model)
     begun = time.perf_counter()
-    result = solve_scene(scene, solver=solver)
+    solver = solver or scene_solver(scene)
+    result, solution = solved_scene(scene, solver)
     timings = {**patient.summary.get("timings", {}), "solving": time.perf_counter() - begun}
     moved = np.linalg.norm(np.asarray(result.displacements)[patient.skin_nodes], axis=1)
     summary = {
@@ -123,7 +157,8 @@ def predict_patient(
         "timings": timings,
         "left_out": _left_out(patient, scene, model),
     }
-    return Prediction(model, patient, scene, result, summary, predicted_by=predict_patient)
+    found = Prediction(model, patient, scene, result, summary, predicted_by=predict_patient)
+    return SolvedPatient(found, scene, solver, solution)
 
 
 def _case_key(patient: PatientModel, scene: Scene) -> str:

@@ -25,7 +25,7 @@ from cmfsim.values.scene import Scene, SceneResult
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 from cmfsim.values.tissue_data import TissueData
 
-__all__ = ["scene_plan", "scene_solver", "solve_scene"]
+__all__ = ["scene_plan", "scene_solver", "solve_scene", "solved_scene"]
 
 _log = logging.getLogger(__name__)
 
@@ -156,7 +156,18 @@ def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneRes
     >>> float(round(result.forces[3, 2], 9))  # V E g² u = 1/6 · 1 · 1 · 0.1
     0.016666667
     """
-    solver = solver or scene_solver(scene)
+    return solved_scene(scene, solver or scene_solver(scene))[0]
+
+
+def solved_scene(scene: Scene, solver: StaticSolver) -> tuple[SceneResult, Solution]:
+    """The result of a scene as `solve_scene` has it, and the core's solution, which can go on.
+
+    Parameters
+    ----------
+    scene : Scene
+    solver : StaticSolver
+        Of this scene, whatever its plan.
+    """
     solution = solver.solve(scene_plan(scene), loads=scene.loads)
     _log.info(
         "solved: residual %.2e, error %.2e mm (estimated)",
@@ -194,7 +205,7 @@ def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneRes
         },
     }
     mesh = solver.tensors.mesh
-    return SceneResult(
+    result = SceneResult(
         nodes=mesh.nodes,
         tets=mesh.tets,
         skin_triangles=mesh.boundary_triangles(),
@@ -208,6 +219,7 @@ def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneRes
         contact_gaps=solution.contact_gaps,
         summary=summary,
     )
+    return result, solution
 
 
 def _inverted(solver: StaticSolver, solution: Solution) -> tuple[int | None, list[dict[str, str]]]:

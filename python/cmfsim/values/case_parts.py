@@ -19,6 +19,7 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.moduli import TissueModuli
 
 __all__ = [
+    "BAND_COVERAGE",
     "DIRECTIONS",
     "FRAMES",
     "LIP_CONTACT",
@@ -27,6 +28,7 @@ __all__ = [
     "LIP_SEAMS",
     "PROCEDURES",
     "UNITS",
+    "CaseBand",
     "CaseImage",
     "CaseLandmarks",
     "CaseLips",
@@ -70,6 +72,8 @@ POSTERIOR_LANDMARKS = ("supraglenoid_L", "supraglenoid_R")
 EDGE_LENGTH = 4.0
 # Tooth rows rest 2 to 4 mm apart, and a mucoperiosteal flap is lifted about as far at a cut, mm.
 CLEFT = 4.0
+# Share of cases that a band is to hold, where nothing else is asked for.
+BAND_COVERAGE = 0.9
 # Whether lips are separated, and kept apart by contact, where a case does not ask for it.
 LIP_CONTACT = False
 # Ways to find the seam between the lips, besides a surface.
@@ -296,6 +300,28 @@ class CaseLips:
     seam: Path | str = "auto"
     depth: float = LIP_DEPTH
     height: float = LIP_HEIGHT
+
+
+@dataclass(frozen=True)
+class CaseBand:
+    """Whether a prediction comes with a band that states how far to trust it.
+
+    Attributes
+    ----------
+    asked : bool
+        The case has a table [band].
+    calibration : Path or None
+        File of a calibration; None makes an uncalibrated band.
+    coverage : float
+        Share of cases that are to lie within it: 0.9 for 90 %.
+    group : str or None
+        The calibration cases to use; None uses all of them.
+    """
+
+    asked: bool = False
+    calibration: Path | None = None
+    coverage: float = BAND_COVERAGE
+    group: str | None = None
 
 
 @dataclass(frozen=True)

@@ -16,18 +16,17 @@ from cmfsim.checks import Floats, as_rows, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
+from cmfsim.values.model_names import MODELS
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.scene import Scene, SceneResult
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:
     from cmfsim.values.musculature import Musculature
+    from cmfsim.values.skin_band import SkinBand
 
 __all__ = ["MODELS", "Prediction", "carried_points", "carried_share"]
 
-# Models of the paper (3.2): homogeneous or with muscles, without or with sliding at teeth and
-# mucosa.
-MODELS = ("H", "M", "H+S", "M+S")
 # Up to so many edges off the mesh's skin a point follows it whole, and from so many on not at all.
 FOLLOWS, FADED = 2.0, 4.0
 
@@ -87,6 +86,8 @@ class Prediction(Frozen):
         plain values, ready for JSON.
     predicted_by : callable, optional
         What predicts a patient's face by a model, as this prediction was made.
+    band : SkinBand or None
+        How far to trust the skin, where that was asked for (`predict_with_band`).
     """
 
     model: str
@@ -95,6 +96,7 @@ class Prediction(Frozen):
     result: SceneResult
     summary: Mapping[str, Any] = field(default_factory=dict)
     predicted_by: Callable[[PatientModel, str], Prediction] | None = field(default=None, repr=False)
+    band: SkinBand | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         check_one_of("model", self.model, MODELS)

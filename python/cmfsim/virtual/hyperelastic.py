@@ -89,8 +89,9 @@ class HyperelasticTissue:
 
     The first line is the neo-Hookean energy of Smith, de Goes & Kim (2018), a polynomial that
     turning inside out does not break, the second adds fibres in the invariants of Bonet & Burton
-    (1998), the third resists collapse: J₀ is `CRUSHED` and p `CRUSHED_PRESSURE`. For small strain ε it is Spencer's law λ/2 (tr ε)² + μ ε:ε + α tr ε (a·ε a)
-    + 2 d |ε a|² + β/2 (a·ε a)². Energies of fat and muscle in one tet add by volume.
+    (1998), the third resists collapse: J₀ is `CRUSHED` and p `CRUSHED_PRESSURE`. For small strain ε
+    it is Spencer's law λ/2 (tr ε)² + μ ε:ε + α tr ε (a·ε a) + 2 d |ε a|² + β/2 (a·ε a)². Energies
+    of fat and muscle in one tet add by volume.
 
     Attributes
     ----------
@@ -256,7 +257,7 @@ class HyperelasticTissue:
         return np.asarray(change)
 
     def _crushing(self) -> Floats:
-        """p λ̂ / J₀², (m,) MPa."""
+        """The factor of the term against collapse, p λ̂ / J₀², (m,) MPa."""
         return np.asarray(CRUSHED_PRESSURE / CRUSHED**2 * (self.lambda_ + self.mu))
 
     def _fibre_strain(self, gradient: Floats) -> tuple[Floats, Floats, Floats]:

@@ -229,7 +229,7 @@ def test_what_the_solution_notices_is_a_finding_of_the_prediction(predictions, m
     noticed = cmfsim.Finding.warning("inverted-tets", "3 of 9 tets rest inverted", where="here")
     summary = {**made.result.summary, "findings": [dataclasses.asdict(noticed)]}
     result = dataclasses.replace(made.result, summary=summary)
-    monkeypatch.setattr("cmfsim.solving.models.solve_scene", lambda _, **__: result)
+    monkeypatch.setattr("cmfsim.solving.models.solved_scene", lambda *_: (result, None))
     prediction = cmfsim.predict_patient(made.patient, "H")
     assert prediction.findings == (*made.patient.findings, noticed)
     assert prediction.summary["findings"][-1] == dataclasses.asdict(noticed)

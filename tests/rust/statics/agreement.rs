@@ -8,8 +8,9 @@ use crate::meshes::{
     with_method,
 };
 use mtm_core::{
-    Boundary, FibreElastic, FibreLaw, Gap, MassTensors, Method, Motion, Segment, StaticOptions,
-    Surface, SurfaceMotion, TetMesh, Tissue, WindingTree, winding_number_exact,
+    Boundary, Change, ContactOptions, FibreElastic, FibreLaw, Gap, MassTensors, Method, Motion,
+    Segment, StaticOptions, Surface, SurfaceMotion, TetMesh, Tissue, WindingTree,
+    winding_number_exact,
 };
 
 const METHODS: [Method; 3] = [Method::Cholesky, Method::Pcg, Method::Relaxation];
@@ -160,6 +161,67 @@ fn plan_operator_with_contact_equals_solve_at_its_reference() {
     let solved = solver.solve(&other, None, GO_ON).unwrap().displacements;
     let e = largest_difference(&operator.apply(&other).unwrap(), &solved);
     assert!(e <= 1e-9, "moved floor: {e:e} mm");
+}
+
+/// A small motion of a pressed lid and of the curved path of its floor, and a small load, add what central
+/// differences of whole solutions show; a share of what an iterative solve leaves is all that differs.
+#[test]
+fn responses_equal_central_differences() {
+    let (mesh, bounds, _) = slab([6, 6, 3]);
+    let tensors = tensors(&mesh, &isotropic(0.01, 0.45));
+    let about = |degrees: f64, shift: f64| {
+        let lid = rigid([1.0, 0.4, 0.1], 20.0, [3.0, 3.0, 3.0], [0.2, shift, -0.1]);
+        let floor = rigid([1.0, 0.5, 0.0], 20.0 + degrees, [0.0; 3], [0.0, 0.0, 0.1]);
+        plan([("lid", Motion::Rigid(lid)), ("floor", Motion::Rigid(floor))])
+    };
+    let motion = about(0.0, 0.0);
+    // d/dt of a turn about a unit axis through the origin: Ṙ = ω R, with R the turn of the floor.
+    let floor = rigid([1.0, 0.5, 0.0], 20.0, [0.0; 3], [0.0, 0.0, 0.1]);
+    let [x, y, z, _] = *floor.matrix();
+    let degree = 1.0_f64.to_radians() / 1.25_f64.sqrt();
+    let turned = |k: f64, u: [f64; 4], l: f64, v: [f64; 4]| {
+        [0, 1, 2, 3].map(|i| if i < 3 { degree * (k * u[i] + l * v[i]) } else { 0.0 })
+    };
+    // ω × along (1, ½, 0): rows of ω R.
+    let turn = [turned(0.5, z, 0.0, x), turned(-1.0, z, 0.0, x), turned(1.0, y, -0.5, x)];
+    let mut shift = [[0.0; 4]; 3];
+    shift[1][3] = 1.0;
+    let mut loads = vec![[0.0; 3]; mesh.n_nodes()];
+    loads[100] = [1e-3, 0.0, 2e-3];
+    let changes = [
+        Change::Rates(vec![("floor".into(), turn)]),
+        Change::Rates(vec![("lid".into(), shift)]),
+        Change::Loads(loads.clone()),
+    ];
+    for (method, allowed) in [(Method::Cholesky, 1e-5), (Method::Pcg, 1e-3)] {
+        let options = StaticOptions {
+            contact: ContactOptions { tolerance: 1e-9, ..ContactOptions::default() },
+            ..with_method(method)
+        };
+        let solver = solver(&tensors, &bounds, options).unwrap();
+        let solved = solver.solve(&motion, None, GO_ON).unwrap();
+        let found = solver.responses((&motion, &solved), &changes, 1e-4, GO_ON).unwrap();
+        let step = 1e-3;
+        let scaled: Vec<[f64; 3]> = loads.iter().map(|f| f.map(|v| step * v)).collect();
+        let against: Vec<[f64; 3]> = loads.iter().map(|f| f.map(|v| -step * v)).collect();
+        let ends = [
+            (about(step, 0.0), about(-step, 0.0), None, None),
+            (about(0.0, step), about(0.0, -step), None, None),
+            (motion.clone(), motion.clone(), Some(&scaled[..]), Some(&against[..])),
+        ];
+        for (k, (ahead, behind, more, less)) in ends.iter().enumerate() {
+            let ahead = solver.solve(ahead, *more, GO_ON).unwrap().displacements;
+            let behind = solver.solve(behind, *less, GO_ON).unwrap().displacements;
+            let difference: Vec<[f64; 3]> = ahead
+                .iter()
+                .zip(&behind)
+                .map(|(a, b)| [0, 1, 2].map(|i| (a[i] - b[i]) / (2.0 * step)))
+                .collect();
+            let size = meshes::largest(&difference);
+            let e = largest_difference(&found[k], &difference);
+            assert!(size > 0.0 && e <= allowed * size, "{method:?}, {k}: {e:e} of {size:e}");
+        }
+    }
 }
 
 /// A plan leaves no trace: solving others in between does not change one bit.

@@ -49,6 +49,12 @@ impl Trail {
     pub fn starting(rows: Vec<[f64; 3]>) -> Self {
         Self { rows, ..Self::default() }
     }
+
+    /// Forgets the last solution, and keeps what is known of the matrix under the same constraints.
+    pub fn begin_again(&mut self) {
+        self.rows.clear();
+        self.reach = None;
+    }
 }
 
 /// What a solve under contact conditions may leave for the next one.

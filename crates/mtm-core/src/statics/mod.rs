@@ -1,5 +1,6 @@
-//! Equilibrium of a body under a plan: options, linear solves, Newton's method, plan operators.
+//! Equilibrium of a body under a plan: options, linear solves, Newton's method, plan operators, first-order changes.
 
+pub(crate) mod about;
 pub(crate) mod confirmed;
 pub(crate) mod effort;
 pub(crate) mod frozen;
@@ -10,6 +11,7 @@ pub(crate) mod projected_product;
 pub(crate) mod reaction;
 pub(crate) mod reduction;
 pub mod replan;
+pub mod response;
 pub mod restraint;
 pub(crate) mod row_conditions;
 pub(crate) mod settling;

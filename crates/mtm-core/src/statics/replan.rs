@@ -6,16 +6,14 @@
 
 use rayon::prelude::*;
 
-use crate::boundary::{Motion, NodeKind, Plan, matched};
-use crate::contact::{ContactState, SlidingNode, Spring};
+use crate::boundary::{Motion, NodeKind, Plan, Segment, matched};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::motion::RigidMotion;
-use crate::mechanics::kinematics::Kinematics;
+use crate::statics::about::{About, Rate};
 use crate::statics::options::Interrupt;
 use crate::statics::reduction::NO_ROW;
 use crate::statics::solver::StaticSolver;
 use crate::statics::system::Frozen;
-use crate::vector::{add, dot, scaled, sub};
 
 /// Unit fields per segment.
 pub const COLUMNS: usize = 12;
@@ -51,22 +49,7 @@ impl StaticSolver {
         reference: Option<&Plan>,
         interrupted: Interrupt<'_>,
     ) -> Result<PlanOperator> {
-        if self.kinematics() != Kinematics::Linear {
-            return Err(MtmError::UnknownName {
-                what: "kinematics of a plan operator",
-                found: self.kinematics().name().into(),
-                known: "linear (no linear map gives the others; use solve)",
-                kind: ErrorKind::Solver,
-            });
-        }
-        if !self.node_kinds.touching().is_empty() {
-            return Err(MtmError::UnknownName {
-                what: "boundary of a plan operator",
-                found: "touching pairs".into(),
-                known: "one without (what touches changes with the plan; use solve)",
-                kind: ErrorKind::Solver,
-            });
-        }
+        self.check_linear("kinematics of a plan operator", "boundary of a plan operator")?;
         let mesh = self.tensors.mesh();
         let places = self.tensors.element_nodes().positions();
         let n = places.len();
@@ -108,7 +91,7 @@ impl StaticSolver {
             for column in 0..COLUMNS {
                 let mut u = vec![[0.0; 3]; n];
                 for &j in &segment.joined {
-                    u[j as usize] = unit_field(column, places[j as usize], centres[s]);
+                    u[j as usize] = Rate::unit(column, centres[s]).at(places[j as usize]);
                 }
                 scales.push(if column < 9 { mesh.diagonal() } else { 1.0 });
                 fields.push(self.coupled(&u));
@@ -118,18 +101,41 @@ impl StaticSolver {
             (Some(state), Some(sliding)) => {
                 scales.push(1.0);
                 fields.push(vec![[0.0; 3]; self.reduction.unknowns.len()]);
-                let about = About { state, sliding: sliding.nodes(), places, centres: &centres };
-                let names: Vec<&str> = segments.iter().map(|s| s.name.as_str()).collect();
-                let slopes = about.slopes(reference, &names, &mut fields);
+                let identity = RigidMotion::identity();
+                let motion = |s: &Segment| *find(reference, &s.name).unwrap_or(&identity);
+                let motions: Vec<RigidMotion> = segments.iter().map(motion).collect();
+                let about = About {
+                    rows: &state.rows,
+                    springs: &state.springs,
+                    normals: &state.normals,
+                    forces: &state.forces,
+                    active: &state.active,
+                    sliding: sliding.nodes(),
+                    motions: &motions,
+                };
+                let (mut offsets, mut goals) = (Vec::new(), Vec::new());
+                for (k, field) in fields.iter_mut().enumerate() {
+                    let slope = match centres.get(k / COLUMNS) {
+                        Some(&centre) => {
+                            let rate = Rate::unit(k % COLUMNS, centre);
+                            let mut slope = about.still();
+                            about.add(k / COLUMNS, &rate, &mut slope, field);
+                            slope
+                        }
+                        None => about.at_rest(&state.displacements, places, field),
+                    };
+                    offsets.push(slope.offsets);
+                    goals.push(slope.goals);
+                }
                 let frozen = Frozen {
                     rows: &state.rows,
-                    offsets: &slopes.offsets,
+                    offsets: &offsets,
                     springs: &state.springs,
-                    goals: &slopes.goals,
+                    goals: &goals,
                 };
-                self.solve_columns(fields, &scales, Some(frozen), interrupted)?
+                self.solve_columns(fields, (&scales, None), Some(frozen), interrupted)?
             }
-            _ => self.solve_columns(fields, &scales, None, interrupted)?,
+            _ => self.solve_columns(fields, (&scales, None), None, interrupted)?,
         };
 
         let kinds = self.node_kinds.kinds(n)?;
@@ -142,7 +148,7 @@ impl StaticSolver {
                     let u = if row != NO_ROW {
                         solved[COLUMNS * s + column][row as usize]
                     } else if kinds[j as usize] == NodeKind::Joined(s) {
-                        unit_field(column, places[j as usize], centres[s])
+                        Rate::unit(column, centres[s]).at(places[j as usize])
                     } else {
                         [0.0; 3]
                     };
@@ -240,78 +246,6 @@ impl PlanOperator {
     }
 }
 
-/// Contact at the reference plan, about which other plans are linearised.
-struct About<'a> {
-    state: &'a ContactState,
-    sliding: &'a [SlidingNode],
-    places: &'a [[f64; 3]],
-    centres: &'a [[f64; 3]],
-}
-
-/// Derivatives of the contact conditions with respect to the columns of the operator, followed by their
-/// constant part.
-struct Slopes {
-    /// Offset of every row, for each column.
-    offsets: Vec<Vec<f64>>,
-    /// Goal of every spring, for each column.
-    goals: Vec<Vec<f64>>,
-}
-
-impl About<'_> {
-    /// First-order change of the contact conditions about the reference. A row follows its surface along its
-    /// normal, n·u = n·w(p), where w is the displacement of the point p of the segment. The force f n turns
-    /// with the surface, and as the node slides on it: f H (u − w) + f (R − R₀) R₀ᵀ n across the normal. The
-    /// first term is a spring that moves with the surface, the second a load, which is added to `fields`.
-    fn slopes(&self, reference: &Plan, segments: &[&str], fields: &mut [Vec<[f64; 3]>]) -> Slopes {
-        let Self { state, sliding, places, centres } = *self;
-        let columns = fields.len();
-        let mut out = Slopes {
-            offsets: vec![vec![0.0; state.rows.len()]; columns],
-            goals: vec![vec![0.0; state.springs.len()]; columns],
-        };
-        let identity = RigidMotion::identity();
-        let motion = |s: usize| find(reference, segments[s]).unwrap_or(&identity);
-        let mut feet = vec![[0.0; 3]; sliding.len()];
-        for (r, row) in state.rows.iter().enumerate() {
-            let node = &sliding[row.node];
-            let foot = motion(node.segment).apply_inverse(row.point);
-            feet[row.node] = foot;
-            for column in 0..COLUMNS {
-                let way = unit_field(column, foot, centres[node.segment]);
-                out.offsets[COLUMNS * node.segment + column][r] = dot(row.normal, way);
-            }
-            out.offsets[columns - 1][r] = dot(row.normal, sub(foot, places[node.node as usize]));
-        }
-        for (r, spring) in state.springs.iter().enumerate() {
-            let Spring { node: i, axis, .. } = *spring;
-            let node = &sliding[i];
-            let rigid = motion(node.segment);
-            let reached = sub(rigid.apply(feet[i]), feet[i]);
-            out.goals[columns - 1][r] = dot(axis, sub(state.displacements[i], reached));
-            let unit = |column: usize| unit_field(column, feet[i], centres[node.segment]);
-            for column in 0..COLUMNS {
-                out.goals[COLUMNS * node.segment + column][r] = dot(axis, unit(column));
-            }
-        }
-        // Rotation of the forces with their segments, only across the normal: the component along it belongs to
-        // the row.
-        for (i, node) in sliding.iter().enumerate().filter(|(i, _)| state.active[*i]) {
-            let (normal, force) = (state.normals[i], state.forces[i]);
-            let back = motion(node.segment).rotate_inverse(normal);
-            let mut push = |column: usize, turn: [f64; 3]| {
-                let across = sub(turn, scaled(normal, dot(normal, turn)));
-                let row = &mut fields[column][node.row as usize];
-                *row = add(*row, scaled(across, force));
-            };
-            for entry in 0..9 {
-                push(COLUMNS * node.segment + entry, unit_field(entry, back, [0.0; 3]));
-            }
-            push(columns - 1, sub(back, normal));
-        }
-        out
-    }
-}
-
 /// Scalar product in four interleaved sums, which the compiler keeps in vector registers.
 fn dot12(a: &[f64; COLUMNS], b: &[f64; COLUMNS]) -> f64 {
     let mut sums = [0.0; 4];
@@ -321,17 +255,6 @@ fn dot12(a: &[f64; COLUMNS], b: &[f64; COLUMNS]) -> f64 {
         }
     }
     (sums[0] + sums[2]) + (sums[1] + sums[3])
-}
-
-/// Displacement of `x` in unit field `column`: entry (r, c) of R − I, or component of the shift.
-fn unit_field(column: usize, x: [f64; 3], centre: [f64; 3]) -> [f64; 3] {
-    let mut u = [0.0; 3];
-    if column < 9 {
-        u[column / 3] = x[column % 3] - centre[column % 3];
-    } else {
-        u[column - 9] = 1.0;
-    }
-    u
 }
 
 fn find<'a>(plan: &'a Plan, name: &str) -> Option<&'a RigidMotion> {

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use crate::contact::ContactStart;
+use crate::contact::{ContactRow, ContactStart, Spring};
 
 /// Seconds by stage; exactly zero for a stage that the scene does not need.
 pub type Timings = Vec<(&'static str, f64)>;
@@ -23,6 +23,10 @@ pub struct ContactResult {
     pub gaps: Vec<f64>,
     /// Whether the node is held to the surface.
     pub active: Vec<bool>,
+    /// Constraint of each held node.
+    pub(crate) rows: Vec<ContactRow>,
+    /// How the forces change direction as held nodes slide.
+    pub(crate) springs: Vec<Spring>,
     /// Largest distance, mm, by which the remaining tangential force would move a sliding node on its own.
     pub unbalanced: f64,
     /// The nodes moved back with their segments to the position at rest; none if a segment is deformed.
@@ -69,6 +73,8 @@ impl Default for ContactResult {
             forces: Vec::new(),
             gaps: Vec::new(),
             active: Vec::new(),
+            rows: Vec::new(),
+            springs: Vec::new(),
             unbalanced: 0.0,
             at_rest: None,
             converged: true,

@@ -342,7 +342,7 @@ impl StaticSolver {
     }
 
     /// `loads` for every node, mid-edge nodes included.
-    fn checked_loads(&self, loads: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
+    pub(crate) fn checked_loads(&self, loads: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
         let n = self.tensors.element_nodes().n_nodes();
         let corners = self.tensors.mesh().n_nodes();
         if loads.len() != n && loads.len() != corners {
@@ -441,8 +441,34 @@ impl StaticSolver {
         if sum == 0.0 { 0.0 } else { (sum / scale.max(f64::MIN_POSITIVE)).sqrt() }
     }
 
+    /// Rejects kinematics and boundaries without a linear map from what drives the body to its displacements:
+    /// `kinematics` and `boundary` are what the error calls them.
+    pub(crate) fn check_linear(
+        &self,
+        kinematics: &'static str,
+        boundary: &'static str,
+    ) -> Result<()> {
+        if self.kinematics() != Kinematics::Linear {
+            return Err(MtmError::UnknownName {
+                what: kinematics,
+                found: self.kinematics().name().into(),
+                known: "linear (no linear map gives the others; use solve)",
+                kind: ErrorKind::Solver,
+            });
+        }
+        if !self.node_kinds.touching().is_empty() {
+            return Err(MtmError::UnknownName {
+                what: boundary,
+                found: "touching pairs".into(),
+                known: "one without (what touches changes with the plan; use solve)",
+                kind: ErrorKind::Solver,
+            });
+        }
+        Ok(())
+    }
+
     /// Rejects a starting solution of another mesh or boundary.
-    fn check_start(&self, start: &Solution) -> Result<()> {
+    pub(crate) fn check_start(&self, start: &Solution) -> Result<()> {
         let n = self.tensors.element_nodes().n_nodes();
         let nodes = self.sliding.as_ref().map_or(0, |s| s.nodes().len());
         let counts = [
@@ -478,6 +504,8 @@ impl StaticSolver {
             at_rest,
             converged: state.converged,
             active: state.active,
+            rows: state.rows,
+            springs: state.springs,
         }
     }
 
@@ -498,11 +526,12 @@ impl StaticSolver {
         Ok(self.solve_rows(&posed, &mut Solve::new(scale, interrupted))?.0.contact)
     }
 
-    /// Unknown rows for several right-hand sides, with contact frozen if there is any.
+    /// Unknown rows for several right-hand sides, with contact frozen if there is any; see
+    /// [`System::solve_columns`].
     pub(crate) fn solve_columns(
         &self,
         columns: Vec<Vec<[f64; 3]>>,
-        scales: &[f64],
+        accuracy: (&[f64], Option<f64>),
         frozen: Option<Frozen<'_>>,
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
@@ -510,7 +539,7 @@ impl StaticSolver {
             unreachable!("plan operators of other kinematics are refused before they get here")
         };
         system
-            .solve_columns(columns, scales, self.sliding.as_ref().zip(frozen), interrupted)
+            .solve_columns(columns, accuracy, self.sliding.as_ref().zip(frozen), interrupted)
             .map_err(|e| by_node(e, &self.reduction.unknowns))
     }
 }

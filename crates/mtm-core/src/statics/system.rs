@@ -311,11 +311,12 @@ impl System {
         Ok(iterative.solve_projected(b, conditions, leave, &mut trail, solve)?.rows)
     }
 
-    /// Rows for several right-hand sides; `scales` are the lengths of their prescribed fields, mm.
+    /// Rows for several right-hand sides; `scales` are the lengths of their prescribed fields, mm. With a
+    /// `share`, iterative solves may leave that error relative to the solution, in the energy norm.
     pub fn solve_columns(
         &self,
         mut columns: Vec<Vec<[f64; 3]>>,
-        scales: &[f64],
+        (scales, share): (&[f64], Option<f64>),
         sliding: Option<(&Sliding, Frozen<'_>)>,
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
@@ -324,8 +325,17 @@ impl System {
                 factor.solve_many(&mut columns);
                 return Ok(columns);
             }
-            let each = columns.iter().zip(scales);
-            return each.map(|(b, &s)| self.solve(b, &mut Solve::new(s, interrupted))).collect();
+            let linked = Linked { share, ..Linked::default() };
+            let solve = |(b, &scale): (&Rows, &f64)| {
+                let mut solve = Solve::new(scale, interrupted);
+                match (&self.kept, share) {
+                    (Kept::Matrix(Unfactored::Iterative(_)), Some(_)) => {
+                        self.solve_linked(b, linked, &[], &mut solve)
+                    }
+                    _ => self.solve(b, &mut solve),
+                }
+            };
+            return columns.iter().zip(scales).map(solve).collect();
         };
         let still = vec![[0.0; 3]; sliding.nodes().len()];
         let conditions = |k: usize, solve: &mut dyn FnMut(&Constraints<'_>) -> Result<Rows>| {
@@ -363,11 +373,13 @@ impl System {
             Kept::Factor(factor) => flexible(factor, &ContactFactor::by_sweeps(factor, sliding)?),
             Kept::Flexible { factor, contact } => flexible(factor, contact),
             Kept::Matrix(system) => {
+                // All columns have the same constraints, so one trial serves them.
+                let mut trail = Trail::default();
                 let solve = |((k, b), &scale): ((usize, &Rows), &f64)| {
                     let mut solve = Solve::new(scale, interrupted);
                     conditions(k, &mut |c| {
-                        let mut trail = Trail::default();
-                        let nodes = (sliding, Linked::default());
+                        trail.begin_again();
+                        let nodes = (sliding, Linked { share, ..Linked::default() });
                         let found = system.solve_projected(b, nodes, c, &mut trail, &mut solve);
                         found.map(|found| found.rows)
                     })

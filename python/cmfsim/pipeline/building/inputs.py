@@ -173,7 +173,7 @@ def case_key(case: Case, hashes: Mapping[str, str] | None = None) -> str:
     """The SHA-256 of everything that results of a case depend on: files, plan, options, version.
 
     Results of one key may be shown together. Folders may be moved: paths count from the case's own,
-    and where the results go does not count.
+    and where the results go does not count, nor does the band around them.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def case_key(case: Case, hashes: Mapping[str, str] | None = None) -> str:
         "case": {
             field.name: _plain(getattr(case, field.name), folder)
             for field in fields(case)
-            if field.name not in {"file", "output", "lines"}
+            if field.name not in {"file", "output", "lines", "band"}
         },
         "version": __version__,
     }

@@ -1,0 +1,79 @@
+"""The band of a prediction painted on its skin."""
+
+import os
+from typing import Any
+
+import numpy as np
+
+from cmfsim.errors import CaseInputError
+from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
+from cmfsim.pictures.distances import NOT_EVALUATED
+from cmfsim.pictures.skin_ends import skin_ends, trimmed
+from cmfsim.values.prediction import Prediction
+
+__all__ = ["picture_band"]
+
+# Left round the face, as a share of its extent.
+MARGIN = 0.12
+
+
+def picture_band(
+    path: str | os.PathLike[str], prediction: Prediction, *, size: tuple[int, int] = SIZE
+) -> None:
+    """Writes a picture of half the width of a band: from the right, the front and the left.
+
+    Where no calibration case says anything the skin is grey. Without a calibration, each view
+    states that.
+
+    Parameters
+    ----------
+    path : path
+        Ends in `.png`.
+    prediction : Prediction
+        With `band`.
+    size : (int, int), pixels
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) The prediction has no band; PyVista or OpenGL is missing, another
+        ending.
+
+    Examples
+    --------
+    >>> import cmfsim.pictures
+    >>> cmfsim.pictures.picture_band("band.png", prediction)  # doctest: +SKIP
+    """
+    band = prediction.band
+    if band is None:
+        raise CaseInputError("the prediction has no band: use predict_with_band")
+    skin, half = prediction.skin, band.half_width
+    vertices = np.asarray(skin.vertices)
+    known = ~np.ma.getmaskarray(half)
+    # What lies beyond the face, as at the cut of the neck, would have the scale to itself.
+    face = band.regions.get("face", known) & known
+    largest = float(half[face if face.any() else known].max())
+    low, high = bounds([vertices[known]])
+    ends = skin_ends(skin)
+    corners = ends.within(np.array([low - MARGIN * (high - low), high + MARGIN * (high - low)]))
+    words = f"± mm, {100 * band.coverage:g} %" if band.calibrated else "± mm, UNCALIBRATED"
+    legend = [] if known.all() else [("no calibration", NOT_EVALUATED)]
+
+    def paint(plotter: Any, view: View) -> None:
+        surface = polydata(vertices, skin.triangles)
+        surface.point_data["band"] = np.ma.filled(half, np.nan)
+        plotter.add_mesh(
+            trimmed(surface, ends),
+            scalars="band",
+            clim=(0.0, largest),
+            cmap="viridis",
+            nan_color=NOT_EVALUATED,
+            smooth_shading=True,
+            ambient=0.3,
+            show_scalar_bar=False,
+        )
+        if view.direction == "left":
+            add_scale_bar(plotter, (0.84, 0.27), 4, "%.1f")
+
+    views = tuple(View(name, f"{name}   {words}") for name in ("right", "front", "left"))
+    draw(path, views, corners, size, paint, legend=legend)

@@ -1,0 +1,241 @@
+"""The band around a prediction: derivatives and priors, regions of the face, a calibration."""
+
+import statistics
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import Surface
+from cmfsim.checks import Floats
+from cmfsim.errors import CalibrationError
+from cmfsim.evaluation import SKIN_LANDMARKS, calibrate, skin_regions
+from cmfsim.pipeline.face_regions import FaceLandmarks, face_landmarks
+from cmfsim.solving.models import solved_patient
+from cmfsim.solving.rates import SkinRates, skin_rates
+from cmfsim.solving.uncertainty import ADDED, NOT_COVERED, band_sources
+from cmfsim.surfaces.depth import tissue_depth
+from cmfsim.values.band_options import BandOptions
+from cmfsim.values.calibration import BandFactor, Calibration, settings_digest
+from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.prediction import Prediction
+from cmfsim.values.skin_band import WHOLE_FACE, SkinBand
+
+__all__ = ["band_regions", "band_settings", "predict_with_band"]
+
+# Regions of `skin_regions` that a band holds simultaneously, each by itself.
+BAND_REGIONS = (
+    WHOLE_FACE,
+    "nose",
+    "upper lip",
+    "lower lip",
+    "chin",
+    "left cheek",
+    "right cheek",
+)
+
+
+def predict_with_band(
+    patient: PatientModel, model: str = "M+S", options: BandOptions | None = None
+) -> Prediction:
+    """The face that a model predicts for a patient, with the band around it.
+
+    Parameters
+    ----------
+    patient : PatientModel
+    model : str
+        "H", "M", "H+S" or "M+S".
+    options : BandOptions, optional
+        Default: 90 %, uncalibrated.
+
+    Returns
+    -------
+    Prediction
+        With `band`.
+
+    Raises
+    ------
+    CalibrationError
+        (also `ValueError`) The calibration belongs to another model, to other settings or another
+        coverage, is too small for the coverage, or has no region of this face.
+    CaseError
+        (also `ValueError`) Kinematics that are not linear; lips in contact.
+    CmfsimError
+        As `predict_patient`.
+
+    Notes
+    -----
+    The standard deviation at a vertex is √Σ(n·∂u/∂p σ_p)² over tissue and plan, and what is added
+    along the normal n without a solve: change of thickness, segmentation, scan noise.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> prediction = cmfsim.predict_with_band(patient, "M+S")  # doctest: +SKIP
+    >>> prediction.band.state, prediction.band.half_width.mean()  # doctest: +SKIP
+    ('uncalibrated', 1.3)
+    """
+    options = options or BandOptions()
+    options.check((model,))
+    solved = solved_patient(patient, model)
+    begun = time.perf_counter()
+    rates = skin_rates(patient, solved.scene, solved.solver, solved.solution)
+    band = _band(solved.prediction, rates, options)
+    seconds = time.perf_counter() - begun
+    summary = dict(solved.prediction.summary)
+    summary["timings"] = {**summary["timings"], "band": seconds}
+    band = replace(band, about={**band.about, "seconds": seconds})
+    summary["band"] = band.as_dict()
+    return replace(solved.prediction, summary=summary, band=band)
+
+
+def band_settings(prediction: Prediction) -> dict[str, Any]:
+    """What the band of a prediction depends on besides its case, as plain values.
+
+    Predictions whose settings are equal may be calibrated by one another. The edge length is no
+    part of it: what a coarser mesh costs is for a convergence study to state.
+    """
+    options = prediction.scene.options
+    used = prediction.patient.summary.get("muscles", {})
+    muscles = {}
+    if prediction.model.startswith("M"):
+        muscles = {name: used.get(name) for name in ("mixing", "moduli")}
+    fat = {name: value.tolist() for name, value in prediction.patient.fat.arrays().items()}
+    return {
+        "model": prediction.model,
+        "element": options.element,
+        "kinematics": options.kinematics,
+        "contact": options.contact if prediction.model.endswith("+S") else "none",
+        "fat": {"kind": prediction.patient.fat.kind, **fat},
+        **muscles,
+        "plan": "achieved" if "achieved" in prediction.patient.summary else "planned",
+        "sources": band_sources(),
+    }
+
+
+def band_regions(patient: PatientModel) -> dict[str, NDArray[np.bool_]]:
+    """The vertices of a patient's skin in each region that a band holds.
+
+    They are placed on the skin before the operation, as those of an evaluation, by the skin
+    landmarks of the case or by proposed ones; none where neither are there.
+
+    Parameters
+    ----------
+    patient : PatientModel
+
+    Returns
+    -------
+    dict of str to (k,) bool
+    """
+    return _placed(patient, face_landmarks(patient))
+
+
+def _placed(patient: PatientModel, landmarks: FaceLandmarks) -> dict[str, NDArray[np.bool_]]:
+    if not landmarks.points:
+        return {}
+    found = skin_regions(patient.skin.vertices, landmarks.points)
+    return {name: found[name] for name in BAND_REGIONS if found[name].any()}
+
+
+def _band(prediction: Prediction, rates: SkinRates, options: BandOptions) -> SkinBand:
+    normals = _normals(prediction)
+    parts: dict[str, Floats] = {
+        name: np.einsum("ka,ka->k", normals, rate) for name, rate in rates.rates.items()
+    }
+    depth = tissue_depth(
+        prediction.skin_before.vertices, [s.surface for s in prediction.patient.segments]
+    )
+    for source in ADDED:
+        scale = depth if source.unit == "share" else np.ones(len(depth))
+        parts[source.name] = source.sd * scale
+    sd = np.sqrt(sum(np.square(part) for part in parts.values()))
+    landmarks = face_landmarks(prediction.patient)
+    settings, regions = band_settings(prediction), _placed(prediction.patient, landmarks)
+    factors: Mapping[str, BandFactor] = {}
+    if options.calibration is not None:
+        _check_settings(options.calibration, settings)
+        factors = _factors(options.calibration, options, regions)
+    sources = {**rates.sources, **{source.name: source for source in ADDED}}
+    return SkinBand(
+        coverage=options.coverage,
+        sd=sd,
+        parts=parts,
+        regions=regions,
+        factors=factors,
+        plain_factor=statistics.NormalDist().inv_cdf(0.5 * (1.0 + options.coverage)),
+        settings=settings,
+        about={
+            "sources": {name: source.as_dict() for name, source in sources.items()},
+            "not_covered": [*rates.left_out, *NOT_COVERED],
+            "notes": [finding.what for finding in landmarks.findings],
+            "calibration": _calibration_values(options),
+        },
+    )
+
+
+def _normals(prediction: Prediction) -> Floats:
+    """The outward unit normals of the predicted skin, (k, 3)."""
+    skin = prediction.skin
+    return np.asarray(Surface(skin.vertices, skin.triangles).vertex_normals, dtype=np.float64)
+
+
+def _calibration_values(options: BandOptions) -> dict[str, Any] | None:
+    found = options.calibration
+    if found is None:
+        return None
+    return {
+        "file": options.source,
+        "note": found.note,
+        "group": options.group,
+        "n": len([c for c in found.cases if options.group in (None, c.group)]),
+        "settings_digest": found.digest,
+    }
+
+
+def _check_settings(calibration: Calibration, settings: Mapping[str, Any]) -> None:
+    if calibration.digest == settings_digest(settings):
+        return
+    theirs = calibration.settings
+    differing = [
+        f"{name} is {_shown(theirs.get(name))} there and {_shown(settings.get(name))} here"
+        for name in sorted(set(theirs) | set(settings))
+        if theirs.get(name) != settings.get(name)
+    ]
+    raise CalibrationError(
+        f"the calibration was made under other settings: {'; '.join(differing)}; calibrate with "
+        "cases that were predicted under the settings of this one"
+    )
+
+
+def _shown(value: object) -> str:
+    return "missing" if value is None else f"{value!r:.120}"
+
+
+def _factors(
+    calibration: Calibration, options: BandOptions, regions: Mapping[str, NDArray[np.bool_]]
+) -> dict[str, BandFactor]:
+    if not regions:
+        raise CalibrationError(
+            "a calibrated band holds regions of the face, and the case has no skin landmarks that "
+            f"place them: add {', '.join(SKIN_LANDMARKS)} to [landmarks], or have cmfsim "
+            "landmarks propose them"
+        )
+    if options.group is not None and options.group not in calibration.groups:
+        known = ", ".join(repr(group) for group in calibration.groups)
+        raise CalibrationError(f"the calibration has no group {options.group!r}; it has: {known}")
+    missing = [name for name in regions if name not in calibration.regions]
+    if missing:
+        raise CalibrationError(
+            f"the calibration has no score of {', '.join(missing)}; it has: "
+            f"{', '.join(calibration.regions)}"
+        )
+    found = {}
+    for name in regions:
+        try:
+            found[name] = calibrate(calibration.scores(name, options.group), options.coverage)
+        except CalibrationError as error:
+            raise CalibrationError(f"region {name}: {error}") from error
+    return found

@@ -1,0 +1,71 @@
+"""The landmarks by which regions of a face are placed: the case's own, else proposed ones."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from cmfsim.checks import Floats
+from cmfsim.errors import CmfsimError
+from cmfsim.evaluation import SKIN_LANDMARKS
+from cmfsim.pipeline.proposing import head_surfaces, propose_landmarks
+from cmfsim.values.finding import Finding
+from cmfsim.values.patient_model import PatientModel
+
+__all__ = ["FaceLandmarks", "face_landmarks"]
+
+
+@dataclass(frozen=True)
+class FaceLandmarks:
+    """Landmarks that place the regions of a face.
+
+    Attributes
+    ----------
+    points : mapping of str to (3,) float64, mm
+        All of `SKIN_LANDMARKS`; empty where they are neither given nor found.
+    findings : tuple of Finding
+        That they were proposed, or why there are none.
+    """
+
+    points: Mapping[str, Floats]
+    findings: tuple[Finding, ...] = ()
+
+
+def face_landmarks(patient: PatientModel) -> FaceLandmarks:
+    """The skin landmarks that place the regions of a patient's face.
+
+    Those of the case where it has all of them; else they are proposed on its surfaces, which takes
+    a few seconds. Proposed ones place regions, and nothing else: no distance depends on them.
+
+    Parameters
+    ----------
+    patient : PatientModel
+    """
+    given = patient.landmarks.get("skin", {})
+    if all(name in given for name in SKIN_LANDMARKS):
+        return FaceLandmarks(given)
+    try:
+        found = propose_landmarks(*head_surfaces(patient.anatomy))
+    except CmfsimError as error:
+        return FaceLandmarks({}, (_none(str(error)),))
+    missing = [name for name in SKIN_LANDMARKS if name not in found.skin]
+    if missing:
+        return FaceLandmarks({}, (_none(f"{', '.join(missing)} were not found"),))
+    worst = max(found.skin[name].error for name in SKIN_LANDMARKS)
+    note = Finding.note(
+        "regions-proposed",
+        "regions of the face are placed by proposed landmarks, each expected to be right to "
+        f"{worst:.1f} mm",
+        where="landmarks.skin",
+        why="The case has no complete skin landmarks. Borders between regions are that uncertain.",
+        fix="Look at them with cmfsim landmarks, and save them.",
+    )
+    return FaceLandmarks({name: found.skin[name].point for name in SKIN_LANDMARKS}, (note,))
+
+
+def _none(reason: str) -> Finding:
+    return Finding.note(
+        "regions-none",
+        f"the face is not divided into regions: {reason}",
+        where="landmarks.skin",
+        why="The case has no complete skin landmarks, and none could be proposed.",
+        fix="Place the skin landmarks.",
+    )

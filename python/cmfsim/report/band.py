@@ -1,0 +1,98 @@
+"""The section of a report that states how far to trust the face."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from cmfsim.report.document import NOTHING, Figure, Note, Section, Table, number
+
+__all__ = ["band_section"]
+
+Values = Mapping[str, Any]
+# Sources listed by region, those with the largest effect first.
+MOST_SOURCES = 12
+
+UNCALIBRATED = (
+    "UNCALIBRATED. The half widths below are {factor:.2f} standard deviations of the sources "
+    "listed below, at one point at a time. No case with a known outcome shows that they hold "
+    "{percent} of faces: the true face may lie outside more often. Give a calibration ([band] in "
+    "the case, or --calibration)."
+)
+CALIBRATED = (
+    "In {percent} of cases like those of the calibration, all of a region lies within its band at "
+    "the same time: its distance from the predicted skin, along the normal, is at most the half "
+    "width everywhere. Calibrated by {file}{note}. Each region is calibrated by itself."
+)
+
+
+def band_section(band: Values, figures: list[Figure]) -> Section:
+    """The band of one prediction.
+
+    Parameters
+    ----------
+    band : mapping
+        `SkinBand.as_dict()`.
+    figures : list of Figure
+        Its picture, where there is one.
+    """
+    percent = f"{100 * band['coverage']:g} %"
+    if band["state"] == "uncalibrated":
+        text = UNCALIBRATED.format(factor=band["factor_uncalibrated"], percent=percent)
+        statement = Note(text, "warning")
+    else:
+        used = band["calibration"]
+        note = f" ({used['note']})" if used["note"] else ""
+        statement = Note(CALIBRATED.format(percent=percent, file=used["file"], note=note))
+    missing = Note("Not covered by the sources: " + "; ".join(band["not_covered"]) + ".")
+    notes = [Note(f"{text}.") for text in band["notes"]]
+    tables = (_widths(band), _effects(band), _priors(band))
+    blocks: tuple[Note | Table | Figure, ...] = (statement, *notes, *figures, *tables, missing)
+    return Section(f"How far to trust it ({band['state']})", blocks)
+
+
+def _widths(band: Values) -> Table:
+    """Half widths by region, with the calibration of each."""
+    columns = ("region", "mean", "95 %", "largest", "factor", "n", "holds")
+    rows = []
+    for name, entry in band["regions"].items():
+        cells = [entry[f"half_width_{which}_mm"] for which in ("mean", "p95", "largest")]
+        factor = entry["calibration"]
+        worth = (NOTHING, NOTHING, "uncalibrated")
+        if factor is not None:
+            low, high = (100 * factor[f"coverage_{end}_percent"] for end in (5, 95))
+            worth = (number(factor["factor"]), str(factor["n"]), f"{low:.0f} to {high:.0f} %")
+        rows.append((name, *(number(cell) for cell in cells), *worth))
+    caption = (
+        "Half the width of the band, mm; the factor on the standard deviation, the calibration "
+        "cases n, and the share of further cases that n of them can vouch for (90 % interval)."
+    )
+    return Table(columns, tuple(rows), caption)
+
+
+def _effects(band: Values) -> Table:
+    """What one standard deviation of each source moves, by region."""
+    regions = band["regions"]
+    sums: dict[str, float] = {}
+    for entry in regions.values():
+        for name, size in entry["sources_rms_mm"].items():
+            sums[name] = max(sums.get(name, 0.0), size)
+    names = sorted(sums, key=lambda name: -sums[name])[:MOST_SOURCES]
+    rows = tuple(
+        (name, *(number(entry["sources_rms_mm"].get(name)) for entry in regions.values()))
+        for name in names
+    )
+    caption = (
+        f"How far one standard deviation of a source moves the skin along its normal, mm (RMS); "
+        f"the {len(names)} largest of {len(sums)}."
+    )
+    return Table(("source", *regions), rows, caption)
+
+
+def _priors(band: Values) -> Table:
+    # Those of a plan are the same for each segment.
+    priors = {name.rpartition(": ")[2]: entry for name, entry in band["sources"].items()}
+    rows = tuple(
+        (name, f"{entry['sd']:g}", entry["unit"], entry["reference"])
+        for name, entry in priors.items()
+    )
+    caption = "Standard deviations of the sources before anything is known of this patient."
+    return Table(("source", "SD", "unit", "from"), rows, caption, numeric=False)

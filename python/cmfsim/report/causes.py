@@ -1,0 +1,95 @@
+"""What the error of an evaluation consists of: what no model makes, and what a model does."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from cmfsim.report.document import Note, Table, number
+
+__all__ = ["not_operated_blocks", "statistics_table", "thickness_blocks"]
+
+Values = Mapping[str, Any]
+
+
+def not_operated_blocks(evaluation: Values) -> list[Note | Table]:
+    """The error where nothing was operated on; that it is not known, where it is not.
+
+    Parameters
+    ----------
+    evaluation : mapping
+        What `metrics.json` holds.
+    """
+    if "not_operated" not in evaluation:
+        return []  # of an earlier version
+    found = evaluation["not_operated"]
+    if found is None:
+        return [
+            Note(
+                "The error where nothing was operated on is not known, so that registration, "
+                "swelling and weight cannot be told from the error of a model.",
+                "warning",
+            )
+        ]
+    whole = found["regions"]["whole"]
+    return [
+        Note(
+            f"Where nothing was operated on, the two scans differ by {whole['mean_mm']:.2f} mm on "
+            f"average ({whole['signed_mean_mm']:+.2f} mm signed; negative: the face before lies "
+            "behind the face after). That is registration, swelling or weight. No model can be "
+            "held to less, and a figure below that says nothing about a model."
+        ),
+        statistics_table(
+            found["regions"],
+            "Distance of the face before from the face after where nothing was operated on, mm.",
+        ),
+    ]
+
+
+def thickness_blocks(evaluation: Values) -> list[Note | Table]:
+    """The mean errors with the fitted change of thickness; nothing where none was fitted.
+
+    Parameters
+    ----------
+    evaluation : mapping
+    """
+    found = evaluation.get("thickness")
+    if found is None:
+        return []
+    means = found["mean_mm"]
+    regions = list(dict.fromkeys(region for table in means.values() for region in table))
+    rows = tuple(
+        (region, *(number(table.get(region)) for table in means.values())) for region in regions
+    )
+    share, depth = found["share_of_depth"], found["mean_depth_mm"]
+    return [
+        Note(
+            f"One change of thickness, {100 * share:+.1f} % of the depth of the soft tissue "
+            f"({share * depth:+.2f} mm on average there), was fitted where nothing was operated "
+            f"on: the mean error there falls from {found['mean_before_mm']:.2f} to "
+            f"{found['mean_after_mm']:.2f} mm. It is known only after the operation, and is no "
+            "part of a prediction."
+        ),
+        Table(("region", *means), rows, "Mean distance with that change applied, mm."),
+    ]
+
+
+def statistics_table(regions: Mapping[str, Values], caption: str) -> Table:
+    """Statistics of signed distances by region.
+
+    Parameters
+    ----------
+    regions : mapping of str to mapping
+        `DistanceStatistics.as_dict()` by region.
+    caption : str
+    """
+    columns = ("region", "mean", "SD", "median", "RMS", "90 %", "95 %", "max", "signed", "< 2 mm")
+    keys = ("mean_mm", "std_mm", "median_mm", "rms_mm", "p90_mm", "p95_mm", "max_mm")
+    rows = tuple(
+        (
+            name,
+            *(number(values[key]) for key in keys),
+            f"{values['signed_mean_mm']:+.2f}",
+            f"{100 * values['within']['2 mm']:.0f} %",
+        )
+        for name, values in regions.items()
+    )
+    return Table(columns, rows, caption)

@@ -1,0 +1,41 @@
+"""Depth of the soft tissue: how far the bone lies below each point of the skin."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim._core import Surface
+from cmfsim.checks import Floats, as_rows
+from cmfsim.errors import MeshInputError
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = ["MOST_DEPTH", "tissue_depth"]
+
+# Beyond this the closest bone is not below the skin but beside what was segmented, mm: the thickest
+# soft tissue of the face, in front of the masseter, is about 25 mm (De Greef et al. 2006).
+MOST_DEPTH = 30.0
+
+
+def tissue_depth(points: ArrayLike, bones: Iterable[SurfaceData]) -> Floats:
+    """The distance of each point of the skin from the closest bone, (k,) mm, 30 mm at most.
+
+    Parameters
+    ----------
+    points : (k, 3) float64, mm
+    bones : iterable of SurfaceData
+
+    Raises
+    ------
+    MeshError
+        (also `ValueError`) No bone is given.
+    """
+    places = as_rows("points", points, 3)
+    depth = np.full(len(places), np.inf)
+    for bone in bones:
+        closest, _, _ = Surface(bone.vertices, bone.triangles).closest(places)
+        depth = np.minimum(depth, np.linalg.norm(closest - places, axis=1))
+    if len(depth) and not np.isfinite(depth).all():
+        raise MeshInputError("the depth of the soft tissue needs at least one bone: there is none")
+    capped: Floats = np.minimum(depth, MOST_DEPTH)
+    return capped

@@ -1,0 +1,176 @@
+"""Scores of cases whose outcome is known, by which the band of other cases is calibrated."""
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from cmfsim.checks import Floats, as_number, as_text, check_one_of
+from cmfsim.errors import CalibrationError
+from cmfsim.values.model_names import MODELS
+
+__all__ = ["BandFactor", "Calibration", "CalibrationCase", "settings_digest"]
+
+
+def settings_digest(settings: Mapping[str, Any]) -> str:
+    """The SHA-256 of plain values, whatever the order of their names.
+
+    Parameters
+    ----------
+    settings : mapping of str to plain values
+    """
+    return hashlib.sha256(json.dumps(dict(settings), sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class BandFactor:
+    """What the standard deviation is multiplied by in one region, and what that is worth.
+
+    Attributes
+    ----------
+    factor : float
+    n : int
+        Calibration cases that have the region.
+    rank : int
+        The factor is the score of this rank, 1 the smallest.
+    coverage : float
+        Asked for: 0.9 for 90 %.
+    interval : (float, float)
+        5 % and 95 % quantile of the coverage that a calibration of this size reaches in further
+        cases like those that it was made of.
+    """
+
+    factor: float
+    n: int
+    rank: int
+    coverage: float
+    interval: tuple[float, float]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return {
+            "factor": self.factor,
+            "n": self.n,
+            "rank": self.rank,
+            "coverage": self.coverage,
+            "coverage_5_percent": self.interval[0],
+            "coverage_95_percent": self.interval[1],
+        }
+
+
+@dataclass(frozen=True)
+class CalibrationCase:
+    """The scores of one case whose outcome is known.
+
+    Attributes
+    ----------
+    case : str
+        Its name, unique in a calibration.
+    scores : mapping of str to float
+        By region of the face: the largest |error| over the standard deviation, 0 or more.
+    group : str
+        Cases that may be calibrated by themselves: a procedure, a centre, "virtual".
+
+    Raises
+    ------
+    CalibrationError
+        (also `ValueError`) No name, no score, a score that is not a finite number from 0 on.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.CalibrationCase("P1", {"chin": 1.7}).scores["chin"]
+    1.7
+    """
+
+    case: str
+    scores: Mapping[str, float]
+    group: str = ""
+
+    def __post_init__(self) -> None:
+        as_text("calibration case", self.case)
+        if not self.scores:
+            raise CalibrationError(f"calibration case {self.case!r} has no score")
+        for region, score in self.scores.items():
+            value = as_number(f"score of {region!r} in case {self.case!r}", score)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise CalibrationError(
+                    f"score of {region!r} in case {self.case!r} is {value!r}: a finite number "
+                    "from 0 on is needed; leave out regions that were not compared"
+                )
+        object.__setattr__(self, "scores", MappingProxyType(dict(self.scores)))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Scores of cases that were predicted by one model under the same settings.
+
+    Attributes
+    ----------
+    model : str
+        "H", "M", "H+S" or "M+S".
+    settings : mapping of str to plain values
+        What predictions and their standard deviations depend on besides the case: `band_settings`.
+    cases : tuple of CalibrationCase
+    note : str
+        What the cases are, such as that they are virtual patients.
+    coverage : float or None
+        The only coverage that the file may be used for; None for any.
+
+    Raises
+    ------
+    CalibrationError
+        (also `ValueError`) Two cases of one name; none; a coverage outside 0 to 1.
+    """
+
+    model: str
+    settings: Mapping[str, Any]
+    cases: tuple[CalibrationCase, ...]
+    note: str = ""
+    coverage: float | None = None
+    digest: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        check_one_of("model", self.model, MODELS)
+        if not self.cases:
+            raise CalibrationError("a calibration needs at least one case: it has none")
+        seen: set[str] = set()
+        for case in self.cases:
+            if case.case in seen:
+                raise CalibrationError(
+                    f"calibration case {case.case!r} is there twice: each patient counts once"
+                )
+            seen.add(case.case)
+        if self.coverage is not None and not 0.0 < as_number("coverage", self.coverage) < 1.0:
+            raise CalibrationError(f"coverage is {self.coverage!r}: allowed is above 0, below 1")
+        # As a file gives them back: tuples are lists.
+        settings = json.loads(json.dumps(dict(self.settings)))
+        object.__setattr__(self, "settings", MappingProxyType(settings))
+        object.__setattr__(self, "digest", settings_digest(self.settings))
+
+    @property
+    def regions(self) -> tuple[str, ...]:
+        """The regions that any case has, in the order in which they appear."""
+        return tuple(dict.fromkeys(region for case in self.cases for region in case.scores))
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The groups of the cases, in the order in which they appear."""
+        return tuple(dict.fromkeys(case.group for case in self.cases))
+
+    def scores(self, region: str, group: str | None = None) -> Floats:
+        """The scores of a region, (n,), of the cases that have it.
+
+        Parameters
+        ----------
+        region : str
+        group : str, optional
+            Only of the cases of this group.
+        """
+        chosen = [c for c in self.cases if group is None or c.group == group]
+        return np.array([c.scores[region] for c in chosen if region in c.scores], dtype=np.float64)
