@@ -1,15 +1,29 @@
-//! The body of the contact problem: its response to constraints by a kept flexibility or by iteration.
+//! A body under contact conditions: systems solved anew for each set of them, and the responses of bodies by a
+//! kept flexibility or by iteration.
 
-use crate::algebra::cholesky::Factor;
+use std::borrow::Cow;
+use std::sync::Arc;
+
+use crate::algebra::blocks::BlockMatrix;
+use crate::algebra::cholesky::{Factor, Symbolic};
+use crate::algebra::constraints::{Constraint, add_offsets, projected_rhs};
+use crate::algebra::krylov::Enough;
 use crate::algebra::row_sums::in_pool;
-use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
-use crate::error::Result;
+use crate::boundary::Motion;
+use crate::contact::links::Link;
+use crate::contact::{Body, Constraints, ContactStart, ContactState, Response, Sliding};
+use crate::error::{ErrorKind, MtmError, Result};
 use crate::statics::effort::Solve;
-use crate::statics::iterative::{Advance, Trail};
+use crate::statics::iterative::{Advance, Iterative, Leave, Trail};
+use crate::statics::options::{Method, StaticOptions};
 use crate::statics::reaction::{Answer, Answers, ContactFactor};
+use crate::statics::row_conditions::RowConditions;
 use crate::statics::solution::Clock;
-use crate::statics::system::{Linked, Settle, Settled, Unfactored};
 use crate::vector::{between, dot, norm, sub};
+
+/// Tolerance of contact as a share of the error allowed in an iterative solve: contact cannot converge further
+/// than successive solves agree.
+const CONTACT_SHARE: f64 = 0.1;
 
 /// Multiple of a factorisation's trial error that is taken as the error of any solution by it. A factor of ten
 /// was too small for one solution in 300 of `benches/error_estimate.rs`, most of them with contact.
@@ -17,6 +31,139 @@ const TRIAL_SAFETY: f64 = 100.0;
 
 /// Multiple of the largest remaining contact gap that is taken as the error of a solution with contact.
 const GAP_SAFETY: f64 = 10.0;
+
+/// The matrix of a system that is solved again for each set of constraints.
+pub(crate) enum Unfactored {
+    /// By factorisations with the same structure, whose values change with the contact normals.
+    Refactored { symbolic: Arc<Symbolic>, matrix: BlockMatrix },
+    /// By iteration.
+    Iterative(Box<Iterative>),
+}
+
+impl Unfactored {
+    /// The matrix without constraints.
+    pub fn matrix(&self) -> &BlockMatrix {
+        match self {
+            Self::Iterative(iterative) => iterative.matrix(),
+            Self::Refactored { matrix, .. } => matrix,
+        }
+    }
+
+    /// Displacements of the rows at contact equilibrium.
+    pub fn settled(
+        &self,
+        b: &[[f64; 3]],
+        settle: &Settle<'_>,
+        solve: &mut Solve<'_>,
+    ) -> Result<Settled> {
+        let clock = Clock::new();
+        let Settle { sliding, motions, begin, options, linked } = settle;
+        let rows = begin.as_ref().map_or(&[][..], |b| b.rows);
+        let first = begin.as_ref().map(|b| &b.contact);
+        let mut contact = options.contact;
+        if let Self::Iterative(_) = self {
+            let far = solve.scale.max(sliding.farthest(motions));
+            contact.allowed = contact.allowed.max(CONTACT_SHARE * options.tolerance * far);
+        }
+        let trail = Trail::starting(rows.to_vec());
+        let interrupted = solve.interrupted;
+        let linked = *linked;
+        let mut body = Projected { system: self, b, linked, sliding, trail, solve, last: None };
+        let state = sliding.solve(motions, first, &contact, interrupted, &mut body)?;
+        // At least one step is always made, so there is a state.
+        let rows = body.last.map_or_else(Vec::new, |last| last.to);
+        let effort = &mut body.solve.effort;
+        effort.error_estimate = effort.error_estimate.max(left_by(&state));
+        Ok(Settled { rows, contact: state, contact_seconds: clock.total() })
+    }
+
+    /// Rows of the projected system, P A P + k (I − P), P = I − n⊗n on held nodes.
+    pub fn solve_projected(
+        &self,
+        b: &[[f64; 3]],
+        (sliding, linked): (&Sliding, Linked<'_>),
+        c: &Constraints<'_>,
+        trail: &mut Trail,
+        solve: &mut Solve<'_>,
+    ) -> Result<Advance> {
+        let conditions = RowConditions::new(sliding, c);
+        let b = linked.pulled(b, &conditions.constraints);
+        let mut rhs = projected_rhs(self.matrix(), &b, &conditions.constraints);
+        conditions.add_pull(&mut rhs);
+        let offsets = conditions.constraints.clone();
+        let mut found = match self {
+            Self::Iterative(iterative) => {
+                let enough = match linked.share {
+                    Some(rough) => Some(Enough::Energy(rough)),
+                    None => (c.share > 0.0).then_some(Enough::Error(c.share)),
+                };
+                let leave = Leave { reach: c.reach, enough, links: linked.links };
+                iterative.solve_projected(rhs, conditions, leave, trail, solve)?
+            }
+            Self::Refactored { .. } if !linked.links.is_empty() => {
+                return Err(touching_needs_pcg(Method::Cholesky));
+            }
+            Self::Refactored { symbolic, matrix } => {
+                let factor = symbolic.factor(&conditions.applied_to(matrix))?;
+                let rows = factor.solve(&rhs);
+                solve.effort.error_estimate = direct_error(&factor, &rows);
+                Advance { rows, solved: true, is_carried: false }
+            }
+        };
+        add_offsets(&mut found.rows, &offsets);
+        Ok(found)
+    }
+}
+
+/// Input of a contact solve.
+pub(crate) struct Settle<'a> {
+    pub sliding: &'a Sliding,
+    /// One motion per segment.
+    pub motions: &'a [&'a Motion],
+    pub begin: Option<Begin<'a>>,
+    pub options: &'a StaticOptions,
+    pub linked: Linked<'a>,
+}
+
+/// Links between the rows of touching nodes.
+#[derive(Clone, Copy, Default)]
+pub(crate) struct Linked<'a> {
+    pub links: &'a [Link],
+    /// Error allowed relative to the change that the links cause, in the energy norm; none for an answer within
+    /// the tolerance.
+    pub share: Option<f64>,
+}
+
+impl Linked<'_> {
+    /// `b` with the forces of the links, where rows satisfy their constraints.
+    fn pulled<'b>(&self, b: &'b [[f64; 3]], constraints: &[Constraint]) -> Cow<'b, [[f64; 3]]> {
+        if self.links.is_empty() {
+            return Cow::Borrowed(b);
+        }
+        let (mut shift, mut out) = (vec![[0.0; 3]; b.len()], b.to_vec());
+        add_offsets(&mut shift, constraints);
+        for link in self.links {
+            link.add_force(&shift, &mut out);
+        }
+        Cow::Owned(out)
+    }
+}
+
+/// Displacements of the rows at contact equilibrium.
+pub(crate) struct Settled {
+    /// mm.
+    pub rows: Vec<[f64; 3]>,
+    pub contact: ContactState,
+    /// Time that contact took, s.
+    pub contact_seconds: f64,
+}
+
+/// Starting state of a solve with contact: the end of a solve for a similar plan or body.
+pub(crate) struct Begin<'a> {
+    /// Displacements of the rows.
+    pub rows: &'a [[f64; 3]],
+    pub contact: ContactStart,
+}
 
 /// Displacements of the rows at contact equilibrium, found from the flexibility of the sliding nodes.
 pub(crate) fn settled_by_flexibility(
@@ -190,4 +337,14 @@ pub(crate) fn left_by(state: &ContactState) -> f64 {
 /// Estimate of the largest nodal error of a solution by factorisation, mm.
 pub(crate) fn direct_error(factor: &Factor, x: &[[f64; 3]]) -> f64 {
     TRIAL_SAFETY * factor.trial_error() * x.iter().fold(0.0_f64, |m, v| m.max(norm(*v)))
+}
+
+/// The error for a method that cannot solve for parts that touch.
+pub(crate) fn touching_needs_pcg(method: Method) -> MtmError {
+    MtmError::UnknownName {
+        what: "method for a boundary with touching pairs",
+        found: method.name().into(),
+        known: "auto, pcg",
+        kind: ErrorKind::Solver,
+    }
 }

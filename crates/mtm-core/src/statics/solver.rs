@@ -17,10 +17,9 @@ use crate::statics::newton::{Equilibrium, Slide};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::reduction::{NO_ROW, Reduction};
 use crate::statics::restraint::{self, Held};
+use crate::statics::settling::{Begin, Linked, Settle, touching_needs_pcg};
 use crate::statics::solution::{Clock, ContactResult, Solution, Timings};
-use crate::statics::system::{
-    Begin, BodyRows, Frozen, Linked, Settle, Solved, System, touching_needs_pcg,
-};
+use crate::statics::system::{BodyRows, Frozen, Solved, System};
 use crate::statics::touching::{Path, Prescribes, Touch};
 use crate::vector::{add, dot, norm, scaled, sub};
 

@@ -1,27 +1,26 @@
 //! The reduced linear system: what each method keeps from one plan to the next, and how it solves with and
 //! without contact.
 
-use std::borrow::Cow;
 use std::sync::Arc;
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::{Factor, Symbolic};
-use crate::algebra::constraints::{Constraint, add_offsets, projected, projected_rhs};
+use crate::algebra::constraints::{Constraint, projected};
 use crate::algebra::krylov::Enough;
 use crate::algebra::multigrid::Multigrid;
 use crate::algebra::row_sums::in_pool;
-use crate::boundary::Motion;
-use crate::contact::links::Link;
-use crate::contact::{Constraints, ContactRow, ContactStart, ContactState, Sliding, Spring};
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::contact::{Constraints, ContactRow, ContactState, Sliding, Spring};
+use crate::error::{MtmError, Result};
 use crate::statics::effort::Solve;
 use crate::statics::frozen::FrozenContact;
-use crate::statics::iterative::{Advance, Extremes, Iterative, Leave, Trail, hierarchy};
+use crate::statics::iterative::{Extremes, Iterative, Leave, Trail, hierarchy};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::reaction::ContactFactor;
 use crate::statics::restraint::Held;
 use crate::statics::row_conditions::RowConditions;
-use crate::statics::settling::{Projected, direct_error, left_by, settled_by_flexibility};
+use crate::statics::settling::{
+    Linked, Settle, Settled, Unfactored, direct_error, settled_by_flexibility, touching_needs_pcg,
+};
 use crate::statics::solution::Clock;
 use crate::vector::sub;
 
@@ -32,9 +31,6 @@ const MAX_DENSE_SLIDING: usize = 2500;
 /// Maximum number of sliding nodes for which the flexibility along the normals at rest is kept: 8 bytes a pair.
 const MAX_KEPT_SLIDING: usize = 6000;
 
-/// Tolerance of contact as a share of the error allowed in an iterative solve: contact cannot converge further
-/// than successive solves agree.
-const CONTACT_SHARE: f64 = 0.1;
 /// One row of three for each unknown node.
 type Rows = Vec<[f64; 3]>;
 
@@ -46,14 +42,6 @@ enum Kept {
     Flexible { factor: Factor, contact: ContactFactor },
     /// The matrix, in which sliding nodes are constrained.
     Matrix(Unfactored),
-}
-
-/// The matrix of a system that is solved again for each set of constraints.
-pub(crate) enum Unfactored {
-    /// By factorisations with the same structure, whose values change with the contact normals.
-    Refactored { symbolic: Arc<Symbolic>, matrix: BlockMatrix },
-    /// By iteration.
-    Iterative(Box<Iterative>),
 }
 
 /// The system of the unknown nodes, ready for any right-hand side.
@@ -69,34 +57,6 @@ pub(crate) struct BodyRows<'a> {
     pub held: Held,
     /// Contrast and compressibility of the tissue.
     pub tissue: Extremes,
-}
-
-/// Input of a contact solve.
-pub(crate) struct Settle<'a> {
-    pub sliding: &'a Sliding,
-    /// One motion per segment.
-    pub motions: &'a [&'a Motion],
-    pub begin: Option<Begin<'a>>,
-    pub options: &'a StaticOptions,
-    pub linked: Linked<'a>,
-}
-
-/// Links between the rows of touching nodes.
-#[derive(Clone, Copy, Default)]
-pub(crate) struct Linked<'a> {
-    pub links: &'a [Link],
-    /// Error allowed relative to the change that the links cause, in the energy norm; none for an answer within
-    /// the tolerance.
-    pub share: Option<f64>,
-}
-
-/// Displacements of the rows at contact equilibrium.
-pub(crate) struct Settled {
-    /// mm.
-    pub rows: Vec<[f64; 3]>,
-    pub contact: ContactState,
-    /// Time that contact took, s.
-    pub contact_seconds: f64,
 }
 
 /// Displacements of the rows after a solve, with contact if nodes slide.
@@ -122,13 +82,6 @@ impl From<Settled> for Solved {
     }
 }
 
-/// Starting state of a solve with contact: the end of a solve for a similar plan or body.
-pub(crate) struct Begin<'a> {
-    /// Displacements of the rows.
-    pub rows: &'a [[f64; 3]],
-    pub contact: ContactStart,
-}
-
 /// Contact constraints that stay the same for several right-hand sides.
 pub(crate) struct Frozen<'a> {
     /// Sliding node and normal of each constraint.
@@ -146,21 +99,6 @@ impl Frozen<'_> {
     fn springs(&self, k: usize) -> Vec<Spring> {
         let goals = self.springs.iter().zip(&self.goals[k]);
         goals.map(|(spring, &goal)| Spring { goal, ..*spring }).collect()
-    }
-}
-
-impl Linked<'_> {
-    /// `b` with the forces of the links, where rows satisfy their constraints.
-    fn pulled<'b>(&self, b: &'b [[f64; 3]], constraints: &[Constraint]) -> Cow<'b, [[f64; 3]]> {
-        if self.links.is_empty() {
-            return Cow::Borrowed(b);
-        }
-        let (mut shift, mut out) = (vec![[0.0; 3]; b.len()], b.to_vec());
-        add_offsets(&mut shift, constraints);
-        for link in self.links {
-            link.add_force(&shift, &mut out);
-        }
-        Cow::Owned(out)
     }
 }
 
@@ -390,81 +328,6 @@ impl System {
     }
 }
 
-impl Unfactored {
-    /// The matrix without constraints.
-    pub fn matrix(&self) -> &BlockMatrix {
-        match self {
-            Self::Iterative(iterative) => iterative.matrix(),
-            Self::Refactored { matrix, .. } => matrix,
-        }
-    }
-
-    /// Displacements of the rows at contact equilibrium.
-    fn settled(
-        &self,
-        b: &[[f64; 3]],
-        settle: &Settle<'_>,
-        solve: &mut Solve<'_>,
-    ) -> Result<Settled> {
-        let clock = Clock::new();
-        let Settle { sliding, motions, begin, options, linked } = settle;
-        let rows = begin.as_ref().map_or(&[][..], |b| b.rows);
-        let first = begin.as_ref().map(|b| &b.contact);
-        let mut contact = options.contact;
-        if let Self::Iterative(_) = self {
-            let far = solve.scale.max(sliding.farthest(motions));
-            contact.allowed = contact.allowed.max(CONTACT_SHARE * options.tolerance * far);
-        }
-        let trail = Trail::starting(rows.to_vec());
-        let interrupted = solve.interrupted;
-        let linked = *linked;
-        let mut body = Projected { system: self, b, linked, sliding, trail, solve, last: None };
-        let state = sliding.solve(motions, first, &contact, interrupted, &mut body)?;
-        // At least one step is always made, so there is a state.
-        let rows = body.last.map_or_else(Vec::new, |last| last.to);
-        let effort = &mut body.solve.effort;
-        effort.error_estimate = effort.error_estimate.max(left_by(&state));
-        Ok(Settled { rows, contact: state, contact_seconds: clock.total() })
-    }
-
-    /// Rows of the projected system, P A P + k (I − P), P = I − n⊗n on held nodes.
-    pub fn solve_projected(
-        &self,
-        b: &[[f64; 3]],
-        (sliding, linked): (&Sliding, Linked<'_>),
-        c: &Constraints<'_>,
-        trail: &mut Trail,
-        solve: &mut Solve<'_>,
-    ) -> Result<Advance> {
-        let conditions = RowConditions::new(sliding, c);
-        let b = linked.pulled(b, &conditions.constraints);
-        let mut rhs = projected_rhs(self.matrix(), &b, &conditions.constraints);
-        conditions.add_pull(&mut rhs);
-        let offsets = conditions.constraints.clone();
-        let mut found = match self {
-            Self::Iterative(iterative) => {
-                let enough = match linked.share {
-                    Some(rough) => Some(Enough::Energy(rough)),
-                    None => (c.share > 0.0).then_some(Enough::Error(c.share)),
-                };
-                let leave = Leave { reach: c.reach, enough, links: linked.links };
-                iterative.solve_projected(rhs, conditions, leave, trail, solve)?
-            }
-            Self::Refactored { .. } if !linked.links.is_empty() => {
-                return Err(touching_needs_pcg(Method::Cholesky));
-            }
-            Self::Refactored { symbolic, matrix } => {
-                let factor = symbolic.factor(&conditions.applied_to(matrix))?;
-                let rows = factor.solve(&rhs);
-                solve.effort.error_estimate = direct_error(&factor, &rows);
-                Advance { rows, solved: true, is_carried: false }
-            }
-        };
-        add_offsets(&mut found.rows, &offsets);
-        Ok(found)
-    }
-}
-
 /// The hierarchy for `matrix` with its sliding rows held along their normals at rest.
 fn multigrid(matrix: &BlockMatrix, body: &BodyRows<'_>) -> Result<Multigrid> {
     let normals: Vec<(usize, [f64; 3])> = body
@@ -477,14 +340,4 @@ fn multigrid(matrix: &BlockMatrix, body: &BodyRows<'_>) -> Result<Multigrid> {
         normals.iter().map(|&(row, normal)| Constraint { row, normal, offset: 0.0 }).collect();
     let held_matrix = (!constraints.is_empty()).then(|| projected(matrix, &constraints));
     hierarchy(held_matrix.as_ref().unwrap_or(matrix), body.positions, &normals, body.tissue)
-}
-
-/// The error for a method that cannot solve for parts that touch.
-pub(crate) fn touching_needs_pcg(method: Method) -> MtmError {
-    MtmError::UnknownName {
-        what: "method for a boundary with touching pairs",
-        found: method.name().into(),
-        known: "auto, pcg",
-        kind: ErrorKind::Solver,
-    }
 }

@@ -19,8 +19,9 @@ use crate::mesh::TetMesh;
 use crate::statics::effort::Solve;
 use crate::statics::options::StaticOptions;
 use crate::statics::reduction::Reduction;
+use crate::statics::settling::{Begin, Linked, Settle, Settled};
 use crate::statics::solution::{Clock, TouchResult};
-use crate::statics::system::{Begin, Linked, Settle, Settled, Solved, System};
+use crate::statics::system::{Solved, System};
 use crate::vector::{add, between, dot, norm, scaled, sub};
 
 /// Motion of the bones in one step, over the mean edge of the tissue that may be touched.

@@ -6,7 +6,28 @@ use crate::algebra::error_bound::{Due, PcgOptions, Spectrum};
 use crate::algebra::row_sums::{ROWS_PER_SUM, advance, dot, dot_and_largest};
 use crate::error::{MtmError, Result, Shortfall};
 
-use super::{Operator, PcgOutcome, Preconditioner};
+use super::operator::{Operator, Preconditioner};
+
+/// The solution of [`pcg`] and its accuracy.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PcgOutcome {
+    /// The solution, one row of three per block row, mm.
+    pub solution: Vec<[f64; 3]>,
+    /// Iterations done, over all restarts.
+    pub iterations: usize,
+    /// Estimate of the largest nodal error, mm: `max_j |z_j| / θ_min` with the true residual, `θ_min` half the
+    /// smallest Ritz value of `M⁻¹ A`. Not a bound: Ritz values lie above the spectrum.
+    pub error_estimate_mm: f64,
+    /// Estimate of the error in the energy norm, relative to the energy norm of the solution.
+    pub energy_error: f64,
+    /// `‖b − A x‖ / ‖b‖`, recomputed at the end. Of little meaning at high contrast.
+    pub residual: f64,
+    /// Relative residual after each iteration, from the recurrence.
+    pub residual_history: Vec<f64>,
+    /// Smallest and largest Ritz values of `M⁻¹ A` observed: their ratio is the condition number of the
+    /// preconditioned system.
+    pub ritz: [f64; 2],
+}
 
 /// The vectors and coefficients of the iteration.
 pub(super) struct State<'a> {

@@ -4,8 +4,8 @@ use crate::algebra::error_bound::{FLOOR_PROGRESS, STAGNATION_ITERATIONS, Spectru
 use crate::algebra::row_sums::{farthest, in_pool};
 use crate::error::{MtmError, Result};
 
+use super::operator::{Operator, Preconditioner};
 use super::state::State;
-use super::{Operator, Preconditioner};
 
 /// Decrease of the error of a trial after which its true residual is computed again.
 const TRIAL_FALL: f64 = 0.1;

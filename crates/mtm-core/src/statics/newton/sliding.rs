@@ -13,8 +13,9 @@ use crate::statics::newton::{
 };
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::restraint::Held;
+use crate::statics::settling::{Begin, Linked, Settle, Settled};
 use crate::statics::solution::Clock;
-use crate::statics::system::{Begin, BodyRows, Linked, Settle, Settled, System};
+use crate::statics::system::{BodyRows, System};
 use crate::vector::{add, sub};
 
 /// Sliding nodes of a body, with the input of their solver.

@@ -22,8 +22,8 @@ use crate::contact::{Constraints, ContactRow, Sliding, Spring};
 use crate::error::{MtmError, Result, Shortfall};
 use crate::vector::{add, dot, scaled, sub};
 use krylov::{Krylov, length};
-pub(crate) use rows::Rows;
 use rows::pushes;
+pub(crate) use rows::{Rows, singular};
 
 /// Maximum number of steps with sweeps: ten are needed on smooth bone, a hundred on teeth.
 const MOST_SWEEPS: usize = 1000;
@@ -505,13 +505,5 @@ pub(crate) fn unheld() -> MtmError {
     MtmError::NotPositiveDefinite {
         node: 0,
         detail: "contact forces carry sliding nodes on by more than the tissue holds".into(),
-    }
-}
-
-/// The error for a flexibility without a positive pivot at a row of the system.
-pub(crate) fn singular(row: u32) -> MtmError {
-    MtmError::NotPositiveDefinite {
-        node: row as usize,
-        detail: "the flexibility of the sliding nodes is singular".into(),
     }
 }

@@ -1,6 +1,5 @@
 //! Conditions of contact as rows of the normal system.
 
-use super::singular;
 use crate::algebra::cholesky::{DenseSymmetric, NormalFactor, RowKey, TailFlexibility};
 use crate::contact::{Constraints, ContactRow};
 use crate::error::{MtmError, Result};
@@ -72,4 +71,12 @@ pub(super) fn pushes(n: usize, rows: &[ContactRow], forces: &[f64]) -> Vec<[f64;
         out[r.node] = add(out[r.node], scaled(r.normal, force));
     }
     out
+}
+
+/// The error for a flexibility without a positive pivot at a row of the system.
+pub(crate) fn singular(row: u32) -> MtmError {
+    MtmError::NotPositiveDefinite {
+        node: row as usize,
+        detail: "the flexibility of the sliding nodes is singular".into(),
+    }
 }
