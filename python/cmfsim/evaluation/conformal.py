@@ -78,6 +78,12 @@ def cases_needed(coverage: float) -> int:
     Parameters
     ----------
     coverage : float
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.cases_needed(0.9), cmfsim.cases_needed(0.95)
+    (9, 19)
     """
     share = _share(coverage)
     return max(1, math.ceil(share / (1.0 - share) - ROUNDING))
@@ -98,6 +104,14 @@ def covered_interval(factor: BandFactor, tests: int) -> tuple[int, int]:
     -------
     (int, int)
         The 5 % and the 95 % quantile.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> found = cmfsim.calibrate(list(range(1, 101)), 0.9)
+    >>> fewest, most = cmfsim.covered_interval(found, 100)
+    >>> fewest < 90 < most
+    True
     """
     a, b = factor.rank, factor.n + 1 - factor.rank
     logs = [
@@ -133,6 +147,13 @@ def region_scores(
     ------
     CalibrationError
         (also `ValueError`) Arrays that do not fit, NaN, a standard deviation that is not above 0.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> regions = {"chin": [True, True, False]}
+    >>> cmfsim.region_scores([0.5, -2.0, 9.0], [1.0, 0.5, 1.0], regions)
+    {'chin': 4.0}
     """
     masked: Any = np.ma.asarray(errors)
     known = ~np.ma.getmaskarray(masked)

@@ -108,6 +108,11 @@ def unmoved_regions(
     ------
     LandmarkError
         (also `ValueError`) As `skin_regions`.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> regions = cmfsim.unmoved_regions(points, landmarks)  # doctest: +SKIP
     """
     return _regions(points, landmarks, _unmoved_outlines)
 

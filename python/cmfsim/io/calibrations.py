@@ -61,6 +61,11 @@ def read_calibration(path: str | os.PathLike[str]) -> Calibration:
     CalibrationError
         (also `ValueError`) Not a calibration, another version, a value out of range, settings that
         are not those of the digest: with the file and the place in it.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> calibration = cmfsim.read_calibration("calibration.json")  # doctest: +SKIP
     """
     path = Path(path)
     if not path.exists():

@@ -97,6 +97,11 @@ def band_settings(prediction: Prediction) -> dict[str, Any]:
 
     Predictions whose settings are equal may be calibrated by one another. The edge length is no
     part of it: what a coarser mesh costs is for a convergence study to state.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> settings = cmfsim.band_settings(prediction)  # doctest: +SKIP
     """
     options = prediction.scene.options
     used = prediction.patient.summary.get("muscles", {})
@@ -129,6 +134,12 @@ def band_regions(patient: PatientModel) -> dict[str, NDArray[np.bool_]]:
     Returns
     -------
     dict of str to (k,) bool
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> regions = cmfsim.band_regions(patient)  # doctest: +SKIP
+    >>> regions["upper lip"].sum()  # doctest: +SKIP
     """
     return _placed(patient, face_landmarks(patient))
 

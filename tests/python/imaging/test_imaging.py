@@ -14,6 +14,7 @@ from cmfsim.imaging import intensity
 from synthetic_head import made_head
 
 pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
+ndimage = pytest.importorskip("scipy.ndimage", reason="needs scipy")
 measure = pytest.importorskip("skimage.measure", reason="needs scikit-image")
 
 DATA = Path(os.environ.get("CMFSIM_DATA", Path(__file__).parents[4] / "shared/data"))
@@ -141,6 +142,24 @@ def test_values_from_nought_to_one_are_recognised(head, anatomy):
     found = segment_head(head.image.with_values(scaled), landmarks=head.landmarks)
     assert "ct-not-hu" in codes(found)
     assert dice(found.skin.values > 0, anatomy.skin.values > 0) > 0.99
+
+
+def test_the_noise_of_a_cone_beam_scanner_does_not_hide_the_scale(head):
+    """0.6 × (HU + 1000), with noise of 150 HU that reconstruction has sharpened."""
+    noise = np.random.default_rng(3).standard_normal(head.image.values.shape)
+    noise -= ndimage.gaussian_filter(noise, 2.0)
+    hu = head.image.values + 150.0 / noise.std() * noise
+    scale = intensity.calibration((0.6 * (hu + 1000.0)).astype(np.float32))
+    assert scale.slope == pytest.approx(1.0 / 0.6, rel=0.03)
+    assert scale.offset == pytest.approx(-1000.0, abs=30.0)
+    assert [finding.code for finding in scale.findings] == ["ct-not-hu"]
+
+
+def test_an_image_without_bright_bone_is_no_ct(head):
+    """Bone as dark as air, as in MR, whose other tissue is alike throughout."""
+    dark = np.where(head.image.values > 250.0, -1000.0, head.image.values)
+    with pytest.raises(ImageError, match=r"0\.0 % as bright as bone \(1 to"):
+        intensity.calibration(0.5 * (dark + 1000.0))
 
 
 def test_a_ct_in_hu_is_left_alone(anatomy):
