@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cmfsim.imaging.inpainting import deviations, without_metal
 from cmfsim.imaging.morphology import (
     Block,
     Mask,
@@ -34,6 +35,17 @@ LEAST_WINDOW = 1000.0
 LEAST_METAL = 15.0
 # Farther from metal than this, streaks are weaker than bone, and thin bone (the vault) is kept, mm.
 FAR_FROM_METAL = 35.0
+# Metal shows this much wider than it is, mm.
+SPREAD = 1.5
+# Streaks that add less than this to the deviation of soft tissue from one value are left, HU.
+LEAST_STREAKS = 50.0
+# A correction that leaves more than this part of the deviation is not worth its blur.
+MOST_LEFT = 0.8
+# A head is wider than this where streaks are narrow, mm; voxels left around it.
+LEAST_ACROSS = 15.0
+RIM = 5
+# Air lies below this, tissue above, HU.
+TISSUE = -300.0
 # Streaks lie in the slices of the metal, and this far above and below, mm.
 STREAK_REACH = 3.0
 # Streaks are narrow: across them the median over this half width, mm, is what was there.
@@ -56,7 +68,7 @@ class Metal:
     layers : slice
         The slices with streaks.
     hu : (nx, ny, nz) float32
-        The image with the median across streaks in those slices; itself where there is no metal.
+        The image with streaks reduced in those slices; itself where there are none.
     findings : tuple of Finding
     """
 
@@ -91,22 +103,73 @@ def find_metal(work: Working, options: SegmentOptions) -> Metal:
         return nothing
     mask: Mask = large[labels]
     layers = np.flatnonzero(mask.any(axis=(0, 1)))
-    more = int(np.ceil(STREAK_REACH / work.spacing[2]))
-    zone = slice(max(int(layers[0]) - more, 0), min(int(layers[-1]) + more + 1, mask.shape[2]))
-    hu = work.hu.copy(order="F")
-    part = hu[:, :, zone]
-    hu[:, :, zone] = np.where(mask[:, :, zone], part, _median(part, work.spacing))
+    hu, streaked = _corrected(work, mask, layers)
     low, high = (work.origin[2] + work.spacing[2] * layers[i] for i in (0, -1))
     finding = Finding.warning(
         "metal",
         f"{int(np.count_nonzero(large))} pieces of metal, "
         f"{np.count_nonzero(mask) * volume / 1000.0:.1f} cm³ above {threshold:.0f} HU, between "
-        f"z = {low:.0f} and {high:.0f} mm",
+        f"z = {low:.0f} and {high:.0f} mm; "
+        + _streaks_text(work, streaked),
         where="image",
-        why="streaks hide skin and bone at that height; they were smoothed and spikes removed",
+        why="streaks hide skin and bone at that height",
         fix="check lips, cheeks and tooth rows by eye",
     )
-    return Metal(mask, zone, hu, (*noticed, finding))
+    return Metal(mask, streaked, hu, (*noticed, finding))
+
+
+def _streaks_text(work: Working, streaked: slice) -> str:
+    if streaked.start == streaked.stop:
+        return "it throws no streaks worth a correction"
+    low, high = (work.origin[2] + work.spacing[2] * k for k in (streaked.start, streaked.stop - 1))
+    return (
+        f"streaks between z = {low:.0f} and {high:.0f} mm were reduced, and spikes of skin and "
+        "bone removed there"
+    )
+
+
+def _corrected(work: Working, mask: Mask, layers: NDArray[np.intp]) -> tuple[Volume, slice]:
+    """The image with streaks reduced, and the slices that had any."""
+    box = (*_head_in(work, layers), slice(int(layers[0]), int(layers[-1]) + 1))
+    part, own = np.asfortranarray(work.hu[box]), np.asfortranarray(mask[box])
+    wide = depth(own, work.spacing, SPREAD) > -SPREAD
+    usual = _usual(work, box)
+    clean, before, after = without_metal(part, wide, work.spacing, usual)
+    bad = (before > np.hypot(usual, LEAST_STREAKS)) & (after < MOST_LEFT * before)
+    if not bad.any():
+        return work.hu, slice(0, 0)
+    hu = work.hu.copy(order="F")
+    hu[box] = np.where(bad & ~own, clean, part)
+    found = np.flatnonzero(bad) + box[2].start
+    more = int(np.ceil(STREAK_REACH / work.spacing[2]))
+    zone = slice(max(int(found[0]) - more, 0), min(int(found[-1]) + more + 1, mask.shape[2]))
+    part = hu[:, :, zone]
+    hu[:, :, zone] = np.where(mask[:, :, zone], part, _median(part, work.spacing))
+    return hu, zone
+
+
+def _head_in(work: Working, layers: NDArray[np.intp]) -> tuple[slice, slice]:
+    """Where along x and y the slices show more than streaks."""
+    tissue = work.hu[:, :, layers] > TISSUE
+    box = []
+    for axis in (0, 1):
+        step = float(work.spacing[1 - axis])
+        found = np.flatnonzero((tissue.sum(axis=1 - axis) * step > LEAST_ACROSS).any(axis=1))
+        low, high = (int(found[i]) for i in (0, -1)) if len(found) else (0, tissue.shape[axis])
+        box.append(slice(max(low - RIM, 0), high + RIM + 1))
+    return box[0], box[1]
+
+
+def _usual(work: Working, box: Block) -> float:
+    """How far soft tissue deviates from one value in slices near the metal, but without it, HU."""
+    apart = int(np.ceil(2.0 * STREAK_REACH / work.spacing[2]))
+    layers = box[2]
+    low = range(layers.start - apart, layers.start - 3 * apart, -1)
+    high = range(layers.stop - 1 + apart, layers.stop - 1 + 3 * apart)
+    others = [k for k in (*low, *high) if 0 <= k < work.hu.shape[2]]
+    if not others:
+        return 0.0
+    return float(np.median(deviations(work.hu[:, :, others][box[:2]], work.spacing)))
 
 
 def _threshold(work: Working, options: SegmentOptions) -> tuple[float, tuple[Finding, ...]]:

@@ -38,6 +38,7 @@ __all__ = [
     "simplex",
     "sizes_of",
     "smoothed",
+    "sparse",
     "watershed",
 ]
 
@@ -54,6 +55,11 @@ def simpleitk() -> Any:
 def ndimage() -> Any:
     """The package scipy.ndimage."""
     return _package("scipy.ndimage")
+
+
+def sparse() -> Any:
+    """The package scipy.sparse."""
+    return _package("scipy.sparse")
 
 
 def _package(name: str) -> Any:

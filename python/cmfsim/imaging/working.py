@@ -38,6 +38,9 @@ LEAST_VOXELS = 8
 COARSE_SLICES = 2.5
 # Air and foam lie below this, skin, couch and bone above, HU.
 TISSUE = -300.0
+# Values beyond these say nothing more on tissue, HU; scales of up to 30000 would make metal as wide
+# as its blur.
+LOWEST, HIGHEST = -1024.0, 4000.0
 # Sheets and tubes thinner than twice this are no head, mm.
 OPENING = 12.0
 
@@ -105,6 +108,7 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     values = image.values
     if values.dtype.kind == "b" or values.dtype == np.float16:
         values = values.astype(np.float32)
+    values = _cut_off(values, scale)
     values, bins, shift = binned(values, factors, spacing)
     low, high = _head_box(values, bins, scale)
     border = np.array([low == 0, high == np.array(values.shape)])
@@ -120,7 +124,7 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
         steps = np.floor((np.array(hu.shape) - 1) * bins / target + 1e-6)
         shape = tuple(int(n) + 1 for n in steps)
         hu = resampled_to(hu, bins, np.zeros(3), shape, target)
-    np.clip(hu, -1024.0, 4000.0, out=hu)
+    np.clip(hu, LOWEST, HIGHEST, out=hu)
     saturation = saturation_of(image.values, float(np.prod(spacing)), scale)
     return Working(hu, target, origin, border, spacing, saturation), tuple(findings)
 
@@ -181,6 +185,14 @@ def _spacing_findings(spacing: NDArray[np.float64]) -> list[Finding]:
             fix="use the thin-slice reconstruction of the same scan",
         )
     ]
+
+
+def _cut_off(values: NDArray[Any], scale: Calibration) -> NDArray[Any]:
+    """Values that are no higher than the densest that matters."""
+    top = (HIGHEST - scale.offset) / scale.slope
+    if float(values.max()) <= top:
+        return values
+    return np.minimum(values, values.dtype.type(top))
 
 
 def _factors(spacing: NDArray[np.float64], working: float) -> tuple[int, int, int]:
