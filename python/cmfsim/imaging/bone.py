@@ -12,6 +12,7 @@ from cmfsim.imaging.morphology import (
     Volume,
     closed,
     depth,
+    grown,
     label,
     resampled_to,
     sizes_of,
@@ -34,8 +35,13 @@ BONE_SCALE = 250.0
 # The cavity of the skull is what a ball of this radius fits into, once the way through the great
 # foramen (some 36 × 30 mm) is left out, mm.
 CAVITY_RADIUS = 19.0
+# Ways that a ball of this radius passes join lobes of one brain, mm.
+JOINED_RADIUS = 16.0
 # A cranial cavity is at least this large, mm³: a third of a child's.
 LEAST_CAVITY = 300_000.0
+# The part of its surface that is bone; what soft tissue and the image's borders enclose is none. A
+# skull that is cut at the brows has 0.92, the mouth in a round field of view 0.78.
+LEAST_BOUNDED = 0.85
 # Bone partly in a voxel seals a hollow from this part of the way between soft tissue and bone on.
 SEAL_PART = 0.6
 SOFT = 40.0
@@ -138,14 +144,28 @@ def _cranial_cavity(solid: Mask, skin: Skin, work: Working) -> Mask | None:
     brain = int(np.argmax(sizes))
     if not sizes[brain] or not len(outer):
         return None
-    seeds = np.where(labels == brain, 1, np.where(labels > 0, 2, 0))
+    # Lobes that more than the great foramen joins are one room.
+    wide_rooms, _ = label(room > JOINED_RADIUS)
+    joined = wide_rooms == wide_rooms[labels == brain][0]
+    if (joined & np.isin(labels, outer)).any():
+        joined = labels == brain
+    seeds = np.where(joined, 1, np.where(labels > 0, 2, 0))
     # Rooms part where the way between them is narrowest.
     basins = watershed(-room, seeds, ~sealed)
     cavity = (basins == 1)[1:-1, 1:-1, 1:-1]
     if np.count_nonzero(cavity) * float(np.prod(steps)) < LEAST_CAVITY:
         return None
+    if not _enclosed_by_skull(cavity, wall):
+        return None
     fine = resampled_to(cavity.astype(np.float32), steps, shift, solid.shape, work.spacing)
     return fine > 0.5
+
+
+def _enclosed_by_skull(cavity: Mask, wall: Mask) -> bool:
+    """Whether a room is the brain's: the mouth is one too where the image cuts the head all round."""
+    rim = grown(cavity) & ~cavity
+    bounded = np.count_nonzero(rim & grown(wall)) / max(np.count_nonzero(rim), 1)
+    return bounded >= LEAST_BOUNDED
 
 
 def _enclosed(

@@ -12,6 +12,7 @@ from cmfsim.errors import ImageInputError
 from cmfsim.imaging.air import air_level
 from cmfsim.imaging.attached import attached_findings
 from cmfsim.imaging.bone import bone_level, find_bone, teeth_level
+from cmfsim.imaging.cupping import without_cupping
 from cmfsim.imaging.intensity import weak_bone
 from cmfsim.imaging.jaw import part_jaws
 from cmfsim.imaging.metal import find_metal, metal_within
@@ -80,7 +81,9 @@ def segment_head(
     points = None if landmarks is None else _checked(landmarks)
     say("grid")
     work, findings = working_grid(image, options)
-    all_findings: list[Finding] = list(findings)
+    hu, cupping = without_cupping(work)
+    work = replace(work, hu=hu)
+    all_findings: list[Finding] = [*findings, *cupping]
     say("metal")
     metal = find_metal(work, options)
     say("skin")

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
+from cmfsim.imaging.field import round_field
 from cmfsim.imaging.morphology import Volume
 from cmfsim.values.finding import Finding
 
-__all__ = ["Calibration", "calibration", "noise_of", "saturation_of", "weak_bone"]
+__all__ = ["AIR", "SOFT", "Calibration", "calibration", "noise_of", "saturation_of", "weak_bone"]
 
 # Air by definition, and muscle and brain as scanners show them (25 to 60), HU.
 AIR = -1000.0
@@ -64,6 +65,8 @@ class Calibration:
 def calibration(values: NDArray[Any], stated: tuple[float, float] | None = None) -> Calibration:
     """The calibration of an image: as stated, or judged by its histogram.
 
+    What lies outside a round field of view does not count.
+
     Errors
     ------
     ImageError
@@ -105,15 +108,17 @@ def _means(values: NDArray[Any]) -> NDArray[np.float64]:
     """The means of blocks throughout an image, or its voxels where it is thinner than a block."""
     edges = [min(BLOCK, n) for n in values.shape]
     step = max(1, int(np.cbrt(values.size / SAMPLE)))
-    total = np.zeros(
-        [len(range(0, n - e + 1, step)) for n, e in zip(values.shape, edges, strict=True)]
-    )
+    starts = [range(0, n - e + 1, step) for n, e in zip(values.shape, edges, strict=True)]
+    total = np.zeros([len(s) for s in starts])
     for shift in product(*(range(e) for e in edges)):
         places = (
             slice(first, n - e + first + 1, step)
             for first, n, e in zip(shift, values.shape, edges, strict=True)
         )
         total += values[tuple(places)]
+    field = round_field(values)
+    if field is not None:
+        total = total[field.inside(values.shape, 2.0 * BLOCK)[np.ix_(starts[0], starts[1])]]
     return np.asarray(total.ravel() / np.prod(edges))
 
 

@@ -109,8 +109,7 @@ def find_metal(work: Working, options: SegmentOptions) -> Metal:
         "metal",
         f"{int(np.count_nonzero(large))} pieces of metal, "
         f"{np.count_nonzero(mask) * volume / 1000.0:.1f} cm³ above {threshold:.0f} HU, between "
-        f"z = {low:.0f} and {high:.0f} mm; "
-        + _streaks_text(work, streaked),
+        f"z = {low:.0f} and {high:.0f} mm; " + _streaks_text(work, streaked),
         where="image",
         why="streaks hide skin and bone at that height",
         fix="check lips, cheeks and tooth rows by eye",

@@ -13,6 +13,8 @@ __all__ = ["view_findings"]
 # Skin or bone that meets a border of the image over less than this is not cut off, mm².
 CUT_SKIN = 150.0
 CUT_BONE = 60.0
+# Width of the ring inside the border of a round field of view that is searched for tissue, mm.
+FIELD_RING = 3.0
 # Face, jaws and spine lie farther than this from the brain's cavity, the vault does not, mm.
 VAULT = 15.0
 # The middle of face, jaws and spine lies some 40 mm in front of the brain's and 80 mm below it: it
@@ -23,7 +25,7 @@ LEAST_OFFSET = 5.0
 def view_findings(work: Working, skin: Skin, bone: Bone) -> tuple[Finding, ...]:
     """Findings on cut-off parts and on the head's direction."""
     wrong = _direction(work, bone)
-    return (*wrong, *([] if wrong else _cut_off(work, skin, bone)))
+    return (*wrong, *([] if wrong else [*_cut_off(work, skin, bone), *_round(work, skin)]))
 
 
 def _direction(work: Working, bone: Bone) -> tuple[Finding, ...]:
@@ -86,11 +88,43 @@ def _cut_off(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
     return findings
 
 
+def _round(work: Working, skin: Skin) -> list[Finding]:
+    """A finding where a round field of view ends inside the head."""
+    if work.field is None:
+        return []
+    axes = (
+        o + s * np.arange(n)
+        for o, s, n in zip(work.origin, work.spacing, skin.mask.shape, strict=True)
+    )
+    x, y = (a - m for a, m in zip(axes, work.field.middle, strict=False))
+    away = np.hypot(x[:, None] / work.field.radii[0], y[None] / work.field.radii[1])
+    # The share of the ring just inside the field that is head.
+    inward = (1.0 - away) * float(work.field.radii.min())
+    ring = (inward > 0.0) & (inward < FIELD_RING)
+    area = float(np.count_nonzero(skin.mask[ring])) * float(np.prod(work.spacing)) / FIELD_RING
+    if area < CUT_SKIN:
+        return []
+    return [
+        Finding.warning(
+            "ct-cut-round",
+            f"the head goes on outside the round field of view, {2.0 * work.field.radii.min():.0f} "
+            f"mm across: skin or tissue meets its border over {area / 100.0:.0f} cm²",
+            where="border of the field of view",
+            why="the surface is closed there, and values near the border are too high",
+            fix="compare and plan well inside the field; use a scan that holds the whole head for "
+            "more",
+        )
+    ]
+
+
 def _top(bone: Bone, area: float) -> Finding:
-    """The forehead is missing if the border cuts the skull below its widest layer."""
+    """The forehead is missing if the border cuts the skull below its widest layer.
+
+    It is as well where the image shows too little of the vault for the brain's room to be found.
+    """
     per_layer = bone.mask.sum(axis=(0, 1))
     what = f"bone of the skull meets the border over {area:.0f} mm²"
-    if per_layer[-1] > 0.75 * per_layer.max():
+    if bone.cavity is None or per_layer[-1] > 0.75 * per_layer.max():
         return _missing("top", "forehead", what)
     return Finding.note(
         "ct-cut-vertex",

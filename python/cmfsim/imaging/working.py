@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
-from cmfsim.imaging.intensity import Calibration, calibration, noise_of, saturation_of
+from cmfsim.imaging.field import RoundField, round_field
+from cmfsim.imaging.intensity import AIR, Calibration, calibration, noise_of, saturation_of
 from cmfsim.imaging.morphology import (
     Block,
     Mask,
@@ -65,6 +66,8 @@ class Working:
         Voxel size of the image.
     saturation : float, HU
         The value at which the image's brightest voxels were cut off; infinite where they were not.
+    field : RoundField or None, mm
+        The round field of view; None where the image shows a box.
     """
 
     hu: Volume
@@ -73,6 +76,7 @@ class Working:
     border: NDArray[np.bool_]
     native: NDArray[np.float64]
     saturation: float = np.inf
+    field: RoundField | None = None
 
     def part(self, box: Block) -> "Working":
         """A block of this grid."""
@@ -85,6 +89,7 @@ class Working:
             self.border & np.array([starts == 0, ends]),
             self.native,
             self.saturation,
+            self.field,
         )
 
     def image(self, values: NDArray[np.float32]) -> ImageData:
@@ -109,6 +114,10 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     if values.dtype.kind == "b" or values.dtype == np.float16:
         values = values.astype(np.float32)
     values = _cut_off(values, scale)
+    field = round_field(image.values)
+    if field is not None:
+        values = values.copy()
+        values[~field.inside(values.shape)] = values.dtype.type((AIR - scale.offset) / scale.slope)
     values, bins, shift = binned(values, factors, spacing)
     low, high = _head_box(values, bins, scale)
     border = np.array([low == 0, high == np.array(values.shape)])
@@ -126,7 +135,9 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
         hu = resampled_to(hu, bins, np.zeros(3), shape, target)
     np.clip(hu, LOWEST, HIGHEST, out=hu)
     saturation = saturation_of(image.values, float(np.prod(spacing)), scale)
-    return Working(hu, target, origin, border, spacing, saturation), tuple(findings)
+    if field is not None:
+        field = field.scaled(spacing[:2], np.asarray(image.origin)[:2])
+    return Working(hu, target, origin, border, spacing, saturation, field), tuple(findings)
 
 
 def without_noise(hu: Volume) -> Volume:
