@@ -41,7 +41,7 @@ FACE = np.array([[-200.0, -400.0, 322.0], [200.0, -200.0, 520.0]])
 # A cut-off head is closed flat: surfaces this near to a border are not compared, mm.
 BORDER = 4.0
 # Surfaces farther than these from those of the clean scan, mm, or a tissue volume that differs by
-# more than this part, have to be reported: the voxels of the scan, and twice the error of landmarks.
+# more than this part, have to be reported: voxels of the scan, and twice the error of landmarks.
 TOLERANCES = {"skin p95": 1.0, "skin max": 5.0, "bone p95": 2.0, "bone max": 6.0, "tissue": 0.05}
 SAMPLES = 20000
 # Middle and radius of the field of view of cone-beam scanners for the face, mm.
@@ -297,9 +297,12 @@ def _cells(row: Mapping) -> str:
 def page(runs: Mapping[str, list[dict]]) -> str:
     """The table in Markdown."""
     commit = _git("rev-parse", "--short", "HEAD").decode().strip()
-    lines = [
+    made = (
         f"cmfsim {cmfsim.__version__} after commit {commit}, {platform.machine()}, Python "
-        f"{platform.python_version()}; `python {NAME}`. Distances in mm: mean / 95 % / largest.",
+        f"{platform.python_version()}; `python {NAME}`. Distances in mm: mean / 95 % / largest."
+    )
+    lines = [
+        made,
         "",
         "| variant | | skin | bone | tissue, % | verdict |",
         "|---|---|---|---|---|---|",

@@ -1,7 +1,8 @@
 """Things on the face that are no part of it: tubes, holders, tape. They are reported, not removed.
 
 What stands out from the head as thin as a tube is looked at: it belongs to a face if it has its
-mirror image on the other side, as ears, nose and lips have, and is not as dense as plastic.
+mirror image on the other side, as ears, nose and lips have, is not as dense as plastic and stands
+out no farther than a nose.
 """
 
 from typing import Any
@@ -29,11 +30,17 @@ NEARLY_ONE_SIDED = 3.0
 # Plastic is denser than this, skin and cartilage are not, HU; bone this near is the head's own, mm.
 PLASTIC = 130.0
 OWN_BONE = 4.0
+# Noses, lips and chins stand out from the opened head by 6 mm at most; plates of chin rests by far
+# more. What is farther out than the first is no face's, with all that joins it beyond the second,
+# mm.
+FARTHEST = 15.0
+STANDING_OUT = 8.0
 # Smaller and shorter things are folds, swellings and noise, mm³ and mm.
 LEAST_VOLUME = 600.0
 LEAST_LENGTH = 18.0
 # The face lies in front of this part of the head's depth: ears, folded or not, lie behind.
 FACE_PART = 0.45
+ONE_SIDED_TEXT = "without its like on the other side"
 # Points of the face that its plane of symmetry is fitted to.
 SAMPLES = 4000
 
@@ -48,13 +55,16 @@ def attached_findings(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
     rows = box[1]
     behind = rows.start + int(FACE_PART * (rows.stop - rows.start))
     around = depth(mask, spacing)
-    out = mask & ~opened(mask, WIDEST, spacing)
+    core = opened(mask, WIDEST, spacing)
+    out = mask & ~core
     out[:, behind:] = False
+    away = -depth(core, spacing)
+    far = reached(out & (away > STANDING_OUT), away > FARTHEST)
     dense = out & (hu > PLASTIC) & (around < WIDEST)
     dense &= depth(np.asfortranarray(own), spacing) < -OWN_BONE
     mirrored = _mirrored(around, spacing, behind, out)
     alone = reached(out & (mirrored < -NEARLY_ONE_SIDED), mirrored < -ONE_SIDED)
-    found: Mask = dense | alone
+    found: Mask = dense | alone | far
     labels, count = label(found, corners=True)
     findings = []
     for piece in range(1, count + 1):
@@ -64,14 +74,16 @@ def attached_findings(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
         if volume < LEAST_VOLUME or float(np.linalg.norm(size)) < LEAST_LENGTH:
             continue
         middle = work.origin + shift + voxels.mean(axis=0) * spacing
-        findings.append(_finding(middle, size, volume, float(dense[labels == piece].mean())))
+        kinds = ((far, "farther out than a nose"), (dense, "as dense as plastic"))
+        here = labels == piece
+        kind = next((text for which, text in kinds if which[here].mean() > 0.5), ONE_SIDED_TEXT)
+        findings.append(_finding(middle, size, volume, kind))
     return findings
 
 
 def _finding(
-    middle: NDArray[np.float64], size: NDArray[np.float64], volume: float, dense: float
+    middle: NDArray[np.float64], size: NDArray[np.float64], volume: float, kind: str
 ) -> Finding:
-    kind = "as dense as plastic" if dense > 0.5 else "without its like on the other side"
     return Finding.warning(
         "skin-attachment",
         f"something stands out from the face {kind}: {size[0]:.0f} × {size[1]:.0f} × "

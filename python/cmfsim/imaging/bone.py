@@ -162,7 +162,7 @@ def _cranial_cavity(solid: Mask, skin: Skin, work: Working) -> Mask | None:
 
 
 def _enclosed_by_skull(cavity: Mask, wall: Mask) -> bool:
-    """Whether a room is the brain's: the mouth is one too where the image cuts the head all round."""
+    """Whether a room is the brain's: so is the mouth where an image cuts the head."""
     rim = grown(cavity) & ~cavity
     bounded = np.count_nonzero(rim & grown(wall)) / max(np.count_nonzero(rim), 1)
     return bounded >= LEAST_BOUNDED

@@ -38,7 +38,7 @@ MOST_LOSS = 450.0
 
 
 def without_cupping(work: Working) -> tuple[Volume, tuple[Finding, ...]]:
-    """HU scaled between air and soft tissue, so that soft tissue has one value, where it has not."""
+    """HU scaled between air and soft tissue where soft tissue has not one value throughout."""
     coarse, steps, shift = coarse_of(work.hu, work.spacing, STEP)
     tissue: Mask = np.asfortranarray(coarse > AIR_LEVEL)
     if not tissue.any():

@@ -17,10 +17,11 @@ from cmfsim.imaging.intensity import weak_bone
 from cmfsim.imaging.jaw import part_jaws
 from cmfsim.imaging.metal import find_metal, metal_within
 from cmfsim.imaging.morphology import Block, Mask, Volume
+from cmfsim.imaging.noise import without_noise
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import find_skin
 from cmfsim.imaging.view import view_findings
-from cmfsim.imaging.working import Working, without_noise, working_grid
+from cmfsim.imaging.working import Working, working_grid
 from cmfsim.progress import Progress
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding
@@ -92,9 +93,11 @@ def segment_head(
     say("bone")
     # The couch and the air around the head need no more work.
     whole, work, metal = work, work.part(skin.box), metal_within(metal, skin.box)
-    metal = replace(metal, hu=without_noise(metal.hu))
+    smooth, noisy = without_noise(metal.hu)
+    metal = replace(metal, hu=smooth)
     bone = find_bone(work, metal, skin, options)
     all_findings += [
+        *noisy,
         *weak_bone(work.hu[skin.mask], options.bone_threshold),
         *metal.findings,
         *skin.findings,

@@ -12,7 +12,16 @@ from cmfsim.imaging.field import round_field
 from cmfsim.imaging.morphology import Volume
 from cmfsim.values.finding import Finding
 
-__all__ = ["AIR", "SOFT", "Calibration", "calibration", "noise_of", "saturation_of", "weak_bone"]
+__all__ = [
+    "AIR",
+    "SOFT",
+    "STATE_IT",
+    "Calibration",
+    "calibration",
+    "noise_of",
+    "saturation_of",
+    "weak_bone",
+]
 
 # Air by definition, and muscle and brain as scanners show them (25 to 60), HU.
 AIR = -1000.0

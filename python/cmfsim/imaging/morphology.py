@@ -26,6 +26,7 @@ __all__ = [
     "closed",
     "depth",
     "distance",
+    "filled",
     "grown",
     "label",
     "largest",
@@ -241,6 +242,19 @@ def reached(mask: Mask, seeds: Mask) -> Mask:
     hit[labels.T[(seeds & mask).T]] = True
     hit[0] = False
     return chosen(hit, labels)
+
+
+def filled(mask: Mask) -> Mask:
+    """The mask with every hollow that does not reach the front, back or sides of the image.
+
+    The bottom and the top are no way out: trachea and neck are cut there.
+    """
+    labels, count = label(~mask)
+    outside = np.zeros(count + 1, dtype=bool)
+    for face in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        outside[np.unique(face)] = True
+    outside[0] = False
+    return ~outside[labels]
 
 
 def smoothed(

@@ -15,6 +15,7 @@ from cmfsim.imaging.morphology import (
     box_of,
     closed,
     depth,
+    filled,
     label,
     largest,
     ndimage,
@@ -291,24 +292,11 @@ def _with_hollows(solid: Mask, work: Working) -> tuple[Mask, Mask]:
     small = np.asfortranarray(solid[blocks])
     steps = work.spacing * np.array(factors)
     shift = work.spacing * (np.array(factors) // 2)
-    sealed = _filled(closed(small, OPENING, steps))
+    sealed = filled(closed(small, OPENING, steps))
     within = depth(sealed, steps)
     inside = resampled_to(within, steps, shift, solid.shape, work.spacing)
     candidate = ~solid & (inside > DRAWN_IN)
     hollow = reached(candidate, candidate & (inside > DEEP))
     mask = solid | hollow
-    filled = _filled(mask)
-    return filled, filled & ~solid
-
-
-def _filled(mask: Mask) -> Mask:
-    """The mask with every hollow that does not reach the front, back or sides of the image.
-
-    The bottom and the top are no way out: trachea and neck are cut there.
-    """
-    labels, count = label(~mask)
-    outside = np.zeros(count + 1, dtype=bool)
-    for face in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
-        outside[np.unique(face)] = True
-    outside[0] = False
-    return ~outside[labels]
+    whole = filled(mask)
+    return whole, whole & ~solid

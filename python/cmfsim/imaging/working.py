@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.field import RoundField, round_field
-from cmfsim.imaging.intensity import AIR, Calibration, calibration, noise_of, saturation_of
+from cmfsim.imaging.intensity import AIR, Calibration, calibration, saturation_of
+from cmfsim.imaging.modality import check_is_ct
 from cmfsim.imaging.morphology import (
     Block,
     Mask,
@@ -18,13 +19,12 @@ from cmfsim.imaging.morphology import (
     opened,
     resampled_to,
     sizes_of,
-    smoothed,
 )
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["COARSE", "Working", "coarse_of", "without_noise", "working_grid"]
+__all__ = ["COARSE", "Working", "coarse_of", "working_grid"]
 
 # Voxel size at which shapes as large as a couch are told apart, mm.
 COARSE = 2.5
@@ -39,16 +39,13 @@ LEAST_VOXELS = 8
 COARSE_SLICES = 2.5
 # Air and foam lie below this, skin, couch and bone above, HU.
 TISSUE = -300.0
+# Voxel size on which a CT is told from an MR image, mm.
+MODALITY_STEP = 2.0
 # Values beyond these say nothing more on tissue, HU; scales of up to 30000 would make metal as wide
 # as its blur.
 LOWEST, HIGHEST = -1024.0, 4000.0
 # Sheets and tubes thinner than twice this are no head, mm.
 OPENING = 12.0
-
-
-# From this noise on (HU on the working grid), a Gaussian of this many voxels: it leaves a third or
-# less of the noise, which then is a tenth of the step from soft tissue to the bone threshold.
-SMOOTHING = ((45.0, 0.8), (25.0, 0.6))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +122,8 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     hu = np.empty(part.shape, dtype=np.float32, order="F")
     np.multiply(part, np.float32(scale.slope), out=hu, casting="unsafe")
     hu += np.float32(scale.offset)
+    if options.rescale is None:
+        check_is_ct(*coarse_of(hu, bins, MODALITY_STEP)[:2])
     origin = np.asarray(image.origin) + shift + low * bins
     target = _target(bins, hu.shape, options)
     if not np.array_equal(target, bins):
@@ -138,16 +137,6 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     if field is not None:
         field = field.scaled(spacing[:2], np.asarray(image.origin)[:2])
     return Working(hu, target, origin, border, spacing, saturation, field), tuple(findings)
-
-
-def without_noise(hu: Volume) -> Volume:
-    """HU smoothed as far as the noise asks for: not at all in most clinical scans.
-
-    For bone only: the skin stands out of any noise, and smoothing would draw it in.
-    """
-    noise = noise_of(hu)
-    sigma = next((sigma for least, sigma in SMOOTHING if noise >= least), 0.0)
-    return smoothed(hu, sigma) if sigma > 0.0 else hu
 
 
 def coarse_of(
