@@ -380,7 +380,7 @@ def _nearest_point(evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
     from cmfsim.imaging.intensity import calibration  # noqa: PLC0415
 
     try:
-        to_hu = calibration(np.asarray(image.values))
+        to_hu = calibration(np.asarray(image.values), given.rescale)
     except ImageError:
         # No CT: reported where the image is segmented.
         return None

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmfsim.errors import ImageInputError
+from cmfsim.imaging.half_way import at_half_height
 from cmfsim.imaging.levels import level_of
 from cmfsim.imaging.metal import Metal, without_streaks
 from cmfsim.imaging.morphology import (
@@ -55,6 +56,8 @@ class Bone:
     ----------
     hu : (nx, ny, nz) float32
         What bone was found in: streaks of metal are taken out.
+    surface : (nx, ny, nz) float32
+        HU whose surface of bone lies at the threshold: see `at_half_height`.
     mask : (nx, ny, nz) bool
         Bone and the hollows in it.
     solid : (nx, ny, nz) bool
@@ -65,6 +68,7 @@ class Bone:
     """
 
     hu: Volume
+    surface: Volume
     mask: Mask
     solid: Mask
     cavity: Mask | None
@@ -79,7 +83,7 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     ImageError
         (also `ValueError`) No bone at this threshold.
     """
-    threshold = options.bone_threshold
+    threshold = options.least_bone
     under = depth(skin.mask, work.spacing, 2.0 * options.least_skin)
     hu = metal.hu
     solid = without_streaks(hu > threshold, metal, work.spacing, bone=True)
@@ -87,12 +91,15 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     solid, findings = _without_islands(solid, work, options)
     cavity = _cranial_cavity(solid, skin, work)
     mask = _enclosed(hu, solid, cavity, under, work=work, options=options)
-    return Bone(hu, mask, solid, cavity, tuple(findings))
+    surface = hu
+    if options.bone_threshold is None:
+        surface, mask = at_half_height(hu, mask, threshold, work)
+    return Bone(hu, surface, mask, solid & mask, cavity, tuple(findings))
 
 
 def bone_level(bone: Bone, options: SegmentOptions) -> Volume:
     """The level of all bone."""
-    return level_of(bone.hu, options.bone_threshold, BONE_SCALE, bone.mask)
+    return level_of(bone.surface, options.least_bone, BONE_SCALE, bone.mask)
 
 
 def _without_islands(
@@ -101,7 +108,7 @@ def _without_islands(
     labels, count = label(solid, corners=True)
     if not count:
         raise ImageInputError(
-            f"no bone above {options.bone_threshold:g} HU inside the skin: is it a CT in HU? Else "
+            f"no bone above {options.least_bone:g} HU inside the skin: is it a CT in HU? Else "
             "set bone_threshold"
         )
     volumes = sizes_of(labels, count) * float(np.prod(work.spacing))
@@ -178,7 +185,7 @@ def _enclosed(
     options: SegmentOptions,
 ) -> Mask:
     """Bone with marrow, sinuses and the cranial cavity."""
-    seal = options.bone_threshold - (1.0 - SEAL_PART) * (options.bone_threshold - SOFT)
+    seal = options.least_bone - (1.0 - SEAL_PART) * (options.least_bone - SOFT)
     walls = solid | ((hu > seal) & (under > 2.0 * options.least_skin))
     walls = closed(walls, options.closing, work.spacing)
     if cavity is not None:

@@ -98,7 +98,7 @@ def segment_head(
     bone = find_bone(work, metal, skin, options)
     all_findings += [
         *noisy,
-        *weak_bone(work.hu[skin.mask], options.bone_threshold),
+        *weak_bone(work.hu[skin.mask], options.least_bone),
         *metal.findings,
         *skin.findings,
         *bone.findings,

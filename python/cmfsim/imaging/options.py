@@ -7,8 +7,10 @@ import numpy as np
 from cmfsim.checks import as_number, as_positive
 from cmfsim.errors import ImageInputError
 
-__all__ = ["METAL", "SegmentOptions"]
+__all__ = ["BONE", "METAL", "SegmentOptions"]
 
+# Bone is denser than this: thin bone that shares its voxels reaches little more, HU.
+BONE = 250.0
 # Enamel reaches 2200 HU; fillings, crowns and plates lie above this.
 METAL = 2500.0
 
@@ -21,8 +23,10 @@ class SegmentOptions:
     ----------
     skin_threshold : float, HU
         Between air (−1000) and fat (−100); −300 lies near half way to muscle.
-    bone_threshold : float, HU
-        Between soft tissue (up to 100) and compact bone (700 and more).
+    bone_threshold : float or None, HU
+        Between soft tissue (up to 100) and compact bone (700 and more): bone's surface lies at this
+        value. None: bone is what exceeds 250, and its surface lies at half the height of the step
+        from soft tissue to the bone behind it, where that is more.
     metal_threshold : float or None, HU
         Above enamel (up to 2200): fillings, crowns, plates. None: 2500, or just below the value at
         which the image saturates where that is lower.
@@ -49,7 +53,7 @@ class SegmentOptions:
     """
 
     skin_threshold: float = -300.0
-    bone_threshold: float = 250.0
+    bone_threshold: float | None = None
     metal_threshold: float | None = None
     working_spacing: float = 1.0
     most_voxels: int = 40_000_000
@@ -61,20 +65,26 @@ class SegmentOptions:
 
     def __post_init__(self) -> None:
         metal = METAL if self.metal_threshold is None else self.metal_threshold
-        if self.metal_threshold is None and self.bone_threshold >= METAL:
+        as_number("skin_threshold", self.skin_threshold)
+        if self.bone_threshold is not None:
+            as_number("bone_threshold", self.bone_threshold)
+        if self.metal_threshold is None and self.least_bone >= METAL:
             metal = np.inf
-        for name in ("skin_threshold", "bone_threshold"):
-            as_number(name, getattr(self, name))
         if self.metal_threshold is not None:
             as_number("metal_threshold", self.metal_threshold)
         for name in ("working_spacing", "most_voxels", "closing", "least_skin", "island"):
             as_positive(name, getattr(self, name))
-        if not -1000.0 < self.skin_threshold < self.bone_threshold < metal:
+        if not -1000.0 < self.skin_threshold < self.least_bone < metal:
             raise ImageInputError(
-                f"thresholds are skin {self.skin_threshold:g}, bone {self.bone_threshold:g}, metal "
+                f"thresholds are skin {self.skin_threshold:g}, bone {self.least_bone:g}, metal "
                 f"{metal:g} HU: they must ascend and lie above −1000"
             )
         if self.rescale is not None:
             slope, intercept = self.rescale
             as_positive("slope of rescale", slope)
             as_number("intercept of rescale", intercept)
+
+    @property
+    def least_bone(self) -> float:
+        """What is denser is bone, HU."""
+        return BONE if self.bone_threshold is None else self.bone_threshold

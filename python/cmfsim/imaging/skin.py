@@ -111,7 +111,7 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
         tissue = closed(tissue, STREAK_GAP, steps)
     tissue = _filled_in_layers(tissue)
     free, removed = _without_couch(tissue, steps)
-    bone = largest(free & (coarse > options.bone_threshold))
+    bone = largest(free & (coarse > options.least_bone))
     head, more = _without_rests(free, bone, steps)
     # Off the coarse grid the head is known to a voxel: the threshold places its surface.
     margin = 1.2 * float(steps.max())
