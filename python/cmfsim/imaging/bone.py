@@ -93,7 +93,7 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     mask = _enclosed(hu, solid, cavity, under, work=work, options=options)
     surface = hu
     if options.bone_threshold is None:
-        surface, mask = at_half_height(hu, mask, threshold, work)
+        surface, mask = at_half_height(hu, mask, threshold, BONE_SCALE, work.spacing)
     return Bone(hu, surface, mask, solid & mask, cavity, tuple(findings))
 
 

@@ -6,10 +6,10 @@ is where the surface is, whatever the blur (Spoor, Zonneveld & Macho 1993).
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmfsim.imaging.intensity import SOFT
 from cmfsim.imaging.morphology import Mask, Volume, depth, grown, ndimage
-from cmfsim.imaging.working import Working
 
 __all__ = ["at_half_height"]
 
@@ -21,16 +21,19 @@ HIGHEST = 0.5 * (SOFT + 1400.0)
 SAMPLE = 0.5
 
 
-def at_half_height(hu: Volume, mask: Mask, threshold: float, work: Working) -> tuple[Volume, Mask]:
+def at_half_height(
+    hu: Volume, mask: Mask, threshold: float, scale: float, spacing: NDArray[np.float64]
+) -> tuple[Volume, Mask]:
     """HU whose surface of bone lies at the threshold, and the mask without what lies outside it.
 
-    Near the surface values are lowered by what half the step exceeds the threshold. The step ends
-    at the densest value behind the surface along its normal. Bone that is less dense than twice the
-    threshold stays as it is.
+    Near the surface values are lowered by what half the step exceeds the threshold; the step ends
+    at the densest value behind the surface along its normal. Bone less dense than twice the
+    threshold stays as it is, as do values farther than `scale` from any such half: no level shows
+    a difference there.
     """
-    reach = BLUR * float(work.spacing.max())
-    away = depth(mask, work.spacing, reach)
-    near = np.abs(away) < reach
+    reach = BLUR * float(spacing.max())
+    near = np.abs(depth(mask, spacing, reach)) < reach
+    near &= (hu > threshold - scale) & (hu < HIGHEST + scale)
     # Borders of the image have no other side.
     for axis in range(3):
         np.moveaxis(near, axis, 0)[[0, -1]] = False
@@ -38,14 +41,14 @@ def at_half_height(hu: Volume, mask: Mask, threshold: float, work: Working) -> t
     gradient = np.stack(
         [
             (hu[tuple(index + step)] - hu[tuple(index - step)]) / (2.0 * width)
-            for step, width in zip(np.eye(3, dtype=int)[:, :, None], work.spacing, strict=True)
+            for step, width in zip(np.eye(3, dtype=int)[:, :, None], spacing, strict=True)
         ]
     )
     inwards = gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)
     own = hu[near]
     densest = own.copy()
-    for far in np.arange(SAMPLE, BLUR + SAMPLE, SAMPLE):
-        places = index + inwards * (far * work.spacing.max() / work.spacing)[:, None]
+    for far in np.arange(SAMPLE, BLUR + 0.5 * SAMPLE, SAMPLE):
+        places = index + inwards * (far * spacing.max() / spacing)[:, None]
         np.maximum(
             densest, ndimage().map_coordinates(hu, places, order=1, mode="nearest"), out=densest
         )

@@ -20,6 +20,7 @@ from cmfsim.imaging.morphology import (
     largest,
     ndimage,
     reached,
+    shrunk,
     smoothed,
     watershed,
 )
@@ -121,7 +122,9 @@ def part_jaws(work: Working, bone: Bone, landmarks: Mapping[str, Floats] | None)
         return Jaws(None, None, None, (_not_parted("the landmarks lie far from bone"),))
     deep = depth(domain, work.spacing) / np.float32(FLOOD_DEPTH)
     dense = np.clip(smoothed(bone.hu[box], 0.7, work.spacing) / np.float32(FLOOD_HU), 0.0, 2.0)
-    basins = watershed(-(deep + dense), seeds, domain)
+    # What lies among seeds of its own kind is known, and floods nothing.
+    inner = shrunk(seeds == 2)
+    basins = watershed(-(deep + dense), seeds, domain & ~inner)
     mandible = np.zeros(bone.mask.shape, dtype=bool, order="F")
     mandible[box] = basins == 1
     # Scraps that the flood cut off elsewhere are not the mandible.

@@ -26,7 +26,11 @@ def level_of(values: Volume, threshold: float, scale: float, mask: Mask) -> Volu
     between voxels as the image has it. Where they do not (hollows filled, other things cut away)
     and that makes a new surface, the surface is that of the smoothed mask.
     """
-    level = (values - np.float32(threshold)) * np.float32(1.0 / scale)
+    # Farther from the mask than its surface reaches, all is outside.
+    box = box_of(mask, REACH)
+    whole = np.full(values.shape, np.float32(-1.0), order="F")
+    values, mask = values[box], np.asfortranarray(mask[box])
+    level = np.asfortranarray(values - np.float32(threshold)) * np.float32(1.0 / scale)
     np.clip(level, -1.0, 1.0, out=level)
     forced = (level > 0.0) != mask
     if forced.any():
@@ -38,7 +42,8 @@ def level_of(values: Volume, threshold: float, scale: float, mask: Mask) -> Volu
     np.minimum(level, -NEAR, out=level, where=outside)
     np.copyto(level, np.float32(1.0), where=shrunk(inside))
     np.copyto(level, np.float32(-1.0), where=shrunk(outside))
-    return level
+    whole[box] = level
+    return whole
 
 
 def _force(level: Volume, forced: Mask, mask: Mask) -> None:

@@ -216,8 +216,9 @@ def label(mask: Mask, *, corners: bool = False) -> tuple[NDArray[np.int32], int]
 
 def sizes_of(labels: NDArray[np.int32], count: int) -> NDArray[np.intp]:
     """How many voxels each label has; that of 0 is given as 0."""
-    flat = labels.ravel(order="K")
-    return np.bincount(flat[flat > 0], minlength=count + 1)
+    sizes = np.bincount(labels.ravel(order="K"), minlength=count + 1)
+    sizes[0] = 0
+    return sizes
 
 
 def chosen(wanted: Mask, labels: NDArray[np.int32]) -> Mask:
