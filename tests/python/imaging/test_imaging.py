@@ -100,8 +100,9 @@ def test_no_level_comes_near_zero_away_from_its_surface(anatomy):
         far = ndimage.binary_erosion(~inside, cube, iterations=2)
         assert deep.any()
         small = np.abs(level.values[deep | far]) < 0.3
-        # A smoothed rim may stand a voxel out from its mask.
-        assert np.count_nonzero(small) < 1e-5 * small.size
+        # A smoothed rim may stand a voxel out from its mask, as in slits one voxel wide between
+        # roots.
+        assert np.count_nonzero(small) < 2e-5 * small.size
 
 
 def test_the_jaws_are_parted_without_landmarks_and_it_is_said(head):
@@ -343,7 +344,9 @@ def phantom_landmarks():
 
 @pytest.fixture(scope="session")
 def phantom_anatomy(phantom, phantom_landmarks):
-    return segment_head(phantom, landmarks=phantom_landmarks)
+    """Segmented as the reference was: bone's surface lies at 250 HU."""
+    options = SegmentOptions(bone_threshold=250.0)
+    return segment_head(phantom, options, landmarks=phantom_landmarks)
 
 
 @pytest.fixture(scope="session")
