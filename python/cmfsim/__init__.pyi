@@ -110,6 +110,8 @@ from cmfsim.io import write_surface as write_surface
 from cmfsim.io import write_transform as write_transform
 from cmfsim.io.calibrations import read_calibration as read_calibration
 from cmfsim.io.calibrations import write_calibration as write_calibration
+from cmfsim.io.populations import Population as Population
+from cmfsim.io.populations import PopulationEntry as PopulationEntry
 from cmfsim.lips import LipSeam as LipSeam
 from cmfsim.lips import lip_regions as lip_regions
 from cmfsim.lips import lip_seam as lip_seam

@@ -4,7 +4,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -130,10 +130,12 @@ def _by_models(
 ) -> None:
     """The mechanical models: the patient is built once, and its time counts for each of them."""
     failed: dict[str, CmfsimError] = {}
+    # The truth is not even opened.
+    case = replace(patient.case, postoperative=None)
     begun = time.perf_counter()
     built = None
     try:
-        for prediction in predict_models(patient.case, models, check=False, failed=failed):
+        for prediction in predict_models(case, models, check=False, failed=failed):
             now = time.perf_counter()
             solved = float(prediction.summary["timings"]["solving"])
             built = now - begun - solved if built is None else built

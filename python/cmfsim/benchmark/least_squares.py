@@ -21,9 +21,9 @@ __all__ = ["LEAST_TRAINED", "LearnedFace", "PartialLeastSquares", "learn_face"]
 # Fewer patients than this teach nothing: one is left out at a time to choose the components.
 LEAST_TRAINED = 4
 MOST_COMPONENTS = 8
-# Points of the skin that are compared from person to person: each so many of the vertices that lie
-# within a distance of the face, mm.
-EACH, AROUND = 5, 30.0
+# Points of the skin that are compared from person to person: of the vertices within a distance of
+# the face, mm, about one for each so many mm².
+AROUND, AREA = 30.0, 30.0
 # A vertex follows so many of these points; from one distance off them on it fades, and beyond the
 # other it stays, mm.
 NEAREST, FOLLOWS, FADED = 4, 6.0, 20.0
@@ -138,7 +138,8 @@ def learn_face(patients: Sequence[BenchmarkPatient]) -> LearnedFace:
     first = patients[0]
     landmarks, skin = _landmarks(first), first.skin
     near = _tree(skin[first.regions["face"]]).query(skin)[0] < AROUND
-    points = skin[near][::EACH]
+    each = max(1, round(AREA * len(skin) / first.surface.area))
+    points = skin[near][::each]
     x = np.array([_features(patient) for patient in patients])
     y = np.array([p.truth[_partners(p, landmarks, points)].ravel() for p in patients])
     components = _components(x, y)

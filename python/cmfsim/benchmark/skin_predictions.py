@@ -50,13 +50,6 @@ class SkinPrediction:
         moves = as_rows("displacement", self.displacement, 3)
         if len(places) != len(moves):
             raise CaseInputError(f"{len(moves)} displacements for {len(places)} vertices")
-        for name, values in (("vertices", places), ("displacement", moves)):
-            bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
-            if len(bad):
-                raise CaseInputError(
-                    f"{name}[{bad[0]}] is {values[bad[0]].tolist()}: finite numbers are needed; "
-                    "a vertex that the method does not move has the displacement 0"
-                )
         length = np.linalg.norm(moves, axis=1)
         most = int(length.argmax()) if len(length) else 0
         if len(length) and length[most] > LARGEST_MOVE:
