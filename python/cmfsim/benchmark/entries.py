@@ -105,11 +105,21 @@ def times_of(folder: Path, method: str, patients: Sequence[str]) -> dict[str, fl
     return found
 
 
-def patient_entries(patient: BenchmarkPatient, folder: Path, methods: Sequence[str]) -> None:
+def patient_entries(patient: str, folder: str, methods: Sequence[str]) -> None:
     """Makes the entries of one patient that need no other patient.
 
     A model that fails is recorded with its reason.
+
+    Parameters
+    ----------
+    patient, folder : str
+        The patient's folder, and that of all predictions.
+    methods : sequence of str
     """
+    _entries_of(BenchmarkPatient(Path(patient).name, Path(patient)), Path(folder), methods)
+
+
+def _entries_of(patient: BenchmarkPatient, folder: Path, methods: Sequence[str]) -> None:
     place, made_from = EntryFolder(folder), patient.digest()
     simple: Mapping[str, Callable[[BenchmarkPatient], Floats]] = {
         NO_CHANGE: lambda p: np.zeros_like(p.skin),

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from cmfsim.benchmark.table import BenchmarkTable, MethodResult
 from cmfsim.checks import as_number, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.io import replacing
-from cmfsim.io.parallel import one_thread_each, worker_pool
+from cmfsim.io.parallel import answers
 from cmfsim.io.populations import FAILED, PARTS, PENDING, TEST, TRAIN, Population
 
 __all__ = ["Benchmark", "run_benchmark"]
@@ -134,12 +133,14 @@ def _predict_each(
     alone = [entry for entry in entries if entry != LEARNED]
     if not alone:
         return
-    with one_thread_each(), worker_pool(workers) as pool:
-        running = {pool.submit(patient_entries, p, folder, alone): p.name for p in patients}
-        for count, future in enumerate(as_completed(running), 1):
-            future.result()
-            if progress is not None:
-                progress(f"{count} of {len(running)}  {running[future]} predicted")
+    jobs = [
+        {"patient": str(p.folder.absolute()), "folder": str(folder.absolute()), "methods": alone}
+        for p in patients
+    ]
+    function = f"{patient_entries.__module__}:{patient_entries.__name__}"
+    for done, (index, _) in enumerate(answers(function, jobs, workers), 1):
+        if progress is not None:
+            progress(f"{done} of {len(jobs)}  {patients[index].name} predicted")
 
 
 def _methods(predictions: Path) -> list[str]:
@@ -160,11 +161,23 @@ def _result(folder: Path, method: str, patients: Sequence[BenchmarkPatient]) -> 
             missing.append(patient.name)
             continue
         try:
-            scores[patient.name] = score(patient, read_skin_prediction(file))
+            prediction = read_skin_prediction(file)
+            if method in ENTRIES:
+                _check_own(method, prediction.made_from, patient)
+            scores[patient.name] = score(patient, prediction)
         except CaseInputError as error:
             raise CaseInputError(f"{file}: {error}") from error
     failed = [name for name in missing if place.file(method, name, FAILURE).exists()]
     return MethodResult(method, scores, tuple(missing), tuple(failed))
+
+
+def _check_own(method: str, made_from: str, patient: BenchmarkPatient) -> None:
+    """Refuses an own entry of another version, or of a patient who was made again."""
+    if not made_from.endswith(patient.digest()):
+        raise CaseInputError(
+            "was not made by this version from the patient as they are: predict it again "
+            f"(--entries {method}), or give a method of your own another name"
+        )
 
 
 def _write(folder: Path, table: BenchmarkTable, predictions: Path) -> tuple[Path, ...]:

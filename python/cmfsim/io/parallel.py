@@ -1,69 +1,155 @@
-"""Worker processes with one thread each, which end with the process that started them."""
+"""Jobs in processes of their own, with one thread each, which end with what started them.
 
+A process of this package's own making needs no `if __name__ == "__main__"` in the user's script, as
+those of `multiprocessing` do, and a killed command leaves none behind that goes on writing.
+"""
+
+import json
 import os
+import queue
+import subprocess
+import sys
 import threading
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from importlib import import_module
+from pathlib import Path
+from typing import IO, Any
 
+from cmfsim import errors
 from cmfsim.errors import CaseError
 
-__all__ = ["one_thread_each", "worker_pool"]
+__all__ = ["answers", "serve"]
 
+# The child's program: it finds the same modules as its parent, and nothing else is run.
+PROGRAM = (
+    "import json, sys; sys.path[:] = json.loads(sys.stdin.buffer.readline());"
+    "from cmfsim.io.parallel import serve; serve()"
+)
 # Read when numpy and the extension are loaded; with one thread sums have one order everywhere.
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 
 
-@contextmanager
-def worker_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes that work on jobs; what is not begun is cancelled where an error ends the block.
+def answers(
+    function: str, jobs: Sequence[Mapping[str, Any]], workers: int
+) -> Iterator[tuple[int, Any]]:
+    """What a function answers to each job, with the job's index, as they end.
+
+    Parameters
+    ----------
+    function : str
+        "module:name" of this package; it takes a job's values by name and returns plain values.
+    jobs : sequence of mapping
+        Plain values, as JSON has them.
+    workers : int
+        Processes.
 
     Raises
     ------
+    CmfsimError
+        What the function raises, with its class.
     CaseError
-        A process died.
+        A process died, or met an error of another kind, which its text has.
     """
-    # Spawned, since a forked process would share the threads of this one.
-    spawn = get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=_end_with_parent) as pool:
+    idle: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
+    started: list[_Worker] = []
+
+    def ask(job: Mapping[str, Any]) -> Any:
+        worker = idle.get()
         try:
-            yield pool
-        except BrokenProcessPool as error:
-            raise CaseError(
-                "a worker process died, perhaps for want of memory: run the command again, with "
-                "fewer workers; what is complete is kept"
-            ) from error
+            return worker.answer(function, job)
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+            idle.put(worker)
 
-
-@contextmanager
-def one_thread_each() -> Iterator[None]:
-    """Has processes that are started in the block use one thread each."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
+    pool = ThreadPoolExecutor(workers)
     try:
-        yield
+        for _ in range(min(workers, len(jobs))):
+            started.append(_Worker())
+            idle.put(started[-1])
+        running = {pool.submit(ask, job): index for index, job in enumerate(jobs)}
+        for future in as_completed(running):
+            yield running[future], future.result()
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for worker in started:
+            worker.end()
+        pool.shutdown(cancel_futures=True)
 
 
-def _end_with_parent() -> None:
-    """Has this process end when the one that started it does, however that ends.
+class _Worker:
+    """A process that takes jobs one after the other, a line of JSON each."""
 
-    A worker that outlives a command that was killed would write into the folder of the next one.
-    """
-    parent = parent_process()
-    if parent is not None:
+    def __init__(self) -> None:
+        environment = {**os.environ, **dict.fromkeys(THREADS, "1")}
+        self._process = subprocess.Popen(  # noqa: S603 (this very Python, and no shell)
+            [sys.executable, "-I", "-c", PROGRAM],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=environment,
+        )
+        self._send([str(Path(path).absolute()) for path in sys.path])
 
-        def watch() -> None:
-            parent.join()
-            os._exit(1)
+    def _send(self, value: object) -> None:
+        stream = _open(self._process.stdin)
+        stream.write(json.dumps(value).encode() + b"\n")
+        stream.flush()
 
-        threading.Thread(target=watch, daemon=True).start()
+    def answer(self, function: str, job: Mapping[str, Any]) -> Any:
+        line = b""
+        try:
+            self._send({"function": function, "job": dict(job)})
+            line = _open(self._process.stdout).readline()
+        except OSError:
+            pass
+        if not line:
+            raise CaseError(
+                f"a worker process died (exit code {self._process.wait()}), perhaps for want of "
+                "memory: run the command again, with fewer workers; what is complete is kept"
+            )
+        found = json.loads(line)
+        if "error" in found:
+            kind = getattr(errors, found["error"], None)
+            if isinstance(kind, type) and issubclass(kind, errors.CmfsimError):
+                raise kind(found["text"])
+            raise CaseError(f"{found['error']} in a worker process:\n{found['text']}")
+        return found["answer"]
+
+    def end(self) -> None:
+        self._process.kill()
+        self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout):
+            _open(stream).close()
+
+
+def _open(stream: IO[bytes] | None) -> IO[bytes]:
+    assert stream is not None  # noqa: S101 (both were asked for)
+    return stream
+
+
+def serve() -> None:
+    """Works on jobs until standard input ends; then the process ends, whatever it is doing."""
+    # What a library prints must not become an answer.
+    results = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+    def read() -> None:
+        for line in sys.stdin.buffer:
+            lines.put(line)
+        os._exit(0)
+
+    threading.Thread(target=read, daemon=True).start()
+    while True:
+        results.write(json.dumps(_done(json.loads(lines.get()))).encode() + b"\n")
+        results.flush()
+
+
+def _done(request: Mapping[str, Any]) -> dict[str, Any]:
+    """The answer to one job, or its error."""
+    module, name = request["function"].split(":")
+    try:
+        return {"answer": getattr(import_module(module), name)(**request["job"])}
+    except errors.CmfsimError as error:
+        return {"error": type(error).__name__, "text": str(error)}
+    except Exception as error:  # noqa: BLE001 (told to the one who asked)
+        return {"error": type(error).__name__, "text": traceback.format_exc()}

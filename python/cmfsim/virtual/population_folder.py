@@ -4,15 +4,16 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from cmfsim.checks import as_number, as_positive
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import replacing
-from cmfsim.io.parallel import one_thread_each, worker_pool
+from cmfsim.io.parallel import answers
 from cmfsim.io.populations import (
     FAILED,
     MADE,
@@ -32,7 +33,7 @@ from cmfsim.virtual.patient_folder import (
 from cmfsim.virtual.people import VirtualPatient
 from cmfsim.virtual.population import drawn_patient
 
-__all__ = ["PatientOutcome", "virtual_population"]
+__all__ = ["PatientOutcome", "make_patient", "virtual_population"]
 
 FAILURE = "failed.json"
 # Of the level images that the true mesh is made from, and of the skin, in the mesh's edge length:
@@ -183,14 +184,14 @@ def _write(folder: Path, record: dict[str, Any], entries: dict[str, PopulationEn
 
 def _made(jobs: list[_Job], workers: int) -> Iterator[tuple[_Job, str, str]]:
     """Each job with its status, as they end, and the reason where it failed."""
-    with one_thread_each(), worker_pool(workers) as pool:
-        running = {pool.submit(_make, job): job for job in jobs}
-        for future in as_completed(running):
-            yield (running[future], *future.result())
+    function = f"{__name__}:{make_patient.__name__}"
+    for index, (status, reason) in answers(function, [asdict(job) for job in jobs], workers):
+        yield jobs[index], status, reason
 
 
-def _make(job: _Job) -> tuple[str, str]:
-    """Makes one patient: "made", "kept" or "failed", and why it failed."""
+def make_patient(**values: Any) -> tuple[str, str]:
+    """Makes the patient of a job: "made", "kept" or "failed", and why it failed."""
+    job = _Job(**values)
     place, patient, settings = Path(job.folder) / job.patient.name, job.patient, job.settings
     failure = place / FAILURE
     if is_made(place, settings):
@@ -211,7 +212,7 @@ def _make(job: _Job) -> tuple[str, str]:
             grid=GRID * job.edge_length,
             skin_spacing=SKIN_SPACING * job.edge_length,
         )
-    except CmfsimError as error:
+    except (CmfsimError, np.linalg.LinAlgError) as error:
         found = {"settings": settings, "reason": str(error)}
         with replacing(failure) as file:
             file.write(json.dumps(found, indent=1).encode())

@@ -194,6 +194,14 @@ def test_an_entry_is_predicted_again_where_its_patient_changed(folder):
     assert np.abs(after - before).max() > 3.0
 
 
+def test_an_entry_of_another_version_is_not_scored(folder):
+    """Left there, and not asked for again: it would pass for this version's."""
+    cmfsim.run_benchmark(folder, entries=["no-change", "ratios"])
+    enter(folder, "ratios", lambda p: p.truth)
+    with pytest.raises(CaseInputError, match="--entries ratios"):
+        cmfsim.run_benchmark(folder, entries=["no-change"])
+
+
 def test_a_model_that_fails_stays_in_the_table(folder):
     """These patients have no CT that can be read: H says so for each, and has no figures."""
     found = cmfsim.run_benchmark(folder, entries=["no-change", "H"])

@@ -136,8 +136,8 @@ def test_the_skin_is_thicker_where_nothing_moved(made):
 def test_another_process_gives_the_same_bytes(made, tmp_path):
     """The patient made in this process, with its threads, against that of a worker."""
     folder, _ = made
-    job = population_folder._Job(str(tmp_path), 1, 1, *COARSE.values())
-    assert population_folder._make(job) == ("made", "")
+    job = {"folder": str(tmp_path), "seed": 1, "index": 1, **COARSE}
+    assert population_folder.make_patient(**job) == ("made", "")
     assert files_of(tmp_path / "D001") == files_of(folder / "D001")
 
 
@@ -169,12 +169,11 @@ def test_a_failure_is_recorded_and_not_tried_again(tmp_path, monkeypatch):
         raise SolverError("Newton's method stalls")
 
     monkeypatch.setattr(population_folder, "write_virtual_patient", stall)
-    job = population_folder._Job(str(tmp_path), 1, 4, 9.0, 4.0)
+    job = {"folder": str(tmp_path), "seed": 1, "index": 4, **COARSE}
     for _ in range(2):
-        assert population_folder._make(job) == ("failed", "Newton's method stalls")
+        assert population_folder.make_patient(**job) == ("failed", "Newton's method stalls")
     assert calls == ["D004"]
-    other = population_folder._Job(str(tmp_path), 1, 4, 8.0, 4.0)
-    population_folder._make(other)
+    population_folder.make_patient(**{**job, "edge_length": 8.0})
     assert calls == ["D004", "D004"]
     record = json.loads((tmp_path / "D004" / "failed.json").read_text())
     assert record["reason"] == "Newton's method stalls"
