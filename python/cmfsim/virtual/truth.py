@@ -56,6 +56,8 @@ BEYOND_OPEN_BITE = 4.0
 ABOVE_NASION = 20.0
 # Parts of the motion where lips may meet.
 STEPS_WITH_LIPS = 6
+# Tissue that becomes thicker or thinner, mm: below lie cartilage (nose), eye, muscle and airway.
+MOST_SWELLING = 12.0
 # Nodes within this distance from the skin lie on it, mm.
 NEAR_SKIN = 0.5
 
@@ -286,6 +288,7 @@ def _outward(
 ) -> Floats:
     """How far each vertex of the skin goes outward by a share of the tissue's depth, (v, 3) mm."""
     depth = tissue_depth(before.vertices, [segment.surface for segment in segments.values()])
+    depth = np.minimum(depth, MOST_SWELLING)
     skin = Surface(before.vertices, before.triangles)
     return moved_outward(skin, after, patient.thickness_change * depth) - after
 
