@@ -56,7 +56,7 @@ PYTHON: tuple[frozenset[str], ...] = tuple(
         "bones evaluation imaging lips meshing muscles node_kinds solving",
         "doctor pictures planning report",
         "pipeline",
-        "bench study virtual",
+        "bench benchmark study virtual",
         "cli",
         "__init__ __main__",
     )

@@ -27,6 +27,11 @@ from cmfsim.bench import FrontierRow as FrontierRow
 from cmfsim.bench import case_choice as case_choice
 from cmfsim.bench import frontier as frontier
 from cmfsim.bench import sweep_choices as sweep_choices
+from cmfsim.benchmark import BenchmarkTable as BenchmarkTable
+from cmfsim.benchmark import SkinPrediction as SkinPrediction
+from cmfsim.benchmark import read_skin_prediction as read_skin_prediction
+from cmfsim.benchmark import run_benchmark as run_benchmark
+from cmfsim.benchmark import write_skin_prediction as write_skin_prediction
 from cmfsim.bones import ContactSheet as ContactSheet
 from cmfsim.bones import CutBones as CutBones
 from cmfsim.bones import CuttingPlane as CuttingPlane
@@ -105,6 +110,8 @@ from cmfsim.io import write_surface as write_surface
 from cmfsim.io import write_transform as write_transform
 from cmfsim.io.calibrations import read_calibration as read_calibration
 from cmfsim.io.calibrations import write_calibration as write_calibration
+from cmfsim.io.populations import Population as Population
+from cmfsim.io.populations import PopulationEntry as PopulationEntry
 from cmfsim.lips import LipSeam as LipSeam
 from cmfsim.lips import lip_regions as lip_regions
 from cmfsim.lips import lip_seam as lip_seam
@@ -241,5 +248,7 @@ from cmfsim.values.surface_data import SurfaceData as SurfaceData
 from cmfsim.values.tissue_data import TissueData as TissueData
 from cmfsim.values.touching import ObstacleData as ObstacleData
 from cmfsim.values.touching import TouchingData as TouchingData
+from cmfsim.virtual import drawn_patient as drawn_patient
 from cmfsim.virtual import virtual_patients as virtual_patients
+from cmfsim.virtual import virtual_population as virtual_population
 from cmfsim.virtual import write_virtual_patient as write_virtual_patient

@@ -18,14 +18,13 @@ from cmfsim.cli import (
     study_commands,
     template_commands,
     view_command,
-    virtual_patients_command,
 )
+from cmfsim.cli.population_parsing import add_population_commands
 from cmfsim.io import result_suffixes
 from cmfsim.muscles.template import WHERE
 from cmfsim.planning.replanning import CORRECTIONS
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import CONTACTS
-from cmfsim.virtual.patient_folder import PATIENTS_WITH_JOINED_LIPS
 
 __all__ = ["make_parser"]
 
@@ -50,6 +49,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_scene_commands(commands, common)
     _add_template_commands(commands, common)
     _add_bench_commands(commands, common)
+    add_population_commands(commands, common)
     return parser
 
 
@@ -142,34 +142,6 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         "--spacing", metavar="MM", type=float, default=1.0, help="CT voxel size (default 1)"
     )
     phantom.set_defaults(run=phantom_command.phantom)
-
-    virtual = commands.add_parser(
-        "virtual-patients",
-        parents=[common],
-        help="write virtual patients with the face after their operation (in silico)",
-        epilog="Existing patients with the same settings are kept.",
-    )
-    virtual.add_argument("folder", metavar="FOLDER", type=Path, help="output folder")
-    virtual.add_argument(
-        "--patients",
-        metavar="N",
-        type=int,
-        nargs="+",
-        default=PATIENTS_WITH_JOINED_LIPS,
-        help="patients, 1 to 6 (default 1 to 4; the lips of 5 and 6 touch, which takes longer)",
-    )
-    virtual.add_argument("--seed", metavar="N", type=int, default=0, help="random seed (default 0)")
-    virtual.add_argument(
-        "--edge-length",
-        metavar="H",
-        type=float,
-        default=6.0,
-        help="edge length of the true mesh, mm (default 6)",
-    )
-    virtual.add_argument(
-        "--spacing", metavar="MM", type=float, default=2.0, help="CT voxel size (default 2)"
-    )
-    virtual.set_defaults(run=virtual_patients_command.virtual_patients)
 
 
 def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentParser) -> None:

@@ -7,15 +7,20 @@ finer mesh, the person's own muscles and contact that only pushes, solved with s
 from cmfsim.virtual.equilibrium import EquilibriumOptions
 from cmfsim.virtual.patient_folder import virtual_patients, write_virtual_patient
 from cmfsim.virtual.people import PATIENTS, Relocation, VirtualPatient
+from cmfsim.virtual.population import drawn_patient
+from cmfsim.virtual.population_folder import PatientOutcome, virtual_population
 from cmfsim.virtual.truth import PostoperativeTruth, postoperative_truth
 
 __all__ = [
     "PATIENTS",
     "EquilibriumOptions",
+    "PatientOutcome",
     "PostoperativeTruth",
     "Relocation",
     "VirtualPatient",
+    "drawn_patient",
     "postoperative_truth",
     "virtual_patients",
+    "virtual_population",
     "write_virtual_patient",
 ]

@@ -35,6 +35,8 @@ CONVEX_ROUNDS = 4
 # is less, down to the other.
 LOOSEST_SOLVE, TIGHTEST_SOLVE = 0.01, 1e-5
 MOST_ITERATIONS = 400
+# Nodes of the coarsest level, of which a dense pseudo-inverse is made: six unknowns each.
+MOST_COARSE = 60
 
 
 class Contact(Protocol):
@@ -341,7 +343,7 @@ class _LinearSolver:
                 improve_candidates=None,
                 presmoother=("block_gauss_seidel", {"sweep": "forward"}),
                 postsmoother=("block_gauss_seidel", {"sweep": "backward"}),
-                max_coarse=300,
+                max_coarse=MOST_COARSE,
             )
         finally:
             np.random.set_state(state)  # noqa: NPY002

@@ -24,10 +24,19 @@ from cmfsim.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.carried_skin import scanned
 from cmfsim.virtual.equilibrium import EquilibriumOptions
-from cmfsim.virtual.people import PATIENTS, Relocation, VirtualPatient, patient_named
+from cmfsim.virtual.people import DRAWN, PATIENTS, Relocation, VirtualPatient, patient_named
 from cmfsim.virtual.truth import PostoperativeTruth, postoperative_truth
 
-__all__ = ["PATIENTS_WITH_JOINED_LIPS", "case_text", "virtual_patients", "write_virtual_patient"]
+__all__ = [
+    "PATIENTS_WITH_JOINED_LIPS",
+    "TRUTH",
+    "case_text",
+    "cohort_text",
+    "is_made",
+    "patient_settings",
+    "virtual_patients",
+    "write_virtual_patient",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -45,6 +54,9 @@ COARSER = 1.25
 PATIENTS_WITH_JOINED_LIPS = tuple(n for n, p in PATIENTS.items() if not p.separate_lips)
 TRUTH = "truth"
 RECORD = "truth.json"
+TIMES = "times.json"
+# The skin before the operation, whose vertices a prediction moves.
+SKIN = "skin.ply"
 COHORT = "cohort.toml"
 
 
@@ -97,8 +109,8 @@ def virtual_patients(
     paths = []
     for patient in patients:
         place = Path(folder) / patient.name
-        settings = _settings(patient, seed, edge_length, spacing)
-        if _is_made(place, settings):
+        settings = patient_settings(patient, seed, edge_length, spacing)
+        if is_made(place, settings):
             _log.info("%s is there already", patient.name)
             paths.append(place / "case.toml")
             continue
@@ -124,23 +136,28 @@ def virtual_patients(
 def _write_cohort(folder: Path) -> None:
     """The study of every patient who is complete in the folder."""
     names = [p.name for p in PATIENTS.values() if (folder / p.name / TRUTH / RECORD).exists()]
+    with replacing(folder / COHORT) as file:
+        file.write(cohort_text("virtual patients", names).encode())
+
+
+def cohort_text(name: str, patients: Iterable[str]) -> str:
+    """The text of a `cohort.toml` beside the folders of patients."""
     lines = [
-        "# `cmfsim study cohort.toml` predicts every patient by every model.",
+        "# `cmfsim study` with this file predicts every patient by every model.",
         f'format = "{COHORT_FORMAT}"',
         "version = 1",
-        'name = "virtual patients"',
+        f'name = "{name}"',
         'note = "in silico: heads made by code and operations computed; no patients"',
         'output = "study"',
     ]
-    for name in names:
-        lines += ["", "[[cases]]", f'file = "{name}/case.toml"']
-    with replacing(folder / COHORT) as file:
-        file.write("\n".join([*lines, ""]).encode())
+    for patient in patients:
+        lines += ["", "[[cases]]", f'file = "{patient}/case.toml"']
+    return "\n".join([*lines, ""])
 
 
 def write_virtual_patient(  # noqa: PLR0913 (options by name)
     folder: str | os.PathLike[str],
-    number: int,
+    patient: int | VirtualPatient,
     *,
     seed: int = 0,
     edge_length: float = 6.0,
@@ -160,8 +177,8 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
     ----------
     folder : path
         Made if it is not there. An earlier truth in it is replaced once the new one is complete.
-    number : int
-        1 to 6.
+    patient : int or VirtualPatient
+        1 to 6, or one that `drawn_patient` gives.
     seed : int
         Draws the noise of CT, landmarks and scan.
     edge_length : float, mm
@@ -196,7 +213,8 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
     >>> import cmfsim
     >>> case = cmfsim.write_virtual_patient("P1", 1)  # doctest: +SKIP
     """
-    patient = patient_named(number)
+    if not isinstance(patient, VirtualPatient):
+        patient = patient_named(patient)
     for name, value in (("edge_length", edge_length), ("spacing", spacing), ("grid", grid)):
         as_positive(name, value)
     as_positive("skin_spacing", skin_spacing)
@@ -236,12 +254,13 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
         smooth=SCAN_SMOOTH,
         seed=[seed, patient.number, SCAN_DRAW],
     )
+    write_surface(folder / SKIN, truth.skin_before)
     fresh = folder / f".{TRUTH}.new"
     shutil.rmtree(fresh, ignore_errors=True)
     _write_truth(fresh, truth, scan, after)
     record = {
         "what": "in silico: a head made by code and an operation computed; no patient",
-        "settings": _settings(patient, seed, edge_length, spacing),
+        "settings": patient_settings(patient, seed, edge_length, spacing),
         "patient": _described(patient),
         "motions": {name: matrix.tolist() for name, matrix in truth.motions.items()},
         "noise_mm": {
@@ -251,9 +270,15 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
             "scan_smooth": SCAN_SMOOTH,
         },
         "truth": _measured(truth),
-        "seconds": time.perf_counter() - begun,
         "versions": {"cmfsim": __version__, "python": platform.python_version()},
     }
+    times = {
+        "seconds": time.perf_counter() - begun,
+        "solve_seconds": truth.equilibrium.seconds,
+    }
+    # Apart from the rest, which the same seed gives again to the last byte.
+    with replacing(fresh / TIMES) as file:
+        file.write(json.dumps(times, indent=1, allow_nan=False).encode())
     with replacing(fresh / RECORD) as file:
         file.write(json.dumps(record, indent=1, allow_nan=False).encode())
     shutil.rmtree(folder / TRUTH, ignore_errors=True)
@@ -325,11 +350,16 @@ def _motion_lines(move: Relocation, skull: Mapping[str, Floats]) -> list[str]:
     return lines
 
 
-def _settings(
+def patient_settings(
     patient: VirtualPatient, seed: int, edge_length: float, spacing: float
 ) -> dict[str, Any]:
-    """What decides the files of a patient."""
+    """What decides the files of a patient: kept in `truth.json`, and compared with it."""
+    # A drawn person is who the distributions of this version make of a number.
+    # Through JSON, so that tuples equal the lists that are read again.
+    drawn = patient.number > DRAWN
+    person = {"person": json.loads(json.dumps(_described(patient)))} if drawn else {}
     return {
+        **person,
         "version": __version__,
         "patient": patient.number,
         "seed": int(seed),
@@ -347,6 +377,8 @@ def _described(patient: VirtualPatient) -> dict[str, Any]:
         "muscle_stiffness": patient.muscle_stiffness,
         "osteotomies": list(patient.osteotomies),
         "plan": {name: asdict(move) for name, move in patient.plan.items()},
+        "departures": {name: asdict(move) for name, move in patient.departures.items()},
+        "thickness_change": patient.thickness_change,
     }
 
 
@@ -371,7 +403,6 @@ def _measured(truth: PostoperativeTruth) -> dict[str, Any]:
         "residual": found.residual,
         "newton_iterations": len(found.history),
         "linear_iterations": found.linear_iterations,
-        "solve_seconds": found.seconds,
         "energy_Nmm": found.energy,
         "penetration_mm": truth.penetration,
         "last_skin_step_mm": truth.last_step,
@@ -401,7 +432,7 @@ def _write_truth(
         )
 
 
-def _is_made(folder: Path, settings: Mapping[str, Any]) -> bool:
+def is_made(folder: Path, settings: Mapping[str, Any]) -> bool:
     """Whether a patient of these settings is there, complete."""
     record = folder / TRUTH / RECORD
     if not record.exists() or not (folder / "case.toml").exists():

@@ -7,9 +7,12 @@ from types import MappingProxyType
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import HeadParameters
 
-__all__ = ["PATIENTS", "Relocation", "VirtualPatient", "patient_named"]
+__all__ = ["DRAWN", "PATIENTS", "Relocation", "VirtualPatient", "patient_named"]
 
 Triple = tuple[float, float, float]
+
+# Numbers above this are of patients drawn at random.
+DRAWN = 1000
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,11 @@ class VirtualPatient:
     separate_lips : bool
         Whether the true lips are separate down to the teeth and touch each other. Otherwise they
         are one behind the slit that the skin shows, as on a CT.
+    departures : mapping of str to Relocation
+        By segment, how the operation departs from the plan, on top of it. The case file has the
+        plan alone.
+    thickness_change : float
+        Share of its depth by which the soft tissue is thicker after the operation.
     """
 
     number: int
@@ -63,14 +71,17 @@ class VirtualPatient:
     osteotomies: tuple[str, ...]
     plan: Mapping[str, Relocation] = field(default_factory=dict)
     separate_lips: bool = False
+    departures: Mapping[str, Relocation] = field(default_factory=dict)
+    thickness_change: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "plan", MappingProxyType(dict(self.plan)))
+        for name in ("plan", "departures"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
     @property
     def name(self) -> str:
-        """P1 to P6."""
-        return f"P{self.number}"
+        """P1 to P6, or D001 and so on if drawn at random."""
+        return f"D{self.number - DRAWN:03d}" if self.number > DRAWN else f"P{self.number}"
 
 
 _BOTH_JAWS = ("le_fort_1", "bsso")

@@ -7,16 +7,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim._core import TetMesh
+from cmfsim._core import Surface, TetMesh
 from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError
+from cmfsim.evaluation.unmoved import thickened as moved_outward
+from cmfsim.extras import third_party
 from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
 from cmfsim.pipeline.building import build_model
 from cmfsim.progress import Progress, no_progress
+from cmfsim.surfaces.depth import tissue_depth
 from cmfsim.surfaces.topology import tet_bodies
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.motion import rigid_motion
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.body import HyperelasticBody
@@ -52,6 +56,8 @@ BEYOND_OPEN_BITE = 4.0
 ABOVE_NASION = 20.0
 # Parts of the motion where lips may meet.
 STEPS_WITH_LIPS = 6
+# Tissue that becomes thicker or thinner, mm: below lie cartilage (nose), eye, muscle and airway.
+MOST_SWELLING = 12.0
 # Nodes within this distance from the skin lie on it, mm.
 NEAR_SKIN = 0.5
 
@@ -74,7 +80,8 @@ class PostoperativeTruth:
     segments : mapping of str to BoneSegment
         Before it.
     motions : mapping of str to (4, 4) float64, mm
-        Of every segment; those that stay have the identity.
+        Of every segment, as it was operated: the plan with the patient's departures from it. Those
+        that stay have the identity.
     equilibrium : Equilibrium
     operation : Operation
     volume_ratios : (m,) float64
@@ -124,10 +131,11 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
 ) -> PostoperativeTruth:
     """The face after the operation of a case, by other means than those that are tested on it.
 
-    Bones are cut and moved exactly as the case says. All else is the person's own: anatomy from
-    level functions instead of a segmented CT, a mesh of its own edge length, the true muscles,
-    hyperelastic tissue without small-strain limit, contact that pushes and never pulls, periosteum
-    stripped at the cuts, no tissue between the tooth rows.
+    Bones are cut as the case says, and moved as it says but for the patient's departures from the
+    plan. All else is the person's own: anatomy from level functions instead of a segmented CT, a
+    mesh of its own edge length, the true muscles, hyperelastic tissue without small-strain limit,
+    contact that pushes and never pulls, periosteum stripped at the cuts, no tissue between the
+    tooth rows, skin that swells.
 
     Parameters
     ----------
@@ -173,7 +181,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
         anatomy = with_open_mouth(head, anatomy, bite)
     model = build_model(fine, progress=progress, check=False, anatomy=anatomy)
     segments = {segment.name: segment for segment in model.segments}
-    motions = {name: _motion(case, name) for name in segments}
+    motions = {name: _departure(patient, head, name) @ _motion(case, name) for name in segments}
 
     stage("opening bite and cuts")
     distances = bone_distances(np.asarray(model.scene.nodes), segments)
@@ -218,10 +226,13 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
 
     stage("carrying the skin along")
     before = head.surface("skin", skin_spacing)
-    places = np.asarray(before.vertices)
+    places, names = np.asarray(before.vertices), list(head.skin_landmarks)
+    points = np.array([head.skin_landmarks[name] for name in names])
     after = places + carried(places, nodes, tets, found.displacements)
-    names, points = list(head.skin_landmarks), np.array(list(head.skin_landmarks.values()))
     moved = points + carried(points, nodes, tets, found.displacements)
+    if patient.thickness_change:
+        outward = _outward(patient, before, after, segments)
+        after, moved = after + outward, moved + outward[_nearest(points, places)]
     on_skin = np.abs(anatomy.skin.sample(nodes)) < NEAR_SKIN
     return PostoperativeTruth(
         nodes=nodes,
@@ -252,6 +263,34 @@ def _motion(case: Case, segment: str) -> Floats:
             f"{case.where(f'plan.{segment}')}: a rigid motion in numbers is needed"
         )
     return motion.matrix
+
+
+def _departure(patient: VirtualPatient, head: PhantomHead, segment: str) -> Floats:
+    """What the operation adds to the planned motion of a segment, (4, 4) mm."""
+    error = patient.departures.get(segment)
+    if error is None:
+        return np.eye(4)
+    centre = head.skull_landmarks[error.centre]
+    return rigid_motion(error.translation, error.angle, error.axis, centre)
+
+
+def _nearest(points: Floats, places: Floats) -> NDArray[np.intp]:
+    """The place that lies nearest to each point."""
+    spatial = third_party("scipy.spatial", "virtual patients are made", "study")
+    return np.asarray(spatial.cKDTree(places).query(points)[1])
+
+
+def _outward(
+    patient: VirtualPatient,
+    before: SurfaceData,
+    after: Floats,
+    segments: Mapping[str, BoneSegment],
+) -> Floats:
+    """How far each vertex of the skin goes outward by a share of the tissue's depth, (v, 3) mm."""
+    depth = tissue_depth(before.vertices, [segment.surface for segment in segments.values()])
+    depth = np.minimum(depth, MOST_SWELLING)
+    skin = Surface(before.vertices, before.triangles)
+    return moved_outward(skin, after, patient.thickness_change * depth) - after
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,6 +52,7 @@ def test_the_twin_is_complete_and_says_what_it_is(twin):
         "ct.nrrd",
         "skull.mrk.json",
         "skin.mrk.json",
+        "skin.ply",
         "truth/skin.ply",
         "truth/skin_exact.ply",
         "truth/skin_before.ply",
@@ -59,6 +60,7 @@ def test_the_twin_is_complete_and_says_what_it_is(twin):
         "truth/skin_exact.mrk.json",
         "truth/skull_exact.mrk.json",
         "truth/truth.json",
+        "truth/times.json",
         *(f"truth/bones/{name}.ply" for name in bones),
         *(f"truth/bones_before/{name}.ply" for name in bones),
     }

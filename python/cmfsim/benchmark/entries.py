@@ -1,0 +1,194 @@
+"""The package's own entries: their predictions of a part of a population, made once."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from cmfsim.benchmark.least_squares import learn_face
+from cmfsim.benchmark.patients import BenchmarkPatient
+from cmfsim.benchmark.ratios import predict_by_ratios
+from cmfsim.benchmark.skin_predictions import (
+    SkinPrediction,
+    read_skin_prediction,
+    write_skin_prediction,
+)
+from cmfsim.checks import Floats
+from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.io import replacing
+from cmfsim.pipeline.predicting import predict_models
+from cmfsim.values.prediction import MODELS
+
+__all__ = [
+    "ENTRIES",
+    "FAILURE",
+    "LEARNED",
+    "NO_CHANGE",
+    "EntryFolder",
+    "learned_entries",
+    "patient_entries",
+    "times_of",
+]
+
+NO_CHANGE, RATIOS, LEARNED = "no-change", "ratios", "pls"
+ENTRIES = (NO_CHANGE, RATIOS, LEARNED, *MODELS)
+FAILURE = ".failed.json"
+TIMES = ".seconds"
+
+
+@dataclass(frozen=True)
+class EntryFolder:
+    """Where the predictions of a population are.
+
+    Attributes
+    ----------
+    folder : Path
+        `predictions`; a method has a folder in it.
+    """
+
+    folder: Path
+
+    def file(self, method: str, patient: str, ending: str = ".npz") -> Path:
+        """The file of a method and a patient."""
+        return self.folder / method / f"{patient}{ending}"
+
+    def is_made(self, method: str, patient: str, made_from: str) -> bool:
+        """Whether a prediction, or its failure, was made from the same."""
+        file, failure = (self.file(method, patient, ending) for ending in (".npz", FAILURE))
+        if failure.exists():
+            return bool(json.loads(failure.read_text("utf-8")).get("made_from") == made_from)
+        return file.exists() and read_skin_prediction(file).made_from == made_from
+
+    def put(self, method: str, patient: BenchmarkPatient, moves: Floats, made_from: str) -> None:
+        """Writes a prediction in place of an earlier one or its failure."""
+        self.file(method, patient.name, FAILURE).unlink(missing_ok=True)
+        prediction = SkinPrediction(patient.skin, moves, made_from=made_from)
+        write_skin_prediction(self.file(method, patient.name), prediction)
+
+    def fail(self, method: str, patient: BenchmarkPatient, reason: str, made_from: str) -> None:
+        """Records why there is no prediction."""
+        self.file(method, patient.name).unlink(missing_ok=True)
+        path = self.file(method, patient.name, FAILURE)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as file:
+            text = json.dumps({"reason": reason, "made_from": made_from}, indent=1)
+            file.write(text.encode())
+
+    def took(self, method: str, patient: str, seconds: float) -> None:
+        """Writes how long a prediction took, beside it: no part of what is the same each time."""
+        path = self.file(method, patient, TIMES)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{seconds:.3f}\n", encoding="utf-8")
+
+
+def times_of(folder: Path, method: str, patients: Sequence[str]) -> dict[str, float]:
+    """The seconds that predictions took, where that was recorded: `PATIENT.seconds`.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A file that holds no number.
+    """
+    found = {}
+    for patient in patients:
+        path = EntryFolder(folder).file(method, patient, TIMES)
+        if path.exists():
+            text = path.read_text(encoding="utf-8").strip()
+            try:
+                found[patient] = float(text)
+            except ValueError as error:
+                raise CaseInputError(f"{path}: {text[:40]!r}: seconds, a number, needed") from error
+    return found
+
+
+def patient_entries(patient: str, folder: str, methods: Sequence[str]) -> None:
+    """Makes the entries of one patient that need no other patient.
+
+    A model that fails is recorded with its reason.
+
+    Parameters
+    ----------
+    patient, folder : str
+        The patient's folder, and that of all predictions.
+    methods : sequence of str
+    """
+    _entries_of(BenchmarkPatient(Path(patient).name, Path(patient)), Path(folder), methods)
+
+
+def _entries_of(patient: BenchmarkPatient, folder: Path, methods: Sequence[str]) -> None:
+    place, made_from = EntryFolder(folder), patient.digest()
+    simple: Mapping[str, Callable[[BenchmarkPatient], Floats]] = {
+        NO_CHANGE: lambda p: np.zeros_like(p.skin),
+        RATIOS: predict_by_ratios,
+    }
+    wanted = [m for m in methods if not place.is_made(m, patient.name, made_from)]
+    for method in (m for m in wanted if m in simple):
+        begun = time.perf_counter()
+        place.put(method, patient, simple[method](patient), made_from)
+        place.took(method, patient.name, time.perf_counter() - begun)
+    models = [m for m in wanted if m in MODELS]
+    if models:
+        _by_models(patient, place, models, made_from)
+
+
+def _by_models(
+    patient: BenchmarkPatient, place: EntryFolder, models: Sequence[str], made_from: str
+) -> None:
+    """The mechanical models: the patient is built once, and its time counts for each of them."""
+    failed: dict[str, CmfsimError] = {}
+    # The truth is not even opened.
+    case = replace(patient.case, postoperative=None)
+    begun = time.perf_counter()
+    built = None
+    try:
+        for prediction in predict_models(case, models, check=False, failed=failed):
+            now = time.perf_counter()
+            solved = float(prediction.summary["timings"]["solving"])
+            built = now - begun - solved if built is None else built
+            moves = prediction.carried(patient.skin)
+            place.put(prediction.model, patient, moves, made_from)
+            place.took(prediction.model, patient.name, built + solved)
+    except CmfsimError as error:
+        # Of building, or of a kind that the next model would meet as well.
+        for model in models:
+            if not place.is_made(model, patient.name, made_from):
+                failed.setdefault(model, error)
+    for model, reason in failed.items():
+        place.fail(model, patient, str(reason), made_from)
+
+
+def learned_entries(
+    training: Sequence[BenchmarkPatient], patients: Sequence[BenchmarkPatient], folder: Path
+) -> None:
+    """Makes the learned entry for patients, none of whom is in the training.
+
+    Where there is nothing to learn from, that is recorded as its failure.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A patient of the training is to be predicted.
+    """
+    both = {patient.name for patient in training} & {patient.name for patient in patients}
+    if both:
+        raise CaseInputError(f"{', '.join(sorted(both))}: learned from, and not to be predicted")
+    taught = hashlib.sha256("".join(p.digest(truth=True) for p in training).encode()).hexdigest()
+    place = EntryFolder(folder)
+    made_from = {patient.name: f"{taught} {patient.digest()}" for patient in patients}
+    wanted = [p for p in patients if not place.is_made(LEARNED, p.name, made_from[p.name])]
+    if not wanted:
+        return
+    try:
+        learned = learn_face(training)
+    except CmfsimError as error:
+        for patient in wanted:
+            place.fail(LEARNED, patient, str(error), made_from[patient.name])
+        return
+    for patient in wanted:
+        begun = time.perf_counter()
+        place.put(LEARNED, patient, learned.predict(patient), made_from[patient.name])
+        place.took(LEARNED, patient.name, time.perf_counter() - begun)

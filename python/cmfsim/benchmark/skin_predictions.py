@@ -1,0 +1,149 @@
+"""What a method enters: a displacement for each vertex of a patient's skin, in one `.npz` file."""
+
+import os
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim.checks import Floats, as_rows
+from cmfsim.errors import CaseInputError
+from cmfsim.io.files import check_readable, named, replacing
+
+__all__ = ["SkinPrediction", "read_skin_prediction", "write_skin_prediction"]
+
+# Vertices of a prediction may differ by this from those of the patient's skin, mm: they are written
+# in single precision.
+SAME_PLACE = 0.01
+# No operation on the jaws moves skin farther, mm: a displacement beyond it has another unit, or is
+# the moved vertex itself.
+LARGEST_MOVE = 60.0
+MEMBERS = {"vertices", "displacement", "half_width", "made_from"}
+
+
+@dataclass(frozen=True, eq=False)
+class SkinPrediction:
+    """How a method has a patient's skin move.
+
+    Attributes
+    ----------
+    vertices : (v, 3) float64, mm
+        Of `PATIENT/skin.ply`, in its order.
+    displacement : (v, 3) float64, mm
+    half_width : (v,) float64, mm, or None
+        Of a band along the normal, which the method states to hold 90 % of patients in each region
+        of the face. NaN where it states none.
+    made_from : str
+        What the package's own entries were made from, so that they are not made again; empty in
+        others.
+    """
+
+    vertices: Floats
+    displacement: Floats
+    half_width: Floats | None = None
+    made_from: str = ""
+
+    def __post_init__(self) -> None:
+        places = as_rows("vertices", self.vertices, 3)
+        moves = as_rows("displacement", self.displacement, 3)
+        if len(places) != len(moves):
+            raise CaseInputError(f"{len(moves)} displacements for {len(places)} vertices")
+        length = np.linalg.norm(moves, axis=1)
+        most = int(length.argmax()) if len(length) else 0
+        if len(length) and length[most] > LARGEST_MOVE:
+            raise CaseInputError(
+                f"displacement[{most}] is {length[most]:.0f} mm long: up to {LARGEST_MOVE:g} mm is "
+                "allowed. Write mm, and where vertices move by, not where they move to"
+            )
+        object.__setattr__(self, "vertices", places)
+        object.__setattr__(self, "displacement", moves)
+        if self.half_width is not None:
+            object.__setattr__(self, "half_width", _half_width(self.half_width, len(places)))
+
+    def check_vertices(self, skin: ArrayLike) -> None:
+        """Refuses a prediction of another skin, or of the same in another order.
+
+        Raises
+        ------
+        CaseError
+            (also `ValueError`) Names the first vertex that lies elsewhere.
+        """
+        places = as_rows("skin", skin, 3)
+        if len(places) != len(self.vertices):
+            raise CaseInputError(
+                f"{len(self.vertices)} vertices, the patient's skin.ply has {len(places)}: was the "
+                "population made again, with another seed or resolution?"
+            )
+        away = np.linalg.norm(self.vertices - places, axis=1)
+        bad = np.flatnonzero(away > SAME_PLACE)
+        if len(bad):
+            raise CaseInputError(
+                f"vertices[{bad[0]}] lies {away[bad[0]]:.2f} mm from that of the patient's "
+                f"skin.ply ({SAME_PLACE:g} mm is allowed): give the vertices of that file, before "
+                "the operation, in its order"
+            )
+
+
+def _half_width(values: ArrayLike, count: int) -> Floats:
+    widths = np.asarray(values, dtype=np.float64)
+    if widths.shape != (count,):
+        raise CaseInputError(f"half_width has shape {widths.shape}: ({count},) is needed")
+    bad = np.flatnonzero(widths < 0.0)
+    if len(bad):
+        raise CaseInputError(f"half_width[{bad[0]}] is {widths[bad[0]]:g} mm: 0 or more is needed")
+    return widths
+
+
+def write_skin_prediction(path: str | os.PathLike[str], prediction: SkinPrediction) -> None:
+    """Writes a prediction as `.npz`, in single precision: the same bytes for the same prediction.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    place = Path(path)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    arrays = {
+        "vertices": prediction.vertices.astype(np.float32),
+        "displacement": prediction.displacement.astype(np.float32),
+    }
+    if prediction.half_width is not None:
+        arrays["half_width"] = prediction.half_width.astype(np.float32)
+    if prediction.made_from:
+        arrays["made_from"] = np.array(prediction.made_from)
+    with replacing(place) as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def read_skin_prediction(path: str | os.PathLike[str]) -> SkinPrediction:
+    """The prediction of a `.npz` file.
+
+    Raises
+    ------
+    FileNotFoundError
+    CaseError
+        (also `ValueError`) No such archive, an array that is missing, unknown or not of its shape,
+        a displacement that is no number, or too long: with file, index and value.
+    """
+    place = Path(path)
+    check_readable(place)
+    with named(place):
+        try:
+            with np.load(place, allow_pickle=False) as archive:
+                unknown = set(archive.files) - MEMBERS
+                missing = {"vertices", "displacement"} - set(archive.files)
+                if unknown or missing:
+                    raise CaseInputError(
+                        f"has {', '.join(sorted(archive.files))}: vertices and displacement are "
+                        "needed, half_width may be there"
+                    )
+                found = {name: archive[name] for name in archive.files}
+        except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+            if isinstance(error, CaseInputError):
+                raise
+            raise CaseInputError(f"is no .npz archive of arrays: {error}") from error
+        made_from = str(found.pop("made_from", ""))
+        return SkinPrediction(**found, made_from=made_from)

@@ -1,0 +1,85 @@
+"""The options of `cmfsim virtual-patients` and `cmfsim benchmark`."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from cmfsim.benchmark.entries import ENTRIES
+from cmfsim.cli import benchmark_command, virtual_patients_command
+from cmfsim.io.populations import PARTS, TEST
+
+__all__ = ["add_population_commands"]
+
+
+def add_population_commands(commands: Any, common: argparse.ArgumentParser) -> None:
+    """Adds both commands."""
+    virtual = commands.add_parser(
+        "virtual-patients",
+        parents=[common],
+        help="write virtual patients with the face after their operation (in silico)",
+        epilog="Existing patients with the same settings are kept.",
+    )
+    virtual.add_argument("folder", metavar="FOLDER", type=Path, help="output folder")
+    virtual.add_argument(
+        "--patients",
+        metavar="N",
+        type=int,
+        nargs="+",
+        help="patients, 1 to 6 (default 1 to 4; the lips of 5 and 6 touch, which takes longer)",
+    )
+    virtual.add_argument(
+        "--count",
+        metavar="N",
+        type=int,
+        help="instead of named ones, N patients drawn at random: shape, tissue, operation, plan",
+    )
+    virtual.add_argument(
+        "--workers",
+        metavar="N",
+        type=int,
+        default=1,
+        help="drawn patients made at a time, a process each (default 1)",
+    )
+    virtual.add_argument("--seed", metavar="N", type=int, default=0, help="random seed (default 0)")
+    virtual.add_argument(
+        "--edge-length",
+        metavar="H",
+        type=float,
+        default=6.0,
+        help="edge length of the true mesh, mm (default 6)",
+    )
+    virtual.add_argument(
+        "--spacing", metavar="MM", type=float, default=2.0, help="CT voxel size (default 2)"
+    )
+    virtual.set_defaults(run=virtual_patients_command.virtual_patients)
+
+    benchmark = commands.add_parser(
+        "benchmark",
+        parents=[common],
+        help="score predictions of a population of virtual patients, by method and region",
+        epilog="A method enters with predictions/METHOD/PATIENT.npz (docs/benchmark.md). Results "
+        "are in FOLDER/benchmark, the same bytes each time but for the run times.",
+    )
+    benchmark.add_argument(
+        "folder", metavar="FOLDER", type=Path, help="written by virtual-patients --count"
+    )
+    benchmark.add_argument(
+        "--entries",
+        metavar="ENTRY",
+        nargs="*",
+        choices=ENTRIES,
+        default=list(ENTRIES),
+        help=f"entries of this package to predict first, none if empty (default all: "
+        f"{' '.join(ENTRIES)})",
+    )
+    benchmark.add_argument(
+        "--part", choices=PARTS, default=TEST, help="patients to score (default test)"
+    )
+    benchmark.add_argument(
+        "--workers",
+        metavar="N",
+        type=int,
+        default=1,
+        help="patients predicted at a time, a process each (default 1)",
+    )
+    benchmark.set_defaults(run=benchmark_command.benchmark)

@@ -1,0 +1,193 @@
+"""Virtual patients drawn at random: shape, tissue, operation, plan and how it is carried out.
+
+docs/virtual_patients.md has the distributions with where they come from. A patient depends on seed
+and index alone, so that a population may be made in any order, in parts, and extended.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from cmfsim.checks import as_number
+from cmfsim.errors import CaseInputError
+from cmfsim.phantom import HeadParameters
+from cmfsim.solving.uncertainty import ADDED, PLAN
+from cmfsim.virtual.people import DRAWN, Relocation, VirtualPatient
+
+__all__ = ["drawn_patient"]
+
+# Mean, standard deviation and largest departure from the mean.
+Distribution = tuple[float, float, float]
+
+# Osteotomies, and the share of patients who have them.
+OPERATIONS = (
+    (("le_fort_1", "bsso"), 0.5),
+    (("bsso",), 0.25),
+    (("le_fort_1", "bsso", "genioplasty"), 0.15),
+    (("le_fort_1",), 0.1),
+)
+LABELS: Mapping[str, str] = {"le_fort_1": "Mx", "bsso": "M", "genioplasty": "G"}
+# By how much the mandible of a patient is too long or too short, mm; half of them each.
+DISCREPANCY: Distribution = (4.0, 1.2, 2.0)
+# What a plan moves, mm.
+MAXILLA_FORWARDS: Distribution = (4.0, 1.9, 3.0)
+MAXILLA_UP: Distribution = (0.5, 1.5, 3.0)
+CHIN_FORWARDS: Distribution = (3.0, 1.5, 3.0)
+# Of the mandible, beyond what corrects its length, and the share of the maxilla's way that it
+# follows.
+MANDIBLE_BEYOND: Distribution = (0.0, 1.0, 2.0)
+MANDIBLE_UP: Distribution = (0.5, 0.5, 1.0)
+FOLLOWS = 0.5
+# Share of the patients whose mandible is too long.
+LONGER = 0.5
+# Turns about the transverse axis, degrees.
+PITCH: Distribution = (0.0, 1.5, 3.0)
+# The shortest way of a mandible that is operated, mm.
+LEAST_WAY = 2.0
+# Of the logarithm of what sets a person's muscles apart from the phantom's.
+MUSCLE_THICKNESS: Distribution = (0.0, 0.12, 0.25)
+MUSCLE_STIFFNESS: Distribution = (0.0, 0.5, 1.0)
+# Between the lips, mm, as in a patient who is scanned at rest; and between the teeth.
+LIP_GAP: Distribution = (2.0, 0.5, 1.0)
+BITE_GAP = 2.5
+# Errors of the execution are cut at so many standard deviations: beyond, it is another operation.
+MOST_ERRORS = 2.0
+# Of a chin beside the jaw that it is cut from, mm along each axis.
+CHIN_ERROR = 0.5
+# Of the soft tissue, as a share of its depth.
+THICKNESS_CHANGE = next(source.sd for source in ADDED if source.name == "thickness change")
+# The share of a `HeadParameters` range, about its middle, that is drawn from: at the ends of
+# several ranges at once no person is.
+MIDDLE = 0.7
+SHAPES = (
+    "scale",
+    "face_height",
+    "nose_length",
+    "nose_projection",
+    "lip_fullness",
+    "chin_projection",
+    "jaw_width",
+    "fat_thickness",
+    "asymmetry",
+)
+
+
+class _Draws:
+    """The random numbers of one patient."""
+
+    def __init__(self, seed: int, index: int) -> None:
+        self.generator = np.random.default_rng([seed, index])
+
+    def within(self, distribution: Distribution) -> float:
+        """A normal draw, cut at the largest departure, rounded as a plan is written."""
+        mean, sd, most = distribution
+        off = float(np.clip(sd * self.generator.standard_normal(), -most, most))
+        return round(mean + off, 2)
+
+    def error(self, sd: float) -> float:
+        """A normal draw about zero."""
+        return self.within((0.0, sd, MOST_ERRORS * sd))
+
+
+def drawn_patient(seed: int, index: int) -> VirtualPatient:
+    """The patient of an index in the population of a seed.
+
+    Parameters
+    ----------
+    seed : int
+        0 or more.
+    index : int
+        1 or more; the patient is called D and this number.
+
+    Returns
+    -------
+    VirtualPatient
+        The same for the same seed and index, whatever else is drawn.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A seed or index that is no whole number of its range.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.drawn_patient(0, 1) == cmfsim.drawn_patient(0, 1)
+    True
+    """
+    for name, value, least in (("seed", seed, 0), ("index", index, 1)):
+        if as_number(name, value) < least or int(value) != value:
+            raise CaseInputError(f"{name} is {value!r}: a whole number from {least} is needed")
+    draws = _Draws(int(seed), int(index))
+    shares = np.array([share for _, share in OPERATIONS])
+    osteotomies = OPERATIONS[int(draws.generator.choice(len(OPERATIONS), p=shares))][0]
+    person = _person(draws, only_maxilla=osteotomies == ("le_fort_1",))
+    plan = _plan(draws, person, osteotomies)
+    return VirtualPatient(
+        DRAWN + int(index),
+        ", ".join(LABELS[procedure] for procedure in osteotomies),
+        person,
+        round(float(np.exp(draws.within(MUSCLE_THICKNESS))), 3),
+        round(float(np.exp(draws.within(MUSCLE_STIFFNESS))), 3),
+        osteotomies,
+        plan,
+        departures=_departures(draws, plan),
+        thickness_change=round(0.01 * draws.error(100.0 * THICKNESS_CHANGE), 4),
+    )
+
+
+def _person(draws: _Draws, *, only_maxilla: bool) -> HeadParameters:
+    """A head whose jaws do not meet."""
+    extreme = HeadParameters.random(int(draws.generator.integers(2**31)))
+    ordinary = HeadParameters()
+    values = {}
+    for name in SHAPES:
+        middle = getattr(ordinary, name)
+        values[name] = round(middle + MIDDLE * (getattr(extreme, name) - middle), 4)
+    longer = bool(draws.generator.random() < LONGER)
+    excess = draws.within(DISCREPANCY)
+    # A maxilla is advanced by itself where the mandible is the longer one.
+    values["mandible_advance"] = excess if longer or only_maxilla else -excess
+    return replace(ordinary, **values, lip_gap=draws.within(LIP_GAP), bite_gap=BITE_GAP)
+
+
+def _plan(
+    draws: _Draws, person: HeadParameters, osteotomies: tuple[str, ...]
+) -> dict[str, Relocation]:
+    """What a planner would make of the person."""
+    plan = {}
+    forwards, up, pitch = (draws.within(d) for d in (MAXILLA_FORWARDS, MAXILLA_UP, PITCH))
+    if "le_fort_1" in osteotomies:
+        plan["maxilla"] = Relocation((0.0, -forwards, up), pitch)
+    follow = FOLLOWS * forwards if "maxilla" in plan else 0.0
+    back = person.mandible_advance - follow + draws.within(MANDIBLE_BEYOND)
+    back = round(float(np.copysign(max(abs(back), LEAST_WAY), back)), 2)
+    up, pitch = draws.within(MANDIBLE_UP), draws.within(PITCH)
+    left = round(-person.asymmetry, 2)
+    if "bsso" in osteotomies:
+        plan["mandible_body"] = Relocation((left, back, up), pitch, centre="infradentale")
+    chin = draws.within(CHIN_FORWARDS)
+    if "genioplasty" in osteotomies:
+        # With the body of the mandible, and further forward.
+        way = (left, round(back - chin, 2), up)
+        plan["chin"] = Relocation(way, pitch, centre="infradentale")
+    return plan
+
+
+def _departures(draws: _Draws, plan: Mapping[str, Relocation]) -> dict[str, Relocation]:
+    """How the operation departs from the plan.
+
+    Jaws that are both operated are off together: a splint holds them in occlusion.
+    """
+    left, back, up, pitch, roll, yaw = (draws.error(source.sd) for source in PLAN)
+    angle = float(np.linalg.norm([pitch, roll, yaw]))
+    axis = (pitch / angle, roll / angle, yaw / angle) if angle > 0.0 else (1.0, 0.0, 0.0)
+    centre = "supradentale" if "maxilla" in plan else "infradentale"
+    both = Relocation((left, back, up), angle, axis, centre)
+    found = {name: both for name in plan if name != "chin"}
+    own = [draws.error(CHIN_ERROR) for _ in range(3)]
+    if "chin" in plan:
+        way = (left + own[0], back + own[1], up + own[2])
+        found["chin"] = replace(both, translation=way)
+    return found
