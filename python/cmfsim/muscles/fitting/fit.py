@@ -250,7 +250,7 @@ def _samples(index: int, muscle: MuscleSurface) -> Floats:
     edge = (abs(volume) / SAMPLES) ** (1.0 / 3.0)
     # One point at random in each cell of a grid.
     cells = np.maximum(np.ceil((high - low) / edge).astype(int), 1)
-    corners = np.stack(np.indices(cells), axis=-1).reshape(-1, 3)
+    corners = np.indices(cells.tolist()).reshape(3, -1).T
     places = corners + np.random.default_rng(index).random(corners.shape)
     points = low + places * (high - low) / cells
     inside = np.abs(np.asarray(surface.winding_number(points))) > 0.5

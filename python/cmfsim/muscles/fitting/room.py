@@ -18,6 +18,8 @@ __all__ = ["Room"]
 SPACING = 1.5
 # How far round the muscles the room is known, mm: further than any of them is moved.
 MARGIN = 12.0
+# Voxels from the surface in which levels refine its distance; further off they are clipped.
+NEAR = 2.5
 # Where the outermost slice of the head is larger than this part of its largest, the head was cut
 # there: by the end of the scan, or of the surface. Crown, nose and chin end in a point.
 CUT_SHARE = 0.3
@@ -118,8 +120,8 @@ def _resampled(level: ImageData, axes: list[Floats]) -> NDArray[np.float32]:
 def _distance(level: NDArray[np.float32]) -> NDArray[np.float32]:
     """Distance to where a level is positive, mm; negative there.
 
-    Voxels next to the surface measure where the level crosses zero on the way to their neighbours;
-    the others measure the distance to those.
+    Near the surface the level by its gradient, as far as that agrees with the distance between
+    voxels to half a voxel; that distance elsewhere.
     """
     closed = np.ascontiguousarray(level > 0.0)
     if closed.all() or not closed.any():
@@ -127,12 +129,12 @@ def _distance(level: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.full(level.shape, -far if closed.all() else far, dtype=np.float32)
     size = (SPACING,) * 3
     apart = _core.distance_image(closed, size) - _core.distance_image(~closed, size)
-    # From centre to centre: the surface is half a voxel nearer on either side.
+    # From centre to centre: the surface is half a voxel nearer on either side, give or take a half.
     rough = apart - 0.5 * SPACING * np.sign(apart)
     gradient = np.sqrt(sum(np.gradient(level, SPACING, axis=a) ** 2 for a in range(3)))
-    near = np.abs(apart) < 1.5 * SPACING
+    near = np.abs(apart) < NEAR * SPACING
     fine = -level / np.maximum(gradient, np.finfo(np.float32).eps)
-    limit = SPACING
+    limit = 0.5 * SPACING
     distance = np.where(near, np.clip(fine, rough - limit, rough + limit), rough)
     # The level alone tells the side.
     wrong = (distance > 0.0) == closed
