@@ -302,7 +302,7 @@ def tissue_of(table: Table) -> TissueData:
 
 def muscles_of(table: Table, folder: Path) -> CaseMuscles:
     """A template's name is that of one in the package; a path leads to a folder."""
-    settings = ("template", "smoothing", "preset", "mixing", "samples", "seed")
+    settings = ("template", "smoothing", "fit", "preset", "mixing", "samples", "seed")
     table.only(*settings, *MODULI, "moduli")
     default = CaseMuscles()
     template: Path | str = table.text("template", str(default.template))
@@ -317,6 +317,7 @@ def muscles_of(table: Table, folder: Path) -> CaseMuscles:
         table.whole("samples", default.samples, *SAMPLES),
         table.whole("seed", default.seed, 0, 2**63 - 1),
         _muscle_moduli(table),
+        table.flag("fit", default=default.fit),
     )
 
 

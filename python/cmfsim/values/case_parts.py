@@ -437,6 +437,8 @@ class CaseMuscles:
     seed : int
     moduli : TissueModuli
         Of muscles, instead of the preset's; those of fat come from the case's `[tissue]`.
+    fit : bool
+        Whether muscles are moved out of bone, air and skin once landmarks have placed them.
 
     Examples
     --------
@@ -452,6 +454,7 @@ class CaseMuscles:
     samples: int = 64
     seed: int = 0
     moduli: TissueModuli = field(default_factory=TissueModuli)
+    fit: bool = True
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,12 @@ __all__ = ["FindingGroup", "counted", "grouped"]
 # What several findings of one code have in common. Others are stated by the worst of them.
 TITLES: Mapping[str, str] = {
     "muscle-cut-off": "{n} muscles partly outside the tissue",
+    "muscle-does-not-fit": "{n} muscles do not fit into the tissue",
     "muscle-inside-out": "{n} muscle surfaces were inside out and were turned",
     "muscle-missed": "{n} muscles hold no sample of the tissue and have no part in it",
     "muscle-open": "{n} muscle surfaces are not closed",
     "muscle-sheet": "{n} muscles are sheets, whose outline hardly shows the direction of fibres",
+    "muscle-volume-changed": "{n} muscles changed in volume as they were moved into the tissue",
     "landmark-far": "{n} landmarks lie far from their surface",
     "surface-closed": "{n} surfaces were open and were closed",
     "surface-open": "{n} surfaces are open",

@@ -241,3 +241,21 @@ def test_what_the_solution_notices_is_a_finding_of_the_prediction(predictions, m
     assert listed.count("3 of 9 tets rest inverted") == 1
     for finding in made.patient.findings:
         assert listed.count(escape(finding.what)) == 1
+
+
+def test_muscles_are_fitted_unless_the_case_says_otherwise(predictions):
+    patient = predictions["M"].patient
+    fitted = cmfsim.with_muscles(patient, cmfsim.CaseMuscles(samples=16))
+    stated = fitted.summary["muscle_fit"]
+    assert stated["used"]
+    assert stated["outside_after"] < stated["outside_before"]
+    assert fitted.muscles.is_fitted
+    assert "fitting the muscles" in fitted.summary["timings"]
+    bare = cmfsim.with_muscles(patient, cmfsim.CaseMuscles(samples=16, fit=False))
+    assert bare.summary["muscle_fit"] is None
+    assert not bare.muscles.is_fitted
+    # The synthetic head is the template's kin: muscles lie nearly right as they are.
+    apart = np.asarray(fitted.muscles["masseter_L"].surface.vertices) - np.asarray(
+        bare.muscles["masseter_L"].surface.vertices
+    )
+    assert 0.0 < np.linalg.norm(apart, axis=1).max() < 3.0

@@ -8,6 +8,7 @@ from cmfsim._core import TetMesh
 from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
 from cmfsim.muscles.equivalent import equivalent_material
+from cmfsim.muscles.fitting import fit_muscles
 from cmfsim.muscles.mixing import MODULI_CODES
 from cmfsim.muscles.template import MuscleTemplate
 from cmfsim.values.case_parts import CaseMuscles
@@ -62,6 +63,12 @@ def with_muscles(
     begun = time.perf_counter()
     muscles = MuscleTemplate.load(given.template).morph(skull, smoothing=given.smoothing)
     placed = time.perf_counter()
+    fit = fit_muscles(muscles, patient.anatomy) if given.fit else None
+    # A head in which muscles lie right already is left alone.
+    helps = fit is not None and fit.helps
+    if fit is not None and helps:
+        muscles = fit.musculature
+    fitted = time.perf_counter()
     scene = patient.scene
     mixture = equivalent_material(
         TetMesh(scene.nodes, scene.tets) if mesh is None else mesh,
@@ -75,8 +82,10 @@ def with_muscles(
     timings = {
         **patient.summary.get("timings", {}),
         "placing the muscles": placed - begun,
-        "sampling the muscles": time.perf_counter() - placed,
+        "sampling the muscles": time.perf_counter() - fitted,
     }
+    if fit is not None:
+        timings["fitting the muscles"] = fitted - placed
     # What the doctor found already has the line of the case.
     repeated = {"template-landmarks-missing", *MODULI_CODES}
     known = {f.code for f in patient.findings} & repeated
@@ -87,6 +96,7 @@ def with_muscles(
         "timings": timings,
         "findings": [asdict(finding) for finding in findings],
         "muscles": {**asdict(given), "template": str(given.template), **mixture.summary},
+        "muscle_fit": None if fit is None else {"used": helps, **fit.summary()},
     }
     return replace(
         patient,

@@ -1,0 +1,352 @@
+"""Muscles of a template moved into the tissue of a patient, once landmarks have carried them."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import Surface
+from cmfsim.checks import Floats
+from cmfsim.errors import MeshError, MeshInputError
+from cmfsim.muscles.fitting.lattice import Lattice
+from cmfsim.muscles.fitting.room import Room
+from cmfsim.muscles.fitting.solving import Problem, Targets
+from cmfsim.muscles.fitting.volumes import Volumes
+from cmfsim.muscles.template.morphing import MorphedMusculature
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding
+from cmfsim.values.musculature import MuscleSurface
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = ["FittedMuscle", "MuscleFit", "fit_muscles"]
+
+# Spacing of the displacement's coefficients, mm: the breadth of a strap muscle. Finer, a sheet
+# follows every voxel of a wall; coarser, it cannot follow the zygomatic arch.
+SPACING = 10.0
+# One point of a muscle's surface in each cube of this edge is moved into the room, mm.
+POINT_SPACING = 3.0
+# Points by which a muscle's share outside is measured: a standard error of 2.5 % at most.
+SAMPLES = 400
+# On the template's bone, mm: as far as muscles are modelled off bone that they arise from.
+ATTACHED = 1.0
+# How deep in bone a muscle may stay that lies in the template's bone, mm: a voxel of a CT.
+MOST_DEPTH = 1.0
+# The least stretch of space that a fit may have, and the largest: beyond, it is made stiffer.
+STRETCHES = (0.5, 1.6)
+STIFFER = 3.0
+MOST_TRIES = 4
+# Change of a muscle's volume beyond which a finding says so.
+VOLUME_CHANGE = 0.05
+# Share of a muscle outside the tissue beyond which it is reported as not fitting.
+STILL_OUTSIDE = 0.15
+
+
+@dataclass(frozen=True)
+class FittedMuscle:
+    """What a fit did to one muscle.
+
+    Attributes
+    ----------
+    outside_before, outside_after : float
+        Share of its volume in bone, in air or outside the skin, where the data show the head; each
+        with a standard error of 0.02 at most.
+    unseen : float
+        Share of its volume beyond the end of the data, where nothing is known of the room.
+    volume_before, volume_after : float, mm³
+    largest_move : float, mm
+    """
+
+    outside_before: float
+    outside_after: float
+    unseen: float
+    volume_before: float
+    volume_after: float
+    largest_move: float
+
+    @property
+    def volume_change(self) -> float:
+        """The change of its volume, as a part of it."""
+        return self.volume_after / self.volume_before - 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class MuscleFit:
+    """Muscles in the tissue of a patient.
+
+    Attributes
+    ----------
+    musculature : MorphedMusculature
+        Surfaces and fibre courses moved; all else is that of the morph.
+    muscles : mapping of str to FittedMuscle
+    stretches : (2,) tuple of float
+        The least and the largest principal stretch of space at the muscles.
+    stiffness : float
+        The factor on the energy of strain that kept stretches in bounds.
+    findings : tuple of Finding
+    seconds : float
+    """
+
+    musculature: MorphedMusculature
+    muscles: Mapping[str, FittedMuscle]
+    stretches: tuple[float, float]
+    stiffness: float
+    findings: tuple[Finding, ...]
+    seconds: float
+
+    @property
+    def helps(self) -> bool:
+        """Whether less of the muscles lies outside the tissue than before, and space is whole."""
+        before, after = (_summed(self.muscles, f"outside_{w}") for w in ("before", "after"))
+        return after < before and self.stretches[0] > 0.0
+
+    def summary(self) -> dict[str, Any]:
+        """Shares, volumes and stretches as plain values: for `build.json`."""
+        return {
+            "outside_before": _summed(self.muscles, "outside_before"),
+            "outside_after": _summed(self.muscles, "outside_after"),
+            "stretches": list(self.stretches),
+            "stiffness": self.stiffness,
+            "seconds": self.seconds,
+            "muscles": {
+                name: {
+                    "outside_before": m.outside_before,
+                    "outside_after": m.outside_after,
+                    "unseen": m.unseen,
+                    "volume_change": m.volume_change,
+                    "largest_move": m.largest_move,
+                }
+                for name, m in self.muscles.items()
+            },
+        }
+
+
+def fit_muscles(morphed: MorphedMusculature, anatomy: Anatomy) -> MuscleFit:
+    """Muscles moved out of bone, air and skin, by one smooth displacement of space for all.
+
+    Points on their surfaces are drawn into the tissue, those on the template's bone to the
+    patient's bone. Space resists strain and bending, and each muscle a change of its volume. One
+    displacement for all keeps muscles apart that were; no triangle turns over as long as space does
+    not, which is checked, and the space made stiffer where it does.
+
+    Parameters
+    ----------
+    morphed : MorphedMusculature
+        What `MuscleTemplate.morph` gives, in the frame of the anatomy.
+    anatomy : Anatomy
+
+    Returns
+    -------
+    MuscleFit
+
+    Raises
+    ------
+    MeshError
+        (also `ValueError`) A muscle that is no surface.
+
+    Notes
+    -----
+    Free-form deformation by B-splines: Rueckert et al. (1999), with quadratic splines. Landmarks
+    are not held: they lie on bone, where there is no muscle.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> head = cmfsim.make_head()
+    >>> template = cmfsim.MuscleTemplate.load("default")
+    >>> muscles = template.morph(head.skull_landmarks)
+    >>> fit = cmfsim.fit_muscles(muscles, head.anatomy(3.0))  # doctest: +SKIP
+    """
+    begun = time.perf_counter()
+    vertices = np.concatenate([np.asarray(m.surface.vertices) for m in morphed.muscles])
+    volumes = Volumes.of([m.surface for m in morphed.muscles])
+    samples = [_samples(i, muscle) for i, muscle in enumerate(morphed.muscles)]
+    courses = [line for muscle in morphed.muscles for line in muscle.course]
+    lattice = Lattice.round(np.concatenate([vertices, *samples, *courses]), SPACING)
+    room = Room.of(anatomy, vertices)
+    basis = lattice.basis(vertices)
+    targets = _targets(morphed, volumes.begins)
+    problem = Problem(vertices, volumes, targets, room, lattice, basis)
+    watched = np.concatenate([vertices[targets.vertices], *samples])
+    found, stretches, stiffness = _bounded(problem, watched)
+
+    def moved(points: Floats) -> Floats:
+        return np.asarray(points + lattice.basis(points) @ found)
+
+    after = vertices + basis @ found
+    muscles = tuple(
+        replace(
+            muscle,
+            surface=replace(muscle.surface, vertices=volumes.part(after, i)),
+            course=tuple(moved(np.asarray(line)) for line in muscle.course),
+        )
+        for i, muscle in enumerate(morphed.muscles)
+    )
+    done = _compared(problem, after, [(inside, moved(inside)) for inside in samples], muscles)
+    findings = tuple(_findings(done))
+    return MuscleFit(
+        replace(morphed, muscles=muscles, findings=(*morphed.findings, *findings), is_fitted=True),
+        MappingProxyType(done),
+        stretches,
+        stiffness,
+        findings,
+        time.perf_counter() - begun,
+    )
+
+
+def _compared(
+    problem: Problem,
+    after: Floats,
+    samples: Sequence[tuple[Floats, Floats]],
+    muscles: Sequence[MuscleSurface],
+) -> dict[str, FittedMuscle]:
+    """What became of each muscle: its vertices, and points within it before and after."""
+    volumes, room = problem.volumes, problem.room
+    first, last = volumes.enclosed(problem.vertices), volumes.enclosed(after)
+    moves = np.linalg.norm(after - problem.vertices, axis=1)
+    done = {}
+    for i, (muscle, (inside, moved)) in enumerate(zip(muscles, samples, strict=True)):
+        known = room.known(inside)
+        done[muscle.name] = FittedMuscle(
+            _outside(room, inside[known]),
+            _outside(room, moved[known]),
+            float(1.0 - known.mean()) if len(known) else 0.0,
+            abs(float(first[i])),
+            abs(float(last[i])),
+            float(volumes.part(moves, i).max()),
+        )
+    return done
+
+
+def _bounded(problem: Problem, points: Floats) -> tuple[Floats, tuple[float, float], float]:
+    """A displacement whose stretches at some points are in bounds, they, and the stiffness."""
+    stiffness = 1.0
+    for _ in range(MOST_TRIES):
+        found = problem.solved(stiffness)
+        stretches = _stretches(problem.lattice, found, points)
+        if STRETCHES[0] <= stretches[0] and stretches[1] <= STRETCHES[1]:
+            break
+        stiffness *= STIFFER
+    return found, stretches, stiffness
+
+
+def _outside(room: Room, points: Floats) -> float:
+    """The share of points outside the tissue."""
+    return float(np.mean(room.tissue.sample(points) < 0.0)) if len(points) else 0.0
+
+
+def _samples(index: int, muscle: MuscleSurface) -> Floats:
+    """Points within a muscle, uniform in its volume; the same in every run."""
+    try:
+        surface = Surface(muscle.surface.vertices, muscle.surface.triangles)
+    except MeshError as error:
+        raise MeshInputError(f"muscle {muscle.name!r}: {error}") from error
+    vertices = np.asarray(muscle.surface.vertices)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    volume = surface.volume or 0.5 * surface.area
+    edge = (abs(volume) / SAMPLES) ** (1.0 / 3.0)
+    # One point at random in each cell of a grid.
+    cells = np.maximum(np.ceil((high - low) / edge).astype(int), 1)
+    corners = np.indices(cells.tolist()).reshape(3, -1).T
+    places = corners + np.random.default_rng(index).random(corners.shape)
+    points = low + places * (high - low) / cells
+    inside = np.abs(np.asarray(surface.winding_number(points))) > 0.5
+    return np.asarray(points[inside])
+
+
+def _targets(morphed: MorphedMusculature, begins: Sequence[int]) -> Targets:
+    """Vertices of the muscles' surfaces, and where the template has them beside its bone."""
+    bone = Surface(morphed.template.skull.vertices, morphed.template.skull.triangles)
+    carried = Surface(morphed.skull.vertices, morphed.skull.triangles)
+    spread = [_spread(muscle.surface) for muscle in morphed.muscles]
+    first, last = (
+        np.concatenate(
+            [np.asarray(m.surface.vertices)[c] for m, (c, _) in zip(muscles, spread, strict=True)]
+        )
+        for muscles in (morphed.template.muscles, morphed.muscles)
+    )
+    closest, normals, _ = bone.closest(first)
+    height = np.einsum("na,na->n", first - closest, normals)
+    apart = np.linalg.norm(first - closest, axis=1)
+    return Targets(
+        np.concatenate([begin + c for begin, (c, _) in zip(begins, spread, strict=False)]),
+        np.concatenate([area for _, area in spread]),
+        np.asarray(carried.closest(last)[1]),
+        (apart < ATTACHED) | (height < 0.0),
+        np.clip(-height, 0.0, MOST_DEPTH),
+    )
+
+
+def _spread(surface: SurfaceData) -> tuple[NDArray[np.intp], Floats]:
+    """Vertices of a surface that are spread over it evenly, and the area for which each stands."""
+    vertices = np.asarray(surface.vertices)
+    triangles = np.asarray(surface.triangles, dtype=np.intp)
+    cross = np.cross(
+        vertices[triangles[:, 1]] - vertices[triangles[:, 0]],
+        vertices[triangles[:, 2]] - vertices[triangles[:, 0]],
+    )
+    area = np.linalg.norm(cross, axis=1) / 6.0
+    each = np.bincount(triangles.ravel(), np.repeat(area, 3), minlength=len(vertices))
+    middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    cells = np.floor((vertices - middle) / POINT_SPACING).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    cell = cell.ravel()
+    # The vertex nearest to the mean of its cell.
+    count = np.bincount(cell)
+    mean = np.stack([np.bincount(cell, vertices[:, a]) / count for a in range(3)], axis=1)
+    order = np.lexsort((np.linalg.norm(vertices - mean[cell], axis=1), cell))
+    _, start = np.unique(cell[order], return_index=True)
+    return order[start], np.asarray(np.bincount(cell, each), dtype=np.float64)
+
+
+def _stretches(lattice: Lattice, found: Floats, points: Floats) -> tuple[float, float]:
+    """The least and largest principal stretch of space at points; below 0 where it turns over."""
+    slopes = [np.asarray(lattice.basis(points, axis) @ found) for axis in range(3)]
+    gradient = np.stack(slopes, axis=2)
+    whole = gradient + np.eye(3)
+    sizes = np.linalg.svd(whole, compute_uv=False)
+    least = sizes[:, 2] * np.sign(np.linalg.det(whole))
+    return float(least.min()), float(sizes[:, 0].max())
+
+
+def _summed(done: Mapping[str, FittedMuscle], name: str) -> float:
+    """A share of all muscles together, by their volumes."""
+    volume = sum(m.volume_before for m in done.values())
+    part = sum(getattr(m, name) * m.volume_before for m in done.values())
+    return float(part / volume) if volume else 0.0
+
+
+def _findings(done: Mapping[str, FittedMuscle]) -> Iterator[Finding]:
+    before, after = (_summed(done, f"outside_{when}") for when in ("before", "after"))
+    furthest = max(done, key=lambda name: done[name].largest_move)
+    yield Finding.note(
+        "muscles-fitted",
+        f"muscles were moved into the tissue: {before:.0%} of their volume lay in bone, in air or "
+        f"outside the skin, now {after:.0%}; {furthest} moved most, by up to "
+        f"{done[furthest].largest_move:.1f} mm",
+        where="muscles",
+        why="landmarks lie on the skull and do not show how thick the tissue is",
+        fix="nothing; fit = false in [muscles] keeps them where landmarks put them",
+    )
+    for name, muscle in done.items():
+        if muscle.outside_after > STILL_OUTSIDE:
+            yield Finding.note(
+                "muscle-does-not-fit",
+                f"{muscle.outside_after:.0%} of {name} lies in bone, in air or outside the skin, "
+                f"{muscle.outside_before:.0%} before it was moved",
+                where=name,
+                why="the tissue is thinner there than the muscle; that part has no tets",
+                fix="look at it; landmarks near it may be misplaced",
+            )
+        if abs(muscle.volume_change) > VOLUME_CHANGE:
+            yield Finding.note(
+                "muscle-volume-changed",
+                f"the volume of {name} changed by {muscle.volume_change:+.0%} as it was moved into "
+                "the tissue",
+                where=name,
+                why="the tissue is thinner there than the muscle, or thicker",
+                fix="look at it; landmarks near it may be misplaced",
+            )

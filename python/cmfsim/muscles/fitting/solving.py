@@ -1,0 +1,220 @@
+"""The displacement that takes muscles out of bone, skin and air: penalties, by least squares."""
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.checks import Floats
+from cmfsim.muscles.fitting.lattice import Lattice, sparse
+from cmfsim.muscles.fitting.room import Room
+from cmfsim.muscles.fitting.volumes import Volumes
+from cmfsim.values.image_data import ImageData
+
+__all__ = ["Problem", "Targets"]
+
+_log = logging.getLogger(__name__)
+
+# How deep below the surface of the skin, or off bone, a muscle's own surface ends, mm. Half a
+# voxel: so that what is placed right stays right on the mesh.
+GAP = 0.25
+# A muscle further out than this is not misplaced: there the head is another, or ends; mm.
+FURTHEST = 10.0
+# Weights beside 1 mm of penetration on 1 mm² of a muscle's surface. Strain: a muscle 10 mm thick
+# that is strained by 0.1 costs as much as its two surfaces 0.2 mm out of place.
+STRAIN = 0.15
+# Curvature over the lattice's spacing counts this much as strain does.
+BENDING = 1.0
+# A part of a muscle's volume, as displacement of its surface: outweighs penetration.
+VOLUME = 200.0
+# A place of attachment off its bone counts less than one in a place that it cannot have.
+ATTACHMENT = 0.15
+ITERATIONS = 5
+# Of the conjugate gradients of each iteration: the next one corrects it.
+TOLERANCE = 1e-3
+MOST_CG_STEPS = 400
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """Vertices spread over the surfaces of muscles, and what is wanted of them.
+
+    Attributes
+    ----------
+    vertices : (n,) int
+    area : (n,) float64, mm²
+        Of the surface that a vertex stands for.
+    outward : (n, 3) float64
+        Unit vectors away from the template's bone next to it.
+    attached : (n,) bool
+        Whether it lies on that bone.
+    depth : (n,) float64, mm
+        How deep in bone it lies in the template; 0 outside.
+    """
+
+    vertices: NDArray[np.intp]
+    area: Floats
+    outward: Floats
+    attached: NDArray[np.bool_]
+    depth: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Muscles where landmarks put them, the room that they have, and what may move.
+
+    Attributes
+    ----------
+    vertices : (v, 3) float64, mm
+        Of all muscles.
+    basis : (v, size) sparse matrix
+        From the coefficients of the lattice to displacements of the vertices.
+    """
+
+    vertices: Floats
+    volumes: Volumes
+    targets: Targets
+    room: Room
+    lattice: Lattice
+    basis: Any
+
+    def solved(self, stiffness: float) -> Floats:
+        """The coefficients of the displacement that is best for all muscles.
+
+        Gauss-Newton iterations on the sum of squares of: how far vertices are out of their room or
+        off their bone, each along the distance's own gradient; the change of each muscle's volume;
+        strain and bending of space.
+
+        Parameters
+        ----------
+        stiffness : float
+            A factor on the energy of strain and bending.
+
+        Returns
+        -------
+        (size, 3) float64, mm
+        """
+        lattice, targets = self.lattice, self.targets
+        basis = self.basis[targets.vertices]
+        energy = stiffness * _energy(lattice)
+        volume_rows, scale = self._volume_rows()
+        before = self.volumes.enclosed(self.vertices)
+        found = np.zeros((lattice.size, 3))
+        for iteration in range(ITERATIONS):
+            u = basis @ found
+            residual, direction, weight = _wanted(
+                self.room, targets, self.vertices[targets.vertices] + u
+            )
+            used = weight > 0.0
+            rows = _rows(basis[used], direction[used], np.sqrt(weight[used]))
+            aim = np.sqrt(weight) * (residual + np.einsum("na,na->n", direction, u))
+            change = self.volumes.enclosed(self.vertices + self.basis @ found) - before
+            keep = volume_rows @ found.ravel() - scale * change
+            right = rows.T @ aim[used] + volume_rows.T @ keep
+            found = _least(rows, volume_rows, energy, right, found)
+            out = np.sqrt(np.average(residual[used] ** 2)) if used.any() else 0.0
+            _log.debug("fit %d: %d points, %.2f mm", iteration, np.count_nonzero(used), out)
+        return found
+
+    def _volume_rows(self) -> tuple[Floats, Floats]:
+        """The slope of each muscle's volume by the coefficients, and the weight that it has.
+
+        By the root of the muscle's area: a volume by an area is a displacement, which counts over
+        the area. Open surfaces have no volume to keep.
+        """
+        slopes, areas = self.volumes.slopes(self.vertices)
+        scale = np.sqrt(VOLUME / areas) * np.array(self.volumes.is_closed)
+        begins = self.volumes.begins
+        rows = [
+            (self.basis[begins[i] : begins[i + 1]].T @ self.volumes.part(slopes, i)).ravel() * s
+            for i, s in enumerate(scale)
+        ]
+        return np.array(rows), scale
+
+
+def _energy(lattice: Lattice) -> Any:
+    """Strain and bending of space, per axis of the displacement: a symmetric matrix."""
+    first, second = lattice.differences()
+    bending = BENDING * lattice.spacing**2
+    return STRAIN * (first.T @ first + bending * (second.T @ second))
+
+
+def _wanted(room: Room, targets: Targets, points: Floats) -> tuple[Floats, Floats, Floats]:
+    """How far each point is to move, along which direction, and the weight of that."""
+    distance, gradient = sampled(room.tissue, points)
+    bone, bone_gradient = sampled(room.bone, points)
+    # Within bone the way out is on the side on which the template has the muscle, not the nearest:
+    # through a thin ramus it would be the other one.
+    behind = (bone < 0.0) & (np.einsum("na,na->n", gradient, targets.outward) < 0.0)
+    gradient = np.where(behind[:, None], targets.outward, gradient)
+    distance = np.where(behind, -_way_out(room.bone, points, targets.outward, behind), distance)
+    # As deep in bone as in the template is right.
+    residual = GAP - targets.depth - distance
+    weight = np.where(residual > 0.0, targets.area, 0.0)
+    # Attachments are held at their bone from both sides.
+    off = targets.attached & (residual <= 0.0) & (bone < FURTHEST)
+    residual = np.where(off, np.minimum(GAP - targets.depth - bone, 0.0), residual)
+    gradient = np.where(off[:, None], bone_gradient, gradient)
+    weight = np.where(off, ATTACHMENT * targets.area, weight)
+    weight[~room.known(points) | (np.abs(residual) > FURTHEST)] = 0.0
+    return residual, gradient, weight
+
+
+def _way_out(
+    level: ImageData, points: Floats, direction: Floats, asked: NDArray[np.bool_]
+) -> Floats:
+    """How far it is along a direction until a distance is positive, mm; 0 where not asked."""
+    way = np.zeros(len(points))
+    inside = np.flatnonzero(asked)
+    step = 0.5 * float(np.asarray(level.spacing)[0])
+    while len(inside) and way[inside].max() <= FURTHEST + step:
+        way[inside] += step
+        places = points[inside] + way[inside, None] * direction[inside]
+        inside = inside[level.sample(places) < 0.0]
+    return way
+
+
+def sampled(level: ImageData, points: Floats) -> tuple[Floats, Floats]:
+    """A distance at points and its unit gradient."""
+    step = 0.5 * float(np.asarray(level.spacing)[0])
+    offsets = step * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
+    around = level.sample((points[None] + offsets[:, None]).reshape(-1, 3)).reshape(7, -1)
+    gradient = (around[1:4] - around[4:]).T
+    size = np.linalg.norm(gradient, axis=1)
+    return around[0], gradient / np.maximum(size, np.finfo(float).eps)[:, None]
+
+
+def _rows(basis: Any, direction: Floats, weight: Floats) -> Any:
+    """One row a point: its displacement along a direction, from coefficients (x, y, z by turns)."""
+    wide = np.repeat(3 * basis.indices, 3).reshape(-1, 3) + np.arange(3)
+    each = np.diff(basis.indptr)
+    data = basis.data[:, None] * np.repeat(weight[:, None] * direction, each, axis=0)
+    shape = (basis.shape[0], 3 * basis.shape[1])
+    return sparse().csr_matrix((data.ravel(), wide.ravel(), 3 * basis.indptr), shape=shape)
+
+
+def _least(rows: Any, volume_rows: Floats, energy: Any, right: Floats, start: Floats) -> Floats:
+    """The solution of (RᵀR + VᵀV + E) x = b by conjugate gradients, near a first guess.
+
+    E acts on each axis alike. The products are never formed: RᵀR has 243 entries in a row.
+    """
+    solvers = sparse("scipy.sparse.linalg")
+    back = rows.T.tocsr()
+    diagonal = np.asarray(rows.multiply(rows).sum(axis=0)).ravel()
+    diagonal += np.repeat(energy.diagonal(), 3) + np.einsum("ra,ra->a", volume_rows, volume_rows)
+    scale = 1.0 / np.maximum(diagonal, np.finfo(float).eps)
+
+    def product(x: Floats) -> Floats:
+        bent = (energy @ x.reshape(start.shape)).ravel()
+        result: Floats = back @ (rows @ x) + volume_rows.T @ (volume_rows @ x) + bent
+        return result
+
+    size = (start.size, start.size)
+    whole = solvers.LinearOperator(size, matvec=product)
+    jacobi = solvers.LinearOperator(size, matvec=lambda x: scale * x.ravel())
+    # Named `tol` before scipy 1.12 and `rtol` after: the absolute one has one name.
+    limit = TOLERANCE * float(np.linalg.norm(right))
+    x, _ = solvers.cg(whole, right, x0=start.ravel(), atol=limit, maxiter=MOST_CG_STEPS, M=jacobi)
+    return np.asarray(x, dtype=float).reshape(start.shape)
