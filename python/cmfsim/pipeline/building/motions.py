@@ -17,6 +17,7 @@ from cmfsim.bones.motion import (
     without_removed,
 )
 from cmfsim.checks import Floats
+from cmfsim.doctor.moved import check_pairs
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface
 from cmfsim.pipeline.building.inputs import motion_source, read_motion
@@ -129,6 +130,7 @@ def _achieved_bones(
         for name in names
         if name in after.bones and (moved := _same_bone(case, name, after.bones[name])) is not None
     }
+    noticed = [found for name, moved in by_vertex.items() for found in _paired(case, name, moved)]
     searched = [segment for segment in segments if segment.name not in by_vertex]
     reference = next((name for name in REFERENCES if name in names), None)
     if searched and reference is not None and reference not in by_vertex:
@@ -160,7 +162,7 @@ def _achieved_bones(
         )
         motions |= {name: found for name, found in achieved.plan.items() if name != reference}
     made = _with_motions(case, segments, motions, achieved)
-    noticed = [
+    noticed += [
         _removed_finding(case, name, name, patch, "note")
         for name, found in ({} if achieved is None else achieved.motions).items()
         for patch in found.removed
@@ -184,6 +186,21 @@ def _same_bone(case: Case, name: str, there: SurfaceData) -> MovedSurface | None
         np.asarray(here.triangles), np.asarray(there.triangles)
     )
     return MovedSurface(here, there.vertices) if same else None
+
+
+def _paired(case: Case, name: str, moved: MovedSurface) -> list[Finding]:
+    """Findings about a bone that is followed vertex by vertex.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Its surfaces are no bone that moved: mirrored, shuffled, in two units.
+    """
+    found = list(check_pairs(name, case.where(_plan_key(case, name)), moved))
+    for finding in found:
+        if finding.severity == "error":
+            raise CaseInputError(f"{finding.where}: {finding.what}; {finding.fix}")
+    return found
 
 
 def _joined(surfaces: list[SurfaceData]) -> SurfaceData:
