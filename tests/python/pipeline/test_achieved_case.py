@@ -197,3 +197,32 @@ def test_what_cannot_be_read_off_is_named(tmp_path):
     head.replace('"mandible_after.ply"', '"gone.ply"')
     findings = cmfsim.diagnose(cmfsim.Case.load(head.write(tmp_path)))
     assert "postoperative.bones.jaw" in findings[0].where
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_piece_that_moved_otherwise_or_was_removed_is_a_warning_of_the_build(is_there, tmp_path):
+    """A chin that was advanced and is no segment; an end of the jaw that was resected."""
+    head = operated(rounds=4)
+    after = head.surfaces["mandible_after"]
+    vertices = np.array(after.vertices)
+    chin = vertices[:, 1] < np.quantile(vertices[:, 1], 0.12)
+    if is_there:
+        vertices[chin] += [0.0, -6.0, 0.0]
+    else:
+        # The left end of the jaw, to a flat stump.
+        stump = np.quantile(vertices[:, 0], 0.7)
+        vertices[:, 0] = np.minimum(vertices[:, 0], stump)
+    head.surfaces["mandible_after"] = cmfsim.SurfaceData(vertices, after.triangles)
+    model = cmfsim.build_model(cmfsim.Case.load(head.write(tmp_path)), check=False)
+    (found,) = [f for f in model.findings if f.code == "achieved-piece-off"]
+    assert found.severity == "warning"
+    assert found.where.startswith("case.toml:")
+    assert re.search(r"\d\.\d cm² of mandible about \(.*\) mm", found.what)
+    assert ("it moved otherwise than the segment" in found.what) == is_there
+    assert ("removed, outside the scan" in found.what) != is_there
+    assert "[[osteotomies]]" in found.fix
+    assert "achieved-piece-off" in [f["code"] for f in model.summary["findings"]]
+    (patch,) = model.summary["achieved"]["segments"]["mandible"]["stray"]
+    assert patch["area_mm2"] > 100.0
+    assert patch["has_bone"] == is_there
+    assert not model.summary["achieved"]["segments"]["cranium"]["stray"]

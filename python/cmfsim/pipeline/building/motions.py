@@ -16,6 +16,7 @@ from cmfsim.bones.motion import (
     torn_pieces,
     without_removed,
 )
+from cmfsim.bones.stray import REACH, StrayPatch
 from cmfsim.checks import Floats
 from cmfsim.doctor.moved import check_pairs
 from cmfsim.errors import CaseInputError
@@ -159,6 +160,7 @@ def _achieved_bones(
             {s.name: s for s in (*still, *(s for s in searched if s not in still))},
             {s.name: bones.get(s.name, whole) for s in searched},
             reference=reference,
+            beside=[s.surface for s in segments if s not in searched],
         )
         motions |= {name: found for name, found in achieved.plan.items() if name != reference}
     made = _with_motions(case, segments, motions, achieved)
@@ -166,6 +168,11 @@ def _achieved_bones(
         _removed_finding(case, name, name, patch, "note")
         for name, found in ({} if achieved is None else achieved.motions).items()
         for patch in found.removed
+    ]
+    noticed += [
+        _stray_finding(case, name, patch, still=name == reference)
+        for name, found in ({} if achieved is None else achieved.motions).items()
+        for patch in found.stray
     ]
     return replace(made, findings=(*made.findings, *noticed))
 
@@ -276,6 +283,42 @@ def _removed_finding(
         fix="look at the bone there; if it was pushed in (fracture, impaction), give that part as "
         "a "
         "bone of its own",
+    )
+
+
+def _stray_finding(case: Case, name: str, patch: StrayPatch, *, still: bool) -> Finding:
+    """A piece of a segment that its motion does not lay on the bone after the operation."""
+    at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
+    piece = f"{patch.area / 100.0:.1f} cm² of {name} about ({at}) mm"
+    if patch.has_bone:
+        what = (
+            f"{piece} lie off the bone after the operation, by {patch.distance:.1f} mm (median): "
+            "bone is there, displaced: it moved otherwise than the segment, or what is left of it "
+            "lies deeper"
+        )
+        fix = (
+            "if that piece was cut (genioplasty, split maxilla), make it a segment of its own in "
+            "[[osteotomies]]; else check whether bone was removed there"
+        )
+    else:
+        what = (
+            f"{piece} have no bone after the operation within {REACH:g} mm that faces alike "
+            f"({patch.distance:.1f} mm to the nearest, median): removed, outside the scan, or "
+            "moved further"
+        )
+        fix = (
+            "check whether bone was removed there and whether the scan after shows that place; if "
+            "the piece was cut and moved, make it a segment of its own in [[osteotomies]]"
+        )
+    # A smaller scan after the operation cuts off the skull nearly always, which moves nothing.
+    return Finding(
+        severity="note" if still and not patch.has_bone else "warning",
+        code="achieved-piece-off",
+        what=what,
+        where=case.where(_plan_key(case, name)),
+        why="the piece had no say in the motion, and moves with the rest of the segment all the "
+        "same: the face over it may be wrong by that distance",
+        fix=fix,
     )
 
 
