@@ -45,9 +45,9 @@ from cmfsim.bones import procedure_options as procedure_options
 from cmfsim.bones import segments_from_surfaces as segments_from_surfaces
 from cmfsim.bones.achieved import AchievedMotion as AchievedMotion
 from cmfsim.bones.achieved import AchievedPlan as AchievedPlan
-from cmfsim.bones.achieved import MatchOptions as MatchOptions
 from cmfsim.bones.achieved import achieved_plan as achieved_plan
 from cmfsim.bones.achieved import measure_motion as measure_motion
+from cmfsim.bones.matching import MatchOptions as MatchOptions
 from cmfsim.doctor import Examination as Examination
 from cmfsim.doctor import diagnose as diagnose
 from cmfsim.doctor import examine as examine

@@ -7,7 +7,7 @@ the motion, rigid or not.
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, TypeAlias
@@ -16,19 +16,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import IcpFit, Surface, rigid_fit
+from cmfsim.bones.matching import MatchOptions, lay_on
 from cmfsim.bones.motion import RemovedBone, missing_patches
+from cmfsim.bones.stray import StrayPatch, stray_patches
 from cmfsim.checks import (
     Floats,
     as_floats,
-    as_number,
     as_positive,
     as_text,
     check_instance,
     check_one_of,
     frozen,
 )
-from cmfsim.errors import RegistrationError, RegistrationInputError
-from cmfsim.registration import icp
+from cmfsim.errors import RegistrationInputError
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import RigidMotion, decompose_motion, rigid_matrix
@@ -37,7 +37,6 @@ from cmfsim.values.surface_data import MovedSurface, SurfaceData
 __all__ = [
     "AchievedMotion",
     "AchievedPlan",
-    "MatchOptions",
     "achieved_plan",
     "measure_motion",
 ]
@@ -47,69 +46,7 @@ _LOG = logging.getLogger(__name__)
 # A motion counts as rigid if it takes every vertex this near to where it went, mm: a tenth of what
 # a segmented bone is known to, and far above the rounding of a surface file.
 RIGID_TOLERANCE = 0.1
-# Points of the quick search for a start, and its steps from each.
-QUICK_POINTS = 400
-QUICK_STEPS = 20
-# The search rests when a step moves no point by more than this share of the segment's size: 0.1 µm,
-# where noise of the bone still swaps partners.
-REST = 2e-6
-MOST_STEPS = 300
-# Trimming a fixed share leaves out sound bone too, its noisier part. The last search takes all
-# within so many times the rms of the trimmed fit, 2.3 standard deviations of the noise if 0.3 are
-# trimmed, but not less than this, mm.
-CUT = 4.0
-LEAST_CUT = 0.05
 Segments: TypeAlias = Mapping[str, SurfaceData | BoneSegment]
-
-
-@dataclass(frozen=True)
-class MatchOptions:
-    """How a bone segment is laid on the post-operative bone.
-
-    Attributes
-    ----------
-    trim : float
-        Share of the segment's vertices, those furthest from the bone, that have no say while the
-        place is searched: cut faces, plates, bone that was ground away. 0 to below 1.
-    reach : float, mm
-        The search also begins this far to each side along each axis, for segments that moved on to
-        a neighbour of their place; 0: only from where they were.
-    max_angle : float, degrees
-        Between normals of partners: keeps the inner side of a bone off its outer side.
-    max_rms : float, mm
-        Of the partners at the end; a worse fit is an error.
-    least_share : float
-        Of the vertices that must have a partner at the end.
-
-    Raises
-    ------
-    RegistrationError, CaseError
-        (also `ValueError`) A value out of its range; not a number.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> cmfsim.MatchOptions(trim=0.4).reach
-    6.0
-    """
-
-    trim: float = 0.3
-    reach: float = 6.0
-    max_angle: float = 60.0
-    max_rms: float = 1.0
-    least_share: float = 0.3
-
-    def __post_init__(self) -> None:
-        for name in ("max_angle", "max_rms"):
-            as_positive(name, getattr(self, name))
-        if as_number("reach", self.reach) < 0.0:
-            raise RegistrationInputError(f"reach is {self.reach:g} mm: must not be below 0")
-        if not 0.0 <= as_number("trim", self.trim) < 1.0:
-            raise RegistrationInputError(f"trim is {self.trim:g}: must be from 0 to below 1")
-        if not 0.0 < as_number("least_share", self.least_share) <= 1.0:
-            raise RegistrationInputError(
-                f"least_share is {self.least_share:g}: must be above 0, to 1"
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +66,8 @@ class AchievedMotion(Frozen):
     rms, worst : float, mm
         What the rigid motion leaves: distance of vertices from where they went ("vertices"), or of
         the kept vertices from the post-operative bone ("icp").
+    median, p95 : float, mm
+        The same distances of all vertices, kept or not: median and 95th percentile.
     share : float
         Share of the vertices that were kept.
     moved : MovedSurface or None
@@ -136,6 +75,9 @@ class AchievedMotion(Frozen):
     removed : tuple of RemovedBone
         Patches of the segment that are not there after the operation, where it was searched for:
         they lie outside the bone after it. They have no say in the motion.
+    stray : tuple of StrayPatch
+        Patches of 1 cm² and more that lie off the bone after the operation, where it was searched
+        for: they moved otherwise than the segment, or were removed.
     """
 
     matrix: Floats
@@ -144,9 +86,12 @@ class AchievedMotion(Frozen):
     is_rigid: bool
     rms: float
     worst: float
+    median: float
+    p95: float
     share: float
     moved: MovedSurface | None
     removed: tuple[RemovedBone, ...] = ()
+    stray: tuple[StrayPatch, ...] = ()
 
     @property
     def plan(self) -> Floats | MovedSurface:
@@ -165,11 +110,14 @@ class AchievedMotion(Frozen):
             "matrix": self.matrix.tolist(),
             "rms_mm": self.rms,
             "worst_mm": self.worst,
+            "median_mm": self.median,
+            "p95_mm": self.p95,
             "share": self.share,
             "removed": [
                 {"area_mm2": p.area, "depth_mm": p.depth, "place_mm": p.place.tolist()}
                 for p in self.removed
             ],
+            "stray": [patch.as_dict() for patch in self.stray],
         }
 
 
@@ -288,6 +236,8 @@ def measure_motion(
         is_rigid=worst <= tolerance,
         rms=float(fit.rms),
         worst=worst,
+        median=float(np.median(fit.residuals)),
+        p95=float(np.quantile(fit.residuals, 0.95)),
         share=1.0,
         moved=MovedSurface(before, there),
     )
@@ -301,6 +251,7 @@ def achieved_plan(
     reference: str | None = None,
     centres: Mapping[str, ArrayLike] | None = None,
     options: MatchOptions | None = None,
+    beside: Sequence[SurfaceData] = (),
 ) -> AchievedPlan:
     """The motion of each bone segment, from the bone before and after the operation.
 
@@ -320,6 +271,9 @@ def achieved_plan(
     centres : mapping of str to (3,) float64, mm, optional
         About which turns are written. Default: the middle of each segment's vertices.
     options : MatchOptions, optional
+    beside : sequence of SurfaceData
+        Segments before the operation whose motion is not asked for. A cut face towards one is no
+        bone that a scan shows, and is not reported as off the bone; those in `segments` are known.
 
     Returns
     -------
@@ -361,7 +315,10 @@ def achieved_plan(
         centre = (centres or {}).get(name)
         if _same_triangles(parts[name], after):
             return measure_motion(parts[name], after, centre=centre)
-        return _matched(name, parts[name], after, centre, options)
+        others = (*beside, *(part for other, part in parts.items() if other != name))
+        bone = Surface(after.vertices, after.triangles, crease_angle=after.crease_angle)
+        fit = lay_on(name, parts[name], bone, options)
+        return _matched(parts[name], bone, fit, centre, others)
 
     correction = None
     if reference is not None:
@@ -379,86 +336,29 @@ def achieved_plan(
 
 
 def _matched(
-    name: str,
     segment: SurfaceData,
-    bone: SurfaceData,
+    bone: Surface,
+    fit: IcpFit,
     centre: ArrayLike | None,
-    options: MatchOptions,
+    others: Sequence[SurfaceData],
 ) -> AchievedMotion:
-    """Lays a segment on the bone."""
-    core = Surface(bone.vertices, bone.triangles, crease_angle=bone.crease_angle)
-    vertices = np.asarray(segment.vertices)
-    try:
-        fit = icp(
-            segment,
-            core,
-            initial=_start(vertices, core, options),
-            trim=options.trim,
-            max_angle=options.max_angle,
-            max_iterations=MOST_STEPS,
-            tolerance=REST,
-        )
-        if fit.rms <= options.max_rms:
-            fit = icp(
-                segment,
-                core,
-                initial=fit.matrix,
-                max_distance=max(CUT * fit.rms, LEAST_CUT),
-                max_angle=options.max_angle,
-                max_iterations=MOST_STEPS,
-                tolerance=REST,
-            )
-    except RegistrationError as error:
-        raise RegistrationError(
-            f"segment {name!r} cannot be laid on the post-operative bone: {error}"
-        ) from error
-    worst = float(fit.distances[fit.kept].max())
-    if fit.rms > options.max_rms or fit.kept_fraction < options.least_share:
-        raise RegistrationError(
-            f"segment {name!r} does not fit the post-operative bone: {fit.rms:.2f} mm rms over "
-            f"{fit.kept_fraction:.0%} of its vertices (allowed {options.max_rms:g} mm, at least "
-            f"{options.least_share:.0%}); see whether the scans are aligned, whether the segment "
-            "is cut as it was in the operation, and whether the bone is all there; a larger trim "
-            "leaves out plates and new bone"
-        )
-    _LOG.info("segment %s: %.3f mm rms, %.0f %% kept", name, fit.rms, 100 * fit.kept_fraction)
+    """The motion of a segment that was laid on the bone."""
+    matrix = np.asarray(fit.matrix, dtype=np.float64)
+    stray, off = stray_patches(segment, bone, matrix, float(fit.rms), others)
     return AchievedMotion(
-        matrix=frozen(fit.matrix),
-        motion=decompose_motion(fit.matrix, _centre(centre, vertices)),
+        matrix=frozen(matrix),
+        motion=decompose_motion(matrix, _centre(centre, np.asarray(segment.vertices))),
         method="icp",
         is_rigid=True,
         rms=float(fit.rms),
-        worst=worst,
+        worst=float(fit.distances[fit.kept].max()),
+        median=float(np.median(off)),
+        p95=float(np.quantile(off, 0.95)),
         share=float(fit.kept_fraction),
         moved=None,
-        removed=missing_patches(segment, core, fit.matrix),
+        removed=missing_patches(segment, bone, matrix),
+        stray=stray,
     )
-
-
-def _start(vertices: Floats, bone: Surface, options: MatchOptions) -> Floats:
-    """The best of several short searches, from where the segment was and from either side."""
-    # Any order of vertices in the file gives points from all over the segment.
-    order = np.random.default_rng(0).permutation(len(vertices))[:QUICK_POINTS]
-    points = vertices[order]
-    shifts = [np.zeros(3)]
-    if options.reach > 0.0:
-        shifts += [sign * options.reach * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
-    best: IcpFit | None = None
-    for shift in shifts:
-        initial = np.eye(4)
-        initial[:3, 3] = shift
-        fit = icp(
-            points,
-            bone,
-            initial=initial,
-            trim=options.trim,
-            max_iterations=QUICK_STEPS,
-            # Exactly as many steps as asked for: the search goes on from the best.
-            tolerance=0.0,
-        )
-        if best is None or fit.rms < best.rms:
-            best = fit
-    return np.eye(4) if best is None else np.asarray(best.matrix)
 
 
 def _surfaces(segments: Segments) -> dict[str, SurfaceData]:

@@ -16,7 +16,7 @@ from cmfsim.values.clinical_motion import clinical_motion
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["check_moved"]
+__all__ = ["check_moved", "check_pairs"]
 
 # A bone whose vertices all move less than this was not moved, mm: rounding in a surface file.
 STILL = 1e-4
@@ -48,6 +48,13 @@ STAYS = 3.0
 FEW = 0.05
 # What is left of a motion if the bone is mirrored first, as a share of what is left if it is not.
 MIRRORED = 0.1
+# What is left where vertices cannot be followed. Bones with the same triangles go vertex by vertex
+# in an achieved plan too, so that naming them there is not enough.
+BY_SHAPE = (
+    'or align the bone by shape: plan = "achieved", with the bone after in [postoperative.bones] '
+    "segmented or remeshed on its own (it then moves rigidly, or is refused where it fits badly; a "
+    "mesh with the same triangles as before is followed vertex by vertex there as well)"
+)
 # Vertices that a fit is made of.
 SAMPLES = 5000
 
@@ -68,7 +75,7 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
             )
             continue
         here, there = np.asarray(moved.surface.vertices), np.asarray(moved.moved_vertices)
-        wrong = list(_check_pairs(name, where, moved))
+        wrong = list(check_pairs(name, where, moved))
         # A bone of another size goes on, and must not go far.
         if all(finding.code == "moved-scaled" and finding.severity != "error" for finding in wrong):
             wrong += _check_distance(name, where, moved)
@@ -88,8 +95,11 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
         )
 
 
-def _check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]:
-    """Whether both are one bone: of one size, with vertices that belong together, not mirrored."""
+def check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]:
+    """Whether both are one bone: of one size, with vertices that belong together, not mirrored.
+
+    An achieved plan is asked the same where it follows a bone vertex by vertex.
+    """
     here, there = np.asarray(moved.surface.vertices), np.asarray(moved.moved_vertices)
     if _is_mirrored(here, there):
         yield Finding.error(
@@ -107,8 +117,7 @@ def _check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding
             f"the edges of {name} point elsewhere after (cosine {along:.2f} on average, not 1)",
             where=where,
             why="both files have as many vertices, but these do not belong together in their order",
-            fix="export the moved mesh without remeshing or sorting its vertices, or name it in "
-            '[postoperative.bones] and write plan = "achieved"',
+            fix=f"export the moved mesh without remeshing or sorting its vertices; {BY_SHAPE}",
         )
     elif abs(scale - 1.0) > SCALED:
         yield _scaled(name, where, scale)
@@ -132,7 +141,7 @@ def _scaled(name: str, where: str, scale: float) -> Finding:
             f"{what}{between}",
             where=where,
             why="bone does not grow in an operation: the files are in two units, or scaled",
-            fix="export both in the unit that [surfaces] states",
+            fix="export both in one unit, that which the case states",
         )
     return Finding.warning(
         "moved-scaled",
@@ -141,9 +150,8 @@ def _scaled(name: str, where: str, scale: float) -> Finding:
         why="bone does not grow in an operation, so that the scans are calibrated or segmented "
         f"differently by {abs(scale - 1.0):.1%}; each vertex is followed all the same, and the "
         "difference counts as motion",
-        fix="check the voxel sizes of both scans and the thresholds of both segmentations, or "
-        "align "
-        'the bone by shape: [postoperative.bones] and plan = "achieved"',
+        fix="check the voxel sizes of both scans and the thresholds of both segmentations, and "
+        f"measure again; {BY_SHAPE}",
     )
 
 

@@ -257,14 +257,19 @@ def _achieved(achieved: Values | None) -> list[Note | Table | Figure]:
     if achieved is None:
         return []
     rows = tuple(
-        (name, number(found["rms_mm"]), number(found["worst_mm"]), f"{found['share']:.0%}")
+        (
+            name,
+            *(number(found[f"{key}_mm"]) for key in ("rms", "worst", "median", "p95")),
+            f"{found['share']:.0%}",
+        )
         for name, found in achieved["segments"].items()
     )
     caption = (
         "The plan was read off the bones after the operation: what is left between each segment "
-        "and that bone, mm, and the share of its vertices that lie on it."
+        "and that bone, mm, and the share of its vertices that lie on it. RMS and the largest are "
+        "of those alone, median and 95th percentile of all."
     )
-    return [Table(("segment", "RMS", "largest", "share"), rows, caption)]
+    return [Table(("segment", "RMS", "largest", "median", "P95", "share"), rows, caption)]
 
 
 def _evaluation_sections(evaluation: Values | None, figures: Sequence[Figure]) -> list[Section]:

@@ -228,3 +228,74 @@ def test_a_segment_that_is_not_there_is_an_error():
     scrap = without(pebble(4, 2), np.asarray(pebble(4, 2).vertices)[:, 0] > 20.0)
     with pytest.raises(cmfsim.RegistrationError, match="segment 'jaw'"):
         cmfsim.achieved_plan({"jaw": pebble(3, 2)}, scrap)
+
+
+# Pieces that the fit leaves out.
+
+FRONT = -10.0
+
+
+def jaw_after(chin="still", noise=0.0):
+    """A jaw before, and after: its front went with it, was advanced, or was removed."""
+    before, fine = pebble(4, 2), pebble(5, 2)
+    vertices = np.array(fine.vertices)
+    front = vertices[:, 1] < FRONT
+    if chin == "advanced":
+        vertices[front] += [0.0, -5.0, 0.0]
+    elif chin == "resected":
+        vertices[front, 1] = FRONT
+    vertices += np.random.default_rng(3).normal(0.0, noise, vertices.shape)
+    return before, moved(cmfsim.SurfaceData(vertices, fine.triangles), MOTION)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_a_sound_bone_has_no_stray_piece(noise):
+    before, after = jaw_after(noise=noise)
+    found = cmfsim.achieved_plan({"jaw": before}, after).motions["jaw"]
+    assert found.stray == ()
+    assert found.median <= found.p95 < 3.0 * noise + 0.1
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+@pytest.mark.parametrize(("chin", "has_bone"), [("advanced", True), ("resected", False)])
+def test_a_piece_off_the_bone_is_named_with_area_place_and_distance(chin, has_bone, noise):
+    """Motion of the rest unharmed; area against the triangles that went; place in front."""
+    before, after = jaw_after(chin, noise)
+    found = cmfsim.achieved_plan({"jaw": before}, after).motions["jaw"]
+    assert apart(found.matrix, MOTION, (0, 0, 0))[0] < 0.3
+    (patch,) = found.stray
+    assert patch.has_bone == has_bone
+    assert patch.place[1] < FRONT
+    corners = np.asarray(before.vertices)[np.asarray(before.triangles)]
+    gone = corners[(corners[:, :, 1] < FRONT).all(axis=1)]
+    sides = gone[:, 1] - gone[:, 0], gone[:, 2] - gone[:, 0]
+    area = 0.5 * np.linalg.norm(np.cross(*sides), axis=1).sum()
+    assert 0.4 * area < patch.area < 1.02 * area
+    assert 2.0 < patch.distance < 8.0
+    assert found.p95 > 1.5 > found.median
+    assert json.loads(json.dumps(found.as_dict()))["stray"][0] == patch.as_dict()
+
+
+def test_a_cut_face_is_not_bone_that_went():
+    """The jaw behind a cut is laid on the healed jaw: no scan shows the face between."""
+    whole, after = jaw_after()
+    vertices = np.asarray(whole.vertices)
+    back, front = vertices.copy(), vertices.copy()
+    back[:, 1] = np.maximum(vertices[:, 1], FRONT)
+    front[:, 1] = np.minimum(vertices[:, 1], FRONT)
+    rear, chin = (cmfsim.SurfaceData(v, whole.triangles) for v in (back, front))
+    alone = cmfsim.achieved_plan({"rear": rear}, after).motions["rear"]
+    assert alone.stray
+    small = cmfsim.MatchOptions(least_share=0.2)
+    for known in (
+        cmfsim.achieved_plan({"rear": rear}, after, beside=[chin]),
+        cmfsim.achieved_plan({"rear": rear, "chin": chin}, after, options=small),
+    ):
+        assert known.motions["rear"].stray == ()
+
+
+def test_the_real_bones_have_no_stray_piece():
+    """Thin walls, sinuses and teeth of an atlas against its decimated copy."""
+    segments, bone = real_bone()
+    found = cmfsim.achieved_plan(segments, bone)
+    assert [m.stray for m in found.motions.values()] == [(), ()]

@@ -8,6 +8,7 @@ import pytest
 import cmfsim
 from cmfsim.cli.study_commands import achieved_text
 from cmfsim.pipeline.building import read_postoperative
+from cmfsim.pipeline.building.motions import planned_bones
 from head_case import HeadCase, ellipsoid
 
 pytest.importorskip("meshio")
@@ -87,6 +88,72 @@ def test_bones_of_the_same_triangles_tell_it_vertex_by_vertex(tmp_path):
     np.testing.assert_allclose(nodes + np.asarray(result.displacements)[joined], went, atol=1e-9)
 
 
+def achieved_bones(head, folder):
+    """What the achieved plan makes of a head's bones, without a mesh."""
+    case = cmfsim.Case.load(head.write(folder))
+    # Levels part a torn bone; these hang together.
+    level = cmfsim.ImageData(np.ones((2, 2, 2)), (1.0, 1.0, 1.0))
+    names = ("cranium", "mandible")
+    segments = tuple(cmfsim.BoneSegment(name, level, head.surfaces[name]) for name in names)
+    return planned_bones(case, segments)
+
+
+@pytest.mark.parametrize("ratio", [0.955, 0.966, 1.034, 1.046])
+def test_another_size_of_paired_bones_is_reported_with_its_figure(ratio, tmp_path):
+    """A few per cent about the bone's own middle would else count as motion, silently."""
+    head = operated(rounds=3)
+    assert not achieved_bones(head, tmp_path).findings
+    after = head.surfaces["mandible_after"]
+    vertices = np.asarray(after.vertices)
+    middle = vertices.mean(axis=0)
+    head.surfaces["mandible_after"] = cmfsim.SurfaceData(
+        middle + ratio * (vertices - middle), after.triangles
+    )
+    (found,) = [f for f in achieved_bones(head, tmp_path).findings if f.code == "moved-scaled"]
+    assert found.severity == "warning"
+    assert f"mandible is {ratio:.3g} times as large" in found.what
+    assert f"{abs(ratio - 1.0):.1%}" in found.why
+    assert found.where.startswith("case.toml:")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda v: v / 10.0, "0.1 times as large after as before (median of its edges): that is"),
+        (
+            lambda v: np.random.default_rng(0).permutation(v),
+            "the edges of mandible point elsewhere",
+        ),
+        (lambda v: v * [-1.0, 1.0, 1.0], "mandible is mirrored after against before"),
+    ],
+)
+def test_paired_bones_that_are_not_one_bone_are_refused(change, words, tmp_path):
+    head = operated(rounds=3)
+    after = head.surfaces["mandible_after"]
+    head.surfaces["mandible_after"] = cmfsim.SurfaceData(
+        change(np.asarray(after.vertices)), after.triangles
+    )
+    with pytest.raises(cmfsim.CaseError, match=re.escape(words)):
+        achieved_bones(head, tmp_path)
+
+
+def test_bones_of_other_triangles_take_no_motion_from_their_size(tmp_path):
+    """The way out that the texts name: a rigid motion by shape, or a refusal where it is bad."""
+    head = operated(rounds=4)
+    after = head.surfaces["mandible_after"]
+    vertices = np.asarray(after.vertices)
+    middle = vertices.mean(axis=0)
+
+    def scaled(ratio):
+        grown = cmfsim.SurfaceData(middle + ratio * (vertices - middle), after.triangles)
+        head.surfaces["mandible_after"] = grown
+        return achieved_bones(head, tmp_path).motions["mandible"]
+
+    assert off(scaled(0.968), JAW)[0] < 0.5
+    with pytest.raises(cmfsim.RegistrationError, match="does not fit the post-operative bone"):
+        scaled(0.95)
+
+
 @pytest.mark.parametrize("rounds", [3, 4])
 def test_surfaces_in_another_frame_are_laid_on_by_the_skull(rounds, tmp_path):
     """15 mm and 8° away; skin and landmarks come along."""
@@ -130,3 +197,32 @@ def test_what_cannot_be_read_off_is_named(tmp_path):
     head.replace('"mandible_after.ply"', '"gone.ply"')
     findings = cmfsim.diagnose(cmfsim.Case.load(head.write(tmp_path)))
     assert "postoperative.bones.jaw" in findings[0].where
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_piece_that_moved_otherwise_or_was_removed_is_a_warning_of_the_build(is_there, tmp_path):
+    """A chin that was advanced and is no segment; an end of the jaw that was resected."""
+    head = operated(rounds=4)
+    after = head.surfaces["mandible_after"]
+    vertices = np.array(after.vertices)
+    chin = vertices[:, 1] < np.quantile(vertices[:, 1], 0.12)
+    if is_there:
+        vertices[chin] += [0.0, -6.0, 0.0]
+    else:
+        # The left end of the jaw, to a flat stump.
+        stump = np.quantile(vertices[:, 0], 0.7)
+        vertices[:, 0] = np.minimum(vertices[:, 0], stump)
+    head.surfaces["mandible_after"] = cmfsim.SurfaceData(vertices, after.triangles)
+    model = cmfsim.build_model(cmfsim.Case.load(head.write(tmp_path)), check=False)
+    (found,) = [f for f in model.findings if f.code == "achieved-piece-off"]
+    assert found.severity == "warning"
+    assert found.where.startswith("case.toml:")
+    assert re.search(r"\d\.\d cm² of mandible about \(.*\) mm", found.what)
+    assert ("it moved otherwise than the segment" in found.what) == is_there
+    assert ("removed, outside the scan" in found.what) != is_there
+    assert "[[osteotomies]]" in found.fix
+    assert "achieved-piece-off" in [f["code"] for f in model.summary["findings"]]
+    (patch,) = model.summary["achieved"]["segments"]["mandible"]["stray"]
+    assert patch["area_mm2"] > 100.0
+    assert patch["has_bone"] == is_there
+    assert not model.summary["achieved"]["segments"]["cranium"]["stray"]

@@ -16,7 +16,9 @@ from cmfsim.bones.motion import (
     torn_pieces,
     without_removed,
 )
+from cmfsim.bones.stray import REACH, StrayPatch
 from cmfsim.checks import Floats
+from cmfsim.doctor.moved import check_pairs
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface
 from cmfsim.pipeline.building.inputs import motion_source, read_motion
@@ -129,6 +131,7 @@ def _achieved_bones(
         for name in names
         if name in after.bones and (moved := _same_bone(case, name, after.bones[name])) is not None
     }
+    noticed = [found for name, moved in by_vertex.items() for found in _paired(case, name, moved)]
     searched = [segment for segment in segments if segment.name not in by_vertex]
     reference = next((name for name in REFERENCES if name in names), None)
     if searched and reference is not None and reference not in by_vertex:
@@ -157,13 +160,19 @@ def _achieved_bones(
             {s.name: s for s in (*still, *(s for s in searched if s not in still))},
             {s.name: bones.get(s.name, whole) for s in searched},
             reference=reference,
+            beside=[s.surface for s in segments if s not in searched],
         )
         motions |= {name: found for name, found in achieved.plan.items() if name != reference}
     made = _with_motions(case, segments, motions, achieved)
-    noticed = [
+    noticed += [
         _removed_finding(case, name, name, patch, "note")
         for name, found in ({} if achieved is None else achieved.motions).items()
         for patch in found.removed
+    ]
+    noticed += [
+        _stray_finding(case, name, patch, still=name == reference)
+        for name, found in ({} if achieved is None else achieved.motions).items()
+        for patch in found.stray
     ]
     return replace(made, findings=(*made.findings, *noticed))
 
@@ -184,6 +193,21 @@ def _same_bone(case: Case, name: str, there: SurfaceData) -> MovedSurface | None
         np.asarray(here.triangles), np.asarray(there.triangles)
     )
     return MovedSurface(here, there.vertices) if same else None
+
+
+def _paired(case: Case, name: str, moved: MovedSurface) -> list[Finding]:
+    """Findings about a bone that is followed vertex by vertex.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Its surfaces are no bone that moved: mirrored, shuffled, in two units.
+    """
+    found = list(check_pairs(name, case.where(_plan_key(case, name)), moved))
+    for finding in found:
+        if finding.severity == "error":
+            raise CaseInputError(f"{finding.where}: {finding.what}; {finding.fix}")
+    return found
 
 
 def _joined(surfaces: list[SurfaceData]) -> SurfaceData:
@@ -259,6 +283,42 @@ def _removed_finding(
         fix="look at the bone there; if it was pushed in (fracture, impaction), give that part as "
         "a "
         "bone of its own",
+    )
+
+
+def _stray_finding(case: Case, name: str, patch: StrayPatch, *, still: bool) -> Finding:
+    """A piece of a segment that its motion does not lay on the bone after the operation."""
+    at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
+    piece = f"{patch.area / 100.0:.1f} cm² of {name} about ({at}) mm"
+    if patch.has_bone:
+        what = (
+            f"{piece} lie off the bone after the operation, by {patch.distance:.1f} mm (median): "
+            "bone is there, displaced: it moved otherwise than the segment, or what is left of it "
+            "lies deeper"
+        )
+        fix = (
+            "if that piece was cut (genioplasty, split maxilla), make it a segment of its own in "
+            "[[osteotomies]]; else check whether bone was removed there"
+        )
+    else:
+        what = (
+            f"{piece} have no bone after the operation within {REACH:g} mm that faces alike "
+            f"({patch.distance:.1f} mm to the nearest, median): removed, outside the scan, or "
+            "moved further"
+        )
+        fix = (
+            "check whether bone was removed there and whether the scan after shows that place; if "
+            "the piece was cut and moved, make it a segment of its own in [[osteotomies]]"
+        )
+    # A smaller scan after the operation cuts off the skull nearly always, which moves nothing.
+    return Finding(
+        severity="note" if still and not patch.has_bone else "warning",
+        code="achieved-piece-off",
+        what=what,
+        where=case.where(_plan_key(case, name)),
+        why="the piece had no say in the motion, and moves with the rest of the segment all the "
+        "same: the face over it may be wrong by that distance",
+        fix=fix,
     )
 
 

@@ -1,0 +1,149 @@
+"""Laying a bone segment on the post-operative bone by trimmed iterative closest points."""
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+
+from cmfsim._core import IcpFit, Surface
+from cmfsim.checks import Floats, as_number, as_positive
+from cmfsim.errors import RegistrationError, RegistrationInputError
+from cmfsim.registration import icp
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = ["MatchOptions", "lay_on"]
+
+_LOG = logging.getLogger(__name__)
+
+# Points of the quick search for a start, and its steps from each.
+QUICK_POINTS = 400
+QUICK_STEPS = 20
+# The search rests when a step moves no point by more than this share of the segment's size: 0.1 µm,
+# where noise of the bone still swaps partners.
+REST = 2e-6
+MOST_STEPS = 300
+# Trimming a fixed share leaves out sound bone too, its noisier part. The last search takes all
+# within so many times the rms of the trimmed fit, 2.3 standard deviations of the noise if 0.3 are
+# trimmed, but not less than this, mm.
+CUT = 4.0
+LEAST_CUT = 0.05
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """How a bone segment is laid on the post-operative bone.
+
+    Attributes
+    ----------
+    trim : float
+        Share of the segment's vertices, those furthest from the bone, that have no say while the
+        place is searched: cut faces, plates, bone that was ground away. 0 to below 1.
+    reach : float, mm
+        The search also begins this far to each side along each axis, for segments that moved on to
+        a neighbour of their place; 0: only from where they were.
+    max_angle : float, degrees
+        Between normals of partners: keeps the inner side of a bone off its outer side.
+    max_rms : float, mm
+        Of the partners at the end; a worse fit is an error.
+    least_share : float
+        Of the vertices that must have a partner at the end.
+
+    Raises
+    ------
+    RegistrationError, CaseError
+        (also `ValueError`) A value out of its range; not a number.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.MatchOptions(trim=0.4).reach
+    6.0
+    """
+
+    trim: float = 0.3
+    reach: float = 6.0
+    max_angle: float = 60.0
+    max_rms: float = 1.0
+    least_share: float = 0.3
+
+    def __post_init__(self) -> None:
+        for name in ("max_angle", "max_rms"):
+            as_positive(name, getattr(self, name))
+        if as_number("reach", self.reach) < 0.0:
+            raise RegistrationInputError(f"reach is {self.reach:g} mm: must not be below 0")
+        if not 0.0 <= as_number("trim", self.trim) < 1.0:
+            raise RegistrationInputError(f"trim is {self.trim:g}: must be from 0 to below 1")
+        if not 0.0 < as_number("least_share", self.least_share) <= 1.0:
+            raise RegistrationInputError(
+                f"least_share is {self.least_share:g}: must be above 0, to 1"
+            )
+
+
+def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions) -> IcpFit:
+    """The rigid fit of a segment, known by its name, to the post-operative bone.
+
+    Raises
+    ------
+    RegistrationError
+        It does not fit, or too little of it; the search does not come to rest.
+    """
+    try:
+        fit = icp(
+            segment,
+            bone,
+            initial=_start(np.asarray(segment.vertices), bone, options),
+            trim=options.trim,
+            max_angle=options.max_angle,
+            max_iterations=MOST_STEPS,
+            tolerance=REST,
+        )
+        if fit.rms <= options.max_rms:
+            fit = icp(
+                segment,
+                bone,
+                initial=fit.matrix,
+                max_distance=max(CUT * fit.rms, LEAST_CUT),
+                max_angle=options.max_angle,
+                max_iterations=MOST_STEPS,
+                tolerance=REST,
+            )
+    except RegistrationError as error:
+        raise RegistrationError(
+            f"segment {name!r} cannot be laid on the post-operative bone: {error}"
+        ) from error
+    if fit.rms > options.max_rms or fit.kept_fraction < options.least_share:
+        raise RegistrationError(
+            f"segment {name!r} does not fit the post-operative bone: {fit.rms:.2f} mm rms over "
+            f"{fit.kept_fraction:.0%} of its vertices (allowed {options.max_rms:g} mm, at least "
+            f"{options.least_share:.0%}); see whether the scans are aligned, whether the segment "
+            "is cut as it was in the operation, and whether the bone is all there; a larger trim "
+            "leaves out plates and new bone"
+        )
+    _LOG.info("segment %s: %.3f mm rms, %.0f %% kept", name, fit.rms, 100 * fit.kept_fraction)
+    return fit
+
+
+def _start(vertices: Floats, bone: Surface, options: MatchOptions) -> Floats:
+    """The best of several short searches, from where the segment was and from either side."""
+    # Any order of vertices in the file gives points from all over the segment.
+    order = np.random.default_rng(0).permutation(len(vertices))[:QUICK_POINTS]
+    points = vertices[order]
+    shifts = [np.zeros(3)]
+    if options.reach > 0.0:
+        shifts += [sign * options.reach * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
+    best: IcpFit | None = None
+    for shift in shifts:
+        initial = np.eye(4)
+        initial[:3, 3] = shift
+        fit = icp(
+            points,
+            bone,
+            initial=initial,
+            trim=options.trim,
+            max_iterations=QUICK_STEPS,
+            # Exactly as many steps as asked for: the search goes on from the best.
+            tolerance=0.0,
+        )
+        if best is None or fit.rms < best.rms:
+            best = fit
+    return np.eye(4) if best is None else np.asarray(best.matrix)
