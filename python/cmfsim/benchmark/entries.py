@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cmfsim._core import Surface
 from cmfsim.benchmark.least_squares import learn_face
 from cmfsim.benchmark.patients import BenchmarkPatient
 from cmfsim.benchmark.ratios import predict_by_ratios
@@ -20,8 +21,12 @@ from cmfsim.benchmark.skin_predictions import (
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import replacing
-from cmfsim.pipeline.predicting import predict_models
-from cmfsim.values.prediction import MODELS
+from cmfsim.pipeline.banding import predict_with_band
+from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline.predicting import build_patient
+from cmfsim.solving.models import predict_patient
+from cmfsim.surfaces.barycentric import at_closest
+from cmfsim.values.prediction import MODELS, Prediction
 
 __all__ = [
     "ENTRIES",
@@ -29,6 +34,7 @@ __all__ = [
     "LEARNED",
     "NO_CHANGE",
     "EntryFolder",
+    "check_own",
     "learned_entries",
     "patient_entries",
     "times_of",
@@ -56,17 +62,19 @@ class EntryFolder:
         """The file of a method and a patient."""
         return self.folder / method / f"{patient}{ending}"
 
-    def is_made(self, method: str, patient: str, made_from: str) -> bool:
-        """Whether a prediction, or its failure, was made from the same."""
+    def is_made(self, method: str, patient: str, made_from: str, *, band: bool = False) -> bool:
+        """Whether a prediction, or its failure, was made from the same, with a band if wanted."""
         file, failure = (self.file(method, patient, ending) for ending in (".npz", FAILURE))
         if failure.exists():
             return bool(json.loads(failure.read_text("utf-8")).get("made_from") == made_from)
-        return file.exists() and read_skin_prediction(file).made_from == made_from
+        if not file.exists():
+            return False
+        found = read_skin_prediction(file)
+        return found.made_from == made_from and (found.sd is not None or not band)
 
-    def put(self, method: str, patient: BenchmarkPatient, moves: Floats, made_from: str) -> None:
+    def put(self, method: str, patient: BenchmarkPatient, prediction: SkinPrediction) -> None:
         """Writes a prediction in place of an earlier one or its failure."""
         self.file(method, patient.name, FAILURE).unlink(missing_ok=True)
-        prediction = SkinPrediction(patient.skin, moves, made_from=made_from)
         write_skin_prediction(self.file(method, patient.name), prediction)
 
     def fail(self, method: str, patient: BenchmarkPatient, reason: str, made_from: str) -> None:
@@ -105,7 +113,9 @@ def times_of(folder: Path, method: str, patients: Sequence[str]) -> dict[str, fl
     return found
 
 
-def patient_entries(patient: str, folder: str, methods: Sequence[str]) -> None:
+def patient_entries(
+    patient: str, folder: str, methods: Sequence[str], banded: Sequence[str] = ()
+) -> None:
     """Makes the entries of one patient that need no other patient.
 
     A model that fails is recorded with its reason.
@@ -115,50 +125,82 @@ def patient_entries(patient: str, folder: str, methods: Sequence[str]) -> None:
     patient, folder : str
         The patient's folder, and that of all predictions.
     methods : sequence of str
+    banded : sequence of str
+        Models whose predictions get a standard deviation, from which a band is calibrated.
     """
-    _entries_of(BenchmarkPatient(Path(patient).name, Path(patient)), Path(folder), methods)
-
-
-def _entries_of(patient: BenchmarkPatient, folder: Path, methods: Sequence[str]) -> None:
-    place, made_from = EntryFolder(folder), patient.digest()
+    of = BenchmarkPatient(Path(patient).name, Path(patient))
+    place, made_from = EntryFolder(Path(folder)), of.digest()
     simple: Mapping[str, Callable[[BenchmarkPatient], Floats]] = {
         NO_CHANGE: lambda p: np.zeros_like(p.skin),
         RATIOS: predict_by_ratios,
     }
-    wanted = [m for m in methods if not place.is_made(m, patient.name, made_from)]
+    wanted = [m for m in methods if not place.is_made(m, of.name, made_from, band=m in banded)]
     for method in (m for m in wanted if m in simple):
         begun = time.perf_counter()
-        place.put(method, patient, simple[method](patient), made_from)
-        place.took(method, patient.name, time.perf_counter() - begun)
+        moves = simple[method](of)
+        place.put(method, of, SkinPrediction(of.skin, moves, made_from=made_from))
+        place.took(method, of.name, time.perf_counter() - begun)
     models = [m for m in wanted if m in MODELS]
     if models:
-        _by_models(patient, place, models, made_from)
+        _by_models(of, place, models, banded, made_from)
 
 
 def _by_models(
-    patient: BenchmarkPatient, place: EntryFolder, models: Sequence[str], made_from: str
+    patient: BenchmarkPatient,
+    place: EntryFolder,
+    models: Sequence[str],
+    banded: Sequence[str],
+    made_from: str,
 ) -> None:
     """The mechanical models: the patient is built once, and its time counts for each of them."""
-    failed: dict[str, CmfsimError] = {}
     # The truth is not even opened.
     case = replace(patient.case, postoperative=None)
     begun = time.perf_counter()
-    built = None
     try:
-        for prediction in predict_models(case, models, check=False, failed=failed):
-            now = time.perf_counter()
-            solved = float(prediction.summary["timings"]["solving"])
-            built = now - begun - solved if built is None else built
-            moves = prediction.carried(patient.skin)
-            place.put(prediction.model, patient, moves, made_from)
-            place.took(prediction.model, patient.name, built + solved)
+        built = build_patient(case, models, BuildOptions(check=False))
     except CmfsimError as error:
-        # Of building, or of a kind that the next model would meet as well.
         for model in models:
-            if not place.is_made(model, patient.name, made_from):
-                failed.setdefault(model, error)
-    for model, reason in failed.items():
-        place.fail(model, patient, str(reason), made_from)
+            place.fail(model, patient, str(error), made_from)
+        return
+    building = time.perf_counter() - begun
+    for model in models:
+        begun = time.perf_counter()
+        try:
+            if model in banded:
+                prediction = predict_with_band(built, model)
+            else:
+                prediction = predict_patient(built, model)
+        except CmfsimError as error:
+            place.fail(model, patient, str(error), made_from)
+            continue
+        place.put(model, patient, _entered(patient, prediction, made_from))
+        place.took(model, patient.name, building + time.perf_counter() - begun)
+
+
+def _entered(patient: BenchmarkPatient, prediction: Prediction, made_from: str) -> SkinPrediction:
+    """A prediction on the vertices of the patient's skin."""
+    moves, band = prediction.carried(patient.skin), prediction.band
+    if band is None:
+        return SkinPrediction(patient.skin, moves, made_from=made_from)
+    before = prediction.skin_before
+    sd = at_closest(Surface(before.vertices, before.triangles), band.sd, patient.skin)
+    settings = json.dumps(dict(band.settings), sort_keys=True)
+    return SkinPrediction(patient.skin, moves, sd=sd, settings=settings, made_from=made_from)
+
+
+def check_own(method: str, prediction: SkinPrediction, patient: BenchmarkPatient) -> None:
+    """Refuses an own entry of another version, or of a patient who was made again.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`)
+    """
+    if method in ENTRIES and not prediction.made_from.endswith(patient.digest()):
+        raise CaseInputError(
+            "was not made by this version from the patient as they are: predict it again "
+            f"(--entries {method}), or give a method of your own another name"
+        )
 
 
 def learned_entries(
@@ -190,5 +232,8 @@ def learned_entries(
         return
     for patient in wanted:
         begun = time.perf_counter()
-        place.put(LEARNED, patient, learned.predict(patient), made_from[patient.name])
+        prediction = SkinPrediction(
+            patient.skin, learned.predict(patient), made_from=made_from[patient.name]
+        )
+        place.put(LEARNED, patient, prediction)
         place.took(LEARNED, patient.name, time.perf_counter() - begun)

@@ -1,6 +1,8 @@
 """A patient of the benchmark: what a method may read, and the truth that it is scored by."""
 
 import hashlib
+import json
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +17,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.evaluation import skin_regions
 from cmfsim.io import Case, read_landmarks, read_surface
 from cmfsim.io.populations import MADE, Population
+from cmfsim.solving.uncertainty import ADDED, PLAN, Source
 
 __all__ = ["LIPS", "BenchmarkPatient", "patients_of"]
 
@@ -22,6 +25,14 @@ LIPS = "lips"
 SKIN, CASE = "skin.ply", "case.toml"
 READ = (CASE, "ct.nrrd", "skull.mrk.json", "skin.mrk.json", SKIN)
 TRUE_SKIN = "truth/skin_exact.ply"
+TRUTH_RECORD = "truth/truth.json"
+# Of the logarithms, as docs/virtual_patients.md has what is drawn, and the axes of the execution.
+THICKNESS_SD, STIFFNESS_SD = 0.12, 0.5
+AXES = ("to the left", "backwards", "upwards")
+
+
+def _sd_of(sources: Iterable[Source], name: str) -> float:
+    return next(source.sd for source in sources if source.name == name)
 
 
 @dataclass(frozen=True)
@@ -84,6 +95,29 @@ class BenchmarkPatient:
                 f"{len(after)}: make the patient again"
             )
         return after - self.skin
+
+    @cached_property
+    def departure(self) -> float | None:
+        """How far the truth departs from what a prediction can know; None where it is not recorded.
+
+        The root mean square of what was drawn for the thickness and the stiffness of muscles, the
+        change of thickness, and the execution of the plan, each over its standard deviation.
+        """
+        path = self.folder / TRUTH_RECORD
+        if not path.exists():
+            return None
+        drawn = json.loads(path.read_text(encoding="utf-8")).get("patient", {})
+        if "departures" not in drawn:
+            return None
+        off = [
+            math.log(drawn["muscle_thickness"]) / THICKNESS_SD,
+            math.log(drawn["muscle_stiffness"]) / STIFFNESS_SD,
+            drawn["thickness_change"] / _sd_of(ADDED, "thickness change"),
+        ]
+        for moved in drawn["departures"].values():
+            shifts = zip(AXES, moved["translation"], strict=True)
+            off += [shift / _sd_of(PLAN, axis) for axis, shift in shifts]
+        return math.sqrt(sum(value**2 for value in off) / len(off))
 
     def planned_motion(self, *segments: str) -> Floats:
         """The planned motion (4, 4) mm of the first of some segments that the plan moves."""

@@ -1,28 +1,33 @@
 """The benchmark of a folder: own entries are made, all predictions there are scored."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from cmfsim.benchmark.bands import calibrated_band
 from cmfsim.benchmark.entries import (
     ENTRIES,
     FAILURE,
     LEARNED,
     EntryFolder,
+    check_own,
     learned_entries,
     patient_entries,
     times_of,
 )
 from cmfsim.benchmark.patients import BenchmarkPatient, patients_of
+from cmfsim.benchmark.results import MethodResult
 from cmfsim.benchmark.scores import score
 from cmfsim.benchmark.skin_predictions import read_skin_prediction
-from cmfsim.benchmark.table import BenchmarkTable, MethodResult
+from cmfsim.benchmark.table import BenchmarkTable
 from cmfsim.checks import as_number, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.io import replacing
 from cmfsim.io.parallel import answers
-from cmfsim.io.populations import FAILED, PARTS, PENDING, TEST, TRAIN, Population
+from cmfsim.io.populations import CALIBRATION, FAILED, PARTS, PENDING, TEST, TRAIN, Population
+from cmfsim.values.model_names import MODELS
 
 __all__ = ["Benchmark", "run_benchmark"]
 
@@ -37,7 +42,7 @@ class Benchmark:
     ----------
     table : BenchmarkTable
     files : tuple of Path
-        CSV, Markdown and JSON, the same bytes each time; and the run times.
+        CSV, Markdown, JSON and calibrations of bands, the same bytes each time; and the run times.
     """
 
     table: BenchmarkTable
@@ -49,6 +54,7 @@ def run_benchmark(
     *,
     part: str = TEST,
     entries: Sequence[str] = ENTRIES,
+    band: Sequence[str] = (),
     workers: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> Benchmark:
@@ -65,6 +71,9 @@ def run_benchmark(
         "test"; or "calibration" or "train", which show nothing about a method that learned there.
     entries : sequence of str
         Own entries to predict; may be empty.
+    band : sequence of str
+        Models among them that state a standard deviation too, also for the part `calibration`: from
+        that part follows how many of them hold 90 % of patients, and this part shows whether.
     workers : int
         Patients predicted at a time.
     progress : callable, optional
@@ -82,6 +91,11 @@ def run_benchmark(
         (also `ValueError`) An unknown entry or part; a population that is not complete; a
         prediction of another skin, or that is no prediction: with file, index and value.
 
+    Notes
+    -----
+    Any method may state standard deviations: those of the calibration part calibrate its band. For
+    models of this package the calibration is written as `benchmark/calibration_MODEL.json`.
+
     Examples
     --------
     >>> import cmfsim
@@ -91,6 +105,8 @@ def run_benchmark(
     check_one_of("part", part, PARTS)
     for entry in entries:
         check_one_of("entry", entry, ENTRIES)
+    for model in band:
+        check_one_of("band", model, [entry for entry in entries if entry in MODELS])
     if as_number("workers", workers) < 1 or int(workers) != workers:
         raise CaseInputError(f"workers is {workers!r}: a whole number from 1 is needed")
     place = Path(folder)
@@ -105,42 +121,61 @@ def run_benchmark(
     if not patients:
         raise CaseInputError(f"{place}: no patient of the part {part!r} has a truth")
     predictions = place / PREDICTIONS
-    _predict_each(patients, predictions, entries, int(workers), progress)
+    calibrating = [] if part == CALIBRATION else patients_of(place, population, [CALIBRATION])
+    jobs = _jobs(patients, predictions, entries, band)
+    jobs += _jobs(calibrating, predictions, band, band)
+    _predict_each(jobs, int(workers), progress)
     if LEARNED in entries and part != TRAIN:
         learned_entries(patients_of(place, population, [TRAIN]), patients, predictions)
     methods = _methods(predictions)
     if not methods:
         raise CaseInputError(f"{predictions}: no method has a folder there (docs/benchmark.md)")
-    results = [_result(predictions, method, patients) for method in methods]
+    results = [_result(predictions, method, patients, calibrating) for method in methods]
     table = BenchmarkTable(
         part,
         tuple(patient.name for patient in patients),
         population.named(FAILED, part),
         tuple(results),
         dict(population.settings),
+        _far(patients),
     )
     return Benchmark(table, _write(place / RESULTS, table, predictions))
 
 
-def _predict_each(
-    patients: Sequence[BenchmarkPatient],
-    folder: Path,
-    entries: Sequence[str],
-    workers: int,
-    progress: Callable[[str], None] | None,
-) -> None:
-    """The entries that need one patient at a time, each patient in a process."""
+def _jobs(
+    patients: Sequence[BenchmarkPatient], folder: Path, entries: Sequence[str], band: Sequence[str]
+) -> list[dict[str, Any]]:
+    """What a process is to predict of each patient: the entries that need one at a time."""
     alone = [entry for entry in entries if entry != LEARNED]
     if not alone:
-        return
-    jobs = [
-        {"patient": str(p.folder.absolute()), "folder": str(folder.absolute()), "methods": alone}
-        for p in patients
+        return []
+    return [
+        {
+            "patient": str(patient.folder.absolute()),
+            "folder": str(folder.absolute()),
+            "methods": alone,
+            "banded": list(band),
+        }
+        for patient in patients
     ]
+
+
+def _predict_each(
+    jobs: Sequence[Mapping[str, Any]], workers: int, progress: Callable[[str], None] | None
+) -> None:
+    """Each patient in a process."""
     function = f"{patient_entries.__module__}:{patient_entries.__name__}"
     for done, (index, _) in enumerate(answers(function, jobs, workers), 1):
         if progress is not None:
-            progress(f"{done} of {len(jobs)}  {patients[index].name} predicted")
+            progress(f"{done} of {len(jobs)}  {Path(jobs[index]['patient']).name} predicted")
+
+
+def _far(patients: Sequence[BenchmarkPatient]) -> tuple[str, ...]:
+    """The half of the patients whose truth departs farthest from what predictions can know."""
+    known = [(p.departure, p.name) for p in patients if p.departure is not None]
+    if len(known) < len(patients):
+        return ()
+    return tuple(sorted(name for _, name in sorted(known)[(len(known) + 1) // 2 :]))
 
 
 def _methods(predictions: Path) -> list[str]:
@@ -151,9 +186,16 @@ def _methods(predictions: Path) -> list[str]:
     return [name for name in ENTRIES if name in found] + [n for n in found if n not in ENTRIES]
 
 
-def _result(folder: Path, method: str, patients: Sequence[BenchmarkPatient]) -> MethodResult:
+def _result(
+    folder: Path,
+    method: str,
+    patients: Sequence[BenchmarkPatient],
+    calibrating: Sequence[BenchmarkPatient],
+) -> MethodResult:
     """The scores of a method, and for whom it has no prediction."""
     place = EntryFolder(folder)
+    band = calibrated_band(method, folder, calibrating)
+    factors = band.factors if band is not None else {}
     scores, missing = {}, []
     for patient in patients:
         file = place.file(method, patient.name)
@@ -162,22 +204,12 @@ def _result(folder: Path, method: str, patients: Sequence[BenchmarkPatient]) -> 
             continue
         try:
             prediction = read_skin_prediction(file)
-            if method in ENTRIES:
-                _check_own(method, prediction.made_from, patient)
-            scores[patient.name] = score(patient, prediction)
+            check_own(method, prediction, patient)
+            scores[patient.name] = score(patient, prediction, factors)
         except CaseInputError as error:
             raise CaseInputError(f"{file}: {error}") from error
     failed = [name for name in missing if place.file(method, name, FAILURE).exists()]
-    return MethodResult(method, scores, tuple(missing), tuple(failed))
-
-
-def _check_own(method: str, made_from: str, patient: BenchmarkPatient) -> None:
-    """Refuses an own entry of another version, or of a patient who was made again."""
-    if not made_from.endswith(patient.digest()):
-        raise CaseInputError(
-            "was not made by this version from the patient as they are: predict it again "
-            f"(--entries {method}), or give a method of your own another name"
-        )
+    return MethodResult(method, scores, tuple(missing), tuple(failed), band)
 
 
 def _write(folder: Path, table: BenchmarkTable, predictions: Path) -> tuple[Path, ...]:
@@ -192,7 +224,12 @@ def _write(folder: Path, table: BenchmarkTable, predictions: Path) -> tuple[Path
     for name, text in texts.items():
         with replacing(folder / name) as file:
             file.write(text.encode())
-    return tuple(folder / name for name in texts)
+    found = [folder / name for name in texts]
+    for result in table.results:
+        if result.method in MODELS and result.band is not None:
+            found.append(folder / f"calibration_{result.method}.json")
+            result.band.write(found[-1], result.method, table.settings)
+    return tuple(found)
 
 
 def _times(table: BenchmarkTable, predictions: Path) -> str:

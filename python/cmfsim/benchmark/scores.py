@@ -1,12 +1,16 @@
 """Errors of one prediction at the vertices of each region."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from cmfsim.benchmark.patients import BenchmarkPatient
 from cmfsim.benchmark.skin_predictions import SkinPrediction
+from cmfsim.checks import Floats
+from cmfsim.values.calibration import BandFactor
 
 __all__ = ["WITHIN", "RegionScore", "score"]
 
@@ -54,8 +58,20 @@ class RegionScore:
         return {names[name]: value for name, value in asdict(self).items() if value is not None}
 
 
-def score(patient: BenchmarkPatient, prediction: SkinPrediction) -> dict[str, RegionScore]:
+def score(
+    patient: BenchmarkPatient,
+    prediction: SkinPrediction,
+    factors: Mapping[str, BandFactor] = MappingProxyType({}),
+) -> dict[str, RegionScore]:
     """The scores of a prediction by region.
+
+    Parameters
+    ----------
+    patient : BenchmarkPatient
+    prediction : SkinPrediction
+    factors : mapping of str to BandFactor
+        How many standard deviations of the prediction its band has in a region; none without a
+        calibration.
 
     Raises
     ------
@@ -70,8 +86,9 @@ def score(patient: BenchmarkPatient, prediction: SkinPrediction) -> dict[str, Re
     for name, part in patient.regions.items():
         errors = length[part]
         covered = half_width = None
-        if prediction.half_width is not None:
-            widths = prediction.half_width[part]
+        band = _widths(prediction, factors.get(name))
+        if band is not None:
+            widths = band[part]
             # A region with a vertex that has no band is not covered.
             covered = bool((along[part] <= widths).all())
             half_width = _rounded(np.nanmean(widths)) if np.isfinite(widths).any() else None
@@ -84,6 +101,15 @@ def score(patient: BenchmarkPatient, prediction: SkinPrediction) -> dict[str, Re
             half_width,
         )
     return found
+
+
+def _widths(prediction: SkinPrediction, factor: BandFactor | None) -> Floats | None:
+    """The half widths of the band that a region is scored by, (v,) mm."""
+    if prediction.half_width is not None:
+        return prediction.half_width
+    if prediction.sd is None or factor is None:
+        return None
+    return factor.factor * prediction.sd
 
 
 def _rounded(value: Any) -> float:

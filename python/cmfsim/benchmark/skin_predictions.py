@@ -20,7 +20,7 @@ SAME_PLACE = 0.01
 # No operation on the jaws moves skin farther, mm: a displacement beyond it has another unit, or is
 # the moved vertex itself.
 LARGEST_MOVE = 60.0
-MEMBERS = {"vertices", "displacement", "half_width", "made_from"}
+MEMBERS = {"vertices", "displacement", "half_width", "sd", "settings", "made_from"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +35,12 @@ class SkinPrediction:
     half_width : (v,) float64, mm, or None
         Of a band along the normal, which the method states to hold 90 % of patients in each region
         of the face. NaN where it states none.
+    sd : (v,) float64, mm, or None
+        In its place, the standard deviation along the normal that the method expects, above 0:
+        predictions of the part `calibration` then say how many of them hold 90 % of patients.
+    settings : str
+        What the standard deviation depends on besides the patient, as JSON: predictions whose
+        settings differ are not calibrated by one another.
     made_from : str
         What the package's own entries were made from, so that they are not made again; empty in
         others.
@@ -43,6 +49,8 @@ class SkinPrediction:
     vertices: Floats
     displacement: Floats
     half_width: Floats | None = None
+    sd: Floats | None = None
+    settings: str = ""
     made_from: str = ""
 
     def __post_init__(self) -> None:
@@ -59,8 +67,19 @@ class SkinPrediction:
             )
         object.__setattr__(self, "vertices", places)
         object.__setattr__(self, "displacement", moves)
+        if self.half_width is not None and self.sd is not None:
+            raise CaseInputError("has half_width and sd: give one of them")
         if self.half_width is not None:
-            object.__setattr__(self, "half_width", _half_width(self.half_width, len(places)))
+            widths = _lengths("half_width", self.half_width, len(places))
+            object.__setattr__(self, "half_width", widths)
+        if self.sd is not None:
+            deviations = _lengths("sd", self.sd, len(places))
+            bad = np.flatnonzero(~(np.isfinite(deviations) & (deviations > 0.0)))
+            if len(bad):
+                raise CaseInputError(
+                    f"sd[{bad[0]}] is {deviations[bad[0]]:g} mm: above 0 is needed, at each vertex"
+                )
+            object.__setattr__(self, "sd", deviations)
 
     def check_vertices(self, skin: ArrayLike) -> None:
         """Refuses a prediction of another skin, or of the same in another order.
@@ -86,14 +105,15 @@ class SkinPrediction:
             )
 
 
-def _half_width(values: ArrayLike, count: int) -> Floats:
-    widths = np.asarray(values, dtype=np.float64)
-    if widths.shape != (count,):
-        raise CaseInputError(f"half_width has shape {widths.shape}: ({count},) is needed")
-    bad = np.flatnonzero(widths < 0.0)
+def _lengths(name: str, values: ArrayLike, count: int) -> Floats:
+    """Lengths from 0 on, or NaN."""
+    found = np.asarray(values, dtype=np.float64)
+    if found.shape != (count,):
+        raise CaseInputError(f"{name} has shape {found.shape}: ({count},) is needed")
+    bad = np.flatnonzero(found < 0.0)
     if len(bad):
-        raise CaseInputError(f"half_width[{bad[0]}] is {widths[bad[0]]:g} mm: 0 or more is needed")
-    return widths
+        raise CaseInputError(f"{name}[{bad[0]}] is {found[bad[0]]:g} mm: 0 or more is needed")
+    return found
 
 
 def write_skin_prediction(path: str | os.PathLike[str], prediction: SkinPrediction) -> None:
@@ -110,10 +130,12 @@ def write_skin_prediction(path: str | os.PathLike[str], prediction: SkinPredicti
         "vertices": prediction.vertices.astype(np.float32),
         "displacement": prediction.displacement.astype(np.float32),
     }
-    if prediction.half_width is not None:
-        arrays["half_width"] = prediction.half_width.astype(np.float32)
-    if prediction.made_from:
-        arrays["made_from"] = np.array(prediction.made_from)
+    for name, values in (("half_width", prediction.half_width), ("sd", prediction.sd)):
+        if values is not None:
+            arrays[name] = values.astype(np.float32)
+    for name, text in (("settings", prediction.settings), ("made_from", prediction.made_from)):
+        if text:
+            arrays[name] = np.array(text)
     with replacing(place) as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
@@ -138,12 +160,12 @@ def read_skin_prediction(path: str | os.PathLike[str]) -> SkinPrediction:
                 if unknown or missing:
                     raise CaseInputError(
                         f"has {', '.join(sorted(archive.files))}: vertices and displacement are "
-                        "needed, half_width may be there"
+                        "needed, half_width or sd may be there"
                     )
                 found = {name: archive[name] for name in archive.files}
         except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
             if isinstance(error, CaseInputError):
                 raise
             raise CaseInputError(f"is no .npz archive of arrays: {error}") from error
-        made_from = str(found.pop("made_from", ""))
-        return SkinPrediction(**found, made_from=made_from)
+        settings, made_from = (str(found.pop(name, "")) for name in ("settings", "made_from"))
+        return SkinPrediction(**found, settings=settings, made_from=made_from)

@@ -3,32 +3,21 @@
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from cmfsim.benchmark.band_table import band_sections
 from cmfsim.benchmark.entries import NO_CHANGE
+from cmfsim.benchmark.markdown import DASH, cell, table
 from cmfsim.benchmark.patients import LIPS
-from cmfsim.benchmark.scores import RegionScore
+from cmfsim.benchmark.results import REGIONS, MethodResult
 
-__all__ = ["BenchmarkTable", "MethodResult"]
+__all__ = ["BenchmarkTable"]
 
 FORMAT = "cmfsim-benchmark"
-# Regions in the order of the tables.
-REGIONS = (
-    "face",
-    "lower face",
-    LIPS,
-    "upper lip",
-    "lower lip",
-    "chin",
-    "nose",
-    "left cheek",
-    "right cheek",
-)
-FIGURES = ("mean", "p95", "within", "normal")
 COLUMNS = (
     "method",
     "region",
@@ -42,54 +31,14 @@ COLUMNS = (
     "patients_with_band",
     "share_covered",
     "half_width_mm",
+    "calibration_patients",
+    "standard_deviations",
 )
-DASH = "–"
 NOTE = (
     "In silico: heads made by code and operations computed; no patients. Each figure is the mean "
     "of the patients' figures. The error is the length of the difference from the true "
     "displacement of a vertex, sliding along the skin included."
 )
-
-
-@dataclass(frozen=True)
-class MethodResult:
-    """The scores of one method.
-
-    Attributes
-    ----------
-    method : str
-    scores : mapping of str to mapping of str to RegionScore
-        By patient, then by region.
-    missing : tuple of str
-        Patients without a prediction, and `failed` those of them where the method says why.
-    """
-
-    method: str
-    scores: Mapping[str, Mapping[str, RegionScore]]
-    missing: tuple[str, ...] = ()
-    failed: tuple[str, ...] = ()
-
-    def figures(self, region: str, name: str) -> list[float]:
-        """A figure of each patient who has it."""
-        found = [getattr(scores[region], name) for scores in self.scores.values()]
-        return [float(value) for value in found if value is not None]
-
-    def mean(self, region: str, name: str) -> float | None:
-        """The mean of a figure over patients; None where none has it."""
-        found = self.figures(region, name)
-        return float(np.mean(found)) if found else None
-
-    def row(self, region: str, count: int) -> list[str]:
-        """The cells of the CSV file."""
-        means = self.figures(region, "mean")
-        spread = float(np.std(means, ddof=1)) if len(means) > 1 else None
-        values = [self.mean(region, name) for name in FIGURES]
-        banded = self.figures(region, "covered")
-        band = [self.mean(region, name) for name in ("covered", "half_width")]
-        numbers = [_number(value) for value in (values[0], spread, *values[1:])]
-        counts = [str(len(means)), str(count)]
-        band_cells = [str(len(banded)), *(_number(value) for value in band)]
-        return [self.method, region, *counts, *numbers, *band_cells]
 
 
 @dataclass(frozen=True)
@@ -106,6 +55,9 @@ class BenchmarkTable:
     results : tuple of MethodResult
     settings : mapping
         Of the population.
+    far : tuple of str
+        The half of the patients whose truth departs farthest from what predictions can know; empty
+        where that is not recorded.
     """
 
     part: str
@@ -113,6 +65,7 @@ class BenchmarkTable:
     without_truth: tuple[str, ...]
     results: tuple[MethodResult, ...]
     settings: Mapping[str, Any]
+    far: tuple[str, ...] = ()
 
     def csv(self) -> str:
         """A row for each method and region."""
@@ -133,10 +86,12 @@ class BenchmarkTable:
             "population": dict(self.settings),
             "patients": list(self.patients),
             "patients_without_truth": list(self.without_truth),
+            "patients_far_from_the_models": list(self.far),
             "methods": {
                 result.method: {
                     "missing": list(result.missing),
                     "failed": list(result.failed),
+                    "band": None if result.band is None else result.band.as_dict(),
                     "patients": {
                         name: {region: found.as_dict() for region, found in scores.items()}
                         for name, scores in result.scores.items()
@@ -166,6 +121,7 @@ class BenchmarkTable:
             self._by_region("within", "{:.0%}"),
             "## Mean error along the normal by region, mm",
             self._by_region("normal", "{:.2f}"),
+            *band_sections(self.results, self.far),
             *self._missing(),
         ]
         return "\n\n".join([*parts, ""])
@@ -180,16 +136,14 @@ class BenchmarkTable:
                 (
                     result.method,
                     f"{len(face)} of {len(self.patients)}",
-                    _cell(result.mean("face", "mean"), "{:.2f}") + spread,
-                    _cell(result.mean("face", "p95"), "{:.2f}"),
-                    _cell(result.mean("face", "within"), "{:.0%}"),
-                    _cell(result.mean(LIPS, "mean"), "{:.2f}"),
-                    _cell(result.mean(LIPS, "p95"), "{:.2f}"),
+                    cell(result.mean("face", "mean"), "{:.2f}") + spread,
+                    cell(result.mean("face", "p95"), "{:.2f}"),
+                    cell(result.mean("face", "within"), "{:.0%}"),
+                    cell(result.mean(LIPS, "mean"), "{:.2f}"),
+                    cell(result.mean(LIPS, "p95"), "{:.2f}"),
                 )
             )
-        return _table(
-            (*titles, "worse than no change in"), [(*r, self._losses(r[0])) for r in rows]
-        )
+        return table((*titles, "worse than no change in"), [(*r, self._losses(r[0])) for r in rows])
 
     def _losses(self, method: str) -> str:
         """Regions where a method's mean is above that of leaving the face as it was."""
@@ -210,10 +164,10 @@ class BenchmarkTable:
 
     def _by_region(self, figure: str, form: str) -> str:
         rows = [
-            (result.method, *(_cell(result.mean(region, figure), form) for region in REGIONS))
+            (result.method, *(cell(result.mean(region, figure), form) for region in REGIONS))
             for result in self.results
         ]
-        return _table(("", *REGIONS), rows)
+        return table(("", *REGIONS), rows)
 
     def _missing(self) -> list[str]:
         """What the figures leave out."""
@@ -230,16 +184,3 @@ class BenchmarkTable:
                     "compared."
                 )
         return found
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.6f}"
-
-
-def _cell(value: float | None, form: str) -> str:
-    return DASH if value is None else form.format(value)
-
-
-def _table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [titles, ["---"] * len(titles), *rows]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)

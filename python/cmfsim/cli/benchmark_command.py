@@ -20,6 +20,7 @@ def benchmark(options: argparse.Namespace) -> int:
         options.folder,
         part=options.part,
         entries=options.entries,
+        band=options.band,
         workers=options.workers,
         progress=tell,
     )

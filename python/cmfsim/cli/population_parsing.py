@@ -7,6 +7,7 @@ from typing import Any
 from cmfsim.benchmark.entries import ENTRIES
 from cmfsim.cli import benchmark_command, virtual_patients_command
 from cmfsim.io.populations import PARTS, TEST
+from cmfsim.values.model_names import MODELS
 
 __all__ = ["add_population_commands"]
 
@@ -71,6 +72,15 @@ def add_population_commands(commands: Any, common: argparse.ArgumentParser) -> N
         default=list(ENTRIES),
         help=f"entries of this package to predict first, none if empty (default all: "
         f"{' '.join(ENTRIES)})",
+    )
+    benchmark.add_argument(
+        "--band",
+        metavar="MODEL",
+        nargs="+",
+        choices=MODELS,
+        default=[],
+        help="models whose band of 90 %% is calibrated on the part calibration, and tested on the "
+        "patients that are scored",
     )
     benchmark.add_argument(
         "--part", choices=PARTS, default=TEST, help="patients to score (default test)"

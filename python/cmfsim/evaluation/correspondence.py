@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface, ThinPlateSpline
 from cmfsim.checks import Floats
+from cmfsim.surfaces.barycentric import barycentric
 from cmfsim.surfaces.topology import edges_of
 from cmfsim.values.surface_data import SurfaceData
 
@@ -60,7 +61,7 @@ class Skin:
         if not len(candidates):
             return near
         corner = corners[candidates]
-        weights = _barycentric(points[candidates], self.vertices[corner])
+        weights = barycentric(self.vertices[corner], points[candidates])
         off = weights <= ON_EDGE
         single = off.sum(axis=1) >= 2
         at_vertex = single & self._on_border[corner[np.arange(len(corner)), weights.argmax(axis=1)]]
@@ -133,13 +134,3 @@ def match_skins(
         int(border.sum()),
         int(far.sum()),
     )
-
-
-def _barycentric(points: Floats, corners: Floats) -> Floats:
-    """The weights of each triangle's corners at a point in its plane, (k, 3)."""
-    a, b, c = (corners[:, i] for i in range(3))
-    normal = np.cross(b - a, c - a)
-    size = (normal * normal).sum(axis=1)
-    first = (np.cross(c - b, points - b) * normal).sum(axis=1) / size
-    second = (np.cross(a - c, points - c) * normal).sum(axis=1) / size
-    return np.stack([first, second, 1.0 - first - second], axis=1)

@@ -171,8 +171,8 @@ def _cranial_cavity(solid: Mask, skin: Skin, work: Working) -> Mask | None:
 def _enclosed_by_skull(cavity: Mask, wall: Mask) -> bool:
     """Whether a room is the brain's: so is the mouth where an image cuts the head."""
     rim = grown(cavity) & ~cavity
-    bounded = np.count_nonzero(rim & grown(wall)) / max(np.count_nonzero(rim), 1)
-    return bounded >= LEAST_BOUNDED
+    bounded = int(np.count_nonzero(rim & grown(wall)))
+    return bounded >= LEAST_BOUNDED * int(np.count_nonzero(rim))
 
 
 def _enclosed(

@@ -192,7 +192,8 @@ def _cut_off(values: NDArray[Any], scale: Calibration) -> NDArray[Any]:
     top = (HIGHEST - scale.offset) / scale.slope
     if float(values.max()) <= top:
         return values
-    return np.minimum(values, values.dtype.type(top))
+    found: NDArray[Any] = np.minimum(values, values.dtype.type(top))
+    return found
 
 
 def _factors(spacing: NDArray[np.float64], working: float) -> tuple[int, int, int]:

@@ -149,6 +149,56 @@ def test_a_band_covers_a_region_only_where_all_of_it_is_covered(folder):
         assert float(found[name, "nose"]["share_covered"]) == 1.0
 
 
+def test_standard_deviations_are_calibrated_on_another_part(folder):
+    """Ten patients whose errors along the normal are known show how many deviations hold them."""
+    entries = dict(cmfsim.Population.load(folder).patients)
+    calibrating = [name for name, entry in entries.items() if entry.part != "test"]
+    for name in calibrating:
+        part = "calibration" if name in calibrating[:10] else "train"
+        entries[name] = cmfsim.PopulationEntry("made", part, "M")
+    entries[f"D{FAILED:03d}"] = cmfsim.PopulationEntry("failed", "test", "M", "stalls")
+    cmfsim.Population(entries).write(folder)
+    errors = {name: 0.5 + 0.1 * k for k, name in enumerate(calibrating)}
+    enter(
+        folder,
+        "stated",
+        lambda p: p.truth + errors.get(p.name, 1.35) * p.normals,
+        parts=("test", "calibration"),
+        sd=lambda p: np.full(len(p.skin), 0.5),
+    )
+    found = cmfsim.run_benchmark(folder, entries=[]).table
+    # Ten cases: 90 % is the tenth smallest, the largest: (0.5 + 0.9) / 0.5 deviations.
+    row = rows(found.csv())["stated", "chin"]
+    assert float(row["standard_deviations"]) == pytest.approx(2.8, abs=1e-4)
+    assert float(row["half_width_mm"]) == pytest.approx(1.4, abs=1e-4)
+    assert (row["calibration_patients"], float(row["share_covered"])) == ("10", 1.0)
+    assert "5 of 5" in found.markdown()
+    # One case less in the calibration: its largest error is now below those of the test.
+    (folder / "predictions" / "stated" / f"{calibrating[9]}.npz").unlink()
+    found = cmfsim.run_benchmark(folder, entries=[]).table
+    assert float(rows(found.csv())["stated", "chin"]["share_covered"]) == 0.0
+    assert f"calibrated without {calibrating[9]}" in found.markdown()
+    (folder / "predictions" / "stated" / f"{calibrating[8]}.npz").unlink()
+    text = cmfsim.run_benchmark(folder, entries=[]).table.markdown()
+    assert "8 patients of the part calibration are too few for a band: 9 are needed" in text
+
+
+def test_standard_deviations_of_other_settings_are_not_mixed(folder):
+    """The second calibration patient was predicted under another setting."""
+    enter(folder, "mixed", lambda p: p.truth, sd=lambda p: np.ones(len(p.skin)))
+    settings = iter(["{}", '{"contact": "none"}'] + ["{}"] * 9)
+    enter(
+        folder,
+        "mixed",
+        lambda p: p.truth,
+        parts=("calibration",),
+        sd=lambda p: np.ones(len(p.skin)),
+        settings=lambda _: next(settings),
+    )
+    with pytest.raises(CaseInputError, match=r'D005\.npz: its settings, \{"contact": "none"\}'):
+        cmfsim.run_benchmark(folder, entries=[])
+
+
 def test_nothing_is_left_out(folder):
     """A patient without a prediction, one without a truth, and regions worse than no change."""
     enter(folder, "worse", lambda p: p.truth + [9.0, 0.0, 0.0])
@@ -235,6 +285,13 @@ def test_what_is_refused_says_where_and_why(folder):
         cmfsim.SkinPrediction(skin, skin + 1.0)
     with pytest.raises(CaseInputError, match="half_width has shape"):
         cmfsim.SkinPrediction(skin, still, half_width=np.ones(3))
+    ones = np.ones(len(skin))
+    with pytest.raises(CaseInputError, match="half_width and sd: give one"):
+        cmfsim.SkinPrediction(skin, still, half_width=ones, sd=ones)
+    with pytest.raises(CaseInputError, match=r"sd\[4\] is 0 mm: above 0"):
+        cmfsim.SkinPrediction(skin, still, sd=np.where(np.arange(len(skin)) == 4, 0.0, 1.0))
+    with pytest.raises(CaseInputError, match=r"band is 'M'"):
+        cmfsim.run_benchmark(folder, entries=["H"], band=["M"])
     path = folder / "predictions/x/D003.npz"
     np.savez(path, vertices=skin, moved=still)
     with pytest.raises(CaseInputError, match="displacement are needed"):

@@ -20,6 +20,7 @@ from cmfsim.planning.replanning import (
     PlanningModel,
     segment_boxes,
 )
+from cmfsim.surfaces.barycentric import barycentric
 from cmfsim.surfaces.levels import simplified_surface
 from cmfsim.values.finding import Finding
 from cmfsim.values.prediction import Prediction, carried_share
@@ -237,25 +238,14 @@ def _carried(part: str, skin: SurfaceData, points: Floats) -> dict[str, NDArray[
     there = Surface(skin.vertices, skin.triangles)
     closest, _, triangles = there.closest(points)
     corners = np.asarray(skin.vertices)[np.asarray(skin.triangles)[triangles]]
-    barycentric = _barycentric(corners, closest)
     offset = points - closest
     share = carried_share(there, np.linalg.norm(offset, axis=1))
     return {
         f"{part}_triangle": _indices(triangles),
-        f"{part}_barycentric": _singles(barycentric),
+        f"{part}_barycentric": _singles(barycentric(corners, closest)),
         f"{part}_offset": _singles(offset),
         f"{part}_share": _singles(share),
     }
-
-
-def _barycentric(corners: Floats, points: Floats) -> Floats:
-    """Barycentric coordinates (k, 3) of points on triangles (k, 3, 3)."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    normal = np.cross(b - a, c - a)
-    square = (normal * normal).sum(axis=1)
-    of_b = (np.cross(points - a, c - a) * normal).sum(axis=1) / square
-    of_c = (np.cross(b - a, points - a) * normal).sum(axis=1) / square
-    return np.stack([1.0 - of_b - of_c, of_b, of_c], axis=1)
 
 
 def _segments(planning: PlanningModel) -> list[dict[str, Any]]:
