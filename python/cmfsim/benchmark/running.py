@@ -56,6 +56,7 @@ def run_benchmark(
     entries: Sequence[str] = ENTRIES,
     band: Sequence[str] = (),
     workers: int = 1,
+    scheduler: str | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Benchmark:
     """The scores of every method that has predictions in a population's folder.
@@ -76,6 +77,8 @@ def run_benchmark(
         that part follows how many of them hold 90 % of patients, and this part shows whether.
     workers : int
         Patients predicted at a time.
+    scheduler : str, optional
+        Address of a Dask cluster that sees the same folder; it then decides how many at a time.
     progress : callable, optional
         Called with a line of text.
 
@@ -124,7 +127,7 @@ def run_benchmark(
     calibrating = [] if part == CALIBRATION else patients_of(place, population, [CALIBRATION])
     jobs = _jobs(patients, predictions, entries, band)
     jobs += _jobs(calibrating, predictions, band, band)
-    _predict_each(jobs, int(workers), progress)
+    _predict_each(jobs, int(workers), scheduler, progress)
     if LEARNED in entries and part != TRAIN:
         learned_entries(patients_of(place, population, [TRAIN]), patients, predictions)
     methods = _methods(predictions)
@@ -161,11 +164,14 @@ def _jobs(
 
 
 def _predict_each(
-    jobs: Sequence[Mapping[str, Any]], workers: int, progress: Callable[[str], None] | None
+    jobs: Sequence[Mapping[str, Any]],
+    workers: int,
+    scheduler: str | None,
+    progress: Callable[[str], None] | None,
 ) -> None:
     """Each patient in a process."""
     function = f"{patient_entries.__module__}:{patient_entries.__name__}"
-    for done, (index, _) in enumerate(answers(function, jobs, workers), 1):
+    for done, (index, _) in enumerate(answers(function, jobs, workers, scheduler), 1):
         if progress is not None:
             progress(f"{done} of {len(jobs)}  {Path(jobs[index]['patient']).name} predicted")
 

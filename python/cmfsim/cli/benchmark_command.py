@@ -22,6 +22,7 @@ def benchmark(options: argparse.Namespace) -> int:
         entries=options.entries,
         band=options.band,
         workers=options.workers,
+        scheduler=options.scheduler,
         progress=tell,
     )
     if options.json:

@@ -52,6 +52,9 @@ def add_population_commands(commands: Any, common: argparse.ArgumentParser) -> N
     virtual.add_argument(
         "--spacing", metavar="MM", type=float, default=2.0, help="CT voxel size (default 2)"
     )
+    virtual.add_argument(
+        "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
+    )
     virtual.set_defaults(run=virtual_patients_command.virtual_patients)
 
     benchmark = commands.add_parser(
@@ -91,5 +94,8 @@ def add_population_commands(commands: Any, common: argparse.ArgumentParser) -> N
         type=int,
         default=1,
         help="patients predicted at a time, a process each (default 1)",
+    )
+    benchmark.add_argument(
+        "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
     )
     benchmark.set_defaults(run=benchmark_command.benchmark)

@@ -19,8 +19,8 @@ def virtual_patients(options: argparse.Namespace) -> int:
     """Writes virtual patients: the case before, the truth after the operation."""
     if options.count is not None:
         return _population(options)
-    if options.workers != 1:
-        raise CaseInputError("--workers is for drawn patients: give --count as well")
+    if options.workers != 1 or options.scheduler is not None:
+        raise CaseInputError("--workers and --scheduler are for drawn patients: give --count too")
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         cases = write_patients(
             options.folder,
@@ -57,6 +57,7 @@ def _population(options: argparse.Namespace) -> int:
         edge_length=options.edge_length,
         spacing=options.spacing,
         workers=options.workers,
+        scheduler=options.scheduler,
         progress=tell,
     )
     if options.json:

@@ -19,8 +19,9 @@ from typing import IO, Any
 
 from cmfsim import errors
 from cmfsim.errors import CaseError
+from cmfsim.io.cluster import on_cluster
 
-__all__ = ["answers", "serve"]
+__all__ = ["answer_alone", "answers", "serve"]
 
 # The child's program: it finds the same modules as its parent, and nothing else is run.
 PROGRAM = (
@@ -32,7 +33,7 @@ THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_
 
 
 def answers(
-    function: str, jobs: Sequence[Mapping[str, Any]], workers: int
+    function: str, jobs: Sequence[Mapping[str, Any]], workers: int, scheduler: str | None = None
 ) -> Iterator[tuple[int, Any]]:
     """What a function answers to each job, with the job's index, as they end.
 
@@ -44,14 +45,19 @@ def answers(
         Plain values, as JSON has them.
     workers : int
         Processes.
+    scheduler : str, optional
+        Address of a Dask cluster that sees the same files; it then decides how many run at a time.
 
     Raises
     ------
     CmfsimError
         What the function raises, with its class.
     CaseError
-        A process died, or met an error of another kind, which its text has.
+        A process died, or met an error of another kind, which its text has; no cluster answers.
     """
+    if scheduler is not None:
+        yield from _on_cluster(function, jobs, scheduler)
+        return
     idle: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
     started: list[_Worker] = []
 
@@ -74,6 +80,30 @@ def answers(
         for worker in started:
             worker.end()
         pool.shutdown(cancel_futures=True)
+
+
+def _on_cluster(
+    function: str, jobs: Sequence[Mapping[str, Any]], scheduler: str
+) -> Iterator[tuple[int, Any]]:
+    asked = [(function, dict(job)) for job in jobs]
+    for index, answer, error in on_cluster(scheduler, answer_alone, asked):
+        if isinstance(error, errors.CmfsimError):
+            raise error
+        if error is not None:
+            raise CaseError(
+                f"the cluster gave up a job ({error}): run the command again; what is complete is "
+                "kept"
+            )
+        yield index, answer
+
+
+def answer_alone(function: str, job: Mapping[str, Any]) -> Any:
+    """The answer to one job from a process of its own, which has one thread wherever it runs."""
+    worker = _Worker()
+    try:
+        return worker.answer(function, job)
+    finally:
+        worker.end()
 
 
 class _Worker:

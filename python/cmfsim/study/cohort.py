@@ -15,8 +15,8 @@ from types import FrameType
 from typing import Any, BinaryIO
 
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.extras import third_party
 from cmfsim.io import Case, Cohort, finish_writing
+from cmfsim.io.cluster import on_cluster
 from cmfsim.io.folders import check_below, check_writable
 from cmfsim.io.metrics import read_evaluation
 from cmfsim.pipeline.evaluating import evaluation_key
@@ -26,8 +26,6 @@ __all__ = ["CaseJob", "CaseOutcome", "StudyReport", "run_study"]
 # Lines of a failed case's log that are shown.
 SHOWN_LINES = 12
 LOG_FILE = "log.txt"
-# In which a Dask scheduler must answer, s.
-ANSWER_TIME = 10.0
 
 
 @dataclass(frozen=True)
@@ -267,21 +265,12 @@ def _ended_by_signal() -> Iterator[None]:
 
 
 def _on_dask(jobs: list[CaseJob], scheduler: str) -> Iterator[CaseOutcome]:
-    distributed = third_party("distributed", "a study on a cluster is run", "study")
-    try:
-        client = distributed.Client(scheduler, timeout=ANSWER_TIME)
-    except (OSError, ValueError) as error:
-        raise CaseInputError(f"no Dask scheduler answers at {scheduler!r}: {error}") from error
-    with client:
-        futures = [
-            client.submit(run_job, job, pure=False, key=f"cmfsim-{job.name}") for job in jobs
-        ]
-        for future in distributed.as_completed(futures):
-            job = jobs[futures.index(future)]
-            try:
-                yield future.result()
-            except Exception as error:  # noqa: BLE001 (a worker that died may raise anything)
-                yield CaseOutcome(job.name, "failed", error=f"the cluster lost the case: {error}")
+    for index, outcome, error in on_cluster(scheduler, run_job, [(job,) for job in jobs]):
+        if error is None:
+            yield outcome
+        else:
+            reason = f"the cluster lost the case: {error}"
+            yield CaseOutcome(jobs[index].name, "failed", error=reason)
 
 
 def run_job(job: CaseJob, processes: _Workers | None = None) -> CaseOutcome:

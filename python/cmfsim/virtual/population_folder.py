@@ -89,6 +89,7 @@ def virtual_population(
     edge_length: float = 6.0,
     spacing: float = 2.0,
     workers: int = 1,
+    scheduler: str | None = None,
     progress: Callable[[PatientOutcome], None] | None = None,
 ) -> Population:
     """Virtual patients D001 to D`count`, drawn at random, each in a folder with the truth.
@@ -110,6 +111,8 @@ def virtual_population(
         Of the CTs.
     workers : int
         Patients at a time, each in a process of its own with one thread.
+    scheduler : str, optional
+        Address of a Dask cluster that sees the same folder; it then decides how many at a time.
     progress : callable, optional
         Called with the outcome of each patient.
 
@@ -142,7 +145,7 @@ def virtual_population(
     entries = {job.patient.name: _entry(job, PENDING) for job in jobs}
     entries |= _further(place, record, entries)
     _write(place, record, entries)
-    for done, (job, status, reason) in enumerate(_made(jobs, int(workers)), 1):
+    for done, (job, status, reason) in enumerate(_made(jobs, int(workers), scheduler), 1):
         name = job.patient.name
         entries[name] = _entry(job, FAILED if reason else MADE, reason)
         _write(place, record, entries)
@@ -182,10 +185,11 @@ def _write(folder: Path, record: dict[str, Any], entries: dict[str, PopulationEn
                 file.write(cohort_text(f"virtual patients, {part}", names).encode())
 
 
-def _made(jobs: list[_Job], workers: int) -> Iterator[tuple[_Job, str, str]]:
+def _made(jobs: list[_Job], workers: int, scheduler: str | None) -> Iterator[tuple[_Job, str, str]]:
     """Each job with its status, as they end, and the reason where it failed."""
     function = f"{__name__}:{make_patient.__name__}"
-    for index, (status, reason) in answers(function, [asdict(job) for job in jobs], workers):
+    asked = [asdict(job) for job in jobs]
+    for index, (status, reason) in answers(function, asked, workers, scheduler):
         yield jobs[index], status, reason
 
 

@@ -33,6 +33,40 @@ def test_a_process_that_dies_is_an_error():
         list(answers("os:_exit", [{"status": 7}], 1))
 
 
+def test_a_cluster_gives_the_same_and_survives_a_lost_machine(tmp_path):
+    """Two machines, one of which dies with a job in hand: its job is done by the other."""
+    distributed = pytest.importorskip("distributed")
+    marks = [str(tmp_path / f"mark{k}") for k in range(4)]
+    # The first to come makes the mark and waits to be killed; whoever comes later finds it.
+    script = (
+        "import os,sys,time; mark=sys.argv[1]; there=os.path.exists(mark); open(mark,'w').close();"
+        "time.sleep(0 if there or not mark.endswith('mark0') else 60)"
+    )
+    jobs = [{"args": [sys.executable, "-c", script, mark]} for mark in marks]
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        found = answers("subprocess:call", jobs, 1, cluster.scheduler_address)
+        first = [next(found) for _ in range(3)]
+        assert soon((tmp_path / "mark0").exists)
+        with distributed.Client(cluster.scheduler_address) as client:
+            busy = client.processing()
+            pids = client.run(os.getpid)
+        holding = next(address for address, tasks in busy.items() if tasks)
+        os.kill(pids[holding], signal.SIGKILL)
+        assert sorted([*first, *found]) == [(0, 0), (1, 0), (2, 0), (3, 0)]
+        bad, address = [{"seed": -1, "index": 1}], cluster.scheduler_address
+        with pytest.raises(CaseInputError, match="seed is -1"):
+            list(answers("cmfsim.virtual.population:drawn_patient", bad, 1, address))
+
+
+def test_a_cluster_that_does_not_answer_is_bad_input():
+    """Nothing listens there."""
+    pytest.importorskip("distributed")
+    with pytest.raises(CaseInputError, match="no Dask scheduler answers at"):
+        list(answers("os:getpid", [{}], 1, "tcp://127.0.0.1:9"))
+
+
 @pytest.mark.skipif(os.name == "nt", reason="looks for processes as Unix shows them")
 def test_no_process_outlives_a_killed_command(tmp_path):
     """Killed without warning in the middle of a job; the script has no guard, as users write it."""
