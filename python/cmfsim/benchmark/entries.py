@@ -26,6 +26,7 @@ from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.solving.models import predict_patient
 from cmfsim.surfaces.barycentric import at_closest
+from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "FAILURE",
     "LEARNED",
     "NO_CHANGE",
+    "ON_REQUEST",
     "EntryFolder",
     "check_own",
     "learned_entries",
@@ -40,8 +42,12 @@ __all__ = [
     "times_of",
 ]
 
-NO_CHANGE, RATIOS, LEARNED = "no-change", "ratios", "pls"
+NO_CHANGE, RATIOS, LEARNED, HYPERELASTIC = "no-change", "ratios", "pls", "hyperelastic"
 ENTRIES = (NO_CHANGE, RATIOS, LEARNED, *MODELS)
+# Entries that are made where they are named: they take longer.
+ON_REQUEST = (HYPERELASTIC,)
+# What the hyperelastic entry is but for its kinematics.
+HYPERELASTIC_MODEL = "M+S"
 FAILURE = ".failed.json"
 TIMES = ".seconds"
 
@@ -140,7 +146,7 @@ def patient_entries(
         moves = simple[method](of)
         place.put(method, of, SkinPrediction(of.skin, moves, made_from=made_from))
         place.took(method, of.name, time.perf_counter() - begun)
-    models = [m for m in wanted if m in MODELS]
+    models = [m for m in wanted if m in MODELS or m == HYPERELASTIC]
     if models:
         _by_models(of, place, models, banded, made_from)
 
@@ -157,7 +163,8 @@ def _by_models(
     case = replace(patient.case, postoperative=None)
     begun = time.perf_counter()
     try:
-        built = build_patient(case, models, BuildOptions(check=False))
+        solved = [HYPERELASTIC_MODEL if model == HYPERELASTIC else model for model in models]
+        built = build_patient(case, solved, BuildOptions(check=False))
     except CmfsimError as error:
         for model in models:
             place.fail(model, patient, str(error), made_from)
@@ -166,7 +173,9 @@ def _by_models(
     for model in models:
         begun = time.perf_counter()
         try:
-            if model in banded:
+            if model == HYPERELASTIC:
+                prediction = predict_patient(_hyperelastic(built), HYPERELASTIC_MODEL)
+            elif model in banded:
                 prediction = predict_with_band(built, model)
             else:
                 prediction = predict_patient(built, model)
@@ -175,6 +184,12 @@ def _by_models(
             continue
         place.put(model, patient, _entered(patient, prediction, made_from))
         place.took(model, patient.name, building + time.perf_counter() - begun)
+
+
+def _hyperelastic(patient: PatientModel) -> PatientModel:
+    """The patient, to be solved with finite strain."""
+    options = replace(patient.scene.options, kinematics="hyperelastic")
+    return replace(patient, scene=replace(patient.scene, options=options))
 
 
 def _entered(patient: BenchmarkPatient, prediction: Prediction, made_from: str) -> SkinPrediction:
@@ -196,7 +211,8 @@ def check_own(method: str, prediction: SkinPrediction, patient: BenchmarkPatient
     CaseError
         (also `ValueError`)
     """
-    if method in ENTRIES and not prediction.made_from.endswith(patient.digest()):
+    own = (*ENTRIES, *ON_REQUEST)
+    if method in own and not prediction.made_from.endswith(patient.digest()):
         raise CaseInputError(
             "was not made by this version from the patient as they are: predict it again "
             f"(--entries {method}), or give a method of your own another name"

@@ -11,6 +11,7 @@ from cmfsim.benchmark.entries import (
     ENTRIES,
     FAILURE,
     LEARNED,
+    ON_REQUEST,
     EntryFolder,
     check_own,
     learned_entries,
@@ -31,6 +32,7 @@ from cmfsim.values.model_names import MODELS
 
 __all__ = ["Benchmark", "run_benchmark"]
 
+OWN = (*ENTRIES, *ON_REQUEST)
 PREDICTIONS, RESULTS = "predictions", "benchmark"
 
 
@@ -71,7 +73,7 @@ def run_benchmark(
     part : str
         "test"; or "calibration" or "train", which show nothing about a method that learned there.
     entries : sequence of str
-        Own entries to predict; may be empty.
+        Own entries to predict; may be empty. "hyperelastic" takes longer and has to be named.
     band : sequence of str
         Models among them that state a standard deviation too, also for the part `calibration`: from
         that part follows how many of them hold 90 % of patients, and this part shows whether.
@@ -107,7 +109,7 @@ def run_benchmark(
     """
     check_one_of("part", part, PARTS)
     for entry in entries:
-        check_one_of("entry", entry, ENTRIES)
+        check_one_of("entry", entry, OWN)
     for model in band:
         check_one_of("band", model, [entry for entry in entries if entry in MODELS])
     if as_number("workers", workers) < 1 or int(workers) != workers:
@@ -189,7 +191,7 @@ def _methods(predictions: Path) -> list[str]:
     if not predictions.is_dir():
         return []
     found = sorted(place.name for place in predictions.iterdir() if place.is_dir())
-    return [name for name in ENTRIES if name in found] + [n for n in found if n not in ENTRIES]
+    return [name for name in OWN if name in found] + [n for n in found if n not in OWN]
 
 
 def _result(

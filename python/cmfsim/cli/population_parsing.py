@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from cmfsim.benchmark.entries import ENTRIES
+from cmfsim.benchmark.entries import ENTRIES, ON_REQUEST
 from cmfsim.cli import benchmark_command, virtual_patients_command
 from cmfsim.io.populations import PARTS, TEST
 from cmfsim.values.model_names import MODELS
@@ -71,10 +71,10 @@ def add_population_commands(commands: Any, common: argparse.ArgumentParser) -> N
         "--entries",
         metavar="ENTRY",
         nargs="*",
-        choices=ENTRIES,
+        choices=(*ENTRIES, *ON_REQUEST),
         default=list(ENTRIES),
-        help=f"entries of this package to predict first, none if empty (default all: "
-        f"{' '.join(ENTRIES)})",
+        help=f"entries of this package to predict first, none if empty (default "
+        f"{' '.join(ENTRIES)}; {' '.join(ON_REQUEST)} takes longer)",
     )
     benchmark.add_argument(
         "--band",
