@@ -184,11 +184,13 @@ from cmfsim.planning.page import page_content as page_content
 from cmfsim.planning.page import page_text as page_text
 from cmfsim.planning.page import write_planning_page as write_planning_page
 from cmfsim.planning.replanning import ExpectedError as ExpectedError
+from cmfsim.planning.replanning import PlanBand as PlanBand
 from cmfsim.planning.replanning import PlanCorrection as PlanCorrection
 from cmfsim.planning.replanning import PlanningModel as PlanningModel
 from cmfsim.planning.replanning import PlanTrial as PlanTrial
 from cmfsim.planning.replanning import corrected_planning as corrected_planning
 from cmfsim.planning.replanning import expected_error as expected_error
+from cmfsim.planning.replanning import plan_band as plan_band
 from cmfsim.planning.replanning import planning_model as planning_model
 from cmfsim.planning.server import serve_planning as serve_planning
 from cmfsim.registration import FoldReport as FoldReport

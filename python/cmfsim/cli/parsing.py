@@ -19,6 +19,7 @@ from cmfsim.cli import (
     template_commands,
     view_command,
 )
+from cmfsim.cli.band_options import add_band_options
 from cmfsim.cli.population_parsing import add_population_commands
 from cmfsim.io import result_suffixes
 from cmfsim.muscles.template import WHERE
@@ -158,24 +159,7 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     predict.add_argument(
         "--plan", metavar="PLAN", type=Path, help="plan.toml to use instead of the case's plan"
     )
-    predict.add_argument(
-        "--band",
-        action="store_true",
-        help="state how far to trust the face: a band in report, files and on the terminal",
-    )
-    predict.add_argument(
-        "--calibration",
-        metavar="FILE",
-        type=Path,
-        help="calibration of the band, from cases whose outcome is known; without one it is "
-        "uncalibrated, and named so",
-    )
-    predict.add_argument(
-        "--coverage", metavar="SHARE", type=float, help="of the band (default 0.9, 90 %%)"
-    )
-    predict.add_argument(
-        "--group", metavar="NAME", help="use the calibration cases of this group alone"
-    )
+    add_band_options(predict)
     predict.set_defaults(run=study_commands.predict)
 
     plan = commands.add_parser(
@@ -216,6 +200,7 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         action="store_true",
         help="solve plans exactly while the page is open, on this machine only, until Ctrl-C",
     )
+    add_band_options(plan)
     plan.add_argument("--port", metavar="N", type=int, default=0, help="port (default: a free one)")
     plan.add_argument("--no-open", action="store_true", help="do not open the page")
     plan.set_defaults(run=plan_command.plan)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from cmfsim.cli.band_options import band_options
 from cmfsim.cli.case_commands import case_of, checked
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.notices import Notices
@@ -31,6 +32,7 @@ from cmfsim.planning.replanning import (
     PlanningModel,
     corrected_planning,
     expected_error,
+    plan_band,
     planning_model,
 )
 from cmfsim.planning.server import check_serving, serve_planning
@@ -103,6 +105,9 @@ def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
     # Before any work: a file that is none would be found a minute later.
     targets = None if options.towards is None else read_targets(options.towards)
     models = (options.model,)
+    wanted = band_options(options, case)
+    if wanted is not None:
+        wanted.check(models)
     findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         asked = BuildOptions(
@@ -112,7 +117,18 @@ def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
         progress.stage("computing the plan operator")
         planning = planning_model(patient, options.model)
         progress.stage("solving the case's plan")
-        reference = planning.solve(planning.reference)
+        band = None
+        if wanted is None:
+            reference = planning.solve(planning.reference)
+        else:
+            # Regions and proposed landmarks: a page without a band does not load them.
+            from cmfsim.pipeline.banding import predict_with_band  # noqa: PLC0415
+
+            reference = predict_with_band(
+                planning.patient, planning.model, wanted, solver=planning.solver
+            )
+            progress.stage("computing how far to trust the face")
+            band = plan_band(planning, reference)
         planning = corrected_planning(planning, options.corrections, progress=progress.stage)
         errors = expected_error(planning, trials=options.trials, progress=progress.stage)
         found = None
@@ -121,7 +137,7 @@ def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
             found = plan_for_face(planning, targets(planning), _search(options, planning))
         progress.stage("making the page")
         wished = {} if found is None else {TOWARDS: found.plan}
-        content = page_content(planning, reference, errors, variants=wished)
+        content = page_content(planning, reference, errors, variants=wished, band=band)
     notices.add(content.findings)
     return _Made(planning, content, errors, found)
 

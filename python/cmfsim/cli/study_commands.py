@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cmfsim.cli.band_options import band_options
 from cmfsim.cli.band_text import band_lines
 from cmfsim.cli.case_commands import case_of, checked
 from cmfsim.cli.causes_text import not_operated_line, thickness_lines
@@ -14,8 +15,7 @@ from cmfsim.cli.exit_codes import DONE, FAILED
 from cmfsim.cli.notices import Notices
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.errors import CmfsimError
-from cmfsim.io import Case, Cohort, read_landmark_file, replacing
-from cmfsim.io.calibrations import read_calibration
+from cmfsim.io import Cohort, read_landmark_file, replacing
 from cmfsim.pipeline.evaluating import evaluate as evaluate_case
 from cmfsim.pipeline.outputs import (
     WrittenPrediction,
@@ -28,7 +28,6 @@ from cmfsim.pipeline.preparation import prepare
 from cmfsim.study import CaseOutcome, StudyReport, run_study
 from cmfsim.study import sensitivity as landmark_sensitivity
 from cmfsim.study.outputs import write_study_report
-from cmfsim.values.band_options import BandOptions
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import MODELS, Prediction
 
@@ -45,7 +44,7 @@ def predict(options: argparse.Namespace) -> int:
     """Predicts the face of a case by one model or by several."""
     case = case_of(options)
     models = models_of(options.model, ("M+S",))
-    band = _band_of(options, case)
+    band = band_options(options, case)
     if band is not None:
         band.check(models)
     prepare(case, report=not options.no_report)
@@ -88,20 +87,6 @@ def predict(options: argparse.Namespace) -> int:
     _end(notices, case.output, written)
     _print_failed({model: str(error) for model, error in failed.items()})
     return FAILED if failed else DONE
-
-
-def _band_of(options: argparse.Namespace, case: Case) -> BandOptions | None:
-    """The band that the command line or the case asks for; the command line comes first."""
-    given = (options.calibration, options.coverage, options.group)
-    if not (options.band or case.band.asked or any(value is not None for value in given)):
-        return None
-    file = case.band.calibration if options.calibration is None else options.calibration
-    return BandOptions(
-        coverage=case.band.coverage if options.coverage is None else options.coverage,
-        calibration=None if file is None else read_calibration(file),
-        group=case.band.group if options.group is None else options.group,
-        source="" if file is None else file.name,
-    )
 
 
 def _at_least_one(

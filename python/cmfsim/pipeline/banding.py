@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim._core import Surface
+from cmfsim._core import StaticSolver, Surface
 from cmfsim.checks import Floats
 from cmfsim.errors import CalibrationError
 from cmfsim.evaluation import SKIN_LANDMARKS, calibrate, skin_regions
@@ -39,7 +39,11 @@ BAND_REGIONS = (
 
 
 def predict_with_band(
-    patient: PatientModel, model: str = "M+S", options: BandOptions | None = None
+    patient: PatientModel,
+    model: str = "M+S",
+    options: BandOptions | None = None,
+    *,
+    solver: StaticSolver | None = None,
 ) -> Prediction:
     """The face that a model predicts for a patient, with the band around it.
 
@@ -50,6 +54,8 @@ def predict_with_band(
         "H", "M", "H+S" or "M+S".
     options : BandOptions, optional
         Default: 90 %, uncalibrated.
+    solver : StaticSolver, optional
+        As for `predict_patient`.
 
     Returns
     -------
@@ -80,7 +86,7 @@ def predict_with_band(
     """
     options = options or BandOptions()
     options.check((model,))
-    solved = solved_patient(patient, model)
+    solved = solved_patient(patient, model, solver=solver)
     begun = time.perf_counter()
     rates = skin_rates(patient, solved.scene, solved.solver, solved.solution)
     band = _band(solved.prediction, rates, options)

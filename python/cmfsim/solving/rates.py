@@ -23,7 +23,7 @@ from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.scene import Scene
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["SkinRates", "skin_rates"]
+__all__ = ["ACCURACY", "SkinRates", "scene_parts", "skin_rates", "tissue_load"]
 
 # Difference of forces, in standard deviations: small enough for its error of first order to be
 # 1e-4 of it, far above rounding. Downwards, away from ν = 0.5 and from a fraction of 1.
@@ -86,15 +86,13 @@ def skin_rates(
     changes: dict[str, ArrayLike | Mapping[str, ArrayLike]] = {}
     sources: dict[str, Source] = {}
     left_out: list[str] = []
-    n_tets = solver.tensors.mesh.n_tets
-    # A homogeneous model has no muscle, whatever the patient has.
-    fraction = None if scene.tissue is patient.fat else patient.fraction
-    parts = tissue_parts(scene.tissue, n_tets, patient.fat, fraction)
+    parts = scene_parts(patient, scene)
     if parts is None:
         left_out.append("tissue: fat and muscle cannot be told apart in the scene's stiffness")
     else:
         for source in (s for s in TISSUE if s.name in parts.sources):
-            changes[source.name] = _load(solver, solution, parts, source)
+            u, forces = solution.all_displacements, solution.all_forces
+            changes[source.name] = tissue_load(solver.tensors, u, forces, parts, source)
             sources[source.name] = source
     for segment, rates in _plan_changes(patient, scene, left_out).items():
         for source, rate in zip(PLAN, rates, strict=True):
@@ -120,13 +118,31 @@ def _check_scene(scene: Scene) -> None:
         )
 
 
-def _load(solver: StaticSolver, solution: Solution, parts: TissueParts, source: Source) -> Floats:
-    """−(∂K/∂p) u times the standard deviation, (n, 3) N."""
-    tensors = solver.tensors
+def scene_parts(patient: PatientModel, scene: Scene) -> TissueParts | None:
+    """Fat and muscle of a scene's tissue; None where they cannot be told apart."""
+    # A homogeneous model has no muscle, whatever the patient has.
+    fraction = None if scene.tissue is patient.fat else patient.fraction
+    return tissue_parts(scene.tissue, scene.n_tets, patient.fat, fraction)
+
+
+def tissue_load(
+    tensors: MassTensors, u: Floats, forces: Floats, parts: TissueParts, source: Source
+) -> Floats:
+    """−(∂K/∂p) u times the standard deviation, (n, 3) N.
+
+    Parameters
+    ----------
+    tensors : MassTensors
+        Of the tissue as it is.
+    u, forces : (n, 3) float64, mm and N
+        Displacements, and their forces K u.
+    parts : TissueParts
+    source : Source
+        One of `parts.sources`.
+    """
     tissue = parts.changed(source.name, STEP * source.sd).tissue()
     changed = MassTensors(tensors.mesh, tissue, element=tensors.element)
-    difference = changed.force(solution.all_displacements) - solution.all_forces
-    return np.asarray(-difference / STEP, dtype=np.float64)
+    return np.asarray(-(changed.force(u) - forces) / STEP, dtype=np.float64)
 
 
 def _plan_changes(

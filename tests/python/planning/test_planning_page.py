@@ -10,9 +10,7 @@ import hashlib
 import http.client
 import json
 import re
-import shutil
 import threading
-import time
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -30,11 +28,10 @@ from cmfsim.planning.server import PlanningServer
 pytest.importorskip("skimage")
 pytest.importorskip("meshio")
 
+from browser_page import READY, open_page, until
 from planning_head import planning_patient
 
 HOSTILE = "</script><img src=x onerror=alert(1)>'\"&\u2028"
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-READY = "globalThis.cmfsimPage?.timing.compute > 0"
 
 
 @pytest.fixture(scope="module")
@@ -336,19 +333,6 @@ def test_a_skin_too_fine_for_a_page_is_refused_and_a_fine_face_simplified(
 
 
 @pytest.fixture(scope="module")
-def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if path is None:
-        pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
-    with playwright.sync_playwright() as driver:
-        # Without its sandbox: tests may run as root, and open pages that they have made.
-        chromium = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
-
-
-@pytest.fixture(scope="module")
 def page(browser, page_file):
     """One page for all tests; in the end it must have had no error and asked for nothing."""
     yield from open_page(browser, page_file)
@@ -362,32 +346,6 @@ def opened(page):
     page.locator("#turns-about").select_option("0")
     settle(page)
     return page
-
-
-def open_page(browser, path):
-    # Small: pictures are drawn by software here.
-    context = browser.new_context(viewport={"width": 920, "height": 420}, accept_downloads=True)
-    page = context.new_page()
-    page.set_default_timeout(20_000)
-    troubles, asked = [], []
-    page.on("pageerror", lambda error: troubles.append(str(error)))
-    page.on("console", lambda line: troubles.append(line.text) if line.type == "error" else None)
-    page.on("request", lambda request: asked.append(request.url))
-    page.goto(path.as_uri())
-    until(page, READY)
-    yield page
-    assert not troubles
-    # Files that are saved are blobs of the page.
-    assert [url for url in asked if not url.startswith("blob:")] == [path.as_uri()]
-    context.close()
-
-
-def until(page, expression, seconds=20.0):
-    """Waits for an expression to be true; the policy of the page allows no other way."""
-    end = time.monotonic() + seconds
-    while not page.evaluate(expression):
-        assert time.monotonic() < end, expression
-        page.wait_for_timeout(20)
 
 
 def type_number(page, key, value):

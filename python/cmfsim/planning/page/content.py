@@ -11,11 +11,13 @@ from cmfsim._core import Surface, __version__
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, midline_profile
+from cmfsim.planning.page.band_content import band_content
 from cmfsim.planning.page.segment_points import segment_points
 from cmfsim.planning.page.tooth_rows import tooth_rows
 from cmfsim.planning.replanning import (
     ExpectedError,
     Motions,
+    PlanBand,
     PlanCorrection,
     PlanningModel,
     segment_boxes,
@@ -69,6 +71,7 @@ def page_content(
     errors: ExpectedError,
     *,
     variants: Mapping[str, Motions] | None = None,
+    band: PlanBand | None = None,
 ) -> PageContent:
     """What the page of a planning model holds.
 
@@ -80,6 +83,8 @@ def page_content(
     errors : ExpectedError
     variants : mapping of str to plan, optional
         Plans by name that the page begins with, besides the reference.
+    band : PlanBand, optional
+        How far to trust the face, which follows the plan.
 
     Returns
     -------
@@ -120,6 +125,8 @@ def page_content(
         "sites": _singles(_rows(sites.skin.values())),
     }
     bones = _bones(planning, arrays, findings)
+    band_values, band_arrays = band_content(band)
+    arrays |= band_arrays
     profile = _profile(planning, face, arrays)
     teeth = _teeth(planning, arrays)
     values = {
@@ -141,6 +148,7 @@ def page_content(
         **teeth,
         "expected_error": errors.as_dict(),
         "correction": _correction(planning),
+        "band": band_values,
         **_framing(skin, arrays["active"]),
     }
     return PageContent(values, arrays, tuple(findings))

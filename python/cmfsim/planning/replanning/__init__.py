@@ -10,16 +10,19 @@ from cmfsim.planning.replanning.expected_error import (
     segment_boxes,
 )
 from cmfsim.planning.replanning.model import Motions, PlanningModel, planning_model
+from cmfsim.planning.replanning.plan_band import PlanBand, plan_band
 
 __all__ = [
     "CORRECTIONS",
     "ExpectedError",
     "Motions",
+    "PlanBand",
     "PlanCorrection",
     "PlanTrial",
     "PlanningModel",
     "corrected_planning",
     "expected_error",
+    "plan_band",
     "plan_distance",
     "planning_model",
     "segment_boxes",

@@ -71,6 +71,16 @@ export class Carrier {
     }
   }
 
+  /** Writes the value of a field of the nodes at each point into `out` (1 per point). */
+  interpolate(out, field) {
+    const { triangles, points: { triangle, barycentric } } = this;
+    for (let p = 0; p < triangle.length; p++) {
+      const t = 3 * triangle[p];
+      out[p] = 0;
+      for (let c = 0; c < 3; c++) out[p] += barycentric[3 * p + c] * field[triangles[t + c]];
+    }
+  }
+
   /** The rotation of every triangle that carries a point: F = Q' (A ⊕ 1) Qᵀ, its polar factor. */
   turnTriangles() {
     const { used, rest, after, turns, triangles } = this;

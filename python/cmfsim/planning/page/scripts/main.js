@@ -1,5 +1,6 @@
 // The page: one plan at a time, its face computed by the operator, and everything that shows it.
 
+import { BandPanel } from "./band_panel.js";
 import { Camera } from "./camera.js";
 import { SKIN, STILL_BONE, DISTINCT, mapped, rgb } from "./colours.js";
 import { Drawing, vertexNormals } from "./drawing.js";
@@ -69,13 +70,14 @@ class App {
     this.pulling = new PullPanel(this);
     this.variants = new VariantPanel(this);
     this.measuring = new MeasurePanel(this);
+    this.trusting = new BandPanel(this);
     this.exporting = new ExportPanel(this);
     this.profile = element("canvas", { className: "profile", role: "img", "aria-label": "Midline profile" });
     this.profileNote = element("p", { className: "note" });
     document.getElementById("panel").append(
       this.panel.root, this.pulling.root, this.variants.root,
       element("div", {}, element("h2", { textContent: "Profile in the midline" }), this.profile, this.profileNote),
-      this.measuring.root, this.exporting.root);
+      this.measuring.root, this.trusting.root, this.exporting.root);
     connectPointing(this);
     connectKeys(this);
     new ResizeObserver(() => this.redraw()).observe(this.overlay);
@@ -179,6 +181,7 @@ class App {
     this.panel.show();
     this.pulling.show();
     this.measuring.show();
+    this.trusting.show();
     this.exporting.show();
     if (this.settled) this.variants.show();
     this.showError();
@@ -189,15 +192,16 @@ class App {
   /** Places, normals and colours of the skin for the picture. */
   place() {
     const { before, triangles } = this.face;
-    const { share, map } = this.view.values;
+    const { share, map, band } = this.view.values;
     for (let i = 0; i < before.length; i++) this.shownPlaces[i] = before[i] + share * this.shift[i];
     const begun = performance.now();
     vertexNormals(this.normals, this.shownPlaces, triangles);
     this.timing.normals = performance.now() - begun;
     this.most = 1;
-    if (map) {
+    if (map || band) {
       const { shift, amounts } = this;
-      for (let i = 0; i < amounts.length; i++) amounts[i] = Math.hypot(shift[3 * i], shift[3 * i + 1], shift[3 * i + 2]);
+      if (band) this.face.face.interpolate(amounts, this.face.band.halfWidths(this.motions));
+      else for (let i = 0; i < amounts.length; i++) amounts[i] = Math.hypot(shift[3 * i], shift[3 * i + 1], shift[3 * i + 2]);
       this.most = Math.max(1, Math.ceil(2 * amounts.reduce((a, b) => Math.max(a, b), 0)) / 2);
     }
     this.drawing.update(this.skin, this.shownPlaces, this.normals, this.amounts);
@@ -205,14 +209,14 @@ class App {
   }
 
   parts(before) {
-    const { skin, bones, share, map } = this.view.values;
+    const { skin, bones, share, map, band } = this.view.values;
     const drawn = this.bones.map(({ segment, surface, colour }) => ({
       surface, colour, opacity: bones,
       motion: segment === null || before ? STAYS
         : share === 1 ? this.motions[segment]
         : partOf(this.motions[segment], share, this.page.segments[segment].centre),
     }));
-    const scale = map && !before ? 1 / this.most : 0;
+    const scale = (map || band) && !before ? 1 / this.most : 0;
     return [...drawn, { surface: before ? this.skinBefore : this.skin, colour: SKIN, opacity: skin, motion: STAYS, scale }];
   }
 

@@ -1,5 +1,6 @@
 // The patient of the page: bones, skin and sites under any plan; no document, no drawing.
 
+import { Band } from "./band.js";
 import { Carrier } from "./carrier.js";
 import { measure } from "./measures.js";
 import { Correction, displace, planNumbers } from "./operator.js";
@@ -21,6 +22,7 @@ export class PatientFace {
     this.numbersOfReference = planNumbers(this.reference, this.centres);
     this.correction = page.correction &&
       new Correction(page.correction, this.reference, arrays.correction_plans, arrays.correction_weights);
+    this.band = page.band && new Band(page.band, arrays, this.reference, this.centres);
     this.before = take("face");
     this.triangles = take("face_triangles");
     const carried = (part) => ({

@@ -7,7 +7,7 @@ import { button, element } from "./elements.js";
 export class ViewPanel {
   constructor(app) {
     this.app = app;
-    this.values = { skin: 1, bones: 1, share: 1, side: false, map: false, handles: true, pull: false };
+    this.values = { skin: 1, bones: 1, share: 1, side: false, map: false, band: false, handles: true, pull: false };
     const views = document.getElementById("views");
     views.append(
       ...VIEWS.map((view, i) => button(view.name, () => this.look(i), { title: `key ${i + 1}` })),
@@ -22,7 +22,8 @@ export class ViewPanel {
     }), label);
     document.getElementById("controls").append(
       slider("share", "Before – after"), slider("skin", "Skin"), slider("bones", "Bones"),
-      box("side", "Side by side"), box("map", "Colour by movement"), box("handles", "Handles"),
+      box("side", "Side by side"), box("map", "Colour by movement"),
+      ...(app.face.band ? [box("band", "Colour by uncertainty")] : []), box("handles", "Handles"),
       box("pull", "Pull the skin"));
     this.legend = document.getElementById("legend");
   }
@@ -34,18 +35,23 @@ export class ViewPanel {
 
   set(key, value) {
     this.values[key] = value;
+    // One field has the colours.
+    const other = { map: "band", band: "map" }[key];
+    const shown = document.getElementById(`show-${other}`);
+    if (value && shown) this.values[other] = shown.checked = false;
     this.app.reshow();
   }
 
   /** The legend of the colours: 0 to `most` mm. */
   showLegend(most) {
-    this.legend.hidden = !this.values.map;
+    const { map, band } = this.values;
+    this.legend.hidden = !(map || band);
     if (this.legend.hidden) return;
     const bar = element("div", { className: "bar" });
     bar.style.background = `linear-gradient(to right, ${MAP_COLOURS.join(",")})`;
     const ends = [0, most / 2, most].map((v) => element("span", { textContent: v.toFixed(1) }));
     this.legend.replaceChildren(
-      element("div", { textContent: "Movement of the skin, mm" }), bar,
+      element("div", { textContent: map ? "Movement of the skin, mm" : "Half the width of the band, mm (0: none is stated)" }), bar,
       element("div", { className: "ends" }, ...ends));
   }
 }

@@ -1,0 +1,33 @@
+// How far to trust the face under the plan that is shown, by region.
+
+import { element } from "./elements.js";
+
+export class BandPanel {
+  constructor(app) {
+    this.app = app;
+    const { band } = app.face;
+    this.root = element("div", {});
+    if (!band) return;
+    this.body = element("tbody");
+    const percent = Math.round(100 * band.coverage);
+    const cases = band.regions[0]?.cases;
+    const meaning = band.state === "calibrated"
+      ? `In ${percent} % of cases like the ${cases} of the calibration, all of a region lies this near, along the skin's normal.`
+      : `Uncalibrated: a multiple of the standard deviation that follows from assumptions on tissue and surgery. No case with a known outcome shows that it holds ${percent} %.`;
+    this.root.append(
+      element("h2", { textContent: `How far to trust it (${band.state})` }),
+      element("table", { id: "band" },
+        element("thead", {}, element("tr", {}, ...["", "± mm"].map((h) => element("th", { scope: "col", textContent: h })))),
+        this.body),
+      element("p", { className: "note", textContent: band.note ? `${meaning} Calibrated on: ${band.note}.` : meaning }));
+  }
+
+  show() {
+    const { band } = this.app.face;
+    if (!band) return;
+    const widths = band.widths(this.app.motions);
+    this.body.replaceChildren(...band.regions.map(({ name }, i) => element("tr", {},
+      element("th", { scope: "row", textContent: name }),
+      element("td", { textContent: widths[i].toFixed(1) }))));
+  }
+}
