@@ -123,6 +123,13 @@ def write_skin_prediction(path: str | os.PathLike[str], prediction: SkinPredicti
     ------
     OSError
         The file cannot be written.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> skin = cmfsim.read_surface("insilico/D003/skin.ply")  # doctest: +SKIP
+    >>> still = cmfsim.SkinPrediction(skin.vertices, 0.0 * skin.vertices)  # doctest: +SKIP
+    >>> cmfsim.write_skin_prediction("insilico/predictions/still/D003.npz", still)  # doctest: +SKIP
     """
     place = Path(path)
     place.parent.mkdir(parents=True, exist_ok=True)
@@ -149,6 +156,13 @@ def read_skin_prediction(path: str | os.PathLike[str]) -> SkinPrediction:
     CaseError
         (also `ValueError`) No such archive, an array that is missing, unknown or not of its shape,
         a displacement that is no number, or too long: with file, index and value.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> found = cmfsim.read_skin_prediction("insilico/predictions/pls/D003.npz")  # doctest: +SKIP
+    >>> found.displacement.shape  # doctest: +SKIP
+    (20214, 3)
     """
     place = Path(path)
     check_readable(place)

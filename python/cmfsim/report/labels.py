@@ -28,6 +28,7 @@ MESH: Labels = {
 MUSCLES: Labels = {
     "template": ("template", 1),
     "smoothing": ("smoothing of the spline", 1.0),
+    "fit": ("moved into the tissue", 1),
     "preset": ("constants of fat and muscle", 1),
     "mixing": ("what is mixed in a tet", 1),
     "inside": ("inside test", 1),

@@ -46,7 +46,7 @@ cranium = "cranium.ply"
 mandible = "mandible.ply"
 """
 # Tissue of the phantom's CT at 2 mm and this edge, as the build found it, mm³.
-ORDINARY = 1.177e6
+ORDINARY = 1.2056e6
 # How each is made harder, the finding that says so, and the part of the ordinary volume of tissue
 # that is left: a head cut off has less of it.
 HARD = {
