@@ -31,7 +31,7 @@ def band_sections(results: Sequence[MethodResult], far: Sequence[str]) -> list[s
         if result.band is not None and not result.band.factors:
             found.append(
                 f"**{result.method}** states standard deviations, but {len(result.band.cases)} "
-                f"patients of the part calibration are too few for a band: "
+                f"patients to calibrate it on are too few for a band: "
                 f"{cases_needed(COVERAGE)} are needed."
             )
         elif result.band is not None and result.band.missing:

@@ -57,6 +57,7 @@ def run_benchmark(
     part: str = TEST,
     entries: Sequence[str] = ENTRIES,
     band: Sequence[str] = (),
+    band_parts: Sequence[str] | None = None,
     workers: int = 1,
     scheduler: str | None = None,
     progress: Callable[[str], None] | None = None,
@@ -77,6 +78,9 @@ def run_benchmark(
     band : sequence of str
         Models among them that state a standard deviation too, also for the part `calibration`: from
         that part follows how many of them hold 90 % of patients, and this part shows whether.
+    band_parts : sequence of str, optional
+        The parts that bands are calibrated on: "calibration" if left out. "train" as well gives
+        more patients, where no method with a band has learned from it.
     workers : int
         Patients predicted at a time.
     scheduler : str, optional
@@ -107,7 +111,10 @@ def run_benchmark(
     >>> found = cmfsim.run_benchmark("insilico", workers=2)  # doctest: +SKIP
     >>> print(found.table.markdown())  # doctest: +SKIP
     """
-    check_one_of("part", part, PARTS)
+    if band_parts is None:
+        band_parts = [] if part == CALIBRATION else [CALIBRATION]
+    for name in (part, *band_parts):
+        check_one_of("part", name, PARTS)
     for entry in entries:
         check_one_of("entry", entry, OWN)
     for model in band:
@@ -126,7 +133,12 @@ def run_benchmark(
     if not patients:
         raise CaseInputError(f"{place}: no patient of the part {part!r} has a truth")
     predictions = place / PREDICTIONS
-    calibrating = [] if part == CALIBRATION else patients_of(place, population, [CALIBRATION])
+    if part in band_parts:
+        raise CaseInputError(
+            f"the part {part!r} is scored, and bands are calibrated on it: that would show "
+            "nothing; score another part, or name other band_parts"
+        )
+    calibrating = patients_of(place, population, band_parts)
     jobs = _jobs(patients, predictions, entries, band)
     jobs += _jobs(calibrating, predictions, band, band)
     _predict_each(jobs, int(workers), scheduler, progress)

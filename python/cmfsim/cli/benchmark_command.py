@@ -21,6 +21,7 @@ def benchmark(options: argparse.Namespace) -> int:
         part=options.part,
         entries=options.entries,
         band=options.band,
+        band_parts=options.band_parts,
         workers=options.workers,
         scheduler=options.scheduler,
         progress=tell,

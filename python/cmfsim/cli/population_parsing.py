@@ -86,6 +86,13 @@ def add_population_commands(commands: Any, common: argparse.ArgumentParser) -> N
         "patients that are scored",
     )
     benchmark.add_argument(
+        "--band-parts",
+        metavar="PART",
+        nargs="*",
+        choices=PARTS,
+        help="parts that bands are calibrated on (default calibration, where it is not scored)",
+    )
+    benchmark.add_argument(
         "--part", choices=PARTS, default=TEST, help="patients to score (default test)"
     )
     benchmark.add_argument(

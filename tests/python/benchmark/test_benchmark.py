@@ -180,7 +180,7 @@ def test_standard_deviations_are_calibrated_on_another_part(folder):
     assert f"calibrated without {calibrating[9]}" in found.markdown()
     (folder / "predictions" / "stated" / f"{calibrating[8]}.npz").unlink()
     text = cmfsim.run_benchmark(folder, entries=[]).table.markdown()
-    assert "8 patients of the part calibration are too few for a band: 9 are needed" in text
+    assert "8 patients to calibrate it on are too few for a band: 9 are needed" in text
 
 
 def test_standard_deviations_of_other_settings_are_not_mixed(folder):
@@ -290,6 +290,8 @@ def test_what_is_refused_says_where_and_why(folder):
         cmfsim.SkinPrediction(skin, still, half_width=ones, sd=ones)
     with pytest.raises(CaseInputError, match=r"sd\[4\] is 0 mm: above 0"):
         cmfsim.SkinPrediction(skin, still, sd=np.where(np.arange(len(skin)) == 4, 0.0, 1.0))
+    with pytest.raises(CaseInputError, match="bands are calibrated on it"):
+        cmfsim.run_benchmark(folder, entries=[], part="train", band_parts=["train"])
     with pytest.raises(CaseInputError, match=r"band is 'M'"):
         cmfsim.run_benchmark(folder, entries=["H"], band=["M"])
     path = folder / "predictions/x/D003.npz"
