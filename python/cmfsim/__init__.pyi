@@ -146,6 +146,7 @@ from cmfsim.node_kinds import SlidingSphere as SlidingSphere
 from cmfsim.node_kinds import classify_nodes as classify_nodes
 from cmfsim.node_kinds import dental_arches as dental_arches
 from cmfsim.node_kinds import kind_options as kind_options
+from cmfsim.node_kinds import lifted_tissue as lifted_tissue
 from cmfsim.node_kinds import segment_data as segment_data
 from cmfsim.phantom import HeadParameters as HeadParameters
 from cmfsim.phantom import Muscle as Muscle
@@ -229,6 +230,7 @@ from cmfsim.values.dental_arch import DentalArch as DentalArch
 from cmfsim.values.finding import Finding as Finding
 from cmfsim.values.image_data import ImageData as ImageData
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS as SKULL_LANDMARKS
+from cmfsim.values.lifted_tissue import LiftedTissue as LiftedTissue
 from cmfsim.values.lip_region import LipRegion as LipRegion
 from cmfsim.values.moduli import FatModuli as FatModuli
 from cmfsim.values.moduli import MuscleModuli as MuscleModuli

@@ -5,6 +5,7 @@ Kim et al. (2010), section 2.5 and Figure 4. Only nodes on the boundary of the m
 
 from cmfsim.node_kinds.arches import DentalArches, dental_arches
 from cmfsim.node_kinds.classification import ClassifiedNodes, classify_nodes, segment_data
+from cmfsim.node_kinds.lifted import lifted_tissue
 from cmfsim.node_kinds.options import KindOptions, SlidingBox, SlidingSphere, kind_options
 
 __all__ = [
@@ -16,5 +17,6 @@ __all__ = [
     "classify_nodes",
     "dental_arches",
     "kind_options",
+    "lifted_tissue",
     "segment_data",
 ]

@@ -75,6 +75,10 @@ class SlidingSphere:
         return cast("NDArray[np.bool_]", distance <= self.radius)
 
 
+# The rim of the orbit lies some 25 mm above the cut.
+MOST_LIFTED = 25.0
+
+
 @dataclass(frozen=True)
 class KindOptions:
     """Distances and regions that decide the kinds.
@@ -106,6 +110,11 @@ class KindOptions:
         How far beside them.
     teeth_distance : float, mm
         Largest distance from the teeth, where these are known apart from bone.
+    lifted : float, mm
+        How far above the cut of a Le Fort I osteotomy tissue is lifted off the cranium, as the
+        surgeon lifts the periosteum between the piriform aperture and the infraorbital foramen:
+        within this distance of the maxilla, what a plan does not press against the bone is free
+        of it. 0: none.
     contact_surface : str
         What they slide on at the arches: "sheet", the labial and buccal face of gums and crowns,
         bridged between teeth and continued past their edges (`contact_sheet`), or "bone", the
@@ -127,6 +136,7 @@ class KindOptions:
     behind: float = 12.0
     beside: float = 8.0
     teeth_distance: float = 15.0
+    lifted: float = 10.0
     contact_surface: str = "sheet"
     regions: tuple[SlidingBox | SlidingSphere, ...] = ()
 
@@ -137,6 +147,11 @@ class KindOptions:
             as_number(name, getattr(self, name))
         for name in ("behind", "beside"):
             as_number(name, getattr(self, name))
+        if not 0.0 <= as_number("lifted", self.lifted) <= MOST_LIFTED:
+            raise CaseInputError(
+                f"lifted is {self.lifted:g} mm: 0 (none) to {MOST_LIFTED:g} is allowed, since the "
+                "orbits lie above"
+            )
         if not 0.0 <= as_number("facing", self.facing) <= 1.0:
             raise CaseInputError(f"facing is {self.facing:g}: 0 to 1 is allowed")
         check_one_of("contact_surface", self.contact_surface, CONTACT_SURFACES)

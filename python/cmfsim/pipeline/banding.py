@@ -38,6 +38,10 @@ BAND_REGIONS = (
 )
 
 
+# Noses and necks, which are deeper, do not become thicker as cheeks do, mm.
+THICKEST = 12.0
+
+
 def predict_with_band(
     patient: PatientModel,
     model: str = "M+S",
@@ -165,6 +169,7 @@ def _band(prediction: Prediction, rates: SkinRates, options: BandOptions) -> Ski
     depth = tissue_depth(
         prediction.skin_before.vertices, [s.surface for s in prediction.patient.segments]
     )
+    depth = np.minimum(depth, THICKEST)
     for source in ADDED:
         scale = depth if source.unit == "share" else np.ones(len(depth))
         parts[source.name] = source.sd * scale

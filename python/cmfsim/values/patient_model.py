@@ -15,6 +15,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
+from cmfsim.values.lifted_tissue import LiftedTissue
 from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.scene import Scene
@@ -54,6 +55,9 @@ class PatientModel(Frozen):
         Unit direction of the fibres of each tet; zero where there is no muscle.
     landmarks : mapping of str to mapping of str to (3,) float64, mm
         "skull" and "skin", where given.
+    lifted : LiftedTissue or None
+        What is lifted off the cranium above a Le Fort I cut: `scene.fixed` has of it what the plan
+        presses against the bone.
     lips : mapping of str to LipRegion
         "upper" and "lower", where the mesh was separated between them.
     findings : tuple of Finding
@@ -76,6 +80,7 @@ class PatientModel(Frozen):
     fraction: Floats | None = None
     fibre: Floats | None = None
     landmarks: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
+    lifted: LiftedTissue | None = None
     lips: Mapping[str, LipRegion] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
@@ -96,7 +101,8 @@ class PatientModel(Frozen):
     def with_plan(self, plan: Mapping[str, ArrayLike | MovedSurface]) -> PatientModel:
         """The patient under another plan; segments that are not named stay.
 
-        Neither mesh nor node kinds depend on how far segments move, so nothing is built again.
+        Neither mesh nor node kinds depend on how far segments move, so nothing is built again. What
+        is lifted off the bone above a Le Fort I cut follows the plan.
 
         Parameters
         ----------
@@ -120,7 +126,10 @@ class PatientModel(Frozen):
             for entry in summary.get("findings", ())
             if not str(entry.get("code", "")).startswith("plan-")
         ]
-        scene = replace(self.scene, plan=motions)
+        fixed = self.scene.fixed
+        if self.lifted is not None:
+            fixed = self.lifted.fixed(fixed, motions[self.lifted.segment])
+        scene = replace(self.scene, plan=motions, fixed=fixed)
         return replace(self, scene=scene, findings=findings, summary=summary)
 
     @cached_property

@@ -171,7 +171,15 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
         options = EquilibriumOptions(steps=STEPS_WITH_LIPS)
     region = replace(case.region, upper=float(head.skull_landmarks["nasion"][2]) + ABOVE_NASION)
     mesh = replace(case.mesh, edge_length=length, refine=refine or separate)
-    fine = replace(case, region=region, mesh=mesh, muscles=None, postoperative=None)
+    fine = replace(
+        case,
+        region=region,
+        mesh=mesh,
+        # The operation itself strips tissue off the bone, by how far the sides of a cut move apart.
+        node_kinds=dict(case.node_kinds, lifted=0.0),
+        muscles=None,
+        postoperative=None,
+    )
     stage("drawing the true anatomy")
     anatomy = head.anatomy(as_positive("grid", grid))
     bite = head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE

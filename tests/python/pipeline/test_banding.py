@@ -63,6 +63,8 @@ def test_the_standard_deviation_is_the_quadrature_of_its_parts(patient, plain):
     floor = np.hypot(0.25, 0.2)
     assert band.sd.min() >= floor
     depth = tissue_depth(patient.skin.vertices, [s.surface for s in patient.segments])
+    assert depth.max() > 12.0
+    depth = np.minimum(depth, 12.0)
     np.testing.assert_allclose(band.parts["thickness change"], 0.05 * depth)
     # The forehead is far from every bone that moves: what is added without a solve remains.
     far = np.linalg.norm(plain.skin_displacements, axis=1) < 1e-4

@@ -40,6 +40,7 @@ from cmfsim.node_kinds import (
     classify_nodes,
     dental_arches,
     kind_options,
+    lifted_tissue,
     segment_data,
 )
 from cmfsim.pictures import picture_anatomy, picture_node_kinds
@@ -74,6 +75,7 @@ from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.lifted_tissue import LiftedTissue
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.scene import Scene, SegmentData
@@ -257,6 +259,7 @@ class _Nodes:
     level: ImageData
     seam: LipSeam | None
     lips: CaseLipContact
+    lifted: LiftedTissue | None
 
 
 def _bones(
@@ -365,7 +368,8 @@ def _nodes(
     stages.add(found)
     stages.add(untouched(case, mesh, kinds, bones))
     stages.drop_repeated()
-    return _Nodes(mesh, report, kinds, contacts, tissue.level, seam, lips)
+    lifted = lifted_tissue(mesh.nodes, kinds, bones.segments, moved, options)
+    return _Nodes(mesh, report, kinds, contacts, tissue.level, seam, lips, lifted)
 
 
 def _assembled(
@@ -398,6 +402,7 @@ def _assembled(
         anatomy=anatomy,
         fat=case.tissue,
         landmarks=head.landmarks,
+        lifted=nodes.lifted,
         lips=nodes.lips.regions,
         findings=tuple(stages.findings),
         summary={
@@ -456,18 +461,21 @@ def _kind_options(case: Case) -> KindOptions:
 def _scene(
     case: Case, nodes: _Nodes, bones: PlannedBones, contacts: Mapping[str, SurfaceData]
 ) -> Scene:
-    mesh, kinds, lips = nodes.mesh, nodes.kinds, nodes.lips
+    mesh, kinds, lips, lifted = nodes.mesh, nodes.kinds, nodes.lips, nodes.lifted
     data = segment_data(kinds, bones.segments, contacts=contacts)
     # Teeth that no node is attached to or slides on may still be before the lips.
     data |= {o.segment: SegmentData() for o in lips.obstacles if o.segment not in data}
     plan = {name: bones.motions.get(name, np.eye(4)) for name in data}
+    fixed = kinds.nodes("fixed")
+    if lifted is not None:
+        fixed = lifted.fixed(fixed, plan[lifted.segment])
     return Scene(
         nodes=mesh.nodes,
         tets=mesh.tets,
         tissue=case.tissue,
         segments=data,
         plan=plan,
-        fixed=kinds.nodes("fixed"),
+        fixed=fixed,
         options=case.solver,
         touching=lips.touching,
         obstacles=lips.obstacles,

@@ -128,6 +128,9 @@ class PlanningModel:
             Contact does not converge, or the equations are not solved.
         """
         patient = self.patient.with_plan(self.whole(plan))
+        # What is lifted off the bone is as at the reference: the factorisation is of that.
+        scene = replace(patient.scene, fixed=self.patient.scene.fixed)
+        patient = replace(patient, scene=scene)
         return predict_patient(patient, self.model, solver=self.solver)
 
 
