@@ -44,7 +44,7 @@ def main(path: Path) -> int:
     skin = _face(truth, head)
     names = list(truth.skin_landmarks)
     parameters = {
-        "what": "in silico: a head made by code and an operation computed; no patient",
+        "what": "in silico: a synthetic head and a computed operation; no patient",
         "head": asdict(PATIENT.parameters),
         "plan": {name: asdict(move) for name, move in PATIENT.plan.items()},
         "muscle_thickness": PATIENT.muscle_thickness,

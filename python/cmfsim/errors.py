@@ -64,7 +64,7 @@ class LandmarkInputError(LandmarkError, ValueError):
 
 
 class ImageInputError(ImageError, ValueError):
-    """An image that cannot be meant: not three axes, no CT, damaged, no head in it."""
+    """An image that is invalid: not three axes, no CT, damaged, no head in it."""
 
 
 class RegistrationInputError(RegistrationError, ValueError):

@@ -123,8 +123,8 @@ def frontier(  # noqa: PLR0913 (options by name)
     jobs.time_limit /= REFERENCE_PATIENCE
     if "error" in first:
         raise SolverError(
-            f"the reference ({_label(reference, base)}) failed, so that nothing can be compared "
-            f"with it: {first['error']}; fix that, or give another reference"
+            f"the reference ({_label(reference, base)}) failed, so nothing can be compared with "
+            f"it: {first['error']}; fix that, or give another reference"
         )
     for number in range(repeats):
         for choice in choices:

@@ -67,7 +67,7 @@ def frontier_page(found: Frontier) -> str:
     failed = [row for row in found.rows if row.failure]
     if failed:
         lines = [f"- {row_label(row.choice)}: {row.failure}" for row in failed]
-        parts += ["## What was refused or failed", "\n".join(lines)]
+        parts += ["## Choices that were refused or failed", "\n".join(lines)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -98,9 +98,9 @@ def _head(found: Frontier) -> str:
         f"max over the face, which the reference moves by {found.moved:.2f} mm on average, and the "
         "mean over the whole skin of the simulated tissue. "
         f"The base (the case's own settings) {verdict}. Time: build is one run from the files to "
-        "the scene; solve is the median of rounds that were interleaved, with the least and the "
-        "most; “times base” is taken within each round. CPU and peak memory are those of the "
-        "solve. The front: no other choice is as near in as little time.\n\n"
+        "the scene; solve is the median of interleaved rounds, with minimum and "
+        "maximum; “times base” is taken within each round. CPU and peak memory are those of the "
+        "solve. The front: no other choice is both as accurate and as fast.\n\n"
         f"{machine['processor']}, {machine['threads']} threads, "
         f"cmfsim {machine['cmfsim']}, commit {machine['commit'] or DASH}."
     )

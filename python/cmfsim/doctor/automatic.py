@@ -23,8 +23,8 @@ def check_automatic(evidence: Evidence) -> Iterator[Finding]:
         "no landmarks are given: they are found when the case is built; not checked here: "
         + ", ".join(left),
         where=case.where("landmarks"),
-        why="what is placed from landmarks can be checked only once they are known, and a build "
-        "stops where they do not suffice",
+        why="what is placed from landmarks can be checked only once they are known; the build "
+        "stops if they are insufficient",
         fix='run "cmfsim landmarks case.toml" to see them with their expected errors, and name its '
         "files under [landmarks]: the doctor then checks all of it",
     )

@@ -27,10 +27,14 @@ def check_ends(evidence: Evidence) -> Iterator[Finding]:
     place, top, where = found
     ends = []
     if case.region.lower is not None:
-        ends.append((case.region.lower, case.where("region.lower"), "lower lies further down"))
+        ends.append(
+            (case.region.lower, case.where("region.lower"), "move lower in [region] further down")
+        )
     if evidence.image is not None:
         key = case.where("image.file")
-        ends.append((float(evidence.image.lowest[2]), key, "the image goes further down"))
+        ends.append(
+            (float(evidence.image.lowest[2]), key, "use an image that extends further down")
+        )
     if not ends:
         return
     end, key, how = max(ends)
@@ -45,7 +49,7 @@ def check_ends(evidence: Evidence) -> Iterator[Finding]:
         "needed)",
         where=key,
         why="tissue below the chin cannot follow: the face there moves too little, or not at all",
-        fix=f"use data where {how}, or leave chin and throat out of the evaluation",
+        fix=f"{how}, or leave chin and throat out of the evaluation",
     )
 
 

@@ -196,7 +196,7 @@ def gather(case: Case) -> Evidence:
                 "region-unplaced",
                 str(error),
                 where=case.where("region.posterior_depth"),
-                why="the face cannot be parted from the rest of the head",
+                why="the face cannot be separated from the rest of the head",
                 fix="place these landmarks, or give posterior_plane",
             )
         )
@@ -206,7 +206,7 @@ def gather(case: Case) -> Evidence:
                 "tissue-preset",
                 f"preset is {case.tissue.preset!r}",
                 where=case.where("tissue.preset"),
-                why="no tissue can be made from it",
+                why="no tissue can be built from it",
                 fix=f"use one of: {', '.join(PRESETS)}",
             )
         )
@@ -286,7 +286,7 @@ def _transform(
                 "transform-unreadable",
                 str(error),
                 where=case.where(f"plan.{name}.transform"),
-                why=f"nobody knows how {name} moves",
+                why=f"the motion of {name} is unknown",
                 fix="save it again as one rigid ITK transform (.tfm or .h5), or write a matrix",
             )
         )
@@ -355,13 +355,13 @@ def _check_output(case: Case, findings: list[Finding]) -> None:
         folder = folder.parent
     if folder.is_dir() and os.access(folder, os.W_OK | os.X_OK):
         return
-    what = "may not be written to" if folder.is_dir() else "is a file, not a folder"
+    what = "is not writable" if folder.is_dir() else "is a file, not a folder"
     findings.append(
         Finding.error(
             "output-not-writable",
             f"{folder} {what}",
             where=case.where("output.folder"),
-            why="results could not be written after the work is done",
-            fix="name another folder, or change its permissions",
+            why="the results could not be written at the end of the run",
+            fix="choose another folder, or change its permissions",
         )
     )

@@ -194,9 +194,8 @@ def _off_surface(
             "they lie "
             f"{shift.after:.1f} mm from the {surface} on average, now {shift.before:.1f} mm",
             where=where,
-            why="a set that is off as a whole was placed in another image or frame; every cut, "
-            "muscle "
-            "or measured point is off by as much",
+            why="a set that is displaced as a whole was placed in another image or frame; every "
+            "cut, muscle or measured point is displaced with it",
             fix="check that the landmarks were placed in this image (same series, same frame, not "
             "resampled or aligned since), and export them again",
         )
@@ -205,13 +204,11 @@ def _off_surface(
             severity="error" if median > ANOTHER else "warning",
             code="landmarks-off",
             what=f"{int(far.sum())} of {n} landmarks of the {key} lie more than {FAR:g} mm from "
-            "the "
-            f"{surface}, half of them more than {median:.1f} mm",
+            f"the {surface}, half of them by more than {median:.1f} mm",
             where=where,
-            why="so many are no placing errors: they belong to another patient, scan or frame, or "
-            "the "
-            f"{surface} is not that of this patient",
-            fix="check that both files are of one patient and one scan",
+            why="so many cannot be placement errors: they belong to another patient, scan or "
+            f"frame, or the {surface} is not this patient's",
+            fix="check that both files come from the same patient and the same scan",
         )
     for (name, point), offset, distance in zip(landmarks.items(), offsets, found, strict=True):
         if distance <= FAR:
@@ -226,7 +223,7 @@ def _off_surface(
             code="landmark-far",
             what=f"{name} {lies}, at {place_text(point)}",
             where=where,
-            why=f"{PLACED_FROM[key]}; more than {FAR:g} mm is no placing error",
+            why=f"{PLACED_FROM[key]}; a placement error does not exceed {FAR:g} mm",
             fix=AGAIN,
         )
 
@@ -237,10 +234,10 @@ def _swapped(landmarks: Mapping[str, Floats], pair: tuple[str, str], where: str)
     return Finding.error(
         "landmarks-swapped",
         f"{one} at {place_text(landmarks[one])} and {other} at {place_text(landmarks[other])} seem "
-        f"to have each other's name: exchanged they fit all others ({apart:.0f} mm apart)",
+        f"to be swapped: exchanged, they fit all the others ({apart:.0f} mm apart)",
         where=where,
-        why="each draws the muscles and cuts near it to the other's place",
-        fix="exchange the two labels, or place both again",
+        why="each pulls the muscles and cuts near it to the wrong place",
+        fix="swap the two labels, or place both again",
     )
 
 
@@ -269,18 +266,17 @@ def _asymmetric(
         what = (
             f"{name} lies {0.5 * distance:.1f} mm off the midline that the other landmarks make"
             if base == name
-            else f"{base}_L and {base}_R are no mirror images of each other by {distance:.1f} mm, "
-            "as the other landmarks show left and right"
+            else f"{base}_L and {base}_R deviate from mirror symmetry by {distance:.1f} mm, "
+            "judged by the other landmarks"
         )
         yield Finding.warning(
             "landmark-asymmetric",
             what,
             where=where,
-            why=f"{PLACED_FROM[key]}; an uneven face as a whole is allowed for, so that one of "
-            "them is "
+            why=f"{PLACED_FROM[key]}; overall asymmetry is allowed for, so one of them is "
             "misplaced or the bone is deformed there",
-            fix="look at both sides in 3D Slicer; place it again, or leave it if the bone is like "
-            "that",
+            fix="look at both sides in 3D Slicer; place it again, or keep it if the bone is "
+            "asymmetric there",
         )
 
 

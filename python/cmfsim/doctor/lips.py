@@ -32,9 +32,9 @@ def check_lips(evidence: Evidence) -> Iterator[Finding]:
     if case.node_kinds.get("sliding") is False:
         yield Finding.warning(
             "lips-attached",
-            "contact of the lips is asked for, and tissue does not slide on the teeth",
+            "contact of the lips is enabled, but tissue does not slide on the teeth",
             where=case.where("node_kinds.sliding"),
-            why="the lips stay attached to the teeth and can hardly come to each other",
+            why="the lips stay attached to the teeth and can hardly meet",
             fix="remove sliding = false from [node_kinds], or set contact = false in [lips]",
         )
     if isinstance(lips.seam, Path) or case.mesh.parting is not None:
@@ -56,7 +56,7 @@ def check_lips(evidence: Evidence) -> Iterator[Finding]:
         "lips-landmarks-few",
         f"the skin landmarks {', '.join(missing)} are missing",
         where=case.where("landmarks.skin"),
-        why="where lips meet and the mouth ends is then read off the skin alone, with nothing to "
-        "check it against, and the lips are not separated where it shows neither gap nor crease",
+        why="the line between the lips and the corners of the mouth are then read off the skin "
+        "alone, unchecked; if the skin shows neither gap nor crease, the lips are not separated",
         fix="place them",
     )

@@ -70,7 +70,7 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
                 "moved-not-paired",
                 str(moved),
                 where=where,
-                why=f"nobody knows where each vertex of {name} went",
+                why=f"it is unknown where each vertex of {name} went",
                 fix="export the bone before, and the same mesh after the motion",
             )
             continue
@@ -89,9 +89,10 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
             "moved-all",
             f"every bone moves: {', '.join(least)}, by {min(least.values()):.1f} mm at least",
             where=case.where("plan"),
-            why="the skull above the jaws stays in surgery of the jaws; if the scans lie in two "
+            why="jaw surgery does not move the skull above the jaws; if the scans are in different "
             "frames, the whole face is moved by the difference",
-            fix="lay the scan after on the one before by the skull (register_volumes, icp)",
+            fix="register the post-operative scan to the pre-operative one on the skull "
+            "(register_volumes, icp)",
         )
 
 
@@ -106,7 +107,7 @@ def check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]
             "moved-mirrored",
             f"{name} is mirrored after against before",
             where=where,
-            why="no motion of bone does that: one file has left and right, or an axis, swapped",
+            why="no bone motion does that: one file has left and right, or an axis, swapped",
             fix="export both in one frame (LPS or RAS)",
         )
         return
@@ -114,9 +115,10 @@ def check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]
     if along < ALONG:
         yield Finding.error(
             "moved-scrambled",
-            f"the edges of {name} point elsewhere after (cosine {along:.2f} on average, not 1)",
+            f"the edges of {name} point in other directions after (cosine {along:.2f} on average, "
+            "not 1)",
             where=where,
-            why="both files have as many vertices, but these do not belong together in their order",
+            why="both files have the same number of vertices, but in a different order",
             fix=f"export the moved mesh without remeshing or sorting its vertices; {BY_SHAPE}",
         )
     elif abs(scale - 1.0) > SCALED:
@@ -140,15 +142,15 @@ def _scaled(name: str, where: str, scale: float) -> Finding:
             "moved-scaled",
             f"{what}{between}",
             where=where,
-            why="bone does not grow in an operation: the files are in two units, or scaled",
-            fix="export both in one unit, that which the case states",
+            why="bone does not grow during an operation: the files are in two units, or scaled",
+            fix="export both in the unit that the case states",
         )
     return Finding.warning(
         "moved-scaled",
-        f"{what}: near no ratio of two units (2.54, 10, 25.4, 100, 1000)",
+        f"{what}: not close to the ratio of any two units (2.54, 10, 25.4, 100, 1000)",
         where=where,
-        why="bone does not grow in an operation, so that the scans are calibrated or segmented "
-        f"differently by {abs(scale - 1.0):.1%}; each vertex is followed all the same, and the "
+        why="bone does not grow during an operation, so the calibration or segmentation of the "
+        f"scans differs by {abs(scale - 1.0):.1%}; each vertex is still followed, and the "
         "difference counts as motion",
         fix="check the voxel sizes of both scans and the thresholds of both segmentations, and "
         f"measure again; {BY_SHAPE}",
@@ -197,7 +199,7 @@ def _check_distance(name: str, where: str, motion: MovedSurface) -> Iterator[Fin
             f"{name} moves by {moved[worst]:.2g} mm at most",
             where=where,
             why="the plan moves nothing there",
-            fix="check that the file is the bone after the operation; else leave it out",
+            fix="check that the file is the bone after the operation; otherwise remove it",
         )
         return
     if moved[worst] > FAR:
@@ -207,11 +209,11 @@ def _check_distance(name: str, where: str, motion: MovedSurface) -> Iterator[Fin
             code="plan-far",
             what=f"{name} moves by up to {moved[worst]:.1f} mm, at {place_text(here[worst])}",
             where=where,
-            why=f"bone moves by {FAR:g} mm at most in ordinary surgery; tissue would be torn",
+            why=f"ordinary surgery moves bone by at most {FAR:g} mm; tissue would tear",
             fix="one file is in LPS, the other in RAS: export both in one frame"
             if turned
-            else "lay the scan after on the one before by the skull, and check that both files "
-            "number their vertices alike",
+            else "register the post-operative scan to the pre-operative one on the skull, and "
+            "check that both files number their vertices in the same order",
         )
         # What flies off may turn as well: one reason is enough.
         return

@@ -34,8 +34,8 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
             "template-unreadable",
             str(error),
             where=evidence.case.where("muscles.template"),
-            why="there is nothing to take muscles from",
-            fix='name a folder that "cmfsim template check" passes, or "default"',
+            why="muscles cannot be placed without a template",
+            fix='give a folder that "cmfsim template check" accepts, or "default"',
         )
         return
     yield from _moduli(evidence, given, template)
@@ -47,7 +47,7 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
             "muscles-without-landmarks",
             "muscles are asked for, and no skull landmarks could be read",
             where=where,
-            why="they carry the template to the patient",
+            why="the template is fitted to the patient by them",
             fix="add [landmarks] skull, or leave out [muscles]",
         )
         return
@@ -58,7 +58,7 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
             "muscles-landmarks",
             str(error),
             where=where,
-            why="the template cannot be carried to the patient by these landmarks",
+            why="the template cannot be fitted to the patient by these landmarks",
             fix='correct the landmarks; "cmfsim template morph" shows each one\'s error',
         )
         return
@@ -75,7 +75,7 @@ def _moduli(evidence: Evidence, given: CaseMuscles, template: MuscleTemplate) ->
             close = difflib.get_close_matches(name, names)
             yield Finding.error(
                 "muscle-moduli-unknown",
-                f"moduli are given for the muscle {name!r}, which the template has not",
+                f"moduli are given for the muscle {name!r}, which the template does not have",
                 where=case.where(f"muscles.moduli.{name}"),
                 why="they would have no effect",
                 fix=f"use one of: {', '.join(close or names)}",
@@ -93,7 +93,7 @@ def _moduli(evidence: Evidence, given: CaseMuscles, template: MuscleTemplate) ->
             str(error),
             where=case.where("tissue"),
             why="the fat of [tissue] lies between the muscles",
-            fix="use a young (MPa) that fat can have, or leave out [tissue]",
+            fix="use a young (MPa) that is plausible for fat, or leave out [tissue]",
         )
         return
     yield from moduli_findings(moduli, given.preset, case.where(place))

@@ -224,11 +224,11 @@ def _check_through_skin(
     worst = int(np.argmax(depth))
     yield Finding.warning(
         "plan-through-skin",
-        f"{name} is moved through the skin at rest, by {depth[worst]:.1f} mm at "
+        f"{name} is moved through the undeformed skin, by {depth[worst]:.1f} mm at "
         f"{place_text(moved[through[worst]])}",
         where=evidence.case.where(f"plan.{name}"),
-        why="the tissue over it would be pressed flat or turned inside out",
-        fix="check the plan; a large true advancement is better solved in steps",
+        why="the tissue over it would be crushed or inverted",
+        fix="check the plan; solve a genuinely large advancement in steps",
     )
 
 
@@ -250,7 +250,7 @@ def _check_tissue(evidence: Evidence, name: str, piece: Floats) -> Iterator[Find
         "segment-no-tissue",
         f"{name} touches no soft tissue in the meshed region",
         where=evidence.case.where(f"plan.{name}"),
-        why="moving it moves nothing",
+        why="moving it has no effect",
         fix="check region (posterior plane, lower, upper), and that the skin encloses it",
     )
 

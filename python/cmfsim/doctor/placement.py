@@ -161,7 +161,7 @@ def _check_bone_sizes(evidence: Evidence) -> Iterator[Finding]:
             "surface-units",
             f"bone {name} is {extent:.4g} mm long, the skin {skin:.4g} mm",
             where=body.where,
-            why="all surfaces of a case have the same units and lie in one frame",
+            why="all surfaces of a case must have the same units and lie in one frame",
             fix="export it in the units of the skin",
         )
 
@@ -309,7 +309,7 @@ def _check_directions(
         for axis, v in enumerate((left, back, up))
     ]
     where = evidence.case.where(f"landmarks.{key}")
-    why = "left and right, front and back would be taken for one another"
+    why = "left and right, front and back would be swapped"
     if signs[0] < 0 and signs[1] < 0:
         yield Finding.error(
             "frame-turned",
@@ -331,7 +331,7 @@ def _check_directions(
             "mirrored: export them again",
         )
     elif signs[1] < 0 or signs[2] < 0:
-        what = "the face looks backwards" if signs[1] < 0 else "the head stands on its crown"
+        what = "the face looks backwards" if signs[1] < 0 else "the head is upside down"
         yield Finding.error(
             "frame-turned",
             f"by its landmarks, {what}",
@@ -451,10 +451,10 @@ def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Fi
     worst = int(np.argmax(depth))
     yield Finding.warning(
         "bone-through-skin",
-        f"bone {name} stands out of the skin by {depth[worst]:.1f} mm at "
+        f"bone {name} protrudes from the skin by {depth[worst]:.1f} mm at "
         f"{place_text(points[worst])}, with {share:.1%} of its points",
         where=body.where,
-        why="there is no tissue over it, so that the skin there is bone",
+        why="there is no tissue over it, so the skin there is bone",
         fix="correct the surface there; build cuts the bone off at the skin",
     )
 
@@ -480,9 +480,8 @@ def _check_bone_overlap(evidence: Evidence) -> Iterator[Finding]:
                     "bone-overlap",
                     f"{share:.0%} of bone {name} lies within bone {other_name}",
                     where=body.where,
-                    why="the same bone stands in the case twice; where one part moves and the "
-                    "other "
-                    "stays, tissue is held by both",
+                    why="the case contains the same bone twice; if one copy moves and the other "
+                    "stays, both hold the tissue",
                     fix=f"cut {name} out of {other_name}, or drop the file and cut by "
                     "[[osteotomies]]",
                 )

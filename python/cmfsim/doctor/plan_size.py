@@ -84,7 +84,7 @@ def _too_far(motion: SizedMotion, far: float, remedy: str) -> Finding:
         code="plan-far",
         what=f"{motion.name} moves by up to {far:.1f} mm",
         where=motion.where,
-        why=f"bone moves by {FAR:g} mm at most in ordinary surgery; tissue would be torn",
+        why=f"ordinary surgery moves bone by at most {FAR:g} mm; tissue would tear",
         fix=remedy,
     )
 
@@ -110,7 +110,7 @@ def check_tiny(name: str, where: str, far: float, angle: float) -> Iterator[Find
             "plan-tiny",
             f"{name} moves by {far:.2g} mm at most",
             where=where,
-            why="no face shows that: the prediction is the face before the operation",
+            why="this is too small to be seen: the prediction equals the face before the operation",
             fix=f"check the unit: translations and matrices are in mm ({far:.2g} m would be "
             f"{1000.0 * far:.2g} mm); if the segment stays, leave it out of the plan",
         )
@@ -120,7 +120,7 @@ def check_tiny(name: str, where: str, far: float, angle: float) -> Iterator[Find
             "plan-tiny-angle",
             f"{name} turns by {angle:.2g}°",
             where=where,
-            why=f"no operation is planned to that; {angle:.2g} radians would be "
+            why=f"no operation is planned that precisely; {angle:.2g} radians would be "
             f"{math.degrees(angle):.1f}°",
             fix="check the unit: angles are in degrees; nothing to do if the turn is meant, or was "
             "measured",

@@ -63,8 +63,8 @@ def _check_body(body: Body) -> Iterator[Finding]:
             what=f"{len(report.borders)} open borders of {lengths}{more} mm, the longest round "
             f"{place_text(longest.centre)}",
             where=where,
-            why="inside and outside are only known for a closed surface: caps are put on"
-            + (", and one this wide makes up a part of the head" if wide else ""),
+            why="only a closed surface has an inside and an outside: gaps are capped"
+            + (", and a cap this wide invents part of the head" if wide else ""),
             fix="look at the caps after build; if they are wrong, close the surface yourself",
         )
     if report.inconsistent or not report.orientable:
@@ -73,7 +73,7 @@ def _check_body(body: Body) -> Iterator[Finding]:
             f"{report.inconsistent} edges have triangles that face opposite ways"
             + ("" if report.orientable else "; a part has only one side (Möbius)"),
             where=where,
-            why="inside and outside swap from place to place; the smaller part is turned round",
+            why="inside and outside change from place to place; the smaller part is flipped",
             fix="recompute normals in the program that made it",
         )
     elif report.volume < 0.0:
@@ -81,7 +81,7 @@ def _check_body(body: Body) -> Iterator[Finding]:
             "surface-inward",
             f"normals point inwards (volume {report.volume:.0f} mm³)",
             where=where,
-            why="inside and outside are swapped; build turns it round",
+            why="inside and outside are swapped; build flips it",
             fix="flip normals in the program that made it",
         )
     if len(report.non_manifold):
@@ -91,15 +91,15 @@ def _check_body(body: Body) -> Iterator[Finding]:
             f"{len(report.non_manifold)} edges have more than two triangles, first at "
             f"{place_text(vertex)}",
             where=where,
-            why="the surface forks there, so that inside and outside are not known close to it",
+            why="the surface forks there, so inside and outside are undefined near it",
             fix="remove inner walls and repeated parts, or remesh it",
         )
     if report.crossings is None:
         yield Finding.warning(
             "surface-crossings-unknown",
-            "triangles lie so close together that crossings were not looked for",
+            "triangles are too crowded to check for intersections",
             where=where,
-            why="crossing triangles make inside and outside doubtful",
+            why="intersecting triangles make inside and outside ambiguous",
             fix="remesh it with triangles of about equal size",
         )
     elif len(report.crossings) and report.crossing_points is not None:
@@ -107,10 +107,11 @@ def _check_body(body: Body) -> Iterator[Finding]:
         yield Finding(
             severity="warning" if share > CROSSING_SHARE or body.name == "skin" else "note",
             code="surface-crossing",
-            what=f"{len(report.crossings)} pairs of triangles cut through each other, first at "
+            what=f"{len(report.crossings)} pairs of triangles intersect, first at "
             f"{place_text(report.crossing_points[0])}",
             where=where,
-            why="what is enclosed twice counts once, and what lies between may count as outside",
+            why="volume enclosed twice counts once, and volume between the folds may count as "
+            "outside",
             fix="smooth or remesh it there",
         )
     yield from _check_pieces(body)
@@ -129,9 +130,8 @@ def _check_pieces(body: Body) -> Iterator[Finding]:
     yield Finding(
         severity="warning" if body.name == "skin" else "note",
         code="surface-islands",
-        what=f"{len(solid)} pieces beside the largest, with {share:.1%} of its area; the next is "
-        "of "
-        f"{solid[0].n_triangles} triangles at {place_text(solid[0].centre)}",
+        what=f"{len(solid)} pieces besides the largest, with {share:.1%} of its area; the next is "
+        f"of {solid[0].n_triangles} triangles at {place_text(solid[0].centre)}",
         where=body.where,
         why="debris becomes islands of bone or skin; pieces below 1 % of the largest are dropped",
         fix="delete what does not belong, or give each bone a file of its own",
@@ -145,7 +145,7 @@ def _check_triangles(body: Body) -> Iterator[Finding]:
             "surface-degenerate",
             f"{len(report.degenerate)} triangles without area and {len(report.duplicate)} repeated",
             where=body.where,
-            why="they have no normal, or count their space twice; they are dropped",
+            why="they have no normal, or count their volume twice; they are dropped",
             fix="nothing to do",
         )
     share = len(report.slivers) / max(report.n_triangles, 1)
@@ -157,7 +157,7 @@ def _check_triangles(body: Body) -> Iterator[Finding]:
             "hundred "
             "times longer than high",
             where=body.where,
-            why="their normals point anywhere, which contact surfaces feel",
+            why="their normals are unreliable, which disturbs contact",
             fix="remesh it if sliding on it matters" if share <= SLIVER_SHARE else "remesh it",
         )
 
@@ -183,7 +183,7 @@ def check_mesh_size(evidence: Evidence) -> Iterator[Finding]:
         what=f"{thin.mean():.0%} of the skin of the region lies closer to bone than "
         f"an edge of {edge:g} mm, {thickness.min():.1f} mm at {place_text(place)}",
         where=case.where("mesh.edge_length"),
-        why="sheets thinner than an edge are lost or stiff"
+        why="layers thinner than an edge are lost or too stiff"
         + (" unless refined" if refined else ""),
         fix="nothing to do"
         if refined

@@ -165,8 +165,8 @@ class SkinComparison:
         """
         if len(self.vertices) and n_vertices <= int(self.vertices.max()):
             raise CaseInputError(
-                f"vertex {int(self.vertices.max())} was evaluated, so a skin of {n_vertices} "
-                "vertices is another one"
+                f"vertex {int(self.vertices.max())} was evaluated, so this skin of {n_vertices} "
+                "vertices is a different one"
             )
         values, masked = np.zeros(n_vertices), np.ones(n_vertices, dtype=bool)
         values[self.vertices] = self.signed
@@ -350,13 +350,14 @@ def _paired(ours: Landmarks, theirs: Landmarks) -> tuple[Floats, Floats, tuple[F
         return match.source, match.target, match.findings
     if isinstance(ours, Mapping) or isinstance(theirs, Mapping):
         raise LandmarkInputError(
-            "one set of landmarks has names and the other has not: give two mappings, or two arrays"
+            "one set of landmarks has names and the other does not: give two mappings, or two "
+            "arrays"
         )
     first, second = (as_rows("landmarks", given, 3) for given in (ours, theirs))
     if len(first) != len(second):
         raise LandmarkInputError(
-            f"there are {len(first)} landmarks of one skin and {len(second)} of the other: as many "
-            "are needed, in the same order"
+            f"there are {len(first)} landmarks of one skin and {len(second)} of the other: both "
+            "need the same number, in the same order"
         )
     return first, second, ()
 
@@ -450,9 +451,9 @@ def _findings(
             Finding.warning(
                 "correspondence-folds",
                 f"the map between the landmarks folds at {folds.count} of {n_chosen} vertices",
-                why="partners there are not where the anatomy is the same",
-                fix="check the landmarks: one stands in another's place, or on another point of "
-                "the face",
+                why="points paired there are not the same anatomy",
+                fix="check the landmarks: one may be swapped with another, or lie on a different "
+                "point of the face",
             )
         )
     return found

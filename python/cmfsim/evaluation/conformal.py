@@ -184,7 +184,9 @@ def region_scores(
 def _share(coverage: float) -> float:
     share = as_number("coverage", coverage)
     if not 0.0 < share < 1.0:
-        raise CalibrationError(f"coverage is {share!r}: allowed is above 0, below 1 (90 % is 0.9)")
+        raise CalibrationError(
+            f"coverage is {share!r}: it must be above 0 and below 1 (90 % is 0.9)"
+        )
     return share
 
 

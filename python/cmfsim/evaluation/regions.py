@@ -155,7 +155,7 @@ def _face_frame(named: Mapping[str, Floats]) -> tuple[Floats, Floats]:
     if width == 0.0 or height == 0.0:
         raise LandmarkInputError(
             f"the landmarks have a mean width of {width:g} mm and a height of {height:g} mm from "
-            "mouth to eyes: no face lies in them"
+            "mouth to eyes: they do not outline a face"
         )
     up = rise / height
     # The midline passes between all pairs.

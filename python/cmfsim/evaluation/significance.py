@@ -16,9 +16,8 @@ __all__ = ["PAIRED_BY", "PairedTest", "wilcoxon_test"]
 PAIRED_BY = ("vertex", "patient")
 CAVEATS = {
     "vertex": (
-        "neighbouring vertices move together and are not independent samples: p says how the "
-        "errors of this one face are ordered, not what to expect of the next patient, and falls "
-        "with every refinement of the mesh"
+        "neighbouring vertices move together and are not independent samples: p describes this one "
+        "face, not what to expect of the next patient, and falls with every refinement of the mesh"
     ),
     "patient": "",
 }

@@ -130,8 +130,8 @@ def fitted_thickness(signed: ArrayLike, depth: ArrayLike) -> ThicknessChange:
     e, d = as_floats("signed distances", signed).ravel(), as_floats("depth", depth).ravel()
     if e.shape != d.shape or not len(e) or not (d > 0.0).any():
         raise CaseInputError(
-            f"{len(e)} signed distances and {len(d)} depths are given: as many of each are needed, "
-            "at least one, and tissue with some depth"
+            f"{len(e)} signed distances and {len(d)} depths are given: give the same number of "
+            "each, with at least one depth above 0"
         )
     thick = d > 0.0
     ratios, weights = -e[thick] / d[thick], d[thick]
@@ -141,8 +141,8 @@ def fitted_thickness(signed: ArrayLike, depth: ArrayLike) -> ThicknessChange:
     if abs(share) > MOST_CHANGE:
         raise CaseInputError(
             f"the soft tissue would have become {100 * share:+.0f} % thicker where nothing was "
-            f"operated on, by {share * d.mean():+.1f} mm: no swelling does that; check that the "
-            "face after the operation lies in the frame of the one before"
+            f"operated on, by {share * d.mean():+.1f} mm: swelling does not explain that; check "
+            "that the face after the operation lies in the frame of the one before"
         )
     before, after = float(np.abs(e).mean()), float(np.abs(e + share * d).mean())
     return ThicknessChange(share, len(e), float(d.mean()), before, after)

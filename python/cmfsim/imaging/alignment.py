@@ -138,14 +138,14 @@ def register_volumes(
     if overlap < options.least_overlap:
         raise RegistrationError(
             f"only {overlap:.0%} of the mask lies in the moving volume (correlation there "
-            f"{similarity:.2f}): at least {options.least_overlap:.0%} must; bring the volumes "
-            "nearer with `initial`, or draw the mask where both were scanned"
+            f"{similarity:.2f}): at least {options.least_overlap:.0%} is needed; bring the volumes "
+            "closer with `initial`, or draw the mask where both were scanned"
         )
     if similarity < options.least_similarity:
         raise RegistrationError(
-            f"the volumes do not look alike where they were laid: correlation {similarity:.2f}, "
-            f"needed {options.least_similarity:g}; start nearer with `initial`, mask out what was "
-            "moved, and see whether both show the same person"
+            f"the volumes do not match after registration: correlation {similarity:.2f}, needed "
+            f"{options.least_similarity:g}; start closer with `initial`, mask out what was moved, "
+            "and see whether both show the same person"
         )
     return VolumeAlignment(inverse(to_moving), information, similarity, overlap, tuple(iterations))
 

@@ -56,7 +56,7 @@ class AlignmentOptions:
         sizes = tuple(as_positive("resolution", s) for s in self.resolutions)
         if not sizes or any(a <= b for a, b in itertools.pairwise(sizes)):
             raise RegistrationInputError(
-                f"resolutions are {sizes} mm: they must become finer, and one is needed"
+                f"resolutions are {sizes} mm: give at least one, each finer than the last"
             )
         object.__setattr__(self, "resolutions", sizes)
         for name, least in (("samples", 1000), ("bins", 8), ("max_iterations", 1), ("seed", 0)):

@@ -1,8 +1,8 @@
 """Things on the face that are no part of it: tubes, holders, tape. They are reported, not removed.
 
-What stands out from the head as thin as a tube is looked at: it belongs to a face if it has its
-mirror image on the other side, as ears, nose and lips have, is not as dense as plastic and stands
-out no farther than a nose.
+Whatever protrudes from the head and is thin is checked: it belongs to the face if it has a mirror
+image on the other side, as ears, nose and lips have, is less dense than plastic and protrudes no
+further than a nose.
 """
 
 from typing import Any
@@ -40,13 +40,13 @@ LEAST_VOLUME = 600.0
 LEAST_LENGTH = 18.0
 # The face lies in front of this part of the head's depth: ears, folded or not, lie behind.
 FACE_PART = 0.45
-ONE_SIDED_TEXT = "without its like on the other side"
+ONE_SIDED_TEXT = "with no counterpart on the other side"
 # Points of the face that its plane of symmetry is fitted to.
 SAMPLES = 4000
 
 
 def attached_findings(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
-    """A finding for each thing on the face that is one-sided or as dense as plastic."""
+    """A finding for each thing on the face that is one-sided or with the density of plastic."""
     inside, spacing, shift = coarse_of(skin.mask.astype(np.float32), work.spacing, STEP)
     mask: Mask = np.asfortranarray(inside > 0.5)
     hu = coarse_of(work.hu, work.spacing, STEP)[0]
@@ -74,7 +74,7 @@ def attached_findings(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
         if volume < LEAST_VOLUME or float(np.linalg.norm(size)) < LEAST_LENGTH:
             continue
         middle = work.origin + shift + voxels.mean(axis=0) * spacing
-        kinds = ((far, "farther out than a nose"), (dense, "as dense as plastic"))
+        kinds = ((far, "further out than a nose"), (dense, "with the density of plastic"))
         here = labels == piece
         kind = next((text for which, text in kinds if which[here].mean() > 0.5), ONE_SIDED_TEXT)
         findings.append(_finding(middle, size, volume, kind))
@@ -86,10 +86,11 @@ def _finding(
 ) -> Finding:
     return Finding.warning(
         "skin-attachment",
-        f"something stands out from the face {kind}: {size[0]:.0f} × {size[1]:.0f} × "
-        f"{size[2]:.0f} mm, {volume / 1000.0:.1f} cm³",
+        f"something protrudes from the face, {kind}: {size[0]:.0f} × {size[1]:.0f} × {size[2]:.0f} "
+        f"mm, {volume / 1000.0:.1f} cm³",
         where=f"skin at ({middle[0]:.0f}, {middle[1]:.0f}, {middle[2]:.0f}) mm",
-        why="a tube, a holder or tape on the face becomes skin, and moves and is compared as such",
+        why="a tube, a holder or tape on the face is taken for skin, and is moved and compared as "
+        "skin",
         fix="look at it in the image; erase it there (air, −1000 HU), or leave that part of the "
         "face out of the evaluation",
     )

@@ -108,7 +108,7 @@ def _without_islands(
     labels, count = label(solid, corners=True)
     if not count:
         raise ImageInputError(
-            f"no bone above {options.least_bone:g} HU inside the skin: is it a CT in HU? Else "
+            f"no bone above {options.least_bone:g} HU inside the skin: is it a CT in HU? If not, "
             "set bone_threshold"
         )
     volumes = sizes_of(labels, count) * float(np.prod(work.spacing))

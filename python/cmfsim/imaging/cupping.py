@@ -61,7 +61,8 @@ def without_cupping(work: Working) -> tuple[Volume, tuple[Finding, ...]]:
     finding = Finding.warning(
         "ct-cupping",
         f"soft tissue is {loss:.0f} HU darker in the middle of the head than near its surface, as "
-        "cone-beam scanners show it; the values were scaled between air and soft tissue to even it",
+        "is typical of cone-beam scanners; the values were scaled between air and soft tissue to "
+        "compensate",
         where="image",
         why="one threshold finds too much bone near the skin and too little in the middle",
         fix="check bone by eye; a CT of a fan-beam scanner has no such loss",

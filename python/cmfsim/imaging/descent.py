@@ -46,7 +46,7 @@ class Places:
         if (extent < LEAST_EXTENT).any():
             raise RegistrationInputError(
                 f"the mask reaches over {' × '.join(f'{e:.0f}' for e in extent)} mm: at least "
-                f"{LEAST_EXTENT:g} mm along each axis are needed to tell a turn"
+                f"{LEAST_EXTENT:g} mm along each axis are needed to find a rotation"
             )
         # Mean square of the shift of the mask's points by a turn of 1 rad about each axis, mm².
         self.inertia = spread.sum() - spread
@@ -158,8 +158,8 @@ def _descend(
     reason = method.GetOptimizerStopConditionDescription()
     if "Maximum number" in reason:
         raise RegistrationError(
-            f"the volumes did not come to rest at {size:g} mm within {options.max_iterations} "
-            "steps; start nearer with `initial`, use a mask that shows the same bone in both, or "
+            f"the registration did not converge at {size:g} mm within {options.max_iterations} "
+            "steps; start closer with `initial`, use a mask that shows the same bone in both, or "
             "raise max_iterations"
         )
     return steps, -float(method.GetMetricValue())

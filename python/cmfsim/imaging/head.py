@@ -132,8 +132,9 @@ def _check_head(work: Working, inside: Mask) -> None:
     volume = np.count_nonzero(inside) * float(np.prod(work.spacing)) / 1000.0
     if volume < LEAST_HEAD:
         raise ImageInputError(
-            f"the largest thing in the image that may be a head has {volume:.0f} cm³: a face has "
-            f"at least {LEAST_HEAD:g}; is the head cut off, empty (a phantom), or the scale wrong?"
+            f"the largest object in the image that could be a head has {volume:.0f} cm³: a face "
+            f"has at least {LEAST_HEAD:g}; is the head cut off, empty (a phantom), or the scale "
+            "wrong?"
         )
 
 

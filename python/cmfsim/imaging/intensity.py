@@ -52,8 +52,8 @@ BELOW_SATURATED = 100.0
 STATED_TOLERANCE = 250.0
 # What to do where the histogram misleads.
 STATE_IT = (
-    "If it is one, state how its values become HU, and nothing is guessed: rescale = [1, 0] in "
-    "[image] for HU, [1, -1024] for values that are 1024 too large"
+    "If it is a CT, state how its values convert to HU, so that nothing is guessed: rescale = [1, "
+    "0] in [image] for HU, [1, -1024] for values that are 1024 too large"
 )
 # About as many voxels as a histogram needs.
 SAMPLE = 500_000
@@ -212,9 +212,9 @@ def _check_spread(hu: NDArray[np.float64], air: float, soft: float) -> None:
     bright = float(np.mean(tissue > SOFT + 250.0))
     if near < LEAST_SOFT_PART or not LEAST_BONE_PART <= bright <= MOST_BONE_PART:
         raise ImageInputError(
-            f"the image is not like a CT: with air at {air:.4g} and soft tissue at {soft:.4g}, "
-            f"{100 * near:.0f} % of the tissue is within {SOFT_SPREAD:g} HU of soft tissue (at "
-            f"least {100 * LEAST_SOFT_PART:.0f} % expected) and {100 * bright:.1f} % as "
+            f"the image does not look like a CT: with air at {air:.4g} and soft tissue at "
+            f"{soft:.4g}, {100 * near:.0f} % of the tissue is within {SOFT_SPREAD:g} HU of soft "
+            f"tissue (at least {100 * LEAST_SOFT_PART:.0f} % expected) and {100 * bright:.1f} % as "
             f"bright as bone ({100 * LEAST_BONE_PART:.0f} to {100 * MOST_BONE_PART:.0f} %). An MR "
             f"image cannot be used: give the CT series. {STATE_IT}"
         )

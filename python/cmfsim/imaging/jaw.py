@@ -173,7 +173,7 @@ def _side(mandible: Mask, bone: Mask) -> Volume:
 def _not_parted(reason: str) -> Finding:
     return Finding.warning(
         "jaws-not-parted",
-        f"the mandible was not told from the skull: {reason}",
+        f"the mandible could not be separated from the skull: {reason}",
         where="bone",
         why="mandible and cranium would move as one",
         fix="give skull landmarks (menton, gonion_L, gonion_R, supradentale, infradentale, …) or "
@@ -184,7 +184,7 @@ def _not_parted(reason: str) -> Finding:
 def _guessed() -> Finding:
     return Finding.note(
         "jaws-parted-by-shape",
-        "the mandible was told from the skull by shape alone, without landmarks",
+        "the mandible was separated from the skull by shape alone, without landmarks",
         where="bone",
         why="the cut between the tooth rows may be some millimetres off",
         fix="give skull landmarks",

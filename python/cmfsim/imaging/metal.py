@@ -119,11 +119,11 @@ def find_metal(work: Working, options: SegmentOptions) -> Metal:
 
 def _streaks_text(work: Working, streaked: slice) -> str:
     if streaked.start == streaked.stop:
-        return "it throws no streaks worth a correction"
+        return "it causes no streaks that need correction"
     low, high = (work.origin[2] + work.spacing[2] * k for k in (streaked.start, streaked.stop - 1))
     return (
         f"streaks between z = {low:.0f} and {high:.0f} mm were reduced, and spikes of skin and "
-        "bone removed there"
+        "bone there were removed"
     )
 
 
@@ -182,11 +182,16 @@ def _threshold(work: Working, options: SegmentOptions) -> tuple[float, tuple[Fin
     finding = Finding(
         severity="warning" if cut >= LEAST_WINDOW else "note",
         code="ct-saturated",
-        what=f"the image is cut off at {work.saturation:.0f} HU, and metal is told by {METAL:g} HU"
-        + (f"; what reaches {cut:.0f} HU was taken for metal" if sees else ": none was looked for"),
+        what=f"the image is cut off at {work.saturation:.0f} HU, but metal is recognised by "
+        f"{METAL:g} HU"
+        + (
+            f"; voxels from {cut:.0f} HU on were taken for metal"
+            if sees
+            else ": metal was not searched for"
+        ),
         where="image",
-        why="metal, enamel and dense bone have one value there"
-        + ("" if sees else ", so that streaks of metal may stay in skin and bone"),
+        why="metal, enamel and dense bone have the same value there"
+        + ("" if sees else ", so metal streaks may remain in skin and bone"),
         fix="export the CT with its whole range of values, or set metal_threshold in [image]",
     )
     return (cut if sees else np.inf), (finding,)

@@ -46,8 +46,8 @@ def check_is_ct(hu: Volume, spacing: NDArray[np.float64]) -> None:
     dark = float((hu[inside] < 0.5 * (AIR + SOFT)).mean())
     if bright[0] > MOST_BRIGHT * bright[1] and dark > MOST_DARK:
         raise ImageInputError(
-            f"the image is not like a CT: {100 * bright[0]:.0f} % of the layer below the skin is "
-            f"as bright as bone, {100 * bright[1]:.0f} % of what lies deeper, and "
+            f"the image does not look like a CT: {100 * bright[0]:.0f} % of the layer below the "
+            f"skin is as bright as bone, {100 * bright[1]:.0f} % of what lies deeper, and "
             f"{100 * dark:.0f} % of that is as dark as air. An MR image cannot be used: give the "
             f"CT series. {STATE_IT}"
         )

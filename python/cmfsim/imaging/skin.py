@@ -124,7 +124,7 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
     above = without_streaks(metal.hu > options.skin_threshold, metal, work.spacing)
     solid = largest(above & (near > 0.0))
     if not solid.any():
-        raise ImageInputError("the image holds no head above the skin's threshold")
+        raise ImageInputError("the image contains no head above the skin's threshold")
     mask, hollow = _with_hollows(solid, work)
     level = level_of(metal.hu, options.skin_threshold, SKIN_SCALE, mask)
     # Where a rest was cut off in contact, the surface is that of the distance.
@@ -153,7 +153,7 @@ def _box(
 def _rest_removed(volume: float) -> Finding:
     return Finding.note(
         "rest-removed",
-        f"{volume / 1000.0:.0f} cm³ of couch, pillow or head-rest was taken away",
+        f"{volume / 1000.0:.0f} cm³ of couch, pillow or head-rest was removed",
         where="behind or beside the head",
         why="where it touched, the skin is drawn from the head's shape, not from the image",
         fix="check the back of the head by eye if it matters",
@@ -226,7 +226,7 @@ def _core(tissue: Mask, spacing: NDArray[np.float64]) -> Mask:
     radius = min(CORE_RADIUS, 0.6 * float(depth(tissue, spacing).max()))
     core = opened(tissue, radius, spacing)
     if not core.any():
-        raise ImageInputError("the image holds nothing as thick as a head")
+        raise ImageInputError("the image contains nothing as thick as a head")
     return largest(core)
 
 

@@ -29,7 +29,7 @@ def view_findings(work: Working, skin: Skin, bone: Bone) -> tuple[Finding, ...]:
 
 
 def _direction(work: Working, bone: Bone) -> tuple[Finding, ...]:
-    """An error where the face looks backwards or the head stands on its vertex.
+    """An error where the face looks backwards or the head is upside down.
 
     Left and right cannot be told apart in a head; nothing here finds a mirrored one.
     """
@@ -45,19 +45,19 @@ def _direction(work: Working, bone: Bone) -> tuple[Finding, ...]:
     away = (np.argwhere(beyond).mean(axis=0) - np.argwhere(cavity).mean(axis=0)) * spacing
     findings = []
     if away[2] > LEAST_OFFSET:
-        findings.append(_turned("upside-down", "the head stands on its vertex"))
+        findings.append(_turned("upside-down", "the head is upside down"))
     if away[1] > LEAST_OFFSET:
-        findings.append(_turned("facing-back", "the face looks to the back (+y, posterior)"))
+        findings.append(_turned("facing-back", "the face points backwards (+y, posterior)"))
     return tuple(findings)
 
 
 def _turned(code: str, what: str) -> Finding:
     return Finding.error(
         f"ct-{code}",
-        f"{what}: the image is flipped, or its header lies",
+        f"{what}: the image is flipped, or its header is wrong",
         where="image",
-        why="front and back, or up and down, would be taken for one another; left and right may "
-        "be swapped as well, which no image shows",
+        why="front and back, or up and down, would be swapped; left and right may be swapped as "
+        "well, which no image can show",
         fix="export the image again with its orientation, and check left and right",
     )
 
@@ -107,12 +107,11 @@ def _round(work: Working, skin: Skin) -> list[Finding]:
     return [
         Finding.warning(
             "ct-cut-round",
-            f"the head goes on outside the round field of view, {2.0 * work.field.radii.min():.0f} "
+            f"the head extends beyond the round field of view, {2.0 * work.field.radii.min():.0f} "
             f"mm across: skin or tissue meets its border over {area / 100.0:.0f} cm²",
             where="border of the field of view",
             why="the surface is closed there, and values near the border are too high",
-            fix="compare and plan well inside the field; use a scan that holds the whole head for "
-            "more",
+            fix="compare and plan well inside the field, or use a scan of the whole head",
         )
     ]
 
@@ -130,7 +129,7 @@ def _top(bone: Bone, area: float) -> Finding:
         "ct-cut-vertex",
         f"the vertex is cut off: {what}",
         where="top border of the image",
-        why="the skull is closed flat there; the face is not concerned",
+        why="the skull is closed flat there; the face is not affected",
     )
 
 
@@ -146,6 +145,6 @@ def _missing(side: str, part: str, what: str) -> Finding:
         f"ct-cut-{side}",
         f"{part} cut off: {what}",
         where=f"{side} border of the image",
-        why="the surface is closed flat there, and the prediction near it means nothing",
+        why="the surface is closed flat there, and the prediction near it is meaningless",
         fix="use an image that holds the whole face, or leave that region out of the evaluation",
     )

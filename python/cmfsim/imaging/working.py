@@ -160,7 +160,7 @@ def _check_size(image: ImageData, spacing: NDArray[np.float64]) -> None:
     if (extent > 2000.0).any() or (spacing > 10.0).any():
         raise ImageInputError(
             f"image has voxels of {spacing.tolist()} mm over {extent.round().tolist()} mm: no head "
-            "is so large; is its spacing in µm, or wrong?"
+            "is that large; is its spacing in µm, or wrong?"
         )
     if image.values.dtype.kind == "f":
         finite = np.isfinite(image.values)
@@ -180,8 +180,8 @@ def _spacing_findings(spacing: NDArray[np.float64]) -> list[Finding]:
             "ct-spacing-coarse",
             f"voxels are {' × '.join(f'{s:g}' for s in spacing)} mm",
             where="image",
-            why="thin bone, lips and lids vanish between slices further apart than "
-            f"{COARSE_SLICES:g} mm; surfaces are a millimetre worse",
+            why=f"thin bone, lips and eyelids vanish between slices more than {COARSE_SLICES:g} mm "
+            "apart; surfaces are a millimetre less accurate",
             fix="use the thin-slice reconstruction of the same scan",
         )
     ]
@@ -219,7 +219,7 @@ def _target(
 def _coarsened(target: NDArray[np.float64], options: SegmentOptions) -> Finding:
     return Finding.note(
         "ct-coarsened",
-        f"the head was sampled at {' × '.join(f'{t:.2f}' for t in target)} mm",
+        f"the head was resampled at {' × '.join(f'{t:.2f}' for t in target)} mm",
         where="image",
         why=f"more than most_voxels = {options.most_voxels} would have been needed",
         fix="crop the image to the face, or raise most_voxels",
@@ -236,7 +236,8 @@ def _head_box(
     labels, count = label(core)
     if not count:
         raise ImageInputError(
-            f"the image holds nothing thicker than {2 * OPENING:g} mm above {TISSUE:g} HU: no head"
+            f"the image contains nothing thicker than {2 * OPENING:g} mm above {TISSUE:g} HU: no "
+            "head"
         )
     sizes = sizes_of(labels, count)
     head = labels == np.argmax(sizes)

@@ -71,7 +71,7 @@ class _Members(Mapping[str, NDArray[Any]]):
         # A damaged name must not make an array look absent.
         other = next((i.filename for i in infos if not i.filename.endswith(ENDING)), None)
         if other is not None:
-            raise CaseInputError(f"has the member {other[:60]!r}, which is no array")
+            raise CaseInputError(f"has the member {other[:60]!r}, which is not an array")
         if len(infos) > MAX_MEMBERS:
             raise CaseInputError(f"has {len(infos)} members: at most {MAX_MEMBERS} are read")
         names = {info.filename for info in infos}
@@ -87,7 +87,7 @@ class _Members(Mapping[str, NDArray[Any]]):
                 "an archive of this size"
             )
         if info.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
-            raise CaseInputError(f"array {name!r} is packed in another way than numpy's")
+            raise CaseInputError(f"array {name!r} is not compressed as numpy does it")
         if info.flag_bits & ENCRYPTED:
             raise CaseInputError(f"array {name!r} is encrypted")
         self._left -= info.file_size
@@ -112,7 +112,7 @@ def _unpacked(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
     with archive.open(info) as file:
         version = np.lib.format.read_magic(file)
         if version not in HEADERS:
-            raise CaseInputError(f"has numpy's format {version}, which is not read")
+            raise CaseInputError(f"has numpy's format {version}, which is not supported")
         shape, by_columns, dtype = HEADERS[version](file)
         if dtype.hasobject:
             raise CaseInputError("holds Python objects: these are pickled, and never read")

@@ -255,7 +255,9 @@ def _read(path: Path) -> Case:
         both = "image" in document
         document.fail(
             "surfaces" if both else None,
-            "stands beside [image]: give one of them" if both else "lacks [image] or [surfaces]",
+            "is given together with [image]: give one of them"
+            if both
+            else "needs [image] or [surfaces]",
         )
     return Case(
         name=document.text("name", path.resolve().parent.name or "case"),

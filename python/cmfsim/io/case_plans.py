@@ -60,7 +60,7 @@ def is_achieved(document: Table) -> bool:
     if "image" not in after and "bones" not in after:
         document.fail(
             "plan",
-            "is achieved, and there is no bone after the operation to read it off: add "
+            "is achieved, but there is no bone after the operation to read it from: add "
             "[postoperative] image, or [postoperative.bones]",
         )
     return True
@@ -83,7 +83,7 @@ def _moved(document: Table, motion: Table, name: str, folder: Path) -> CaseMotio
     """The motion of a bone of the case, given by the same surface after it moved."""
     bones = document.table("surfaces").table("bones") if "surfaces" in document else ()
     if name not in bones:
-        known = f"one of {', '.join(bones)}" if bones else "no bone, for there is no [surfaces]"
+        known = f"one of {', '.join(bones)}" if bones else "no bone, because there is no [surfaces]"
         motion.fail(
             "moved",
             f"is for bones that [surfaces.bones] names ({known}), not for {name!r}: give surface "
@@ -147,7 +147,7 @@ def _transform(motion: Table, folder: Path) -> CaseMotion:
     if is_itk_file(file) and frame == "RAS":
         table.fail(
             "frame",
-            'is "RAS", but ITK files (.tfm, .h5) are in LPS always, those that 3D Slicer saves as '
-            "well: remove frame",
+            'is "RAS", but ITK files (.tfm, .h5) are always in LPS, as are those that 3D '
+            "Slicer saves: remove frame",
         )
     return CaseMotion(transform=file, direction=direction, frame=frame)

@@ -91,7 +91,7 @@ def output_folder(table: Table, folder: Path) -> Path:
     if not plain or any(c in name for c in "\\:\0") or relative == PurePosixPath():
         table.fail(
             "folder",
-            f"is {name!r}: name a folder below the case's own (another one: cmfsim build -o)",
+            f"is {name!r}: give a folder below the case's own (for any other: cmfsim build -o)",
         )
     try:
         is_there(folder / relative)
@@ -169,7 +169,9 @@ def surfaces_of(table: Table, folder: Path) -> CaseSurfaces:
 def checked_name(table: Table, key: str, name: str) -> str:
     """A name that can stand in a file name: of a bone or segment."""
     if not name or not all(c.isalnum() or c in "_-+" for c in name) or len(name) > 64:
-        table.fail(key, f"is no name ({name!r}): letters, digits, '_', '-' and '+', 64 at most")
+        table.fail(
+            key, f"is not a valid name ({name!r}): letters, digits, '_', '-' and '+', 64 at most"
+        )
     return name
 
 
@@ -209,7 +211,7 @@ def region_of(table: Table) -> Region:
     """The part of the head that is meshed, from [region]."""
     table.only("posterior_plane", "posterior_depth", "lower", "upper")
     if "posterior_plane" in table and "posterior_depth" in table:
-        table.fail("posterior_depth", "stands beside posterior_plane: give one of them")
+        table.fail("posterior_depth", "is given together with posterior_plane: give one of them")
     plane = plane_of(table, "posterior_plane") if "posterior_plane" in table else None
     with table.at("lower"):
         return Region(
@@ -248,7 +250,7 @@ def lips_of(document: Table, folder: Path) -> CaseLips:
         if seam not in LIP_SEAMS:
             seam = file_of(table, "seam", folder)
             if "parting" in document.table("mesh"):
-                table.fail("seam", "is a surface, as parting in [mesh] is: give one of them")
+                table.fail("seam", "is a surface, as is parting in [mesh]: give one of them")
     depth = table.number("depth", "mm", low=0.0, high=MOST_LIP_DEPTH)
     low, high = LIP_HEIGHTS
     height = table.number("height", "mm", low=low, high=high)
@@ -294,7 +296,7 @@ def tissue_of(table: Table) -> TissueData:
         with table.at("preset"):
             return TissueData("preset", preset=table.text("preset", "kim2010"), fraction=0.0)
     if "preset" in table:
-        table.fail("preset", "stands beside young or poisson: give the one or the others")
+        table.fail("preset", "is given together with young or poisson: give one or the other")
     if young is None or poisson is None:
         table.fail(None, "needs both young (MPa) and poisson, or neither")
     return TissueData("isotropic", young=young, poisson=poisson)
@@ -344,13 +346,15 @@ def postoperative_of(table: Table, folder: Path) -> CasePostoperative:
     table.only("skin", "image", "landmarks", "bones", "aligned", "units", "frame", "series")
     bones = table.table("bones")
     if "skin" in table and "image" in table:
-        table.fail("image", "stands beside skin: give one of them")
+        table.fail("image", "is given together with skin: give one of them")
     if "image" in table and "bones" in table:
-        table.fail("bones", "stands beside image, from which bones are read: give one of them")
+        table.fail(
+            "bones", "is given together with image, from which bones are read: give one of them"
+        )
     if "series" in table and "image" not in table:
-        table.fail("series", "chooses among the DICOM series of an image, and there is no image")
+        table.fail("series", "chooses among the DICOM series of an image, but there is no image")
     if "skin" not in table and "image" not in table and not list(bones):
-        table.fail(None, "lacks skin, image or bones")
+        table.fail(None, "needs skin, image or bones")
     return CasePostoperative(
         file_or_none(table, "skin", folder),
         file_or_none(table, "image", folder),

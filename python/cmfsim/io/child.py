@@ -190,7 +190,7 @@ class _Child:
         code = self.process.wait()
         self.end()
         if late or (os.name == "posix" and code == -signal.SIGXCPU):
-            return "its reader did not come to an end in the time that a file of this size needs"
+            return "its reader took longer than a file of this size needs"
         if code < 0:
             return f"its reader crashed ({signal.Signals(-code).name})"
         return f"its reader ended with exit code {code}"

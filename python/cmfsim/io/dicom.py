@@ -101,7 +101,7 @@ def read_dicom_file(path: Path) -> tuple[ImageData, str, tuple[Finding, ...]]:
     header = dicom_header(path)
     if header is None or not header.has_pixels:
         raise ImageInputError(
-            f"{path.name}: is no image that can be read; NRRD, NIfTI, MetaImage or DICOM is needed"
+            f"{path.name}: is not a readable image; NRRD, NIfTI, MetaImage or DICOM is needed"
         )
     _check_modality(path.name, {header.text("modality")})
     slices = slices_of(header)
@@ -114,7 +114,7 @@ def read_dicom_file(path: Path) -> tuple[ImageData, str, tuple[Finding, ...]]:
 def _check_modality(name: str, found: set[str]) -> None:
     if not found & {"", "CT"}:
         raise ImageInputError(
-            f"{name}: DICOM modality is {', '.join(sorted(found))!r}: a CT is needed, for "
+            f"{name}: DICOM modality is {', '.join(sorted(found))!r}: a CT is needed, because "
             "thresholds are in HU"
         )
 
@@ -147,7 +147,7 @@ def _headers(folder: Path) -> tuple[list[DicomHeader], list[Finding]]:
                 "dicom-other-files",
                 f"skipped {counted(len(others), 'file')} not in DICOM: {listed(others)}",
                 where=folder.name,
-                why="a slice that was damaged in its first bytes would be among them",
+                why="a slice with damaged first bytes would be among them",
             )
         )
     return headers, findings
@@ -173,7 +173,7 @@ def _chosen(folder: Path, found: list[Series], wanted: str | None) -> tuple[Seri
         ]
         if len(meant) != 1:
             raise ImageInputError(
-                f"{folder.name}: series {wanted!r} is asked for, which {len(meant)} of "
+                f"{folder.name}: series {wanted!r} was requested, which {len(meant)} of "
                 f"{len(found)} series have: {listed}"
             )
         _check_modality(folder.name, {meant[0].modality})
@@ -198,10 +198,10 @@ def _chosen(folder: Path, found: list[Series], wanted: str | None) -> tuple[Seri
         return first, []
     finding = Finding.warning(
         "dicom-series",
-        f"{len(found)} series in the folder; the largest CT, {first.described()}, was taken of: "
+        f"{len(found)} series in the folder; the largest CT, {first.described()}, was chosen from: "
         f"{listed}",
         where=folder.name,
-        why="another series may be the one that was meant",
+        why="another series may be the right one",
         fix=how,
     )
     return first, [finding]

@@ -189,8 +189,8 @@ class _Reader:
             syntax = str(found.tags.get("transfer_syntax", ""))
             if syntax == DEFLATED:
                 raise ImageInputError(
-                    f"{self.path.name}: is packed as a whole (deflated transfer syntax): export it "
-                    "uncompressed"
+                    f"{self.path.name}: is compressed as a whole (deflated transfer syntax): "
+                    "export it uncompressed"
                 )
             self.order = ">" if syntax == EXPLICIT_BIG else "<"
             self.explicit = syntax != IMPLICIT

@@ -176,8 +176,8 @@ def _without_scouts(name: str, slices: list[Slice]) -> tuple[list[Slice], list[F
         "orientation): "
         f"{listed(left)}",
         where=name,
-        why="they show the head from elsewhere",
-        fix="" if not others else "see whether these are no slices of the volume",
+        why="they show the head from other directions",
+        fix="" if not others else "check that none of these is a slice of the volume",
     )
     return groups[0], [finding]
 
@@ -225,8 +225,8 @@ def _stack(name: str, slices: list[Slice]) -> _Stack:
     lengths = np.linalg.norm(across, axis=1)
     if (np.abs(lengths - 1.0) > PARALLEL).any() or abs(float(across[0] @ across[1])) > PARALLEL:
         raise ImageInputError(
-            f"{name}: the orientation {slices[0].text('orientation')} is no pair of perpendicular "
-            "unit vectors"
+            f"{name}: the orientation {slices[0].text('orientation')} is not a pair of "
+            "perpendicular unit vectors"
         )
     axes = across / lengths[:, None]
     positions = np.array([s.numbers("position", 3) for s in slices])
@@ -305,9 +305,9 @@ def _without_copies(
         if shift > ONE_PLACE or not np.array_equal(values[i], values[before]):
             count = int(np.count_nonzero(np.diff(heights) <= ONE_PLACE))
             raise ImageInputError(
-                f"{name}: {one.name} and {other.name} lie at one place ({_place(stack, i)}) with "
-                f"different pixels, as {counted(count, 'pair')} of slices do: more than one scan, "
-                "reconstruction or time in the series; keep one of them in the folder"
+                f"{name}: {one.name} and {other.name} lie in the same place ({_place(stack, i)}) "
+                f"with different pixels, as {counted(count, 'pair')} of slices do: more than one "
+                "scan, reconstruction or time in the series; keep one of them in the folder"
             )
         copies.append(other.name)
     if not copies:
@@ -367,7 +367,7 @@ def _check_steps(name: str, stack: _Stack) -> list[int]:
     narrow = np.flatnonzero(steps <= LEAST_STEP * usual)
     if len(narrow):
         raise ImageInputError(
-            f"{name}: slices too near one another: they are {usual:.3g} mm apart, but "
+            f"{name}: slices too close together: they are {usual:.3g} mm apart, but "
             f"{_steps(stack, narrow)}: more than one scan or reconstruction in the series; keep "
             "one in the folder"
         )
@@ -451,10 +451,9 @@ def _tilt_findings(
                 f"{what}, resampled by each slice's own position "
                 f"({np.linalg.norm(along[-1]):.1f} mm from first to last slice)",
                 where=name,
-                why="stacked at right angles the head would be sheared; between slices "
-                f"{gap:.1f} mm apart the skin is known to {SKIN_SHARE * gap:.1f} mm; outside the "
-                "slices there is air, so that the neck may end on an oblique plane, where nothing "
-                "is fixed",
+                why=f"without resampling the head would be sheared; between slices {gap:.1f} mm "
+                f"apart the skin is known to {SKIN_SHARE * gap:.1f} mm; outside the slices there "
+                "is air, so the neck may end on an oblique plane, where nothing is fixed",
                 fix=f"check the skin by eye; {_whole_heights(stack)}",
             )
         )
@@ -495,7 +494,7 @@ def _uneven(name: str, stack: _Stack, uneven: list[int]) -> Finding:
         f"slices are {np.median(steps):.3g} mm apart, from {steps.min():.3g} to "
         f"{steps.max():.3g} mm: {_steps(stack, uneven)}; resampled by their positions",
         where=name,
-        why="between slices farther apart than the others, shapes are less certain",
+        why="shapes are less certain where slices are further apart",
         fix="use a reconstruction with even slices if there is one",
     )
 
@@ -514,8 +513,8 @@ def _coarse(name: str, gap: float) -> Finding:
         "ct-spacing-coarse",
         f"slices are {gap:.3g} mm apart",
         where=name,
-        why="thin bone, lips and lids vanish between slices further apart than "
-        f"{COARSE_SLICES:g} mm; surfaces are a millimetre worse",
+        why=f"thin bone, lips and eyelids vanish between slices more than {COARSE_SLICES:g} mm "
+        "apart; surfaces are a millimetre less accurate",
         fix="use the thin-slice reconstruction of the same scan",
     )
 

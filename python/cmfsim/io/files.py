@@ -110,7 +110,7 @@ def check_readable(path: Path, error: type[ValueError] = CaseInputError) -> None
     if not stat.S_ISREG(mode):
         raise error(f"{name}: is a pipe or a device, not a file: copy its content to a file")
     if not os.access(path, os.R_OK):
-        raise error(f"{name}: may not be read: its owner has to permit it")
+        raise error(f"{name}: cannot be read: change its permissions")
 
 
 def is_there(path: Path, error: type[ValueError] = CaseInputError) -> bool:
@@ -134,7 +134,7 @@ def _mode(path: Path, error: type[ValueError]) -> int | None:
         # Path.exists and Path.is_file raise these too: a name of 300 characters, for one.
         raise error(f"{_shown(path)}: cannot be opened ({other.strerror})") from other
     except ValueError as other:
-        raise error(f"{_shown(path)!r}: no file is called so ({other})") from other
+        raise error(f"{_shown(path)!r}: no file has that name ({other})") from other
 
 
 def _shown(path: Path) -> str:
@@ -154,7 +154,7 @@ def named(path: Path) -> Iterator[None]:
     except IsADirectoryError as error:
         raise CaseInputError(f"{path.name}: is a folder, not a file") from error
     except PermissionError as error:
-        raise CaseInputError(f"{path.name}: may not be read: its owner has to permit it") from error
+        raise CaseInputError(f"{path.name}: cannot be read: change its permissions") from error
     except ValueError as error:
         text = str(error)
         own = text.startswith(f"{path.name}: ")
@@ -283,7 +283,7 @@ def _refuse_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(table) < len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in names if names.count(name) > 1)
-        message = f"{twice[:40]!r} stands there twice"
+        message = f"{twice[:40]!r} appears twice"
         raise ValueError(message)
     return table
 
@@ -327,5 +327,5 @@ def check_version(version: object) -> None:
     if isinstance(version, bool) or not isinstance(version, int):
         raise CaseInputError(f"version is {version!r}: a whole number is needed")
     if version != FORMAT_VERSION:
-        hint = "a newer cmfsim made it: update" if version > FORMAT_VERSION else "unknown version"
+        hint = "a newer cmfsim wrote it: update" if version > FORMAT_VERSION else "unknown version"
         raise CaseInputError(f"version is {version}, this cmfsim reads {FORMAT_VERSION}; {hint}")

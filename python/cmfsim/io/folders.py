@@ -145,7 +145,7 @@ def check_below(folder: Path, base: Path) -> None:
         raise CaseInputError(f"{folder}: cannot be followed ({error})") from error
     if leads_out:
         raise CaseInputError(
-            f"{folder}: is a link that leads out of the case's folder, to {real}: remove it, or "
+            f"{folder}: is a link that points outside the case's folder, to {real}: remove it, or "
             f"write there by -o {real}"
         )
 
@@ -164,7 +164,7 @@ def check_writable(folder: Path) -> None:
     """
     there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     if not there.is_dir():
-        what = "is a link that leads nowhere" if there.is_symlink() else "is a file"
+        what = "is a broken link" if there.is_symlink() else "is a file"
         raise CaseInputError(
             f"{there}: {what}; the output folder cannot be made there: give another by -o"
         )
@@ -256,8 +256,9 @@ def _check_subfolders(folder: Path, names: Sequence[str]) -> None:
     """Refuses a subfolder that leads elsewhere, or that is none."""
     for parent in sorted({(folder / name).parent for name in names} - {folder}):
         if parent.is_symlink() or (os.path.lexists(parent) and not parent.is_dir()):
-            what = "a link that leads out of the output folder" if parent.is_symlink() else "a file"
-            raise CaseInputError(f"{parent}: is {what}, where a folder of results is needed")
+            what = "a link that points outside the output folder" if parent.is_symlink() else "a "
+            "file"
+            raise CaseInputError(f"{parent}: is {what}, but a folder of results is needed")
 
 
 def _journal(path: Path) -> _Journal | None:
@@ -302,7 +303,7 @@ def _reach_disk(path: Path) -> None:
 def _keep(path: Path, copy: Path) -> None:
     """A second name for a file, or a copy where the file system knows no second names."""
     if path.is_dir() and not path.is_symlink():
-        text = "is a folder, where a file is to be written: remove it, or give another output"
+        text = "is a folder, but a file is to be written there: remove it, or give another output"
         raise IsADirectoryError(errno.EISDIR, text, str(path))
     copy.parent.mkdir(exist_ok=True)
     try:

@@ -178,7 +178,7 @@ def _unpacked_length(name: str, data: Path, start: int, needed: int, packing: st
         )
     if found <= needed and not reader.eof:
         raise ImageInputError(
-            f"{name}: is cut short: its voxels are packed, and their end is not in the file; copy "
+            f"{name}: is cut short: its voxels are compressed, and the file ends before them; copy "
             "it again"
         )
     return found
@@ -202,8 +202,8 @@ def data_file(path: Path, name: str) -> Path:
         names, or there is none.
     """
     how = (
-        "a header may name one file beside it or below; save the image as one file (.nrrd, .mha, "
-        ".nii.gz)"
+        "a header may refer to one file next to it or below; save the image as one file (.nrrd, "
+        ".mha, .nii.gz)"
     )
     shown = name if len(name) <= MOST_SHOWN else f"{name[:MOST_SHOWN]}…"
     if name.split(maxsplit=1)[:1] == ["LIST"] or "%" in name or "\0" in name or not name:
@@ -214,13 +214,13 @@ def data_file(path: Path, name: str) -> Path:
     data = path.parent / given
     if not is_below(data, path.parent):
         raise ImageInputError(
-            f"{path.name}: its data file {shown!r} is a link that leads out of the folder: {how}"
+            f"{path.name}: its data file {shown!r} is a link that points outside the folder: {how}"
         )
     try:
         check_readable(data, ImageInputError)
     except FileNotFoundError as error:
         raise ImageInputError(
-            f"{path.name}: its data file {shown!r} does not exist beside it: copy both"
+            f"{path.name}: its data file {shown!r} does not exist next to it: copy both"
         ) from error
     except ImageInputError as error:
         raise ImageInputError(f"{path.name}: its data file {shown!r}: {error}") from error
@@ -231,10 +231,10 @@ def unstated(path: Path, stated: str, how: str) -> Finding:
     """A finding on a file that does not state its frame, and how it would."""
     return Finding.warning(
         "image-frame-unstated",
-        f"{stated}: its axes were taken as left, posterior and superior",
+        f"{stated}: its axes were assumed to be left, posterior and superior",
         where=path.name,
-        why="left and right of the face would be swapped, or front and back, if that is wrong; no "
-        "image shows left and right",
+        why="if that is wrong, left and right of the face are swapped, or front and back; no image "
+        "can show left and right",
         fix=f"export the image again with its orientation ({how}), and check left and right",
     )
 
@@ -256,7 +256,7 @@ def whole(path: Path, key: str, text: str) -> int:
         (also `ValueError`)
     """
     if not _WHOLE.fullmatch(text.strip()):
-        raise ImageInputError(f"{path.name}: {key} is {text[:MOST_DIGITS]!r}: no whole number")
+        raise ImageInputError(f"{path.name}: {key} is {text[:MOST_DIGITS]!r}: not a whole number")
     return int(text)
 
 
@@ -270,10 +270,10 @@ def number(path: Path, key: str, text: str) -> float:
     """
     text = text.strip()
     if len(text) > MOST_DIGITS or not _NUMBER.fullmatch(text):
-        raise ImageInputError(f"{path.name}: {key} has {text[:MOST_DIGITS]!r}: no finite number")
+        raise ImageInputError(f"{path.name}: {key} has {text[:MOST_DIGITS]!r}: not a finite number")
     value = float(text)
     if abs(value) > FARTHEST:
-        raise ImageInputError(f"{path.name}: {key} has {value:g}: no head is so large or so far")
+        raise ImageInputError(f"{path.name}: {key} has {value:g}: no head is that large or so far")
     return value
 
 
@@ -292,8 +292,8 @@ def check_affine(name: str, affine: NDArray[np.float64], size: tuple[int, int, i
     # Axes of a scan tilted by 30° span 0.87; below a half they nearly lie in one plane.
     if volume < 0.5:
         raise ImageInputError(
-            f"{name}: direction {(affine[:, :3] / lengths).round(4).tolist()} is no set of axes in "
-            f"space (they span {volume:.2g} of a cube)"
+            f"{name}: direction {(affine[:, :3] / lengths).round(4).tolist()} is not a set of axes "
+            f"in space (they span {volume:.2g} of a cube)"
         )
     farthest = float(np.abs(affine[:, 3]).max() + (lengths * np.array(size)).max())
     if farthest > FARTHEST:

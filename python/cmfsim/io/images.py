@@ -101,8 +101,8 @@ def read_image_file(path: str | os.PathLike[str], *, series: str | None = None) 
         return ImageFile(*read_dicom_folder(path, series))
     if series is not None:
         raise ImageInputError(
-            f"{path.name}: series = {series!r} chooses among the series of a DICOM folder, and "
-            "this is a file: remove it, or name the folder"
+            f"{path.name}: series = {series!r} chooses among the series of a DICOM folder, but "
+            "this is a file: remove it, or give the folder"
         )
     with path.open("rb") as file:
         begin = file.read(FIRST_BYTES)
@@ -118,7 +118,7 @@ def read_image_file(path: str | os.PathLike[str], *, series: str | None = None) 
         if is_meta(begin):
             return _read_file(path, meta_header(path))
         if path.name.lower().endswith(OTHER_SUFFIXES):
-            raise ImageInputError(f"{path.name}: is no image that can be read; {KNOWN}")
+            raise ImageInputError(f"{path.name}: is not a readable image; {KNOWN}")
     return ImageFile(*read_dicom_file(path))
 
 
@@ -244,10 +244,10 @@ def _resampled(path: Path, affine: NDArray[np.float64]) -> Finding:
         )
     return Finding.warning(
         "image-sheared",
-        f"the image's axes are {shear:.1f}° from right angles, as those of a CT with a tilted "
-        "gantry; it was resampled by its own map",
+        f"the image's axes are {shear:.1f}° from right angles, as in a CT with a tilted gantry; it "
+        "was resampled by its stated axes",
         where=path.name,
-        why="programs that take such axes for perpendicular shear the head",
+        why="programs that assume perpendicular axes shear the head",
         fix="check the skin by eye against the scan",
     )
 

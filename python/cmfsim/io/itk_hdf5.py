@@ -48,7 +48,7 @@ def read_itk_hdf5(path: Path) -> list[tuple[str, Floats, Floats]]:
         )
     with path.open("rb") as file:
         if file.read(len(SIGNATURE)) != SIGNATURE:
-            raise CaseInputError("is no HDF5 file: save the transform as .h5 or .tfm again")
+            raise CaseInputError("is not an HDF5 file: save the transform as .h5 or .tfm again")
     try:
         answer = read_in_child(
             "cmfsim.io.itk_hdf5:parse_itk_hdf5",

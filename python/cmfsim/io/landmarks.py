@@ -128,7 +128,7 @@ def _known_labels(
     for label, name in labels.items():
         if label != name and name in points:
             raise LandmarkInputError(
-                f"{where}: has {name!r} and {label!r}, which differ in spelling alone: remove or "
+                f"{where}: has {name!r} and {label!r}, which differ only in spelling: remove or "
                 "rename one"
             )
     renamed = [f"{label!r} is {name!r}" for label, name in labels.items() if label != name]
@@ -144,8 +144,8 @@ def _known_labels(
         "landmark-spelling",
         f"{len(renamed)} labels are spelled differently: {', '.join(renamed[:4])}{more}",
         where=where,
-        why="they are used under the second name",
-        fix="nothing has to be done; spelled alike they are easier to find",
+        why="the second spelling is used",
+        fix="nothing needs to be done; one spelling is easier to find",
     )
     return MappingProxyType({labels[label]: point for label, point in points.items()}), [finding]
 
@@ -241,7 +241,9 @@ def _from_fcsv(text: str, path: Path, frame: str | None) -> LandmarkFile:
             columns = tuple(name.strip() for name in value.split(","))
     lacking = [name for name in ("x", "y", "z", "label") if name not in columns]
     if lacking:
-        raise LandmarkInputError(f"lacks the column {', '.join(lacking)}: it is no .fcsv of Slicer")
+        raise LandmarkInputError(
+            f"lacks the column {', '.join(lacking)}: it is not a Slicer .fcsv file"
+        )
     sign = frame_signs(its_frame or frame or UNSTATED[".fcsv"])
     points: list[_Point] = []
     for number, (line_number, line) in enumerate(rows, start=1):
@@ -294,9 +296,9 @@ def _landmark_file(
         findings.append(
             Finding.note(
                 "landmark-unset",
-                f"{len(unset)} points were never placed and are left out: {names}",
+                f"{len(unset)} points were never placed and are skipped: {names}",
                 where=path.name,
-                why="what is placed from them falls back to its default or is refused",
+                why="whatever is placed from them uses its default or is refused",
                 fix="place them in 3D Slicer, or delete them",
             )
         )
@@ -305,7 +307,7 @@ def _landmark_file(
 
 def _by_label(points: list[_Point]) -> dict[str, Floats]:
     if not points:
-        raise LandmarkInputError("holds no points that were placed")
+        raise LandmarkInputError("contains no placed points")
     found: dict[str, _Point] = {}
     for point in points:
         label = _label(point.number, point.label)

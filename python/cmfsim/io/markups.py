@@ -89,7 +89,7 @@ def markups_of(text: str, unstated: str) -> list[Markup]:
         raise LandmarkInputError(f"is not JSON ({error})") from error
     markups = document.get("markups") if isinstance(document, dict) else None
     if not isinstance(markups, list) or not all(isinstance(m, dict) for m in markups):
-        raise LandmarkInputError("has no list 'markups': it is no markups file of 3D Slicer")
+        raise LandmarkInputError("has no list 'markups': it is not a markups file of 3D Slicer")
     found: list[Markup] = []
     number = 0
     for markup in markups:

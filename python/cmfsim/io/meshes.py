@@ -99,7 +99,7 @@ def _by_meshio(path: Path) -> PlainMesh:
     suffix = path.suffix.lower()
     if suffix in NAME_OTHERS or not suffix:
         raise CaseInputError(
-            f"files of {suffix or 'no ending'} are not read: save it as .vtu (meshio convert)"
+            f"files of {suffix or 'no ending'} are not supported: save it as .vtu (meshio convert)"
         )
     if find_spec("meshio") is None:
         raise CaseInputError(
@@ -155,7 +155,7 @@ def meshio_answer(path: str) -> Answer:
     except (Exception, SystemExit) as error:
         raise CaseInputError(f"cannot be read as a mesh ({error})") from error
     if any(array.dtype.kind not in "fiub" for array in arrays.values()):
-        raise CaseInputError("holds cells or values that are no arrays of numbers")
+        raise CaseInputError("holds cells or values that are not arrays of numbers")
     texts = {
         "types": [str(block.type) for block in mesh.cells],
         "point_data": [str(name) for name in mesh.point_data],

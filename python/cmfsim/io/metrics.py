@@ -69,7 +69,7 @@ def _regions(where: str, value: object) -> None:
 
 def _file_name(where: str, value: object) -> None:
     if not isinstance(value, str) or not is_evaluation_file(value):
-        raise CaseInputError(f"{where} is {value!r:.60}: no file of an evaluation is called so")
+        raise CaseInputError(f"{where} is {value!r:.60}: an evaluation has no file of that name")
 
 
 _EVALUATION = table(
@@ -143,7 +143,7 @@ def read_picture(path: Path) -> bytes:
         raise CaseInputError(f"{path}: is larger than {MOST_PICTURE} bytes")
     data = path.read_bytes()
     if not data.startswith(PNG):
-        raise CaseInputError(f"{path}: is no PNG picture")
+        raise CaseInputError(f"{path}: is not a PNG picture")
     return data
 
 

@@ -126,7 +126,7 @@ class _Reader:
     def _format(self) -> None:
         file = self.file
         if file.line() != "$MeshFormat":
-            raise CaseInputError("is no file of Gmsh: $MeshFormat is its first line")
+            raise CaseInputError("is not a Gmsh file: $MeshFormat is its first line")
         words = (file.line() or "").split()
         if len(words) != 3 or words[0] not in {"2.2", "4.1"} or words[1] not in {"0", "1"}:
             raise CaseInputError(
@@ -279,7 +279,7 @@ class _Reader:
 
     def _size(self, kind: int) -> int:
         if kind not in ELEMENTS:
-            raise CaseInputError(f"has elements of Gmsh's type {kind}, which is not read")
+            raise CaseInputError(f"has elements of Gmsh's type {kind}, which is not supported")
         return ELEMENTS[kind][1]
 
     def _close(self, name: str) -> None:
@@ -314,7 +314,7 @@ def _order(tags: Integers, what: str) -> Integers:
     order = np.argsort(tags, kind="stable")
     again = np.flatnonzero(np.diff(tags[order]) == 0)
     if len(again):
-        raise CaseInputError(f"{what} {tags[order][again[0]]} stands there twice")
+        raise CaseInputError(f"{what} {tags[order][again[0]]} appears twice")
     return order
 
 
@@ -327,7 +327,9 @@ def _places(tags: Integers, order: Integers, wanted: Integers, what: str) -> Int
     bad = np.argwhere(tags[found] != wanted)
     if len(bad):
         number = wanted[tuple(bad[0])]
-        raise CaseInputError(f"{what.format(bad[0][0])} names node {number}, which is not there")
+        raise CaseInputError(
+            f"{what.format(bad[0][0])} refers to node {number}, which does not exist"
+        )
     return found
 
 

@@ -115,7 +115,7 @@ def _header(path: Path, data: bytes) -> _Header:
     first = 0 if order is None else struct.unpack(f"{order}i", data[:4])[0]
     if order is None or len(data) < first:
         raise ImageInputError(
-            f"{path.name}: is no image that can be read (no NIfTI header, or cut short); {KNOWN}"
+            f"{path.name}: is not a readable image (no NIfTI header, or cut short); {KNOWN}"
         )
 
     def at(form: str, place: int) -> tuple[Any, ...]:
@@ -229,7 +229,7 @@ def _no_unit(path: Path, spacing: NDArray[np.float64]) -> Finding:
         "image-unit-unstated",
         f"it states no unit of length: voxels were taken as {text} mm",
         where=path.name,
-        why="every length of the head follows from it",
+        why="every length of the head depends on it",
         fix="compare a distance with one on the patient, or export with units of mm",
     )
 
@@ -247,7 +247,7 @@ def _affine(path: Path, header: _Header) -> tuple[NDArray[np.float64], list[Find
     if code_rows <= 0:
         return to_lps * turned, []
     if code_turn > 0 and code_rows in TEMPLATE_SPACES and code_turn not in TEMPLATE_SPACES:
-        used = "; its qform, which leads to the scanner's, was used"
+        used = "; its qform, which refers to the scanner's, was used"
         return to_lps * turned, [_template(path, code_rows, "note", used)]
     if code_turn > 0:
         off = apart(turned, rows, header.size)
@@ -271,7 +271,7 @@ def _template(path: Path, code: int, severity: str, used: str) -> Finding:
         code="image-template-space",
         what=f"its sform (code {code}) leads to the space of a template{used}",
         where=path.name,
-        why="lengths in a template's space are not the patient's",
+        why="lengths in a template's space are not those of the patient",
         fix="" if used else "use the image in the scanner's space",
     )
 

@@ -48,7 +48,7 @@ def read_obj(data: bytes) -> tuple[Floats, Integers]:
         there; a coordinate that is not finite; other counts than a comment states.
     """
     if b"\0" in data:
-        raise CaseInputError("is no OBJ file: it holds zero bytes")
+        raise CaseInputError("is not an OBJ file: it holds zero bytes")
     lines = data.split(b"\n")
     if b"\\" in data:
         lines = _joined(lines)
@@ -128,7 +128,7 @@ def _faces(faces: list[bytes], places: list[tuple[int, int]], points: Floats) ->
     if b"/" in text:
         if other := BAD_REFERENCE.search(text):
             number = places[text.count(b"\n", 0, other.start())][0]
-            raise CaseInputError(f"line {number}: {shown(other[0])} is no texture or normal")
+            raise CaseInputError(f"line {number}: {shown(other[0])} is not a texture or normal")
         text = REFERENCE.sub(b"", text)
     rows = [line.split() for line in text.split(b"\n")] if faces else []
     counts = np.fromiter(map(len, rows), np.int64, len(rows)) - 1

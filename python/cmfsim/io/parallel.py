@@ -91,8 +91,8 @@ def _on_cluster(
             raise error
         if error is not None:
             raise CaseError(
-                f"the cluster gave up a job ({error}): run the command again; what is complete is "
-                "kept"
+                f"the cluster abandoned a job ({error}): run the command again; what is complete "
+                "is kept"
             )
         yield index, answer
 
@@ -133,8 +133,8 @@ class _Worker:
             pass
         if not line:
             raise CaseError(
-                f"a worker process died (exit code {self._process.wait()}), perhaps for want of "
-                "memory: run the command again, with fewer workers; what is complete is kept"
+                f"a worker process died (exit code {self._process.wait()}), perhaps out of memory: "
+                "run the command again, with fewer workers; what is complete is kept"
             )
         found = json.loads(line)
         if "error" in found:

@@ -141,7 +141,7 @@ def _header(data: bytes) -> tuple[list[_Element], str, int]:
     """The elements, the order of bytes (empty for text) and where the first element begins."""
     found = END.search(data, 0, MAX_HEADER) if data[:3] == b"ply" else None
     if found is None:
-        raise CaseInputError("is no PLY file, or is cut short in its header")
+        raise CaseInputError("is not a PLY file, or is cut short in its header")
     end = found.end()
     lines = re.split(rb"\r\n|\n|\r", data[: found.start()])
     # Where lines end in one character, a zero byte or line feed after it belongs to the data.
@@ -176,12 +176,12 @@ def _header(data: bytes) -> tuple[list[_Element], str, int]:
                 fail(f"types are {', '.join(name.decode() for name in TYPES)}")
             last = elements[-1]
             if last.place(found_property.name) is not None:
-                fail("stands there a second time")
+                fail("appears a second time")
             elements[-1] = _Element(last.name, last.number, (*last.properties, found_property))
         else:
             fail("is not known in PLY")
     if order is None or lines[0].strip() != b"ply":
-        raise CaseInputError("is no PLY file: its header lacks 'ply' or 'format'")
+        raise CaseInputError("is not a PLY file: its header lacks 'ply' or 'format'")
     return elements, order, end
 
 

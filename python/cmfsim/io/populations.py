@@ -98,7 +98,7 @@ class Population:
         found = {
             "format": FORMAT,
             "version": FORMAT_VERSION,
-            "note": "in silico: heads made by code and operations computed; no patients",
+            "note": "in silico: synthetic heads and computed operations; no patients",
             "settings": dict(self.settings),
             "patients": {name: entry.as_dict() for name, entry in self.patients.items()},
         }

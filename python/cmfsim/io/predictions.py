@@ -78,7 +78,7 @@ def _motion(where: str, value: object) -> None:
 
 def _file_name(where: str, value: object) -> None:
     if not isinstance(value, str) or not is_prediction_file(value):
-        raise CaseInputError(f"{where} is {value!r:.60}: no file of a prediction is called so")
+        raise CaseInputError(f"{where} is {value!r:.60}: a prediction has no file of that name")
 
 
 _SOLUTION = table(

@@ -310,7 +310,9 @@ def _tissue(table: Mapping[str, Any], tet_data: Mapping[str, NDArray[Any]]) -> T
     for name, tail in wanted.items():
         if name in tet_data:
             if name in given:
-                raise CaseInputError(f"tissue {name} stands in the file and in the mesh: drop one")
+                raise CaseInputError(
+                    f"tissue {name} is both in the file and in the mesh: remove one"
+                )
             values = tet_data[name]
             # VTK has tensors of 9 components at most, so 6 × 6 travel as 36.
             given[name] = values.reshape(-1, 6, 6) if tail == (6, 6) else values

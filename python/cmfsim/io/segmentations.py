@@ -75,7 +75,7 @@ def read_segmentation(path: Path) -> Segmentation:
     check_readable(path, ImageInputError)
     with path.open("rb") as file:
         if not file.read(7).startswith(b"NRRD000"):
-            raise ImageInputError(f"{path.name}: is no NRRD file: save the segmentation again")
+            raise ImageInputError(f"{path.name}: is not an NRRD file: save the segmentation again")
     fields, begin = nrrd_fields(path)
     sizes = [whole(path, "sizes", text) for text in fields.get("sizes", "").split()]
     if len(sizes) == 3:

@@ -50,7 +50,7 @@ def unpack_bundle(path: Path, folder: Path) -> Path:
         # Damaged archives raise whatever zipfile, zlib and struct raise.
         except Exception as error:
             raise CaseInputError(
-                f"is no bundle of 3D Slicer, or is damaged ({error}): save it again"
+                f"is not a 3D Slicer bundle, or is damaged ({error}): save it again"
             ) from error
         with archive:
             scenes = _unpack(archive, path.stat().st_size, folder)
@@ -111,7 +111,7 @@ def _check_names(members: Sequence[zipfile.ZipInfo]) -> None:
         leads_out = place.is_absolute() or ".." in place.parts or DRIVE.match(name)
         too_long = len(name) > MAX_PATH or any(len(p.encode()) > MAX_NAME for p in place.parts)
         if leads_out or not place.parts or too_long or any(c in name for c in "\\\0"):
-            raise CaseInputError(f"names the file {shown!r}, which would lie outside: not unpacked")
+            raise CaseInputError(f"names the file {shown!r}, which would be outside: not unpacked")
         if stat.S_ISLNK(member.external_attr >> 16):
             raise CaseInputError(f"holds the link {shown!r}: links are not unpacked")
         if member.flag_bits & ENCRYPTED:

@@ -108,7 +108,7 @@ class SlicerScene:
             if above is None or above.kind != "transform":
                 raise CaseInputError(
                     f"{self.file.name}: {node.name!r} lies under the transform {parent[:60]!r}, "
-                    "which the scene does not have: save the scene again"
+                    "which is not in the scene: save the scene again"
                 )
             if above in found:
                 raise CaseInputError(
@@ -158,7 +158,9 @@ class SlicerScene:
         try:
             numbers = np.array([float(word) for word in node.matrix.split()])
         except ValueError as error:
-            raise CaseInputError(f"its matrix holds what is no number ({error})") from error
+            raise CaseInputError(
+                f"its matrix contains an entry that is not a number ({error})"
+            ) from error
         if len(numbers) != 16:
             raise CaseInputError(f"its matrix has {len(numbers)} numbers: 16 are needed")
         return motion_in_lps(rigid_matrix(numbers.reshape(4, 4)), "RAS")
@@ -183,7 +185,7 @@ def read_slicer_scene(path: str | os.PathLike[str]) -> SlicerScene:
     check_readable(path)
     with named(path):
         if path.stat().st_size > MAX_SCENE:
-            raise CaseInputError(f"is larger than {MAX_SCENE} bytes: no scene is")
+            raise CaseInputError(f"is larger than {MAX_SCENE} bytes: no scene is that large")
         elements = _elements(path.read_bytes())
         storages = {a["id"]: a for name, a in elements if name.endswith("Storage") and "id" in a}
         nodes: dict[str, SceneNode] = {}
@@ -229,7 +231,7 @@ def _file(name: str, folder: Path) -> tuple[Path | None, str]:
     decoded = unquote(name).replace("\\", "/")
     shown = decoded[:MAX_NAME]
     if "\0" in decoded:
-        return folder / "?", f"{shown!r}: no file is called so"
+        return folder / "?", f"{shown!r}: no file has that name"
     path = folder / decoded
     if not is_below(path, folder):
         return path, (
@@ -240,7 +242,7 @@ def _file(name: str, folder: Path) -> tuple[Path | None, str]:
         is_file = is_there(path) and path.is_file()
     except CaseInputError as error:
         return path, str(error)
-    return path, "" if is_file else f"{shown}: the scene names this file, and it is not there"
+    return path, "" if is_file else f"{shown}: the scene refers to this file, but it does not exist"
 
 
 def _elements(text: bytes) -> list[tuple[str, dict[str, str]]]:

@@ -44,11 +44,11 @@ def read_stl(data: bytes) -> Floats:
         return _read_text(data)
     if len(data) < HEADER + 4:
         raise CaseInputError(
-            f"is no STL file, or is cut short: {len(data)} bytes, a header has {HEADER + 4}"
+            f"is not an STL file, or is cut short: {len(data)} bytes, a header has {HEADER + 4}"
         )
     raise CaseInputError(
-        f"is no STL file, or is cut short or damaged: it states {_count(data)} triangles, which "
-        f"take {_length(data)} bytes, and has {len(data)}; export it again"
+        f"is not an STL file, or is cut short or damaged: it states {_count(data)} triangles, "
+        f"which take {_length(data)} bytes, but has {len(data)}; export it again"
     )
 
 

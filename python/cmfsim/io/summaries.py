@@ -130,7 +130,7 @@ def checked_file(folder: Path, summary: Mapping[str, Any], name: str, again: str
         raise FileNotFoundError(f"{path}: no such file; {again}") from error
     if not regular or _hash_of(path) != known:
         raise CaseInputError(
-            f"{path}: is not the file that was written with the results in its folder; {again}"
+            f"{path}: is not the file written with the results in its folder; {again}"
         )
     return path
 
@@ -166,7 +166,7 @@ def _digest(content: Mapping[str, Any]) -> str:
     try:
         plain = json.dumps(content, sort_keys=True, allow_nan=False)
     except (ValueError, RecursionError) as error:  # 1e400 is read as infinity
-        raise CaseInputError(f"holds what no summary holds ({error})") from error
+        raise CaseInputError(f"contains a value that no summary contains ({error})") from error
     return hashlib.sha256(plain.encode()).hexdigest()
 
 

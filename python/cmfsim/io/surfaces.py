@@ -84,8 +84,8 @@ def _scale(path: Path, units: str, frame: str | None, stated: str | None) -> NDA
         check_one_of("frame", frame, FRAMES)
     if frame is not None and stated is not None and frame != stated:
         raise CaseInputError(
-            f"{path.name}: its header states {stated}, and frame is {frame}: remove frame, which "
-            "is for files that state none, or export the file again"
+            f"{path.name}: its header states {stated}, and frame is {frame}: remove frame(it is "
+            "for files that state none), or export the file again"
         )
     # RAS to LPS is half a turn about the long axis: triangles keep their orientation.
     signs = [-1.0, -1.0, 1.0] if (frame or stated) == "RAS" else [1.0, 1.0, 1.0]
@@ -154,9 +154,9 @@ def read_moved_surface(
 
 
 SAME_NEEDED = (
-    "the same vertices and triangles in the same order are needed; where the bone was segmented or "
-    'remeshed, name it in [postoperative.bones] and write plan = "achieved", which lays the '
-    "bone before on the one after"
+    "the same vertices and triangles in the same order are needed; if the bone was segmented or "
+    'remeshed, list it in [postoperative.bones] and write plan = "achieved", which registers the '
+    "bone before to the one after"
 )
 
 

@@ -148,7 +148,7 @@ class Table:
         try:
             yield
         except CmfsimError as error:
-            self.fail(key, f"cannot be meant: {error}")
+            self.fail(key, f"is invalid: {error}")
 
     def all_lines(self) -> dict[str, int]:
         """The line of each dotted key of the file."""
@@ -256,11 +256,11 @@ class Table:
         """A path to read, against a folder unless it is absolute; `~` is the home folder."""
         name = self.text(key)
         if "\0" in name:
-            self.fail(key, "holds a zero character: no file is called so")
+            self.fail(key, "holds a zero character: no file has that name")
         try:
             path = folder / Path(name).expanduser()
         except RuntimeError:
-            self.fail(key, f"is {name!r}: there is no home folder of this name; write the path")
+            self.fail(key, f"is {name!r}: no home folder has this name; write the path")
         try:
             is_there(path)
         except CaseInputError as error:
@@ -278,7 +278,7 @@ class Table:
         """The tables of an array of tables; none where it is absent."""
         value = self._values.get(key, [])
         if not isinstance(value, list) or any(not isinstance(entry, dict) for entry in value):
-            self.fail(key, f"is no list of tables: write [[{key}]] before each")
+            self.fail(key, f"is not a list of tables: write [[{key}]] before each")
         return [
             Table(entry, (*self._path, key, number), self._file, self._lines)
             for number, entry in enumerate(value)

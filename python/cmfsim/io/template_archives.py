@@ -115,7 +115,7 @@ def read_template_archive(path: Path) -> TemplateData:
     names = header.get("landmarks")
     points = member_of(members, "landmarks")
     if not isinstance(names, list) or len(set(map(str, names))) != len(points):
-        raise LandmarkInputError(f"has {len(points)} landmarks and other names than that")
+        raise LandmarkInputError(f"has {len(points)} landmarks, but a different number of names")
     definitions = header.get("definitions", {})
     if not isinstance(definitions, dict):
         raise CaseInputError("'definitions' is not a table")
@@ -184,12 +184,14 @@ def _muscles_of(
         if "mirror_of" in entry:
             other = muscles.get(str(entry["mirror_of"]))
             if other is None:
-                raise CaseInputError(f"{name} mirrors {entry['mirror_of']!r}, which is not before")
+                raise CaseInputError(
+                    f"{name} mirrors {entry['mirror_of']!r}, which does not come before it"
+                )
             muscles[name] = mirrored_muscle(other, name, str(side))
             continue
         counts = entry.get("course", [])
         if not isinstance(counts, list):
-            raise CaseInputError(f"course of {name} is no list of numbers of points")
+            raise CaseInputError(f"course of {name} is not a list of point counts")
         lines = tuple(rows.take("course", count) for count in counts)
         surface = rows.surface(entry)
         muscles[name] = MuscleSurface(name, str(side), surface, str(kind), boxes, lines)

@@ -197,7 +197,7 @@ def _survey_folder(folder: Path, gathered: _Gathered) -> TemplateData | None:
         table.only(*KEYS)
     with gathered.at("template-format", f'write format = "{TEMPLATE_FORMAT}"'):
         _check_format(table)
-    with gathered.at("template-licence", 'say under which terms it may be used: licence = "…"'):
+    with gathered.at("template-licence", 'state its terms of use: licence = "…"'):
         given["licence"] = table.text("licence")
     with gathered.at("template-text", "correct the line"):
         given["name"] = table.text("name")
@@ -383,10 +383,10 @@ def _refuse_foreign(folder: Path) -> None:
     if not folder.exists():
         return
     if not folder.is_dir():
-        raise CaseInputError(f"{folder.name}: is a file; a folder is to be written there")
+        raise CaseInputError(f"{folder.name}: is a file, but a folder is to be written there")
     foreign = sorted(p.name for p in folder.iterdir() if not TEMPLATE_FILES.fullmatch(p.name))
     if foreign:
         raise CaseInputError(
-            f"{folder.name}: holds {foreign[0]!r} ({len(foreign)} such), which is no part of a "
-            "template: name another folder, or move it away"
+            f"{folder.name}: holds {foreign[0]!r} ({len(foreign)} such), which is not part of a "
+            "template: choose another folder, or move that file away"
         )

@@ -89,7 +89,7 @@ class Cursor:
             words += self.data[self.at : end].split()
             self.at = end + 1
         if len(words) > count:
-            raise CaseInputError(f"{what}: more than {count} numbers stand there")
+            raise CaseInputError(f"{what}: more than {count} numbers were found")
         return words
 
     def _short(self, what: str, found: int, count: int) -> None:

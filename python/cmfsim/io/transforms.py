@@ -42,12 +42,12 @@ DEFAULT_DIRECTION, DEFAULT_FRAME = "to-parent", "LPS"
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
 # What to state, as part of an error.
 DIRECTION_CHOICE = (
-    'direction = "from-parent" if the file carries the moved bone back to where it was, as 3D '
+    'direction = "from-parent" if the file takes the moved bone back to its old place, as 3D '
     "Slicer saves a transform that was applied to the bone; "
-    'direction = "to-parent" if it carries the bone to where it goes, as ITK registers the bone '
+    'direction = "to-parent" if it takes the bone to its new place, as when ITK registers the bone '
     "after (moving image) to the bone before (fixed image)"
 )
-ITK_IS_LPS = "is an ITK transform, which is LPS always: remove frame"
+ITK_IS_LPS = "is an ITK transform, which is always LPS: remove frame"
 # A comment by which `write_transform` states frame and direction.
 STATED = re.compile(r"^#.*\bmm, (LPS|RAS)(?:, (to-parent|from-parent))?\s*$")
 

@@ -70,7 +70,7 @@ class _Reader:
         """What the file holds."""
         file = self.file
         if not HEADER.fullmatch(file.raw_line().strip()):
-            raise CaseInputError("is no VTK file: '# vtk DataFile Version' is its first line")
+            raise CaseInputError("is not a VTK file: '# vtk DataFile Version' is its first line")
         file.raw_line()
         form = file.raw_line().strip().upper()
         if form not in {"ASCII", "BINARY"}:

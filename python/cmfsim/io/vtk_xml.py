@@ -223,7 +223,9 @@ def _joined(meshes: Sequence[PlainMesh]) -> PlainMesh:
         ("CellData", {tuple(sorted(m.cell_data)) for m in filled}),
     ):
         if len(names) > 1:
-            raise CaseInputError(f"its pieces have other arrays as {what}: {sorted(names)}")
+            raise CaseInputError(
+                f"its pieces differ in the arrays of their {what}: {sorted(names)}"
+            )
     blocks, first = list[Cells](), 0
     for mesh in meshes:
         blocks += [Cells(block.type, block.data + first) for block in mesh.cells]
@@ -319,7 +321,7 @@ class _Arrays:
             text = "".join(array.text).encode("ascii", "replace").translate(None, SPACE)
             raw, end = self._block(text, 0, size, coded=True)
             if end != len(text):
-                raise CaseInputError(f"has {len(text) - end} characters too many")
+                raise CaseInputError(f"has {len(text) - end} extra characters")
             return raw
         start = array.count("offset")
         coded = self.encoding == "base64"

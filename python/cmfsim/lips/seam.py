@@ -112,7 +112,7 @@ def lip_seam(
         lacks = (
             f"skin landmarks {', '.join(missing)} are missing"
             if missing
-            else "the lip landmarks lie in no order that a mouth has"
+            else "the order of the lip landmarks does not fit a mouth"
         )
         return _not_found(" and ".join(filter(None, (shows, lacks))))
     sheet = lip_sheet(anatomy, frame, profiles, line, depth)
@@ -224,7 +224,7 @@ def _outside(line: MouthLine, frame: MouthFrame, marks: Mapping[str, Floats]) ->
     return [
         Finding.warning(
             "lip-seam-outside",
-            f"the seam between the lips lies at a height of {at.mean():.1f} mm over the middle of "
+            f"the seam between the lips is at a height of {at.mean():.1f} mm over the middle of "
             f"the arches, the landmarks labiale_superius at {upper[2]:.1f} and labiale_inferius at "
             f"{lower[2]:.1f} mm: it should lie between them",
             where="lips",
@@ -244,7 +244,7 @@ def _told(source: str, way: str) -> list[Finding]:
             "the skin shows no gap or crease between the lips: the seam was placed from the skin "
             "landmarks of the mouth",
             where="lips",
-            why="it is right to some millimetres only",
+            why="it is accurate only to some millimetres",
             fix="check it in node_kinds.png, or give seam in [lips]",
         )
     ]
@@ -255,7 +255,7 @@ def _not_found(why: str) -> LipSeam:
         "lip-seam-not-found",
         f"the lips were not separated: {why}",
         where="lips",
-        why="upper and lower lip stay one, and pull each other along where the jaws move apart",
+        why="the upper and lower lip stay joined, and pull on each other where the jaws move apart",
         fix="place the skin landmarks cheilion_L, cheilion_R, labiale_superius and "
         "labiale_inferius and the skull landmarks of both arches, or give a surface between the "
         "lips as seam in [lips]",

@@ -97,14 +97,14 @@ def anatomy_from_surfaces(
     """
     as_positive("spacing", spacing)
     if not bones:
-        raise MeshInputError("no bone is given: the tissue would hang on nothing")
+        raise MeshInputError("no bone is given: the tissue would not be attached to anything")
     vertices = np.asarray(skin.vertices, dtype=np.float64)
     lowest = vertices.min(axis=0) - MARGIN * spacing
     shape = np.ceil((vertices.max(axis=0) - lowest) / spacing) + 1 + MARGIN
     if shape.prod() > MAX_VOXELS:
         size = " × ".join(f"{extent:.0f}" for extent in np.ptp(vertices, axis=0))
         raise MeshInputError(
-            f"skin measures {size} mm: with voxels of {spacing:g} mm that is more than "
+            f"skin measures {size} mm: at voxels of {spacing:g} mm that is more than "
             f"{MAX_VOXELS:.0e}; are the surfaces in mm?"
         )
     nx, ny, nz = (int(n) for n in shape)
@@ -145,7 +145,6 @@ def _outside(name: str, bone: ImageData, skin: ImageData) -> Finding | None:
         f"{volume:.0f} mm³ of bone {name!r} lie outside the skin",
         where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
         why="there is no tissue over it, so the face cannot be predicted there",
-        fix="check that skin and bone are of one patient, in one frame; a neck cut lower fixes a "
-        "spine "
-        "that sticks out",
+        fix="check that skin and bone belong to one patient, in one frame; if the spine protrudes, "
+        "cut the neck lower",
     )

@@ -182,7 +182,7 @@ def mesh_findings(report: MeshReport) -> tuple[Finding, ...]:
                 "mesh-poor-tet",
                 f"tet {worst['tet']} has a dihedral angle of {report.min_dihedral:.1f}°",
                 where=f"mesh, at ({x:.1f}, {y:.1f}, {z:.1f}) mm",
-                why="its deformation is inaccurate and the system worse conditioned",
+                why="its deformation is inaccurate, and the system is less well conditioned",
                 fix="change edge_length a little, or set refinements = 0",
             )
         )
@@ -190,10 +190,10 @@ def mesh_findings(report: MeshReport) -> tuple[Finding, ...]:
         findings.append(
             Finding.note(
                 "mesh-specks-dropped",
-                f"{report.dropped_parts} specks of tissue with {report.dropped_volume:.1f} mm³ "
-                "in all were left out",
+                f"{report.dropped_parts} specks of tissue with {report.dropped_volume:.1f} mm³ in "
+                "all were removed",
                 where="mesh",
-                why="they hang on nothing",
+                why="they are not attached to anything",
                 fix="none is needed; check the thresholds if a part of the face is missing",
             )
         )

@@ -169,7 +169,7 @@ def _without_hollows(
     place = np.asarray(grid.lowest) + np.argwhere(hollow).mean(axis=0) * np.asarray(grid.spacing)
     yield Finding.note(
         "hollow-left-out",
-        f"{volume / 1000.0:.1f} cm³ behind bone were left out of the tissue",
+        f"{volume / 1000.0:.1f} cm³ behind bone were removed from the tissue",
         where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
         why="the cranial cavity and closed sinuses do not deform with the face",
         fix="none is needed; lower foramen_radius if tissue of the face is missing",

@@ -345,7 +345,7 @@ def _findings(
         if was_turned:
             yield Finding.note(
                 "muscle-inside-out",
-                f"the surface of {name} is inside out; it was turned",
+                f"the surface of {name} was inside out and has been flipped",
                 where=name,
             )
         if volume.enclosed is None:
@@ -353,14 +353,14 @@ def _findings(
                 "muscle-open",
                 f"the surface of {name} is not closed: {surface.n_border_edges} border edges",
                 where=name,
-                why="Inside is where the winding number exceeds one half; holes are bridged.",
+                why="Inside is where the winding number exceeds one half, which bridges holes.",
             )
         if volume.inside == 0.0:
             yield Finding.warning(
                 "muscle-missed",
                 f"{name} holds no sample of any tet",
                 where=name,
-                why="It has no part in the tissue: it lies outside the mesh, or encloses nothing.",
+                why="It does not affect the tissue: it lies outside the mesh, or encloses nothing.",
                 fix="Check its frame and that its surface is closed; or take more samples.",
             )
         elif volume.enclosed is not None:
@@ -376,6 +376,6 @@ def _findings(
                 "muscle-sheet",
                 f"{name} is a sheet: second extent {fibres.sheet_ratio:.2f} of the first",
                 where=name,
-                why="Its outline hardly tells the direction of its fibres.",
+                why="Its outline hardly shows the direction of its fibres.",
                 fix="Give the course of its fibres.",
             )

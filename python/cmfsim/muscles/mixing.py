@@ -99,8 +99,8 @@ def check_muscle_names(moduli: TissueModuli, names: Sequence[str]) -> None:
         if name not in names:
             known = ", ".join(names) or "none"
             raise MaterialInputError(
-                f"moduli are given for the muscle {name!r}, which there is not"
-                f"{nearest(name, tuple(names))} (muscles: {known})"
+                f"moduli are given for the muscle {name!r}, which does not "
+                f"exist{nearest(name, tuple(names))} (muscles: {known})"
             )
 
 

@@ -105,7 +105,7 @@ def _nothing_slides(missing: Sequence[str]) -> Finding:
     return Finding.warning(
         "sliding-landmarks",
         f"no sliding region at the teeth: landmarks {', '.join(missing)} are missing, and the "
-        "image shows no teeth apart from bone",
+        "image does not show teeth apart from bone",
         where="landmarks",
         why="lips and cheeks would stick to the teeth",
         fix="place them, give regions, or set sliding = false",
@@ -118,7 +118,7 @@ def _from_teeth(missing: Sequence[str]) -> Finding:
         f"landmarks {', '.join(missing)} are missing: the sliding regions were placed from the "
         "teeth that the image shows",
         where="landmarks",
-        why="the depth of the vestibule is then right to some 3 mm",
+        why="the depth of the vestibule is then accurate to about 3 mm",
         fix="place the landmarks if lips or cheeks matter",
     )
 

@@ -255,7 +255,9 @@ def _checked_names(
     segments: Sequence[BoneSegment], moved: Collection[str], options: KindOptions
 ) -> tuple[str, ...]:
     if not segments:
-        raise CaseInputError("there is no bone segment: nothing would hold the tissue")
+        raise CaseInputError(
+            "there is no bone segment: the tissue would not be attached to anything"
+        )
     for segment in segments:
         check_instance("segment", segment, BoneSegment)
     names = tuple(segment.name for segment in segments)
@@ -338,7 +340,7 @@ def _noticed(
             f"no node is joined to {name!r}, which the plan moves "
             f"({counts[f'sliding on {name}']} slide on it)",
             where=name,
-            why="its motion pulls no tissue along",
+            why="its motion does not reach the tissue",
             fix="look at the picture; raise bone_distance, or leave it out of the plan",
         )
         for name in kinds.segments
@@ -353,7 +355,7 @@ def _noticed(
                 f"{len(held)} nodes are fixed or joined: at least {HOLDING_NODES} not on one line "
                 "are needed",
                 where="node kinds",
-                why="the tissue could drift as a whole, so there is no answer",
+                why="the tissue could drift as a whole, so there is no unique solution",
                 fix="give fixed_planes (posterior), or raise bone_distance",
             )
         )

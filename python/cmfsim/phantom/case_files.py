@@ -10,7 +10,7 @@ from cmfsim.phantom import PhantomHead
 __all__ = ["write_phantom_case"]
 
 CASE = """\
-# A made head: no patient. `cmfsim build case.toml` makes its model.
+# A synthetic head: no patient. `cmfsim build case.toml` makes its model.
 format = "cmfsim-case"
 version = 1
 name = "phantom"

@@ -40,7 +40,7 @@ __all__ = ["EVALUATION_FILE", "CaseEvaluation", "evaluate", "evaluation_key"]
 
 WILCOXON_NOTE = (
     "Wilcoxon's signed-rank test vertex by vertex, as the paper has it: neighbouring vertices are "
-    "not independent, so that its p values are far too small; look at the size of the difference."
+    "not independent, so its p values are far too small; look at the size of the difference."
 )
 
 
@@ -299,8 +299,9 @@ def _not_shown(reason: str) -> Finding:
         "not-operated-none",
         f"the error where nothing was operated on is not known: {reason}",
         where="postoperative",
-        why="Errors of registration, swelling and weight cannot be told from those of a model.",
-        fix="Have both scans show forehead and temples.",
+        why="Errors of registration, swelling and weight cannot be separated from those of a "
+        "model.",
+        fix="Use scans that both show the forehead and temples.",
     )
 
 

@@ -55,7 +55,8 @@ def face_landmarks(patient: PatientModel) -> FaceLandmarks:
         "regions of the face are placed by proposed landmarks, each expected to be right to "
         f"{worst:.1f} mm",
         where="landmarks.skin",
-        why="The case has no complete skin landmarks. Borders between regions are that uncertain.",
+        why="The case has no complete skin landmarks. The borders between regions are equally "
+        "uncertain.",
         fix="Look at them with cmfsim landmarks, and save them.",
     )
     return FaceLandmarks({name: found.skin[name].point for name in SKIN_LANDMARKS}, (note,))

@@ -328,7 +328,7 @@ def write_case_report(folder: Path) -> str | None:
             evaluation = None
             left_out = (
                 f"the comparison of {EVALUATION_FILE} belongs to another plan, other inputs or "
-                "another version: left out; run cmfsim evaluate"
+                "another version: skipped; run cmfsim evaluate"
             )
             _log.warning("%s", left_out)
     if evaluation is not None:

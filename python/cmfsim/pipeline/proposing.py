@@ -107,7 +107,7 @@ def head_surfaces(anatomy: Anatomy) -> tuple[dict[str, SurfaceData], SurfaceData
         surface = anatomy.surfaces.get(name) or detailed_surface(name, level)
         if surface is None:
             raise CaseInputError(
-                "landmarks are found on surfaces, which need scikit-image: install "
+                "finding landmarks needs surfaces, which need scikit-image: install "
                 "'cmfsim[imaging]', or place the landmarks by hand"
             )
         found[name] = surface
@@ -219,19 +219,19 @@ def _separated_again(apart: Mapping[str, float]) -> Finding:
     name = max(apart, key=lambda site: apart[site])
     return Finding.note(
         "jaws-separated-again",
-        "the mandible was told from the skull by shape, and again by the landmarks found: they "
-        f"moved by {np.mean(list(apart.values())):.1f} mm on average, {apart[name]:.1f} mm at most "
-        f"({name})",
+        "the mandible was separated from the skull by shape, and again by the landmarks found: "
+        f"they moved by {np.mean(list(apart.values())):.1f} mm on average, {apart[name]:.1f} mm at "
+        f"most ({name})",
         where="bone",
-        why="shape alone leaves the cut between the tooth rows some millimetres off",
-        fix="give skull landmarks placed by hand where a millimetre counts",
+        why="by shape alone, the cut between the tooth rows is some millimetres off",
+        fix="place skull landmarks by hand where a millimetre matters",
     )
 
 
 def _not_separated_again() -> Finding:
     return Finding.warning(
         "jaws-not-separated-again",
-        "the landmarks found separate the jaws worse than their shape does: they do not agree",
+        "the landmarks found separate the jaws less well than shape does: they are inconsistent",
         where="bone",
         why="the cut between the tooth rows may be some millimetres off, and with it the landmarks "
         "of teeth and jaw",

@@ -149,7 +149,7 @@ def _keys(name: str, points: Mapping[str, Floats]) -> dict[str, str]:
         key = label_key(label)
         if key in found:
             raise LandmarkInputError(
-                f"the {name} has {found[key]!r} and {label!r}, which differ in spelling alone: "
+                f"the {name} has {found[key]!r} and {label!r}, which differ only in spelling: "
                 "remove or rename one"
             )
         found[key] = label
@@ -181,7 +181,7 @@ def _extra(keys: Mapping[str, Mapping[str, str]], *, strict: bool) -> list[Findi
         extra = [label for key, label in keys[name].items() if key not in keys[other]]
         if not extra:
             continue
-        what = f"{len(extra)} landmarks are in the {name} alone: {_listed(extra)}"
+        what = f"{len(extra)} landmarks are only in the {name}: {_listed(extra)}"
         if strict:
             raise LandmarkInputError(f"{what}; add them to the {other} or remove them")
         findings.append(
@@ -190,7 +190,7 @@ def _extra(keys: Mapping[str, Mapping[str, str]], *, strict: bool) -> list[Findi
                 what,
                 where=f"landmarks of the {name}",
                 why="they are not used",
-                fix=f"place them in the {other} as well, if they should be",
+                fix=f"if they should be used, place them in the {other} as well",
             )
         )
     return findings
@@ -202,8 +202,8 @@ def _check_apart(name: str, names: tuple[str, ...], points: Floats) -> None:
     i, j = np.unravel_index(np.argmin(distances), distances.shape)
     if distances[i, j] < LEAST_DISTANCE:
         raise LandmarkInputError(
-            f"{names[i]} and {names[j]} of the {name} lie at one place ({distances[i, j]:.2g} mm "
-            "apart): place one of them again"
+            f"{names[i]} and {names[j]} of the {name} lie in the same place ({distances[i, j]:.2g} "
+            "mm apart): place one of them again"
         )
 
 

@@ -13,9 +13,9 @@ MOST_SOURCES = 12
 
 UNCALIBRATED = (
     "UNCALIBRATED. The half widths below are {factor:.2f} standard deviations of the sources "
-    "listed below, at one point at a time. No case with a known outcome shows that they hold "
-    "{percent} of faces: the true face may lie outside more often. Give a calibration ([band] in "
-    "the case, or --calibration)."
+    "listed below, at one point at a time. They aim at {percent} of faces but have not been "
+    "checked on cases with a known outcome: the true face may lie outside more often. Give a "
+    "calibration ([band] in the case, or --calibration)."
 )
 CALIBRATED = (
     "In {percent} of cases like those of the calibration, all of a region lies within its band at "

@@ -26,17 +26,17 @@ MODEL_NAMES: Mapping[str, str] = {
 PICTURES: Mapping[str, str] = {
     "prediction": "The face before the operation and as predicted after it, and how far it moves.",
     "band": "Half the width of the band around the predicted skin, mm; grey where no calibration "
-    "case says anything.",
-    "plan": "The plan: bone segments where they are moved to, and before as outlines.",
-    "muscles": "The muscles, carried from the template to the skull by its landmarks.",
+    "case has data.",
+    "plan": "The plan: bone segments in their planned places, with outlines of their old ones.",
+    "muscles": "The muscles, fitted from the template to the skull by its landmarks.",
     "anatomy": "Skin and bone segments.",
     "node_kinds": "Kinds of node (Kim et al. 2010, Figure 4): fixed pink, joined orange, sliding "
     "blue, free white.",
 }
 
 NO_PICTURES = (
-    "Without pictures: none could be drawn where this was made. PyVista and OpenGL draw them "
-    "(pip install 'cmfsim[view]'; Debian: libgl1, libegl1)."
+    "This report has no pictures: none could be drawn on the machine that wrote it. PyVista and "
+    "OpenGL draw them (pip install 'cmfsim[view]'; Debian: libgl1, libegl1)."
 )
 
 
@@ -233,8 +233,8 @@ def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
     if bent:
         notes.append(
             Note(
-                "Moved vertex by vertex, with the nearest rigid motion in the table and what it "
-                f"leaves: {', '.join(bent)}."
+                "Moved vertex by vertex, with the nearest rigid motion and its residual in the "
+                f"table: {', '.join(bent)}."
             )
         )
     words = [
@@ -265,9 +265,9 @@ def _achieved(achieved: Values | None) -> list[Note | Table | Figure]:
         for name, found in achieved["segments"].items()
     )
     caption = (
-        "The plan was read off the bones after the operation: what is left between each segment "
-        "and that bone, mm, and the share of its vertices that lie on it. RMS and the largest are "
-        "of those alone, median and 95th percentile of all."
+        "The plan was read from the bones after the operation: remaining distance between each "
+        "segment and that bone, mm, and the share of its vertices that lie on it. RMS and maximum "
+        "are of those vertices, median and 95th percentile of all."
     )
     return [Table(("segment", "RMS", "largest", "median", "P95", "share"), rows, caption)]
 
@@ -407,7 +407,7 @@ def _time_section(predictions: Sequence[Values]) -> Section:
     ]
     rows.append(("sum", *(number(float(sum(entry["timings"].values()))) for entry in predictions)))
     columns = ("stage", *(entry["model"] for entry in predictions))
-    note = Note("A case is built once for all its models; the time of building is in each sum.")
+    note = Note("A case is built once for all its models; each sum includes the time of building.")
     table = Table(columns, tuple(rows), "Wall time of each stage, s.")
     return Section("Time", (table, *([note] if len(predictions) > 1 else [])))
 

@@ -24,8 +24,8 @@ def not_operated_blocks(evaluation: Values) -> list[Note | Table]:
     if found is None:
         return [
             Note(
-                "The error where nothing was operated on is not known, so that registration, "
-                "swelling and weight cannot be told from the error of a model.",
+                "The error where nothing was operated on is not known, so registration, swelling "
+                "and weight cannot be separated from the error of a model.",
                 "warning",
             )
         ]
@@ -34,8 +34,8 @@ def not_operated_blocks(evaluation: Values) -> list[Note | Table]:
         Note(
             f"Where nothing was operated on, the two scans differ by {whole['mean_mm']:.2f} mm on "
             f"average ({whole['signed_mean_mm']:+.2f} mm signed; negative: the face before lies "
-            "behind the face after). That is registration, swelling or weight. No model can be "
-            "held to less, and a figure below that says nothing about a model."
+            "behind the face after). That is registration, swelling or weight. No model can do "
+            "better, and smaller differences say nothing about a model."
         ),
         statistics_table(
             found["regions"],
@@ -65,7 +65,7 @@ def thickness_blocks(evaluation: Values) -> list[Note | Table]:
             f"One change of thickness, {100 * share:+.1f} % of the depth of the soft tissue "
             f"({share * depth:+.2f} mm on average there), was fitted where nothing was operated "
             f"on: the mean error there falls from {found['mean_before_mm']:.2f} to "
-            f"{found['mean_after_mm']:.2f} mm. It is known only after the operation, and is no "
+            f"{found['mean_after_mm']:.2f} mm. It is known only after the operation and is not "
             "part of a prediction."
         ),
         Table(("region", *means), rows, "Mean distance with that change applied, mm."),

@@ -64,8 +64,8 @@ def _alerts(cases: Sequence[Values]) -> list[Alert]:
 
 
 PAPER_NOTE = (
-    "Kim et al. (2010), Table 3. Other patients, other scans and other landmarks: the two tables "
-    "say whether errors are of one size, not which program is better."
+    "Kim et al. (2010), Table 3. Patients, scans and landmarks differ: the two tables show whether "
+    "the errors are of similar size, not which program is better."
 )
 
 
@@ -111,7 +111,7 @@ def _region_blocks(done: Sequence[Values], models: tuple[str, ...]) -> tuple[Not
             rows.append((case["name"], *(_gain(entry, still, name) for name in names)))
         caption = f"Model {model}: mean error, and in brackets its change against no change, mm."
         blocks.append(Table(("case", *names), tuple(rows), caption))
-    return tuple(blocks) or (Note("No case was finished."),)
+    return tuple(blocks) or (Note("No case has finished."),)
 
 
 def _gain(entry: Values, still: Values | None, region: str) -> str:

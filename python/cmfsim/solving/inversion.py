@@ -98,7 +98,7 @@ def inversion_finding(tensors: MassTensors, displacements: ArrayLike) -> tuple[i
     >>> tensors = cmfsim.MassTensors(mesh, cmfsim.Tissue.isotropic(0.003, 0.46))
     >>> found = inversion_finding(tensors, [[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, -1.5]])
     >>> found[0], found[1].what
-    (1, '1 of 1 tets rest inverted; worst is tet 0, at -0.5 of its volume')
+    (1, '1 of 1 tets are inverted at equilibrium; the worst is tet 0, at -0.5 of its volume')
     """
     ratios = least_volume_ratios(tensors, displacements)
     count = int(np.count_nonzero(ratios <= 0.0))
@@ -108,11 +108,10 @@ def inversion_finding(tensors: MassTensors, displacements: ArrayLike) -> tuple[i
     x, y, z = np.asarray(tensors.mesh.nodes)[np.asarray(tensors.mesh.tets)[worst]].mean(axis=0)
     return count, Finding.warning(
         "inverted-tets",
-        f"{count} of {len(ratios)} tets rest inverted; worst is tet {worst}, at "
+        f"{count} of {len(ratios)} tets are inverted at equilibrium; the worst is tet {worst}, at "
         f"{ratios[worst]:.2g} of its volume",
         where=f"({x:.1f}, {y:.1f}, {z:.1f}) mm before the operation",
-        why="tissue cannot turn inside out: forces and displacements about these tets are wrong",
-        fix="a smaller motion, or larger tets where bones squeeze a thin layer; where kinematics "
-        "is "
-        '"corotational" also "hyperelastic", which resists longer',
+        why="tissue cannot turn inside out: forces and displacements around these tets are wrong",
+        fix="a smaller motion, larger tets where bones squeeze a thin layer, or kinematics = "
+        '"hyperelastic", which resists inversion longer than "corotational"',
     )

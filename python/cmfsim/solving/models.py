@@ -54,8 +54,8 @@ def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
     check_one_of("model", model, MODELS)
     if model.startswith("M") and patient.muscles is None:
         raise CaseInputError(
-            f"model {model} needs muscles, and {patient.name!r} was built without: add [muscles] "
-            "to the case and skull landmarks"
+            f"model {model} needs muscles, and {patient.name!r} was built without them: add "
+            "[muscles] to the case and skull landmarks"
         )
     scene = patient.scene
     if model.startswith("H"):
@@ -240,7 +240,7 @@ def _lip_findings(patient: PatientModel, model: str) -> list[dict[str, str]]:
         return []
     found = Finding.warning(
         "lips-without-contact",
-        f"the lips are separate, and model {model} has no contact between them",
+        f"the lips are separate, but model {model} has no contact between them",
         where="[lips]",
         why="they follow their teeth and may pass through each other, which a prediction with the "
         "lips in one piece cannot do",

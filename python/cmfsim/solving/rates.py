@@ -150,7 +150,7 @@ def _plan_changes(
 ) -> dict[str, list[Floats]]:
     """Rates of the motion of each segment that is moved, (4, 4) each, in the order of `PLAN`."""
     if "achieved" in patient.summary:
-        left_out.append("execution of the plan: it was read off the bones after the operation")
+        left_out.append("execution of the plan: it was read from the bones after the operation")
         return {}
     found = {}
     for name, motion in scene.plan.items():

@@ -257,7 +257,7 @@ def _contact_findings(solution: Solution) -> list[dict[str, str]]:
             f"{solution.contact_gap:.1e} mm and nodes {solution.contact_unbalanced:.1e} mm out of "
             "balance",
             where="contact",
-            why="the tolerance asks for less, though no face would show it",
+            why="this exceeds the tolerance, though it is too small to see on a face",
             fix="allow more contact_iterations or a larger contact_tolerance, or smooth the "
             "surface",
         )
@@ -268,7 +268,7 @@ def _contact_findings(solution: Solution) -> list[dict[str, str]]:
             f"one-sided contact stopped after {solution.touching_rounds} rounds with tissue "
             f"{solution.penetration:.1e} mm deep in other tissue or bone",
             where="contact",
-            why="what touches may have changed had it gone on",
+            why="further rounds might have changed what touches",
             fix="look at the lips in the result; a smaller motion or a smoother surface converges",
         )
         findings.append(told(found))

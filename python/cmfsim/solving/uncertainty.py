@@ -85,8 +85,8 @@ NOT_COVERED = (
         "direction stand for them here"
     ),
     (
-        "segmentation threshold of bone, contact of the lips, the form of the model itself: only "
-        "a calibration knows their effect"
+        "segmentation threshold of bone, contact of the lips, the form of the model itself: only a "
+        "calibration shows their effect"
     ),
 )
 

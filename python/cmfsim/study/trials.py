@@ -86,7 +86,7 @@ class SensitivityReport:
         """Mean over trials and the muscles whose name holds `part`, mm."""
         found = [d for t in self.trials for name, d in t.muscle_deviation.items() if part in name]
         if not found:
-            raise CaseInputError(f"no muscle's name holds {part!r}")
+            raise CaseInputError(f"no muscle's name contains {part!r}")
         return float(np.mean(found))
 
     def skin_deviation(self, *, moved: bool = False) -> float:
@@ -193,7 +193,7 @@ def sensitivity(  # noqa: PLR0913 (options by name)
     if not model.startswith("M"):
         raise CaseInputError(f"model {model!r} has no muscles for landmarks to move: use M or M+S")
     if (trials if isinstance(trials, int) else len(trials)) < 1:
-        raise CaseInputError("no trial is asked for: at least one is needed")
+        raise CaseInputError("no trial was given: at least one is needed")
     case = as_case(case)
     options = BuildOptions(
         progress=progress, check=check, findings=findings, on_findings=on_findings
@@ -222,7 +222,9 @@ def _trial(
     placed = {name: np.asarray(point, dtype=np.float64) for name, point in landmarks.items()}
     unknown = [name for name in placed if name not in known]
     if unknown:
-        raise LandmarkInputError(f"a trial has the landmark {unknown[0]!r}, which the case has not")
+        raise LandmarkInputError(
+            f"a trial has the landmark {unknown[0]!r}, which the case does not have"
+        )
     # A trial may place some landmarks anew; the others stay.
     placed = {**known, **placed}
     changed = with_muscles(patient, given, landmarks=placed)

@@ -76,7 +76,7 @@ def repair_surface(
     """A closed, outward surface made from one that is nearly so, with a finding for each repair.
 
     Vertices in the same place become one; triangles without area and repeated ones are dropped, and
-    so are small pieces; triangles are turned round until neighbours agree and the largest piece
+    so are small pieces; triangles are flipped until neighbours agree and the largest piece
     encloses a positive volume; other pieces that enclose a negative one stay if they lie inside the
     largest (hollows) and are turned if not; borders are closed by caps.
 
@@ -124,7 +124,7 @@ def repair_surface(
     triangles, n_flat, n_again = _without_flat(vertices, triangles)
     if n_flat or n_again:
         what = f"{n_flat} triangles without area and {n_again} repeated ones are removed"
-        note("surface-cleaned", what, "they have no normal, or count their space twice")
+        note("surface-cleaned", what, "they have no normal, or count their volume twice")
     if not len(triangles):
         raise CaseInputError(f"{name}: no triangle with an area is left")
 
@@ -134,7 +134,7 @@ def repair_surface(
         note("surface-debris", what, "debris would become islands of bone or skin")
     triangles, n_turned = _outward(vertices, triangles)
     if n_turned:
-        what = f"{n_turned} of {len(triangles)} triangles are turned round"
+        what = f"{n_turned} of {len(triangles)} triangles are flipped"
         note("surface-turned", what, "normals that point inwards swap inside and outside")
     if options.close_borders:
         caps = []
@@ -166,8 +166,8 @@ def _cap_finding(name: str, length: float, centre: Floats, bulge: float) -> Find
         what=f"a border of {length:.1f} mm (at most {bulge:.1f} mm from a plane) is closed by a "
         "cap",
         where=f"{name} at ({place})",
-        why="inside and outside are only known for a closed surface"
-        + ("" if flat else "; this cap is far from flat, so its shape is made up"),
+        why="only a closed surface has an inside and an outside"
+        + ("" if flat else "; this cap is far from flat, so its shape is invented"),
         fix="look at the cap; if it is wrong, close the surface yourself",
     )
 

@@ -34,7 +34,7 @@ class BandOptions:
     def __post_init__(self) -> None:
         if not 0.0 < self.coverage < 1.0:
             raise CalibrationError(
-                f"coverage is {self.coverage!r}: allowed is above 0, below 1 (90 % is 0.9)"
+                f"coverage is {self.coverage!r}: it must be above 0 and below 1 (90 % is 0.9)"
             )
 
     def check(self, models: Sequence[str]) -> None:

@@ -143,11 +143,11 @@ class Calibration:
         for case in self.cases:
             if case.case in seen:
                 raise CalibrationError(
-                    f"calibration case {case.case!r} is there twice: each patient counts once"
+                    f"calibration case {case.case!r} appears twice: each patient counts once"
                 )
             seen.add(case.case)
         if self.coverage is not None and not 0.0 < as_number("coverage", self.coverage) < 1.0:
-            raise CalibrationError(f"coverage is {self.coverage!r}: allowed is above 0, below 1")
+            raise CalibrationError(f"coverage is {self.coverage!r}: it must be above 0 and below 1")
         # As a file gives them back: tuples are lists.
         settings = json.loads(json.dumps(dict(self.settings)))
         object.__setattr__(self, "settings", MappingProxyType(settings))

@@ -246,8 +246,8 @@ class Region:
         elif self.posterior_depth is not None:
             names = " and ".join(POSTERIOR_LANDMARKS)
             raise CaseInputError(
-                f"posterior_depth is {depth:g} mm behind {names}, which the landmarks lack: "
-                "add them, or give posterior_plane"
+                f"posterior_depth is {depth:g} mm behind {names}, which are not among the "
+                "landmarks: add them, or give posterior_plane"
             )
         else:
             height = foremost + POSTERIOR_SHARE * (hindmost - foremost)

@@ -67,9 +67,9 @@ class DentalArch(Frozen):
         if self.half_width < LEAST_ARCH or float(axes[1] @ (tip - self.middle)) < LEAST_ARCH:
             raise CaseInputError(
                 f"{self.jaw} arch: its front {tip.round(1).tolist()} and its molars "
-                f"{left.round(1).tolist()} and {right.round(1).tolist()} mm span "
-                f"no arch: the front lies ahead of the molars, and these apart, by {LEAST_ARCH:g} "
-                "mm at least; are landmarks exchanged?"
+                f"{left.round(1).tolist()} and {right.round(1).tolist()} mm do not span an arch: "
+                f"the front must lie ahead of the molars, and these apart, by {LEAST_ARCH:g} mm at "
+                "least; are landmarks swapped?"
             )
 
     @property

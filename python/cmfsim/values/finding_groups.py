@@ -12,10 +12,10 @@ __all__ = ["FindingGroup", "counted", "grouped"]
 TITLES: Mapping[str, str] = {
     "muscle-cut-off": "{n} muscles partly outside the tissue",
     "muscle-does-not-fit": "{n} muscles do not fit into the tissue",
-    "muscle-inside-out": "{n} muscle surfaces were inside out and were turned",
-    "muscle-missed": "{n} muscles hold no sample of the tissue and have no part in it",
+    "muscle-inside-out": "{n} muscle surfaces were inside out and were flipped",
+    "muscle-missed": "{n} muscles contain no sample of the tissue and do not affect it",
     "muscle-open": "{n} muscle surfaces are not closed",
-    "muscle-sheet": "{n} muscles are sheets, whose outline hardly shows the direction of fibres",
+    "muscle-sheet": "{n} muscles are sheets, whose outline hardly shows their fibre direction",
     "muscle-volume-changed": "{n} muscles changed in volume as they were moved into the tissue",
     "landmark-far": "{n} landmarks lie far from their surface",
     "surface-closed": "{n} surfaces were open and were closed",

@@ -81,7 +81,7 @@ class FatModuli:
             (also `ValueError`) One of them is None.
         """
         if self.young is None or self.poisson is None:
-            raise MaterialInputError(f"{self} has a gap: take TissueModuli.resolved")
+            raise MaterialInputError(f"{self} has a gap: use TissueModuli.resolved")
         return self.young, self.poisson
 
     @classmethod
@@ -104,8 +104,8 @@ class FatModuli:
         if fat.kind == "isotropic" and all(array.size == 1 for array in values.values()):
             return cls(**{name: array.item() for name, array in values.items()})
         raise MaterialInputError(
-            f"fat is of kind {fat.kind!r}: between muscles one fat is needed, isotropic with one "
-            "young (MPa) and one poisson, or a preset's"
+            f"fat is of kind {fat.kind!r}: the fat between muscles must be isotropic, with one "
+            "young (MPa) and one poisson, or that of a preset"
         )
 
 
@@ -165,7 +165,7 @@ class MuscleModuli:
         """
         along, across, poisson = self.young_along, self.young_across, self.poisson
         if along is None or across is None or poisson is None:
-            raise MaterialInputError(f"{self} has a gap: take TissueModuli.resolved")
+            raise MaterialInputError(f"{self} has a gap: use TissueModuli.resolved")
         return along, across, poisson
 
 
@@ -270,6 +270,6 @@ def _check_definite(name: str, moduli: MuscleModuli) -> None:
     except MaterialError as error:
         raise MaterialInputError(
             f"moduli of {name} have no positive definite stiffness: {error}; take young_along and "
-            f"young_across within {YOUNG_RANGE[0]:g} to {YOUNG_RANGE[1]:g} MPa, less far from each "
+            f"young_across within {YOUNG_RANGE[0]:g} to {YOUNG_RANGE[1]:g} MPa, closer to each "
             "other, and poisson from 0 to 0.49"
         ) from error

@@ -169,7 +169,7 @@ class Prediction(Frozen):
         """
         if self.predicted_by is None:
             raise CaseInputError(
-                "this prediction does not record what made it: use predict or predict_patient"
+                "this prediction does not record how it was made: use predict or predict_patient"
             )
         return self.predicted_by(self.patient.with_plan(plan), self.model)
 

@@ -63,8 +63,8 @@ class TemplateData(Frozen):
             other = taken.setdefault(muscle.name.lower(), muscle.name)
             if other != muscle.name:
                 raise CaseInputError(
-                    f"muscles {other!r} and {muscle.name!r} differ in capitals alone, "
-                    "which some file systems do not tell apart"
+                    f"muscles {other!r} and {muscle.name!r} differ in capitals alone, which some "
+                    "file systems do not distinguish"
                 )
         object.__setattr__(self, "muscles", muscles)
         object.__setattr__(self, "landmarks", as_landmarks(self.landmarks))

@@ -234,8 +234,8 @@ class _Search:
         if ratio[worst] <= 0.0:
             x, y, z = self.body.nodes[self.body.tets[worst]].mean(axis=0)
             raise SolverError(
-                f"tet {worst} at ({x:.0f}, {y:.0f}, {z:.0f}) mm is inside out after the motion: "
-                "bones close in on tissue there; plan less, or mesh finer"
+                f"tet {worst} at ({x:.0f}, {y:.0f}, {z:.0f}) mm is inverted after the motion: "
+                "bones squeeze the tissue there; plan a smaller motion, or use a finer mesh"
             )
 
     def _settle(self, part: float, tolerance: float) -> float:

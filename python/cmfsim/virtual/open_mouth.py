@@ -60,7 +60,7 @@ class MouthSlit:
         if gap < LEAST_GAP:
             raise CaseInputError(
                 f"lip_gap is {gap:g} mm: {LEAST_GAP:g} mm or more is needed where lips are "
-                "separate, for the mesh does not resolve a narrower slit"
+                "separate, because the mesh does not resolve a narrower slit"
             )
 
     def _drawn(self, points: Floats) -> tuple[Floats, Floats, Floats]:

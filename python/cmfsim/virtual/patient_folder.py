@@ -111,7 +111,7 @@ def virtual_patients(
         place = Path(folder) / patient.name
         settings = patient_settings(patient, seed, edge_length, spacing)
         if is_made(place, settings):
-            _log.info("%s is there already", patient.name)
+            _log.info("%s already exists", patient.name)
             paths.append(place / "case.toml")
             continue
 
@@ -147,7 +147,7 @@ def cohort_text(name: str, patients: Iterable[str]) -> str:
         f'format = "{COHORT_FORMAT}"',
         "version = 1",
         f'name = "{name}"',
-        'note = "in silico: heads made by code and operations computed; no patients"',
+        'note = "in silico: synthetic heads and computed operations; no patients"',
         'output = "study"',
     ]
     for patient in patients:
@@ -259,7 +259,7 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
     shutil.rmtree(fresh, ignore_errors=True)
     _write_truth(fresh, truth, scan, after)
     record = {
-        "what": "in silico: a head made by code and an operation computed; no patient",
+        "what": "in silico: a synthetic head and a computed operation; no patient",
         "settings": patient_settings(patient, seed, edge_length, spacing),
         "patient": _described(patient),
         "motions": {name: matrix.tolist() for name, matrix in truth.motions.items()},

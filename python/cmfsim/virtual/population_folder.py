@@ -168,8 +168,8 @@ def _further(
         return {}
     if earlier.settings != record:
         raise CaseInputError(
-            f"{folder} holds a population with {dict(earlier.settings)}, not {record}: use another "
-            "folder, or the same values"
+            f"{folder} contains a population with {dict(earlier.settings)}, not {record}: use "
+            "another folder, or the same values"
         )
     return {name: entry for name, entry in earlier.patients.items() if name not in wanted}
 

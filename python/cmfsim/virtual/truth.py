@@ -204,7 +204,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     )
     nodes, tets = opened.nodes, opened.tets
 
-    stage("laying the true muscles")
+    stage("placing the true muscles")
     muscles = thickened(head.muscles, patient.muscle_thickness)
     depth = np.maximum(anatomy.skin.sample(nodes), 0.0)
     fraction, fibre = muscle_field(head, muscles, nodes, tets, depth)
@@ -232,7 +232,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
         contact = ContactSum((operation.contact, lips))
     found = find_equilibrium(body, operation.held, operation.path, contact, options)
 
-    stage("carrying the skin along")
+    stage("moving the skin")
     before = head.surface("skin", skin_spacing)
     places, names = np.asarray(before.vertices), list(head.skin_landmarks)
     points = np.array([head.skin_landmarks[name] for name in names])

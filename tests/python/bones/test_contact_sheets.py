@@ -388,7 +388,7 @@ regions = [{segment = "mandible", centre = [0, -160, 1450], radius = 9}]
     with pytest.raises(cmfsim.CaseError, match=f"case.toml:{line} node_kinds: there is no option"):
         cmfsim.build_model(case.write(tmp_path), check=False)
     case.replace("regions = [{", "regions = [3, {")
-    with pytest.raises(cmfsim.CaseError, match="regions is no list of tables"):
+    with pytest.raises(cmfsim.CaseError, match="regions is not a list of tables"):
         cmfsim.Case.load(case.write(tmp_path))
 
 

@@ -168,10 +168,12 @@ SPOILT = {
     "moved-mirrored": [(lambda v, t: (v * [-1.0, 1.0, 1.0], t), "left and right")],
     "moved-still": [(None, "mandible moves by 0 mm at most")],
     "plan-far": [
-        (lambda v, t: (v + [0.0, 80.0, 0.0], t), "lay the scan after on the one before"),
+        (lambda v, t: (v + [0.0, 80.0, 0.0], t), "register the post-operative scan"),
         (lambda v, t: (v * [-1.0, -1.0, 1.0], t), "one file is in LPS, the other in RAS"),
     ],
-    "plan-through-skin": [(lambda v, t: (v - [0.0, 40.0, 0.0], t), "moved through the skin")],
+    "plan-through-skin": [
+        (lambda v, t: (v - [0.0, 40.0, 0.0], t), "moved through the undeformed skin")
+    ],
 }
 
 
@@ -358,7 +360,7 @@ def test_a_trimmed_bone_of_a_case_is_reported_and_its_tissue_follows_the_bone(tm
     ("ratio", "severity", "words"),
     [
         (0.955, "warning", "0.955 times as large after as before"),
-        (1.1, "warning", "near no ratio of two units"),
+        (1.1, "warning", "not close to the ratio of any two units"),
         (10.0, "error", "mm read as cm"),
         (25.4, "error", "mm read as inch"),
         (0.001, "error", "m read as mm"),

@@ -191,7 +191,7 @@ def test_what_cannot_be_registered_is_named():
             )
         assert isinstance(caught.value, ValueError)
     for options, pattern in [
-        ({"resolutions": (2.0, 4.0)}, "must become finer"),
+        ({"resolutions": (2.0, 4.0)}, "each finer than the last"),
         ({"samples": 1}, "samples is 1"),
         ({"least_overlap": 2.0}, "from 0 to 1"),
     ]:

@@ -66,7 +66,7 @@ def test_muscles_of_a_case(tmp_path):
         ('[muscles]\nmixing = "modulus"\n', "case.toml:8.*did you mean 'moduli'"),
         ("[muscles]\nsmoothing = -1\n", "case.toml:8.*at least 0"),
         ("[postoperative]\n", "case.toml:7.*skin, image or bones"),
-        ('[postoperative]\nskin = "a"\nimage = "b"\n', "case.toml:9.*beside skin"),
+        ('[postoperative]\nskin = "a"\nimage = "b"\n', "case.toml:9.*together with skin"),
         ('[postoperative]\nskin = "a"\nbone = "b"\n', "case.toml:9.*did you mean 'bones'"),
     ],
 )

@@ -226,7 +226,7 @@ def test_a_name_twice_in_one_table_is_refused(scene, tmp_path):
         '{"markups": [{"controlPoints": [{"label": "a", "position": [0, 0, 0], '
         '"position": [0, 0, 1]}]}]}'
     )
-    refused(lambda: cmfsim.read_landmarks(tmp_path / "a.mrk.json"), "'position' stands there twice")
+    refused(lambda: cmfsim.read_landmarks(tmp_path / "a.mrk.json"), "'position' appears twice")
 
 
 # Long numbers and deep keys.
@@ -330,7 +330,7 @@ def test_no_reader_waits_for_a_pipe(scene, tmp_path):
 
 def test_no_reader_fails_on_a_strange_name(scene, tmp_path):
     for suffix, read in readers(scene).items():
-        refused(lambda read=read, suffix=suffix: read("a\0b" + suffix), "no file is called so")
+        refused(lambda read=read, suffix=suffix: read("a\0b" + suffix), "no file has that name")
         refused(lambda read=read, suffix=suffix: read("a" * 999 + suffix), "cannot be opened")
         (tmp_path / f"folder{suffix}").mkdir()
         refused(lambda r=read, s=suffix: r(tmp_path / f"folder{s}"), "is a folder")

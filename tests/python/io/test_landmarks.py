@@ -107,7 +107,7 @@ BAD = {
     "not JSON": ("{", "is not JSON"),
     "not markups": ({"points": []}, "no list 'markups'"),
     "a list": ([1], "no list 'markups'"),
-    "no points": (markups({}), "holds no points"),
+    "no points": (markups({}), "contains no placed points"),
     "two numbers": (markups({"a": [1, 2]}), "point 1 is at"),
     "a text": (markups({"a": [1, 2, "3"]}), r"point 1 has the coordinate '3'"),
     "a flag": (markups({"a": [1, 2, True]}), "point 1 has the coordinate True"),
@@ -174,7 +174,7 @@ def test_other_files_are_refused(tmp_path):
     ("name", "points", "pattern"),
     [
         ("points.json", {"a": (0, 0, 0)}, r"\.mrk\.json"),
-        ("points.mrk.json", {}, "holds no points"),
+        ("points.mrk.json", {}, "contains no placed points"),
         ("points.mrk.json", {"": (0, 0, 0)}, "point 1 has no label"),
         ("points.mrk.json", {"a": (0, 0)}, "three numbers"),
         ("points.mrk.json", {"a": (0, np.nan, 0)}, "point 1 has the coordinate nan"),

@@ -436,12 +436,12 @@ def test_gmsh_numbers_of_nodes_are_looked_up(tmp_path):
     assert tets.tolist() == [[0, 1, 2, 3]]
     assert nodes[3].tolist() == [0, 0, 1]
     for node in (0, 9, 41, 2**62):
-        with pytest.raises(cmfsim.CaseError, match=f"names node {node}, which is not there"):
+        with pytest.raises(cmfsim.CaseError, match=f"refers to node {node}, which does not exist"):
             cmfsim.read_tet_mesh(saved(tmp_path, "it.msh", text.format(node)))
     for old, new, match in (
         ("1 4 3 40", "1 5 3 40", "states 5 nodes, its blocks hold 4"),
         ("1 1 1 1\n", "1 2 1 1\n", "states 2 elements, its blocks hold 1"),
-        ("40\n3\n", "3\n3\n", "node 3 stands there twice"),
+        ("40\n3\n", "3\n3\n", "node 3 appears twice"),
         ("0 0 1\n", "0 0 inf\n", "not finite"),
     ):
         with pytest.raises(cmfsim.CaseError, match=match):
@@ -475,7 +475,7 @@ def test_vtk_models_of_slicer_are_read(tmp_path):
 
 def test_files_that_name_other_files_are_refused(tmp_path):
     for name in ("it.xdmf", "it.ele", "it"):
-        refused(saved(tmp_path, name, "<Xdmf/>"), "are not read: save it as .vtu")
+        refused(saved(tmp_path, name, "<Xdmf/>"), "are not supported: save it as .vtu")
 
 
 # What is no file.
@@ -488,7 +488,7 @@ def test_a_pipe_is_not_waited_for(tmp_path):
 
 
 def test_names_that_no_file_can_have_are_refused(tmp_path):
-    with pytest.raises(cmfsim.CaseError, match="no file is called so"):
+    with pytest.raises(cmfsim.CaseError, match="no file has that name"):
         cmfsim.read_surface("a\0b.ply")
     with pytest.raises(cmfsim.CaseError, match="cannot be opened"):
         cmfsim.read_surface("a" * 5000 + ".ply")

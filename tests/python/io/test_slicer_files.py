@@ -224,7 +224,7 @@ def test_a_link_in_a_bundle_is_refused(tmp_path):
 @pytest.mark.parametrize("data", [b"", b"PK\x03\x04", b"no zip at all"])
 def test_a_damaged_bundle_is_a_named_error(tmp_path, data):
     (tmp_path / "scene.mrb").write_bytes(data)
-    with pytest.raises(cmfsim.CaseError, match="no bundle"):
+    with pytest.raises(cmfsim.CaseError, match="not a 3D Slicer bundle"):
         init_case(tmp_path)
 
 
@@ -288,7 +288,7 @@ def test_a_segmentation_becomes_closed_outward_surfaces_where_its_voxels_lie(tmp
         (lambda data: data.replace(b"Segment1_Layer:=1", b"Segment1_Layer:=7"), "layers"),
         (lambda data: data.replace(b"Segment1_Layer:=1", b"Segment1_Layer:=" + 5000 * b"9"), "lay"),
         (lambda data: data.replace(b"encoding: gzip", b"encoding: hex"), "packed as"),
-        (lambda data: data.replace(b"NRRD0004", b"NOPE0004"), "no NRRD"),
+        (lambda data: data.replace(b"NRRD0004", b"NOPE0004"), "not an NRRD"),
     ],
 )
 def test_a_damaged_segmentation_is_a_named_error(tmp_path, change, words):

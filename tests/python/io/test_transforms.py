@@ -134,7 +134,7 @@ def test_a_damaged_hdf5_file_is_an_error(tmp_path):
     whole = good.read_bytes()
     unknown = whole.replace(b"BSplineTransform_double", b"XSplineTransform_double")
     for content, complaint in (
-        (b"#Insight Transform File V1.0\n", "is no HDF5 file"),
+        (b"#Insight Transform File V1.0\n", "is not an HDF5 file"),
         (whole[:2000], "ITK cannot read it: it is damaged"),
         (unknown, "XSplineTransform_double_3_3, which ITK does not have"),
     ):
@@ -241,7 +241,7 @@ ROWS = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 @pytest.mark.parametrize(
     ("name", "text", "complaint"),
     [
-        ("a.h5", "", r"a\.h5: is no HDF5 file"),
+        ("a.h5", "", r"a\.h5: is not an HDF5 file"),
         ("a.xfm", "", r"\.tfm, \.h5, \.txt or \.mat"),
         ("a.tfm", "", "line 1: an ITK transform begins"),
         ("a.tfm", HEAD, "no line 'Transform"),

@@ -184,5 +184,5 @@ def test_the_fat_of_a_case_lies_between_its_muscles():
         0.003,
         0.46,
     )
-    with pytest.raises(ValueError, match="one fat is needed"):
+    with pytest.raises(ValueError, match="must be isotropic"):
         cmfsim.FatModuli.of(cmfsim.TissueData("stiffness", stiffness=np.eye(6)))

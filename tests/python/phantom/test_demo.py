@@ -38,7 +38,7 @@ def test_the_demo_reports_every_model(folder):
         assert summary["solution"]["residual"] < (1e-5 if "S" in model else 1e-12)
     drawn = len(re.findall(r'<img src="data:image/png', page))
     # Prediction, plan, muscles; errors of every model, and their chart.
-    assert drawn == 7 or "Without pictures" in page
+    assert drawn == 7 or "This report has no pictures" in page
 
 
 def test_upper_lip_comes_forward_and_chin_goes_back(folder):
@@ -110,7 +110,7 @@ def test_view_says_what_it_cannot_show(folder, tmp_path, capsys, monkeypatch):
 def test_a_folder_of_others_is_left_alone(tmp_path, capsys):
     (tmp_path / "thesis.txt").write_text("years", encoding="utf-8")
     assert main(["demo", str(tmp_path), *COARSE]) == 2
-    assert "holds other files" in capsys.readouterr().err
+    assert "contains files that are not" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
     assert main(["demo", str(tmp_path / "thesis.txt"), *COARSE]) == 2
     assert main(["demo", str(tmp_path / "new"), "--edge-length", "-1"]) == 2

@@ -172,7 +172,7 @@ def test_surfaces_in_another_frame_are_laid_on_by_the_skull(rounds, tmp_path):
         ('"achieved"', '"achived"', "case.toml:3: plan is 'achived': tables [plan.SEGMENT]"),
         ('"achieved"', "3", "case.toml:3: plan is 3"),
         (BONES, "", "case.toml:3: plan is achieved, and there is no bone"),
-        ('skin = "face_after.ply"', 'image = "ct.nrrd"', "stands beside image"),
+        ('skin = "face_after.ply"', 'image = "ct.nrrd"', "is given together with image"),
     ],
 )
 def test_an_achieved_plan_is_checked_where_the_case_is_read(old, new, words, tmp_path):
@@ -185,7 +185,7 @@ def test_an_achieved_plan_is_checked_where_the_case_is_read(old, new, words, tmp
 def test_what_cannot_be_read_off_is_named(tmp_path):
     head = operated(aligned=False)
     head.replace('cranium = "cranium_after.ply"\n', "")
-    with pytest.raises(cmfsim.CaseError, match="laid on one another by the skull"):
+    with pytest.raises(cmfsim.CaseError, match="aligned on the skull"):
         read_postoperative(cmfsim.Case.load(head.write(tmp_path)))
     head = operated()
     head.replace('mandible = "mandible_after.ply"', 'jaw = "mandible_after.ply"')

@@ -439,7 +439,7 @@ def test_an_output_folder_that_leads_elsewhere_is_refused(tmp_path, case, predic
     (tmp_path / "out").symlink_to(elsewhere)
     for command in ("predict", "build", "evaluate", "sensitivity"):
         assert main([command, str(path), "-q", "--no-doctor"]) == 2
-        assert f"leads out of the case's folder, to {elsewhere}" in capsys.readouterr().err
+        assert f"points outside the case's folder, to {elsewhere}" in capsys.readouterr().err
     assert not list(elsewhere.iterdir())
     words = ["predict", str(path), "-q", "--no-doctor", "--model", "H", "-o", str(tmp_path / "out")]
     assert main(words) == 0

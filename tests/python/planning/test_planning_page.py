@@ -197,7 +197,7 @@ def test_a_prediction_is_planned_again_as_the_model_solves_it(planning, referenc
     assert again.summary["case_key"] != reference.summary["case_key"]
     with pytest.raises(cmfsim.CaseError, match="'skull'; segments are"):
         reference.replan({"skull": np.eye(4)})
-    with pytest.raises(cmfsim.CaseError, match="does not record what made it"):
+    with pytest.raises(cmfsim.CaseError, match="does not record how it was made"):
         dataclasses.replace(reference, predicted_by=None).replan({})
 
 

@@ -133,7 +133,7 @@ def test_a_failed_run_gives_the_words_of_the_doctor(tmp_path):
     code, answer = run.code, run.answer()
     run.close()
     assert code == 2
-    assert "lacks [image] or [surfaces]" in running.words_of(answer)
+    assert "needs [image] or [surfaces]" in running.words_of(answer)
 
 
 def test_stages_are_those_that_cmfsim_prints(ran):

@@ -85,7 +85,7 @@ def test_a_build_stops_where_the_maxilla_was_taken_for_the_mandible(tmp_path):
     child = cmfsim.make_head(cmfsim.HeadParameters(scale=0.85, lip_gap=8.0, bite_gap=6.0))
     cmfsim.write_image(child.ct(3.0), tmp_path / "ct.nrrd")
     (tmp_path / "case.toml").write_text(CASE, encoding="utf-8")
-    with pytest.raises(cmfsim.LandmarkError, match=r"mandible is none.*by hand"):
+    with pytest.raises(cmfsim.LandmarkError, match=r"mandible is not one.*by hand"):
         cmfsim.build_case(tmp_path / "case.toml")
 
 

@@ -46,7 +46,9 @@ def test_a_bar_pushed_to_half_its_length_says_which_tets_inverted(caplog):
     assert result.summary["inverted_tets"] == count
     (said,) = (cmfsim.Finding.from_values(entry) for entry in result.summary["findings"])
     assert (said.severity, said.code) == ("warning", "inverted-tets")
-    assert said.what.startswith(f"{count} of {len(rest)} tets rest inverted; worst is tet {worst},")
+    assert said.what.startswith(
+        f"{count} of {len(rest)} tets are inverted at equilibrium; the worst is tet {worst},"
+    )
     assert f"at {ratios[worst]:.2g} of its volume" in said.what
     middle = result.nodes[result.tets[worst]].mean(axis=0)
     assert said.where.startswith("({:.1f}, {:.1f}, {:.1f}) mm".format(*middle))

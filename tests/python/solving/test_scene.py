@@ -220,7 +220,7 @@ def test_surfaces_of_repeated_vertices_are_welded(tmp_path):
         ('"tissue.vtu"', '"/etc/passwd"', "folder of the scene"),
         ('"floor.ply"', '"scene.toml"', "cannot be read as a mesh"),
         ("poisson = 0.4", "", "lacks 'poisson'"),
-        ("poisson = 0.4", "poisson = 0.4\nyoung = 1.0", "drop one"),
+        ("poisson = 0.4", "poisson = 0.4\nyoung = 1.0", "remove one"),
         ("poisson = 0.4", "poison = 0.4", "unknown key 'poison'"),
         ('kind = "isotropic"', 'kind = "rubber"', "tissue kind is 'rubber'"),
         ("[plan.bone]", "[plan.chin]", "'chin'"),

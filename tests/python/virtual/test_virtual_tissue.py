@@ -405,7 +405,7 @@ def test_bones_that_close_on_tissue_are_an_error_that_says_where():
     held = np.arange(len(nodes))
     move = np.zeros_like(nodes)
     move[:, 2] = -1.2 * nodes[:, 2]
-    with pytest.raises(SolverError, match=r"tet \d+ at .* mm is inside out"):
+    with pytest.raises(SolverError, match=r"tet \d+ at .* mm is inverted"):
         find_equilibrium(body, held[:-1], lambda part: part * move[:-1])
 
 

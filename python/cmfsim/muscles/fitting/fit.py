@@ -328,7 +328,7 @@ def _findings(done: Mapping[str, FittedMuscle]) -> Iterator[Finding]:
         f"outside the skin, now {after:.0%}; {furthest} moved most, by up to "
         f"{done[furthest].largest_move:.1f} mm",
         where="muscles",
-        why="landmarks lie on the skull and do not show how thick the tissue is",
+        why="landmarks lie on the skull, so they do not show how thick the tissue is",
         fix="nothing; fit = false in [muscles] keeps them where landmarks put them",
     )
     for name, muscle in done.items():

@@ -59,7 +59,7 @@ _EXCHANGED_NAMES = Finding.note(
     "exchanged them",
     where="masseter_superficial, masseter_deep (FMA49001 to FMA49005)",
     why="only the names are affected: each keeps its own place and direction",
-    fix="mind it where a name is read as anatomy",
+    fix="keep it in mind where a name is read as anatomy",
 )
 
 
@@ -186,7 +186,7 @@ def _verified(folder: Path, *, must_be_known: bool) -> list[Finding]:
     if not other:
         return []
     named = ", ".join(f"{name}.obj" for name in other[:3]) + (", …" if len(other) > 3 else "")
-    what = f"{len(other)} of {len(HASHES)} files have other SHA-256 hashes than known: {named}"
+    what = f"{len(other)} of {len(HASHES)} files do not have the known SHA-256 hashes: {named}"
     fix = f"download them again from {WHERE}"
     if must_be_known:
         raise CaseInputError(f"{folder.name}: {what}; {fix}, or import with verification off")
@@ -237,7 +237,7 @@ def _both_sides(
         f"the {sides[1]} one ({bad.concept}: {bad.volume:.0f} mm³, {bad.damage[2]} pieces) is "
         f"mirrored from the {sides[0]} one ({good.concept}: {good.volume:.0f} mm³)",
         where=f"{pair.name}_{'R' if left_is_better else 'L'}",
-        why="its file has lost a part of it",
+        why="part of it is missing from its file",
         fix="look at the muscle; nothing to do",
     )
     surfaces = (good.surface, mirrored) if left_is_better else (mirrored, good.surface)
@@ -249,7 +249,7 @@ def _mirrored(surface: SurfaceData, landmarks: Mapping[str, Floats]) -> SurfaceD
     vectors = side_vectors(landmarks)
     if not vectors:
         raise LandmarkInputError(
-            "a broken muscle is to be mirrored, but no landmark is given on both sides (_L and _R)"
+            "a broken muscle must be mirrored, but no landmark is given on both sides (_L and _R)"
         )
     across = np.mean(list(vectors.values()), axis=0)
     normal = across / np.linalg.norm(across)

@@ -104,8 +104,8 @@ def _listed(names: list[str]) -> str:
 
 def _check_terms(template: TemplateData) -> Iterator[Finding]:
     for key, why in (
-        ("attribution", "most licences ask that its makers are named"),
-        ("source", "nobody can tell where it comes from"),
+        ("attribution", "most licences require attribution"),
+        ("source", "its origin is unknown"),
     ):
         if not getattr(template, key):
             yield Finding.warning(
@@ -140,7 +140,7 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
             + (f"; without a definition: {_listed(undefined)}" if undefined else ""),
             where=template.name,
             why="only patients with landmarks of the same names can use them",
-            fix="say where they lie under [landmarks.definitions], or take the usual names",
+            fix="describe where they lie under [landmarks.definitions], or use the usual names",
         )
     points = np.array(list(template.landmarks.values()))
     pairs = _coincident(points)
@@ -149,7 +149,7 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
             "template-landmarks-coincide",
             f"{names[one]} and {names[other]} lie in the same place",
             where=template.name,
-            why="no map takes one place to two",
+            why="no map can take one place to two",
             fix="place one of them again",
         )
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
@@ -159,7 +159,7 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
             "template-landmarks-flat",
             f"four landmarks that do not lie in a plane are needed: {found}",
             where=template.name,
-            why="the map to a patient has no third direction",
+            why="the map to a patient is undefined in the third direction",
             fix="place more landmarks",
         )
 
@@ -182,10 +182,10 @@ def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Ite
             + ("every pair" if everything else f"{len(swapped)} pairs")
             + f": {_listed(swapped)}",
             where=template.name,
-            why="muscles would be turned inside out on the way to a patient",
+            why="muscles would be inverted when they are fitted to a patient",
             fix="the set is mirrored, or in another frame than LPS"
             if everything
-            else "exchange their labels: _L is the patient's left, at greater x in LPS",
+            else "swap their labels: _L is the patient's left, at greater x in LPS",
         )
     if skull is None:
         return
@@ -197,7 +197,7 @@ def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Ite
                 f"{name} lies {distance:.1f} mm from the skull reference (at most "
                 f"{LANDMARK_DISTANCE:g})",
                 where=template.name,
-                why="muscles follow it to where no bone is",
+                why="muscles would follow it to a place without bone",
                 fix="place it on the bone, in the frame and units of the skull reference",
             )
 
@@ -211,7 +211,7 @@ def _check_skull(template: TemplateData) -> Iterator[Finding]:
             "template-skull-size",
             f"the skull reference is {extent:.3g} mm long (a head has {low:g} to {high:g})",
             where=template.name,
-            why="it is in another unit than mm, or no skull",
+            why="its unit is not mm, or it is not a skull",
             fix='state the unit of the files: units = "cm"',
         )
 
@@ -226,7 +226,7 @@ def _check_partners(template: TemplateData) -> Iterator[Finding]:
                 "template-side-name",
                 f"the side is {muscle.side!r}, the name ends in {ending or 'no side'!r}",
                 where=muscle.name,
-                why="muscles are addressed by names that say their side",
+                why="muscles are addressed by names that state their side",
                 fix="end the name in _L or _R, or in neither for side both",
             )
         elif ending:
@@ -236,7 +236,7 @@ def _check_partners(template: TemplateData) -> Iterator[Finding]:
                     "template-partner-missing",
                     f"there is no {partner}",
                     where=muscle.name,
-                    why="a face with a muscle on one side alone is drawn to that side",
+                    why="a muscle on one side only pulls the face to that side",
                     fix="add it, mirrored if need be",
                 )
             elif muscle.side == "L" and kinds[partner] != muscle.kind:
@@ -257,7 +257,7 @@ def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Find
             f"it encloses {report.volume:.0f} mm³: normals point inwards",
             where=muscle.name,
             why="inside and outside are exchanged",
-            fix="turn its triangles round (cmfsim.repair_surface)",
+            fix="flip its triangles (cmfsim.repair_surface)",
         )
     if not report.is_closed:
         length = sum(loop.length for loop in report.borders)
@@ -274,15 +274,16 @@ def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Find
             f"{len(report.non_manifold)} edges of more than two triangles, {report.inconsistent} "
             "between triangles that face opposite ways",
             where=muscle.name,
-            why="which side is inside is not certain there",
+            why="the inside is ambiguous there",
             fix="repair it (cmfsim.repair_surface)",
         )
     if report.crossings is not None and len(report.crossings):
         yield Finding.note(
             "template-crosses-itself",
-            f"{len(report.crossings)} pairs of triangles cut through each other",
+            f"{len(report.crossings)} pairs of triangles intersect",
             where=muscle.name,
-            why="winding numbers above ½ count as inside, so that only folds of the surface suffer",
+            why="winding numbers above ½ count as inside, so only folds of the surface are "
+            "affected",
             fix="nothing, if the muscle looks right",
         )
     if skull is None or not len(np.asarray(muscle.surface.vertices)):
@@ -291,9 +292,10 @@ def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Find
     if nearest > MUSCLE_DISTANCE:
         yield Finding.warning(
             "template-far-from-skull",
-            f"it comes no nearer to the skull than {nearest:.0f} mm (at most {MUSCLE_DISTANCE:g})",
+            f"its distance from the skull is never below {nearest:.0f} mm (at most "
+            f"{MUSCLE_DISTANCE:g})",
             where=muscle.name,
-            why="it lies in another frame or unit than the skull, or is no muscle of the face",
+            why="it lies in another frame or unit than the skull, or is not a muscle of the face",
             fix="bring both into one frame",
         )
     body = _searchable(muscle.surface)
@@ -326,5 +328,5 @@ def _check_sides(template: TemplateData) -> Iterator[Finding]:
                 f"it lies {-across:.0f} mm to the right of {partner}",
                 where=muscle.name,
                 why="left and right are exchanged",
-                fix="exchange the names, or correct the frame: x grows to the patient's left",
+                fix="swap the names, or correct the frame: x grows to the patient's left",
             )

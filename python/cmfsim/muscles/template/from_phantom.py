@@ -79,7 +79,7 @@ def phantom_template(
         definitions=SKULL_LANDMARKS,
         licence="MIT OR Apache-2.0",
         attribution="The cmfsim maintainers",
-        source="cmfsim.phantom: a head made by code, no image of a person",
+        source="cmfsim.phantom: a synthetic head, no image of a person",
     )
 
 

@@ -229,7 +229,7 @@ def _agreement(matched: LandmarkMatch) -> tuple[LandmarkAgreement | None, list[F
         left_out = leave_one_out(matched.source, matched.target, matched.names)
     except LandmarkError as error:
         what = f"no landmark can be judged by the others: {error}"
-        why = "a misplaced landmark would not be noticed"
+        why = "a misplaced landmark would go unnoticed"
         finding = Finding.note(
             "template-landmarks-few", what, where="landmarks", why=why, fix="place more"
         )
@@ -241,9 +241,9 @@ def _agreement(matched: LandmarkMatch) -> tuple[LandmarkAgreement | None, list[F
     listed = ", ".join(away[:MOST_NAMES]) + (", …" if len(away) > MOST_NAMES else "")
     finding = Finding.warning(
         "template-landmarks-disagree",
-        f"{len(away)} landmarks lie out of line from where the others put them: {listed}",
+        f"{len(away)} landmarks are far from where the others place them: {listed}",
         where="landmarks",
-        why="each draws the muscles near it along, and its neighbours out of line",
+        why="each pulls the muscles near it along, and makes its neighbours look misplaced",
         fix="look at the first in both heads; place it again, or leave it out, and morph again",
     )
     return left_out, [finding]
@@ -280,9 +280,9 @@ def _fold_finding(folds: Mapping[str, int], worst: tuple[float, str, Floats]) ->
     where = ", ".join(f"{x:.1f}" for x in place)
     return Finding.warning(
         "template-folds",
-        f"the map turns {sum(folds.values())} vertices of {len(folds)} muscles inside out, worst "
-        f"in {name} (Jacobian {smallest:.2g})",
+        f"the map turns {sum(folds.values())} vertices of {len(folds)} muscles inside out, most "
+        f"severely in {name} (Jacobian {smallest:.2g})",
         where=f"template, at ({where}) mm",
-        why="muscles overlap themselves there, and their fibres run astray",
+        why="muscles overlap themselves there, and their fibres point in wrong directions",
         fix="look at the landmarks near there, or smooth the map",
     )

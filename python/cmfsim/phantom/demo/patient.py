@@ -42,13 +42,14 @@ MOST_TRIANGLES = 1_000_000
 
 MARK = "# cmfsim demo: written by this command, and overwritten by it."
 NOTE = (
-    "No patient: a head made by code (class III), and an operation of ordinary size. Skin, bones "
-    "and airway come straight from the formulas that draw the head, so that nothing was scanned or "
-    "segmented (cmfsim phantom writes a head with its CT). Tets are coarse to be fast."
+    "No patient: a synthetic head (class III) and an operation of ordinary size. Skin, bones and "
+    "airway come straight from the formulas that define the head, so nothing was scanned or "
+    "segmented (cmfsim phantom writes a head with its CT). The tets are coarse, for speed."
 )
 IN_SILICO = (
-    " The face after the operation is computed, too, by other equations on a finer mesh with other "
-    "muscles (in silico): errors show how the models differ from it, not how they do on patients."
+    " The face after the operation is computed as well, by other equations on a finer mesh with "
+    "other muscles (in silico): errors show how the models differ from it, not how accurate they "
+    "are on patients."
 )
 CASE = """\
 {mark}
@@ -178,13 +179,13 @@ def write_demo_case(
 def _check_folder(folder: Path) -> None:
     """Refuses a folder that holds what the demo did not write."""
     if folder.exists() and not folder.is_dir():
-        raise CaseInputError(f"{folder}: is a file; name a folder for the demo")
+        raise CaseInputError(f"{folder}: is a file; choose a folder for the demo")
     if not folder.is_dir() or not any(folder.iterdir()):
         return
     case = folder / "case.toml"
     if not case.is_file() or not case.read_bytes().startswith(MARK.encode()):
         raise CaseInputError(
-            f"{folder}: holds other files than the demo's; name a new or an empty folder"
+            f"{folder}: contains files that are not the demo's; choose a new or empty folder"
         )
 
 

@@ -114,7 +114,7 @@ def untouched(
         findings.append(
             Finding.warning(
                 "segment-touches-no-tissue",
-                f"{what}; it lies beyond the meshed tissue, and the case does not name it",
+                f"{what}; it lies beyond the meshed tissue, and the case does not mention it",
                 where=where,
                 why="its motion does not reach the face",
                 fix="if it belongs to the face, widen [region]",

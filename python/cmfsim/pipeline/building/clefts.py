@@ -47,11 +47,10 @@ def without_clefts(
     finding = Finding.note(
         "clefts-left-out",
         f"{int(inside.sum())} tets of {volume:.0f} mm³ in all lie in the clefts between segments "
-        f"and were left out: of two segments they are less than {width:g} mm away, taken together",
+        f"and were left out: their distances from two segments add up to less than {width:g} mm",
         where=f"segments {', '.join(sorted(moved))}",
-        why="between tooth rows there is air, and at a cut tissue is lifted off the bone: "
-        "stretched "
-        "across, tets would turn inside out and hold the bones back",
+        why="there is air between the tooth rows, and at a cut the tissue is lifted off the bone: "
+        "tets stretched across would be inverted and hold the bones back",
         fix="set cleft in [mesh] to another width, or to 0 to keep all tissue",
     )
     return left, NodeKinds(kinds.kind[used], kinds.segment[used], kinds.segments), (finding,)

@@ -179,11 +179,11 @@ def _mostly(inside: NDArray[np.bool_], bone: NDArray[Any]) -> bool:
 def _bears_both(name: str) -> Finding:
     return Finding.note(
         "contact-sheet-both-arches",
-        f"{name!r} bears the upper and the lower teeth: tissue slides on the blurred bone, for one "
-        "sheet cannot go on past the edges of both",
+        f"{name!r} bears the upper and the lower teeth: tissue slides on the smoothed bone, "
+        "because one sheet cannot extend past the edges of both",
         where=f"segment {name}",
         why="lips and cheeks move with both jaws, which move as one",
-        fix="part the jaws in the image or surfaces if one of them moves alone",
+        fix="separate the jaws in the image or surfaces if one of them moves alone",
     )
 
 

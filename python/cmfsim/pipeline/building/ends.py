@@ -70,7 +70,9 @@ def _near_ends(
             room = sign * (end - place)
             # The plane lies some voxels inside the image where the head was cut off there.
             cut = abs(end - border) < NEAR_END
-            how = "use a scan that goes further" if cut else f"move {key} in [region] further away"
+            how = (
+                "use a scan that extends further" if cut else f"move {key} in [region] further away"
+            )
             yield Finding.warning(
                 "segment-near-end",
                 f"{segment.name}, which moves, "
@@ -82,7 +84,7 @@ def _near_ends(
                 + f", on which all tissue is fixed (at least {NEAR_END:g} mm is needed)",
                 where=f"{segment.name} at z = {place:.1f} mm",
                 why=f"tissue {side} it cannot follow: the face there moves too little, or not at "
-                "all" + (", for the image ends there" if cut else ""),
+                "all" + (", because the image ends there" if cut else ""),
                 fix=f"{how}, or leave that part of the face out of the evaluation",
             )
 
@@ -110,8 +112,8 @@ def _loose_ends(
                 f"the tissue ends on the {name} border of the image over {area:.0f} mm², and "
                 "nothing is fixed there",
                 where=f"{name} border, {'xyz'[axis]} = {end[axis]:.1f} mm",
-                why="what lies beyond would hold the tissue back: near that border the face moves "
-                "too far",
+                why="the missing tissue would hold the face back: near that border it moves too "
+                "far",
                 fix="use an image that holds the whole face"
                 + (
                     ", or bring the posterior plane inside it (posterior_depth in [region])"

@@ -39,8 +39,8 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
         return mesh, kinds, ()
     if loose.all():
         raise MeshInputError(
-            "no part of the tissue is held: no node lies on the posterior plane or on a bone; "
-            "check that bones and skin are in one frame, and the posterior plane"
+            "the tissue is not attached anywhere: no node lies on the posterior plane or on a "
+            "bone; check that bones and skin are in one frame, and the posterior plane"
         )
     dropped = loose[body]
     keep_node = np.zeros(mesh.n_nodes, dtype=bool)
@@ -57,11 +57,11 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
         "were "
         "left out",
         where=f"mesh, about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
-        why="nothing says where they would go",
-        fix="nothing: they are specks beside the face"
+        why="nothing determines where they would move",
+        fix="nothing: they are specks outside the face"
         if speck
-        else "check skin and bone near there; a larger bone threshold or closing may have parted "
-        "them",
+        else "check skin and bone near there; a larger bone threshold or closing may have cut "
+        "them off",
     )
     left = NodeKinds(kinds.kind[keep_node], kinds.segment[keep_node], kinds.segments)
     return kept, left, (finding,)

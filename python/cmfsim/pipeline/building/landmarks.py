@@ -56,10 +56,10 @@ def found_landmarks(
     found = head.landmarks
     if found.impossible_jaw and case.image is not None:
         raise LandmarkInputError(
-            f"{case.where('image.file')}: the jaws of the image could not be separated: what was "
-            f"taken for the mandible is none: {found.impossible_jaw}. Place the landmarks of the "
-            "skull by hand (menton, gonion, supradentale, infradentale, occlusal_line, ...) and "
-            "name the file under [landmarks], or give surfaces of both bones"
+            f"{case.where('image.file')}: the jaws in the image could not be separated: what was "
+            f"taken for the mandible is not one: {found.impossible_jaw}. Place the landmarks of "
+            "the skull by hand (menton, gonion, supradentale, infradentale, occlusal_line, ...) "
+            "and name the file under [landmarks], or give surfaces of both bones"
         )
     if head.anatomy is not anatomy:
         stages.drop({BY_SHAPE})

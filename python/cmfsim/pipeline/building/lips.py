@@ -105,7 +105,7 @@ def separated_at_seam(
             "lips-apart",
             "the image shows the lips apart as far as the teeth: there was no tissue to separate",
             where="lips",
-            why="they are kept apart by contact all the same",
+            why="contact still keeps them apart",
             fix="none is needed",
         )
         return mesh, kinds, (finding,)

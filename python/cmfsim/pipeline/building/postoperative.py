@@ -110,9 +110,9 @@ def _laid_on(case: Case, bones: Mapping[str, SurfaceData]) -> Floats:
     name = next((n for n in REFERENCES if n in bones and n in before), None)
     if name is None or case.surfaces is None:
         raise CaseInputError(
-            f"{case.where('postoperative.aligned')}: surfaces are laid on one another by the "
-            f"skull: name it ({' or '.join(REFERENCES)}) in [surfaces.bones] and in "
-            "[postoperative.bones], or align them first and write aligned = true"
+            f"{case.where('postoperative.aligned')}: surfaces are aligned on the skull: list it "
+            f"({' or '.join(REFERENCES)}) in [surfaces.bones] and in [postoperative.bones], or "
+            "align them first and write aligned = true"
         )
     still = read_surface(before[name], units=case.surfaces.units, frame=case.surfaces.frame)
     after = bones[name]
@@ -130,7 +130,7 @@ def _laid_on(case: Case, bones: Mapping[str, SurfaceData]) -> Floats:
             f"fits best (allowed {LARGEST_RMS:g} mm): align the surfaces yourself, by the skull "
             "above the jaws, and write aligned = true"
         )
-    _log.info("%s after the operation laid on the one before: %.2f mm rms", name, fit.rms)
+    _log.info("%s after the operation aligned with the one before: %.2f mm rms", name, fit.rms)
     return np.asarray(fit.matrix, dtype=np.float64)
 
 

@@ -70,7 +70,7 @@ def init_case(
     folder = path.parent if is_scene else path
     case_file = folder / CASE_FILE
     if case_file.exists() and not force:
-        raise CaseInputError(f"{case_file}: is there already; --force replaces it")
+        raise CaseInputError(f"{case_file}: already exists; --force replaces it")
     with tempfile.TemporaryDirectory(prefix="cmfsim-init-") as unpacked:
         draft = _drafted(folder, path if is_scene else None, Path(unpacked), progress)
     if draft.files:

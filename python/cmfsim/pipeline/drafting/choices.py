@@ -79,7 +79,7 @@ def _no_ct(find: ImageFind) -> str:
     if find.error:
         return f"cannot be read: {find.error}"
     if find.modality not in {"", "CT"}:
-        return f"its header says {find.modality}, which is no CT"
+        return f"its header says {find.modality}, which is not a CT"
     low, high = find.values
     if low >= 0.0 and high <= 20.0:
         return f"its values are {low:g} to {high:g}: labels, not a CT"
@@ -93,7 +93,7 @@ def _check_values(images: Images, find: ImageFind) -> None:
     if asked:
         offset = OFFSET_RANGE[0] <= high <= OFFSET_RANGE[1]
         images.rescale = (
-            f"values are {low:g} to {high:g}: a CT in HU has air at -1000. What takes them to HU?",
+            f"values are {low:g} to {high:g}: a CT in HU has air at -1000. How do they become HU?",
             (
                 "[1, -1024], if 1024 was added to HU"
                 + (", as this range suggests" if offset else ""),

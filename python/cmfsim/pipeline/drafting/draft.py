@@ -97,9 +97,11 @@ def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
     draft = _decide(found, unpacked)
     taken = _taken(draft)
     text = draft.text
-    text.comment("Written by cmfsim init. Read every line: it states what each file was taken for.")
-    text.comment('A line with "?" has to be decided first: cmfsim doctor refuses the case until')
-    text.comment("then, and repeats the question. Not a medical device.")
+    text.comment("Written by cmfsim init. Read every line: each states what a file was taken for.")
+    text.comment(
+        'A line with "?" must be decided first: until then, cmfsim doctor refuses the case'
+    )
+    text.comment("and repeats the question. Not a medical device.")
     text.comment()
     for entry in taken:
         mark = "?" if entry.question or not entry.taken_for else entry.taken_for
@@ -107,7 +109,9 @@ def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
     text.lines += ["", 'format = "cmfsim-case"', "version = 1", f"name = {quoted(name)}"]
     achieved = not draft.plan.motions and _has_after(draft)
     if achieved:
-        text.value("plan", '"achieved"', "read off the bones after the operation: no plan is given")
+        text.value(
+            "plan", '"achieved"', "read from the bones after the operation: no plan is given"
+        )
     _write_head(draft)
     _write_landmarks(draft)
     if not achieved:
@@ -293,8 +297,8 @@ def _surface_path(draft: _Draft, find: SurfaceFind, name: str) -> str:
     reference = draft.reference if find.in_scene and not draft.by_image else np.eye(4)
     if draft.anatomy.asks("units") is not None:
         raise CaseInputError(
-            f"{find.label} is {find.extent.max():.4g} long: a scene of 3D Slicer is in mm, so that "
-            "its transforms and this surface do not fit: scale it to mm, and save the scene again"
+            f"{find.label} is {find.extent.max():.4g} long: a scene of 3D Slicer is in mm, so its "
+            "transforms do not fit this surface: scale it to mm, and save the scene again"
         )
     vertices = draft.anatomy.placed(find) @ reference[:3, :3].T + reference[:3, 3]
     surface = SurfaceData(vertices, find.surface.triangles)
@@ -307,7 +311,7 @@ def _surface_path(draft: _Draft, find: SurfaceFind, name: str) -> str:
 def _write_landmarks(draft: _Draft) -> None:
     text, marks = draft.text, draft.marks
     if not marks.skull and not marks.skin and not marks.questions:
-        text.table("landmarks", "no file of landmarks is there")
+        text.table("landmarks", "there is no file of landmarks")
         if not _shows_skull(draft):
             text.comment("Cuts by procedures and muscles are placed from those of the skull:")
             text.comment(
@@ -315,7 +319,7 @@ def _write_landmarks(draft: _Draft) -> None:
             )
             return
         text.value("automatic", "true", "they will be found on bone and skin")
-        text.comment('"cmfsim landmarks case.toml" shows them, with the error to be expected, and')
+        text.comment('"cmfsim landmarks case.toml" shows them, with the expected error, and')
         text.comment("writes files to correct and name here: skull = ..., skin = ... (.mrk.json).")
         return
     text.table("landmarks")

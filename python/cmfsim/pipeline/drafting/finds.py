@@ -184,7 +184,7 @@ def listing(folder: Path) -> Listing:
     for count, path in enumerate(_files(folder)):
         if count >= MAX_FILES:
             raise CaseInputError(
-                f"{folder}: holds more than {MAX_FILES} files: name the folder of one patient"
+                f"{folder}: contains more than {MAX_FILES} files: give the folder of one patient"
             )
         name = path.name.lower()
         kind = (

@@ -152,8 +152,8 @@ def _gather_scene(
     if scene is None and len(paths.scenes) > 1:
         names = ", ".join(found.shown(path) for path in paths.scenes)
         raise CaseInputError(
-            f"{found.folder}: holds {len(paths.scenes)} scenes of 3D Slicer ({names}): name the "
-            f"one that is meant, such as cmfsim init {paths.scenes[0]}"
+            f"{found.folder}: holds {len(paths.scenes)} scenes of 3D Slicer ({names}): give the "
+            f"right one, such as cmfsim init {paths.scenes[0]}"
         )
     if scene is None:
         scene = next(iter(paths.scenes), None)

@@ -163,7 +163,7 @@ def _ask_whose(
 def _unusual(name: str, find: SurfaceFind, words: str) -> tuple[str, tuple[str, ...]]:
     """Why a motion that a scene has may be none of the plan."""
     if name == "cranium":
-        return "the scene moves the cranium against the skin: is that planned?", (
+        return "the scene moves the cranium relative to the skin: is that planned?", (
             f"it {words}",
             "remove this table if it stays, or rename it and write the matrix below",
         )
@@ -221,7 +221,7 @@ def file_motions(plan: Plan, found: Sequence[TransformFind], *, by_slicer: bool)
         try:
             motion = _of_file(plan, name, find, by_slicer=by_slicer)
         except (CmfsimError, OSError) as error:
-            plan.others.append(OtherFind(find.label, f"is no rigid motion of {name}: {error}"))
+            plan.others.append(OtherFind(find.label, f"is not a rigid motion of {name}: {error}"))
             text = f"{find.label} cannot be used: {error}"
             plan.motions[name] = DraftMotion("", (), None, '"?"', text, ("or remove this table",))
             continue

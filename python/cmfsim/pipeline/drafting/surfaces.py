@@ -135,7 +135,7 @@ def _by_part(anatomy: Anatomy, found: Iterable[SurfaceFind]) -> dict[str, list[S
     parts: dict[str, list[SurfaceFind]] = {}
     for find in found:
         if find.role.part == "other":
-            why = f"its name says {find.role.word!r}, which is no bone of a case"
+            why = f"its name says {find.role.word!r}, which is not a bone of a case"
             anatomy.taken.append(Taken(find.label, "not used", why))
         else:
             parts.setdefault(find.role.part, []).append(find)
@@ -179,7 +179,7 @@ def _choose_bones(anatomy: Anatomy, parts: dict[str, list[SurfaceFind]]) -> None
         parts["cranium"] = whole
         whole = []
     for find in whole:
-        why = "the bones are given one by one; its name says all of them in one"
+        why = "the bones are given one by one; by its name it is all of them in one"
         anatomy.taken.append(Taken(find.label, "not used", why))
     for part in ("cranium", *MOVING):
         named = _moved_alone(anatomy, parts.get(part, []))
@@ -240,8 +240,8 @@ def _check_pieces(anatomy: Anatomy) -> None:
         name, share = max(inside.items(), key=lambda entry: entry[1])
         piece = anatomy.bones.pop(name)
         text = (
-            f"{piece.label} lies in {whole.label} ({share:.0%} of it): the bone would be there "
-            "twice. Which is right?"
+            f"{piece.label} lies in {whole.label} ({share:.0%} of it): the bone would be in the "
+            "case twice. Which is right?"
         )
         cut = {"maxilla": "le_fort_1", "midface": "le_fort_3", "chin": "genioplasty"}
         procedure = cut.get(name, "bsso")

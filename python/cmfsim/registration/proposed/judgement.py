@@ -124,7 +124,7 @@ def _own(points: Mapping[str, Floats], pose: Pose) -> dict[str, Floats]:
 def _impossible(off: Mapping[str, float], gone: dict[str, str]) -> None:
     for name, distance in off.items():
         if distance > IMPOSSIBLE:
-            gone.setdefault(name, "what was found there does not fit the other sites of any head")
+            gone.setdefault(name, "what was found there does not fit the other sites")
 
 
 def _below_a_cut_chin(

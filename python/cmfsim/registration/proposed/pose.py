@@ -185,8 +185,8 @@ def _fitted(
     if residual > WORST_FIT:
         raise LandmarkInputError(
             f"the bones lie {residual:.1f} mm from an average skull wherever it is placed (at most "
-            f"{WORST_FIT:g} mm allowed): they show no head, or one turned by more than 30°; place "
-            "the landmarks by hand"
+            f"{WORST_FIT:g} mm allowed): they are not a head, or one turned by more than 30°; "
+            "place the landmarks by hand"
         )
     axes = linear / scale @ upright
     origin = centre - upright.T @ (np.linalg.solve(linear, offset))

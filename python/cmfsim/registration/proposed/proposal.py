@@ -138,8 +138,7 @@ def _check_head(skull: Mapping[str, Floats]) -> None:
     if len(cranial) < LEAST_SITES or not any(n.startswith("suborbital") for n in cranial):
         raise LandmarkInputError(
             f"{len(cranial)} sites of the cranium were found, {LEAST_SITES} and an orbit are "
-            "needed: the bones show no face, or lie otherwise than LPS says; place the landmarks "
-            "by hand"
+            "needed: the bones do not show a face, or are not in LPS; place the landmarks by hand"
         )
 
 

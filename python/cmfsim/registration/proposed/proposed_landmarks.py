@@ -80,8 +80,8 @@ class ProposedLandmarks:
         typical = sorted(s.error for s in (*self.skull.values(), *self.skin.values()))
         yield Finding.note(
             "landmarks-proposed",
-            f"{count} landmarks were found automatically, none was placed by a person; expected "
-            f"error {typical[len(typical) // 2]:.1f} mm (median), {typical[-1]:.1f} mm (largest)",
+            f"{count} landmarks were found automatically; none was placed by hand; expected error "
+            f"{typical[len(typical) // 2]:.1f} mm (median), {typical[-1]:.1f} mm (largest)",
             where="landmarks",
             why="cuts, muscles, the region and the lips are placed from them",
             fix='"cmfsim landmarks case.toml" writes them with a picture: check them in 3D Slicer '
@@ -105,7 +105,7 @@ class ProposedLandmarks:
                         "landmark-doubtful",
                         f"{name} ({kind}) at ({x:.1f}, {y:.1f}, {z:.1f}) is doubtful: {site.doubt}",
                         where=f"landmarks.{kind}",
-                        why="it was proposed, and what is placed from it follows its error",
+                        why="whatever is placed from it inherits its error",
                         fix='look at it in the picture of "cmfsim landmarks", and place it by hand '
                         "where it is wrong",
                     )
@@ -116,6 +116,6 @@ class ProposedLandmarks:
                     "landmarks-missing",
                     f"{len(names)} {kind} landmarks were not found: {', '.join(names)}: {reason}",
                     where=f"landmarks.{kind}",
-                    why="they are left out rather than guessed; what needs them is refused",
+                    why="they are omitted rather than guessed; whatever needs them is refused",
                     fix="place them by hand if the image shows them",
                 )
