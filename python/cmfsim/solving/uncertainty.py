@@ -73,6 +73,7 @@ ADDED = (
     Source("thickness change", 0.05, "share", "assumed: share of the depth of the soft tissue"),
     Source("segmentation threshold", 0.25, "mm", "assumed: half a voxel of 0.5 mm"),
     Source("scan noise", 0.2, "mm", "assumed: noise of a surface scan"),
+    Source("form of the model", 0.5, "mm", "assumed: mean error on virtual patients P1 to P4"),
 )
 # What no derivative gives, and what stands for it.
 NOT_COVERED = (
@@ -85,8 +86,8 @@ NOT_COVERED = (
         "direction stand for them here"
     ),
     (
-        "segmentation threshold of bone, contact of the lips, the form of the model itself: only a "
-        "calibration shows their effect"
+        "segmentation threshold of bone, contact of the lips, and how the form of the model errs "
+        "more in one place than in another: only a calibration shows their effect"
     ),
 )
 
