@@ -1,4 +1,8 @@
-"""Laying a bone segment on the post-operative bone by trimmed iterative closest points."""
+"""Laying a bone segment on the post-operative bone.
+
+Trimmed iterative closest points find the place; a robust fit that lets the size change ends there.
+Trimming a fixed share would leave out sound bone too, its noisier part.
+"""
 
 import logging
 from dataclasses import dataclass
@@ -6,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmfsim._core import IcpFit, Surface
+from cmfsim.bones.shape_fit import ShapeFit, fit_shape
 from cmfsim.checks import Floats, as_number, as_positive
 from cmfsim.errors import RegistrationError, RegistrationInputError
 from cmfsim.registration import icp
@@ -22,11 +27,6 @@ QUICK_STEPS = 20
 # where noise of the bone still swaps partners.
 REST = 2e-6
 MOST_STEPS = 300
-# Trimming a fixed share leaves out sound bone too, its noisier part. The last search takes all
-# within so many times the rms of the trimmed fit, 2.3 standard deviations of the noise if 0.3 are
-# trimmed, but not less than this, mm.
-CUT = 4.0
-LEAST_CUT = 0.05
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ class MatchOptions:
             )
 
 
-def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions) -> IcpFit:
-    """The rigid fit of a segment, known by its name, to the post-operative bone.
+def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions) -> ShapeFit:
+    """The fit of a segment, known by its name, to the post-operative bone.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
         It does not fit, or too little of it; the search does not come to rest.
     """
     try:
-        fit = icp(
+        found = icp(
             segment,
             bone,
             initial=_start(np.asarray(segment.vertices), bone, options),
@@ -97,29 +97,23 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
             max_iterations=MOST_STEPS,
             tolerance=REST,
         )
-        if fit.rms <= options.max_rms:
-            fit = icp(
-                segment,
-                bone,
-                initial=fit.matrix,
-                max_distance=max(CUT * fit.rms, LEAST_CUT),
-                max_angle=options.max_angle,
-                max_iterations=MOST_STEPS,
-                tolerance=REST,
-            )
+        fit = fit_shape(
+            segment, bone, np.asarray(found.matrix, dtype=np.float64), max_angle=options.max_angle
+        )
     except RegistrationError as error:
         raise RegistrationError(
             f"segment {name!r} cannot be laid on the post-operative bone: {error}"
         ) from error
-    if fit.rms > options.max_rms or fit.kept_fraction < options.least_share:
+    share = float(fit.kept.mean())
+    if fit.rms > options.max_rms or share < options.least_share:
         raise RegistrationError(
             f"segment {name!r} does not fit the post-operative bone: {fit.rms:.2f} mm rms over "
-            f"{fit.kept_fraction:.0%} of its vertices (allowed {options.max_rms:g} mm, at least "
-            f"{options.least_share:.0%}); see whether the scans are aligned, whether the segment "
-            "is cut as it was in the operation, and whether the bone is all there; a larger trim "
-            "leaves out plates and new bone"
+            f"{share:.0%} of its vertices, with the size that fits best (allowed "
+            f"{options.max_rms:g} mm, at least {options.least_share:.0%}); see whether the scans "
+            "are aligned, whether the segment is cut as it was in the operation, and whether the "
+            "bone is all there; a larger trim leaves out plates and new bone"
         )
-    _LOG.info("segment %s: %.3f mm rms, %.0f %% kept", name, fit.rms, 100 * fit.kept_fraction)
+    _LOG.info("segment %s: %.3f mm rms, %.0f %% kept", name, fit.rms, 100 * share)
     return fit
 
 

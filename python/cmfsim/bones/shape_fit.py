@@ -17,7 +17,7 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["OpenDirection", "ShapeFit", "fit_shape"]
+__all__ = ["OpenDirection", "ShapeFit", "fit_shape", "vertex_areas"]
 
 # Tukey's constant, with which the biweight is 95 % as efficient as least squares on normal noise,
 # and what makes the median of absolute values a standard deviation (Huber 1981).
@@ -26,12 +26,12 @@ TUKEY, TO_SIGMA = 4.685, 1.4826
 LEAST_SIGMA = 0.02
 # Points that a fit is made of: 0.3 mm of noise leaves 0.003 mm in a shift.
 MOST_POINTS = 20000
-# Steps end when one moves no point by more than this, mm (rms), a hundredth of the accuracy that
+# Steps end when one moves no point by more than this, mm (rms), a thousandth of the accuracy that
 # is promised; noise swaps partners below it.
-REST, MOST_STEPS = 1e-3, 100
+REST, MOST_STEPS = 1e-4, 100
 # A direction is open if the normal equations hold it by less than this share of the best: an error
-# of the surface is then ten times as large in it as in the best.
-OPEN = 0.01
+# of the surface is then seven times as large in it as in the best. A noisy ball reaches 0.015.
+OPEN = 0.02
 # Blocks of the jackknife, a power of two, and Student's t of 31 degrees of freedom (95 %).
 BLOCKS, STUDENT = 32, 2.04
 # How well the surface of a bone is known all round, mm: thresholds and triangles of two scans move
@@ -119,14 +119,18 @@ class ShapeFit(Frozen):
     kept: NDArray[np.bool_]
     middle: Floats
 
-    def carry(self, points: Floats) -> Floats:
-        """Where points before lie after, the change of size included: (n, 3), mm."""
-        return _Pose(self.matrix[:3, :3], self.image, self.scale).of(points - self.middle)
+    @property
+    def similarity(self) -> Floats:
+        """The motion with the change of size, (4, 4) mm."""
+        found = self.matrix.copy()
+        found[:3, :3] *= self.scale
+        found[:3, 3] += (1.0 - self.scale) * (self.matrix[:3, :3] @ self.middle)
+        return found
 
     @property
-    def image(self) -> Floats:
-        """Where the middle went, (3,) mm."""
-        return np.asarray(self.matrix[:3, :3] @ self.middle + self.matrix[:3, 3])
+    def rms(self) -> float:
+        """Of the distances of the vertices that had a say, mm."""
+        return float(np.sqrt((self.off[self.kept] ** 2).mean())) if self.kept.any() else np.inf
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values with units in their names, as JSON holds them."""
@@ -175,7 +179,7 @@ def fit_shape(
     points = np.asarray(segment.vertices)
     middle = points.mean(axis=0)
     own = Surface(segment.vertices, segment.triangles)
-    whole = _Sample(points - middle, np.asarray(own.vertex_normals), _vertex_areas(segment))
+    whole = _Sample(points - middle, np.asarray(own.vertex_normals), vertex_areas(segment))
     # Any order of vertices in the file gives points from all over the segment.
     few = whole.some(np.random.default_rng(0).permutation(len(points))[:MOST_POINTS])
     radius = float(np.sqrt((few.arms**2).sum(axis=1).mean()))
@@ -335,7 +339,7 @@ def _blocks(points: Floats) -> NDArray[np.int64]:
     return number
 
 
-def _vertex_areas(surface: SurfaceData) -> Floats:
+def vertex_areas(surface: SurfaceData) -> Floats:
     """A third of the triangles round each vertex, mm²."""
     vertices = np.asarray(surface.vertices)
     triangles = np.asarray(surface.triangles).astype(np.int64)
