@@ -17,7 +17,7 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["OpenDirection", "ShapeFit", "fit_shape", "vertex_areas"]
+__all__ = ["OPEN", "OpenDirection", "ShapeFit", "fit_shape", "vertex_areas"]
 
 # Tukey's constant, with which the biweight is 95 % as efficient as least squares on normal noise,
 # and what makes the median of absolute values a standard deviation (Huber 1981).
@@ -118,6 +118,11 @@ class ShapeFit(Frozen):
     off: Floats
     kept: NDArray[np.bool_]
     middle: Floats
+
+    @property
+    def image(self) -> Floats:
+        """Where the rigid motion takes the middle, (3,) mm."""
+        return np.asarray(self.matrix[:3, :3] @ self.middle + self.matrix[:3, 3])
 
     @property
     def similarity(self) -> Floats:
