@@ -285,7 +285,7 @@ def measure_pair(
     found = measure_motion(before, after, centre=centre)
     if found.is_rigid:
         return found
-    shape = paired_shape(before, after, found.matrix)
+    shape = paired_shape(before, after)
     known = {"removed": shape.removed, "stray": shape.stray, "slip": shape.slip}
     if not shape.is_rigid:
         return replace(found, fit=shape.fit, slip=shape.slip, stray=shape.stray)

@@ -23,9 +23,9 @@ _LOG = logging.getLogger(__name__)
 # Points of the quick search for a start, and its steps from each.
 QUICK_POINTS = 400
 QUICK_STEPS = 20
-# The search rests when a step moves no point by more than this share of the segment's size: 0.1 µm,
-# where noise of the bone still swaps partners.
-REST = 2e-6
+# The search rests when a step moves no point by more than this share of the segment's size, some
+# micrometres: a bone of another size swaps partners below it, and a robust fit follows.
+REST = 1e-4
 MOST_STEPS = 300
 
 

@@ -17,7 +17,16 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["OPEN", "OpenDirection", "ShapeFit", "fit_shape", "vertex_areas"]
+__all__ = [
+    "LEAST_SIGMA",
+    "OPEN",
+    "TO_SIGMA",
+    "TUKEY",
+    "OpenDirection",
+    "ShapeFit",
+    "fit_shape",
+    "vertex_areas",
+]
 
 # Tukey's constant, with which the biweight is 95 % as efficient as least squares on normal noise,
 # and what makes the median of absolute values a standard deviation (Huber 1981).
@@ -297,7 +306,7 @@ class _Equations:
         basis[:6, :-1], basis[6, -1] = vectors[:, held], 1.0
         rows = self.rows @ basis
         inverse = np.linalg.pinv((rows * self.weight[:, None]).T @ rows, hermitian=True)
-        self.has_size = bool(inverse[-1, -1] * OPEN * values[-1] < 1.0)
+        self.has_size = bool(0.0 < inverse[-1, -1] * OPEN * values[-1] < 1.0)
         self.basis = basis if self.has_size else basis[:, :-1]
 
     def step(self, keep: NDArray[np.bool_] | None = None) -> Floats:
