@@ -23,6 +23,8 @@ _LOG = logging.getLogger(__name__)
 # Points of the quick search for a start, and its steps from each.
 QUICK_POINTS = 400
 QUICK_STEPS = 20
+# Points of the quick fits that let the size change.
+SIZED_POINTS = 1500
 # The search rests when a step moves no point by more than this share of the segment's size, some
 # micrometres: a bone of another size swaps partners below it, and a robust fit follows.
 REST = 1e-4
@@ -97,8 +99,12 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
             max_iterations=MOST_STEPS,
             tolerance=REST,
         )
+        found_matrix = np.asarray(found.matrix, dtype=np.float64)
         fit = fit_shape(
-            segment, bone, np.asarray(found.matrix, dtype=np.float64), max_angle=options.max_angle
+            segment,
+            bone,
+            _sized_start(segment, bone, found_matrix, options),
+            max_angle=options.max_angle,
         )
     except RegistrationError as error:
         raise RegistrationError(
@@ -117,22 +123,55 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
     return fit
 
 
+def _sized_start(
+    segment: SurfaceData, bone: Surface, matrix: Floats, options: MatchOptions
+) -> Floats:
+    """The best start of a fit in which the size may change.
+
+    A bone of another size may lie nearest when it is turned by degrees: the place that was found
+    at the same size competes with those that a quick fit finds from where the segment was.
+    """
+    starts = [matrix, *(_shifted(shift) for shift in _shifts(options))]
+    best, least = matrix, np.inf
+    for start in starts:
+        try:
+            fit = fit_shape(
+                segment, bone, start, max_angle=options.max_angle, most_points=SIZED_POINTS
+            )
+        except RegistrationError:
+            # From there it shrinks on to a part of the bone, or finds none.
+            continue
+        nearest = np.sort(fit.off)[: max(int((1.0 - options.trim) * len(fit.off)), 1)]
+        if float(nearest.mean()) < least:
+            best, least = fit.matrix, float(nearest.mean())
+    return best
+
+
+def _shifts(options: MatchOptions) -> list[Floats]:
+    """Where a search begins: at the segment's place, and to each side of it."""
+    shifts = [np.zeros(3)]
+    if options.reach > 0.0:
+        shifts += [sign * options.reach * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
+    return shifts
+
+
+def _shifted(shift: Floats) -> Floats:
+    found = np.eye(4)
+    found[:3, 3] = shift
+    return found
+
+
 def _start(vertices: Floats, bone: Surface, options: MatchOptions) -> Floats:
     """The best of several short searches, from where the segment was and from either side."""
     # Any order of vertices in the file gives points from all over the segment.
     order = np.random.default_rng(0).permutation(len(vertices))[:QUICK_POINTS]
     points = vertices[order]
-    shifts = [np.zeros(3)]
-    if options.reach > 0.0:
-        shifts += [sign * options.reach * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
     best: IcpFit | None = None
-    for shift in shifts:
-        initial = np.eye(4)
-        initial[:3, 3] = shift
+    for shift in _shifts(options):
         fit = icp(
             points,
             bone,
-            initial=initial,
+            initial=_shifted(shift),
             trim=options.trim,
             max_iterations=QUICK_STEPS,
             # Exactly as many steps as asked for: the search goes on from the best.

@@ -31,8 +31,9 @@ __all__ = [
 # Tukey's constant, with which the biweight is 95 % as efficient as least squares on normal noise,
 # and what makes the median of absolute values a standard deviation (Huber 1981).
 TUKEY, TO_SIGMA = 4.685, 1.4826
-# The least standard deviation that weights are made with, mm: a surface file is no better.
-LEAST_SIGMA = 0.02
+# The least standard deviation that weights are made with, mm: the best surfaces of scans. Below it,
+# triangles of clean surfaces would part sound vertices from one another.
+LEAST_SIGMA = 0.1
 # Points that a fit is made of: 0.3 mm of noise leaves 0.003 mm in a shift.
 MOST_POINTS = 20000
 # Steps end when one moves no point by more than this, mm (rms), a thousandth of the accuracy that
@@ -158,7 +159,12 @@ class ShapeFit(Frozen):
 
 
 def fit_shape(
-    segment: SurfaceData, bone: Surface, start: Floats, *, max_angle: float = 60.0
+    segment: SurfaceData,
+    bone: Surface,
+    start: Floats,
+    *,
+    max_angle: float = 60.0,
+    most_points: int = MOST_POINTS,
 ) -> ShapeFit:
     """The motion that lays a segment on the bone after the operation, by the shape of both.
 
@@ -172,6 +178,8 @@ def fit_shape(
         Rigid motion to begin with. What the shape leaves open stays as it is there.
     max_angle : float, degrees
         Between normals of partners.
+    most_points : int
+        Vertices that the fit is made of.
 
     Returns
     -------
@@ -195,7 +203,7 @@ def fit_shape(
     own = Surface(segment.vertices, segment.triangles)
     whole = _Sample(points - middle, np.asarray(own.vertex_normals), vertex_areas(segment))
     # Any order of vertices in the file gives points from all over the segment.
-    few = whole.some(np.random.default_rng(0).permutation(len(points))[:MOST_POINTS])
+    few = whole.some(np.random.default_rng(0).permutation(len(points))[:most_points])
     radius = float(np.sqrt((few.arms**2).sum(axis=1).mean()))
     facing = np.cos(np.radians(max_angle))
     start = np.asarray(start)
