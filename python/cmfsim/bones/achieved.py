@@ -3,21 +3,23 @@
 Scans are first laid on each other by the skull that was left alone (`register_volumes`). Then each
 bone segment is laid on the post-operative bone; what that takes is its motion, as Table 2 of the
 paper has it. Surfaces with the same triangles before and after need no search: their vertices say
-the motion, rigid or not.
+the motion, and their shape says which part of it is slip along the surface.
 """
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim._core import IcpFit, Surface, rigid_fit
+from cmfsim._core import Surface, rigid_fit
 from cmfsim.bones.matching import MatchOptions, lay_on
 from cmfsim.bones.motion import RemovedBone, missing_patches
+from cmfsim.bones.paired import paired_shape
+from cmfsim.bones.shape_fit import ShapeFit
 from cmfsim.bones.stray import StrayPatch, stray_patches
 from cmfsim.checks import (
     Floats,
@@ -39,6 +41,7 @@ __all__ = [
     "AchievedPlan",
     "achieved_plan",
     "measure_motion",
+    "measure_pair",
 ]
 
 _LOG = logging.getLogger(__name__)
@@ -60,12 +63,13 @@ class AchievedMotion(Frozen):
     motion : RigidMotion
         The same in a planner's numbers.
     method : str
-        "vertices" (same triangles before and after) or "icp".
+        "vertices" (same triangles before and after), "shape" (the same, vertices slid along the
+        bone) or "icp".
     is_rigid : bool
-        Whether the rigid motion is the whole motion; always for "icp".
+        Whether the rigid motion is the whole motion; always for "shape" and "icp".
     rms, worst : float, mm
         What the rigid motion leaves: distance of vertices from where they went ("vertices"), or of
-        the kept vertices from the post-operative bone ("icp").
+        the kept vertices from the post-operative bone, less the change of size ("shape", "icp").
     median, p95 : float, mm
         The same distances of all vertices, kept or not: median and 95th percentile.
     share : float
@@ -78,6 +82,11 @@ class AchievedMotion(Frozen):
     stray : tuple of StrayPatch
         Patches of 1 cm² and more that lie off the bone after the operation, where it was searched
         for: they moved otherwise than the segment, or were removed.
+    fit : ShapeFit or None
+        How the segment lies on the bone after by shape: its change of size with an interval, and
+        the directions that its shape leaves open. None where the vertices said all.
+    slip : float, mm
+        How far vertices with the same triangles slid along the surface, median; 0 for "icp".
     """
 
     matrix: Floats
@@ -92,6 +101,8 @@ class AchievedMotion(Frozen):
     moved: MovedSurface | None
     removed: tuple[RemovedBone, ...] = ()
     stray: tuple[StrayPatch, ...] = ()
+    fit: ShapeFit | None = None
+    slip: float = 0.0
 
     @property
     def plan(self) -> Floats | MovedSurface:
@@ -118,6 +129,7 @@ class AchievedMotion(Frozen):
                 for p in self.removed
             ],
             "stray": [patch.as_dict() for patch in self.stray],
+            **({} if self.fit is None else {"shape": self.fit.as_dict(), "slip_mm": self.slip}),
         }
 
 
@@ -243,6 +255,48 @@ def measure_motion(
     )
 
 
+def measure_pair(
+    before: SurfaceData,
+    after: SurfaceData,
+    *,
+    centre: ArrayLike | None = None,
+    is_still: bool = False,
+) -> AchievedMotion:
+    """The motion between two surfaces with the same triangles, less what vertices slid.
+
+    Where the bone after has the shape of the bone before, the motion is the rigid one that lays
+    the one on the other, whatever the vertices did along it; a bone that was left alone keeps
+    what it changed along its normals. Where it has another shape, vertices are followed.
+
+    Parameters
+    ----------
+    before, after : SurfaceData
+        The same vertices and triangles in the same order, in one frame.
+    centre : (3,) float64, mm, optional
+        About which the turn is written. Default: the middle of the vertices before.
+    is_still : bool
+        Whether the operation left the bone alone: what changes on it is no motion of one bone.
+
+    Raises
+    ------
+    RegistrationError
+        See `measure_motion` and `fit_shape`.
+    """
+    found = measure_motion(before, after, centre=centre)
+    if found.is_rigid:
+        return found
+    shape = paired_shape(before, after)
+    known = {"removed": shape.removed, "stray": shape.stray, "slip": shape.slip}
+    if not shape.is_rigid:
+        return replace(found, fit=shape.fit, slip=shape.slip, stray=shape.stray)
+    if is_still:
+        moved = MovedSurface(before, shape.slid_free)
+        return _by_shape(
+            "vertices", before, shape.fit, centre, is_rigid=False, moved=moved, **known
+        )
+    return _by_shape("shape", before, shape.fit, centre, moved=found.moved, **known)
+
+
 def achieved_plan(
     segments: Segments,
     postoperative: SurfaceData | Mapping[str, SurfaceData],
@@ -290,7 +344,9 @@ def achieved_plan(
     Notes
     -----
     Trimmed iterative closest points (Besl & McKay 1992; Chetverikov et al. 2002), begun from where
-    the segment was and from 6 mm to each side, on the best of which it goes on.
+    the segment was and from 6 mm to each side, on the best of which it goes on; then a robust fit
+    to tangent planes in which the size may change. A change of size is about the segment's middle,
+    and no part of its motion.
 
     Examples
     --------
@@ -314,7 +370,7 @@ def achieved_plan(
         after = _transformed(targets[name], frame)
         centre = (centres or {}).get(name)
         if _same_triangles(parts[name], after):
-            return measure_motion(parts[name], after, centre=centre)
+            return measure_pair(parts[name], after, centre=centre, is_still=name == reference)
         others = (*beside, *(part for other, part in parts.items() if other != name))
         bone = Surface(after.vertices, after.triangles, crease_angle=after.crease_angle)
         fit = lay_on(name, parts[name], bone, options)
@@ -338,26 +394,41 @@ def achieved_plan(
 def _matched(
     segment: SurfaceData,
     bone: Surface,
-    fit: IcpFit,
+    fit: ShapeFit,
     centre: ArrayLike | None,
     others: Sequence[SurfaceData],
 ) -> AchievedMotion:
     """The motion of a segment that was laid on the bone."""
-    matrix = np.asarray(fit.matrix, dtype=np.float64)
-    stray, off = stray_patches(segment, bone, matrix, float(fit.rms), others)
-    return AchievedMotion(
-        matrix=frozen(matrix),
-        motion=decompose_motion(matrix, _centre(centre, np.asarray(segment.vertices))),
-        method="icp",
-        is_rigid=True,
-        rms=float(fit.rms),
-        worst=float(fit.distances[fit.kept].max()),
-        median=float(np.median(off)),
-        p95=float(np.quantile(off, 0.95)),
-        share=float(fit.kept_fraction),
-        moved=None,
-        removed=missing_patches(segment, bone, matrix),
+    stray, _ = stray_patches(segment, bone, fit.similarity, fit.rms, others)
+    return _by_shape(
+        "icp",
+        segment,
+        fit,
+        centre,
+        removed=missing_patches(segment, bone, fit.similarity),
         stray=stray,
+    )
+
+
+def _by_shape(
+    method: str, segment: SurfaceData, fit: ShapeFit, centre: ArrayLike | None, **known: Any
+) -> AchievedMotion:
+    """The motion of a segment by its shape, with what else is known of it."""
+    return AchievedMotion(
+        **{
+            "matrix": fit.matrix,
+            "motion": decompose_motion(fit.matrix, _centre(centre, np.asarray(segment.vertices))),
+            "method": method,
+            "is_rigid": True,
+            "rms": fit.rms,
+            "worst": float(fit.off[fit.kept].max()),
+            "median": float(np.median(fit.off)),
+            "p95": float(np.quantile(fit.off, 0.95)),
+            "share": float(fit.kept.mean()),
+            "moved": None,
+            "fit": fit,
+            **known,
+        }
     )
 
 

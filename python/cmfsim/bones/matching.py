@@ -1,4 +1,8 @@
-"""Laying a bone segment on the post-operative bone by trimmed iterative closest points."""
+"""Laying a bone segment on the post-operative bone.
+
+Trimmed iterative closest points find the place; a robust fit that lets the size change ends there.
+Trimming a fixed share would leave out sound bone too, its noisier part.
+"""
 
 import logging
 from dataclasses import dataclass
@@ -6,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmfsim._core import IcpFit, Surface
+from cmfsim.bones.shape_fit import ShapeFit, fit_shape
 from cmfsim.checks import Floats, as_number, as_positive
 from cmfsim.errors import RegistrationError, RegistrationInputError
 from cmfsim.registration import icp
@@ -18,15 +23,12 @@ _LOG = logging.getLogger(__name__)
 # Points of the quick search for a start, and its steps from each.
 QUICK_POINTS = 400
 QUICK_STEPS = 20
-# The search rests when a step moves no point by more than this share of the segment's size: 0.1 µm,
-# where noise of the bone still swaps partners.
-REST = 2e-6
+# Points of the quick fits that let the size change.
+SIZED_POINTS = 1500
+# The search rests when a step moves no point by more than this share of the segment's size, some
+# micrometres: a bone of another size swaps partners below it, and a robust fit follows.
+REST = 1e-4
 MOST_STEPS = 300
-# Trimming a fixed share leaves out sound bone too, its noisier part. The last search takes all
-# within so many times the rms of the trimmed fit, 2.3 standard deviations of the noise if 0.3 are
-# trimmed, but not less than this, mm.
-CUT = 4.0
-LEAST_CUT = 0.05
 
 
 @dataclass(frozen=True)
@@ -79,8 +81,8 @@ class MatchOptions:
             )
 
 
-def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions) -> IcpFit:
-    """The rigid fit of a segment, known by its name, to the post-operative bone.
+def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions) -> ShapeFit:
+    """The fit of a segment, known by its name, to the post-operative bone.
 
     Raises
     ------
@@ -88,7 +90,7 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
         It does not fit, or too little of it; the search does not come to rest.
     """
     try:
-        fit = icp(
+        found = icp(
             segment,
             bone,
             initial=_start(np.asarray(segment.vertices), bone, options),
@@ -97,30 +99,66 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
             max_iterations=MOST_STEPS,
             tolerance=REST,
         )
-        if fit.rms <= options.max_rms:
-            fit = icp(
-                segment,
-                bone,
-                initial=fit.matrix,
-                max_distance=max(CUT * fit.rms, LEAST_CUT),
-                max_angle=options.max_angle,
-                max_iterations=MOST_STEPS,
-                tolerance=REST,
-            )
+        found_matrix = np.asarray(found.matrix, dtype=np.float64)
+        fit = fit_shape(
+            segment,
+            bone,
+            _sized_start(segment, bone, found_matrix, options),
+            max_angle=options.max_angle,
+        )
     except RegistrationError as error:
         raise RegistrationError(
             f"segment {name!r} cannot be laid on the post-operative bone: {error}"
         ) from error
-    if fit.rms > options.max_rms or fit.kept_fraction < options.least_share:
+    share = float(fit.kept.mean())
+    if fit.rms > options.max_rms or share < options.least_share:
         raise RegistrationError(
             f"segment {name!r} does not fit the post-operative bone: {fit.rms:.2f} mm rms over "
-            f"{fit.kept_fraction:.0%} of its vertices (allowed {options.max_rms:g} mm, at least "
-            f"{options.least_share:.0%}); see whether the scans are aligned, whether the segment "
-            "is cut as it was in the operation, and whether the bone is all there; a larger trim "
-            "leaves out plates and new bone"
+            f"{share:.0%} of its vertices, with the size that fits best (allowed "
+            f"{options.max_rms:g} mm, at least {options.least_share:.0%}); see whether the scans "
+            "are aligned, whether the segment is cut as it was in the operation, and whether the "
+            "bone is all there; a larger trim leaves out plates and new bone"
         )
-    _LOG.info("segment %s: %.3f mm rms, %.0f %% kept", name, fit.rms, 100 * fit.kept_fraction)
+    _LOG.info("segment %s: %.3f mm rms, %.0f %% kept", name, fit.rms, 100 * share)
     return fit
+
+
+def _sized_start(
+    segment: SurfaceData, bone: Surface, matrix: Floats, options: MatchOptions
+) -> Floats:
+    """The best start of a fit in which the size may change.
+
+    A bone of another size may lie nearest when it is turned by degrees: the place that was found
+    at the same size competes with those that a quick fit finds from where the segment was.
+    """
+    starts = [matrix, *(_shifted(shift) for shift in _shifts(options))]
+    best, least = matrix, np.inf
+    for start in starts:
+        try:
+            fit = fit_shape(
+                segment, bone, start, max_angle=options.max_angle, most_points=SIZED_POINTS
+            )
+        except RegistrationError:
+            # From there it shrinks on to a part of the bone, or finds none.
+            continue
+        nearest = np.sort(fit.off)[: max(int((1.0 - options.trim) * len(fit.off)), 1)]
+        if float(nearest.mean()) < least:
+            best, least = fit.matrix, float(nearest.mean())
+    return best
+
+
+def _shifts(options: MatchOptions) -> list[Floats]:
+    """Where a search begins: at the segment's place, and to each side of it."""
+    shifts = [np.zeros(3)]
+    if options.reach > 0.0:
+        shifts += [sign * options.reach * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
+    return shifts
+
+
+def _shifted(shift: Floats) -> Floats:
+    found = np.eye(4)
+    found[:3, 3] = shift
+    return found
 
 
 def _start(vertices: Floats, bone: Surface, options: MatchOptions) -> Floats:
@@ -128,17 +166,12 @@ def _start(vertices: Floats, bone: Surface, options: MatchOptions) -> Floats:
     # Any order of vertices in the file gives points from all over the segment.
     order = np.random.default_rng(0).permutation(len(vertices))[:QUICK_POINTS]
     points = vertices[order]
-    shifts = [np.zeros(3)]
-    if options.reach > 0.0:
-        shifts += [sign * options.reach * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
     best: IcpFit | None = None
-    for shift in shifts:
-        initial = np.eye(4)
-        initial[:3, 3] = shift
+    for shift in _shifts(options):
         fit = icp(
             points,
             bone,
-            initial=initial,
+            initial=_shifted(shift),
             trim=options.trim,
             max_iterations=QUICK_STEPS,
             # Exactly as many steps as asked for: the search goes on from the best.

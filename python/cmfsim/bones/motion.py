@@ -65,6 +65,9 @@ LEAST_FITTED, FIT_ROUNDS, FIT_SHARE = 50, 20, 0.75
 # What lies further from the bone after than this, mm, is not shown by its scan; patches smaller
 # than this, mm², are corners of a cut.
 SHOWN, LEAST_PATCH = 10.0, 10.0
+# Holes of this share of the area, as the sum of all area vectors shows them, let inside and outside
+# be told apart all the same: a hundredth of the winding number.
+CLOSED_SHARE = 0.01
 # Volume that a map must keep for its inverse to mean something.
 LEAST_DETERMINANT = 0.1
 
@@ -83,11 +86,14 @@ class RemovedBone:
         The greatest distance of a vertex from where the rest of the piece would have taken it.
     place : (3,) float64, mm
         Where that is, before.
+    vertices : (n,) int64
+        Of the surface before, that lie in the patch.
     """
 
     area: float
     depth: float
     place: Floats
+    vertices: Integers
 
 
 def sound_motion(motion: MovedSurface) -> MovedSurface:
@@ -250,14 +256,18 @@ def without_removed(motion: MovedSurface) -> tuple[MovedSurface, tuple[RemovedBo
         if float(np.median(off[ring])) > RING_SHARE * off[worst]:
             continue
         corrected[patch] = went[patch]
-        found.append(RemovedBone(area, float(off[worst]), here[worst].copy()))
+        found.append(
+            RemovedBone(area, float(off[worst]), here[worst].copy(), np.flatnonzero(patch))
+        )
     if not found:
         return motion, ()
     found.sort(key=lambda patch: -patch.area)
     return MovedSurface(motion.surface, corrected), tuple(found)
 
 
-def missing_patches(segment: SurfaceData, bone: Surface, matrix: Floats) -> tuple[RemovedBone, ...]:
+def missing_patches(
+    segment: SurfaceData, bone: Surface, matrix: Floats, *, shown: float = SHOWN
+) -> tuple[RemovedBone, ...]:
     """Patches of a segment that are not there once it is laid on the bone after the operation.
 
     Parameters
@@ -267,7 +277,9 @@ def missing_patches(segment: SurfaceData, bone: Surface, matrix: Floats) -> tupl
     bone : Surface
         After; what is not closed by it encloses nothing, and nothing is then found.
     matrix : (4, 4) float64, mm
-        The motion of the segment.
+        The motion of the segment, or the similarity that lays it on the bone.
+    shown : float, mm
+        What lies further from the bone after is not known to be gone: its scan may end there.
 
     Returns
     -------
@@ -278,9 +290,9 @@ def missing_patches(segment: SurfaceData, bone: Surface, matrix: Floats) -> tupl
     triangles = np.asarray(segment.triangles).astype(np.int64)
     moved = here @ np.asarray(matrix)[:3, :3].T + np.asarray(matrix)[:3, 3]
     off = np.linalg.norm(bone.closest(moved)[0] - moved, axis=1)
-    far = np.flatnonzero((off > REMOVED_RIM) & (off < SHOWN))
+    far = np.flatnonzero((off > REMOVED_RIM) & (off < shown))
     gone = np.zeros(len(here), dtype=bool)
-    if bone.is_closed:
+    if _encloses(bone):
         gone[far[bone.winding_number(moved[far]) < 0.5]] = True
     if not (off[gone] > REMOVED).any():
         return ()
@@ -293,8 +305,21 @@ def missing_patches(segment: SurfaceData, bone: Surface, matrix: Floats) -> tupl
         area = float(areas[patch[triangles].all(axis=1)].sum())
         worst = int(np.argmax(np.where(patch, off, 0.0)))
         if area >= LEAST_PATCH:
-            found.append(RemovedBone(area, float(off[worst]), here[worst].copy()))
+            found.append(
+                RemovedBone(area, float(off[worst]), here[worst].copy(), np.flatnonzero(patch))
+            )
     return tuple(sorted(found, key=lambda patch: -patch.area))
+
+
+def _encloses(bone: Surface) -> bool:
+    """Whether a surface is closed, but for triangles without area that were taken out of it."""
+    if bone.is_closed:
+        return True
+    vertices, triangles = np.asarray(bone.vertices), np.asarray(bone.triangles)
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    # The area vectors of a closed surface add up to nothing.
+    open_area = 0.5 * np.linalg.norm(np.cross(b - a, c - a).sum(axis=0))
+    return bool(open_area <= CLOSED_SHARE * bone.area)
 
 
 def _rest_of(here: Floats, there: Floats) -> tuple[Floats, Callable[[Floats], Floats]] | None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmfsim._core import Surface
 from cmfsim.checks import Floats
@@ -50,12 +51,15 @@ class StrayPatch:
     has_bone : bool
         Whether bone lies within reach that may be this patch, displaced, or what is left of it
         after grinding; else it was removed, lies outside the scan, or moved further.
+    vertices : (n,) int64
+        Of the segment, that lie in the patch.
     """
 
     area: float
     distance: float
     place: Floats
     has_bone: bool
+    vertices: NDArray[np.int64]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values with units in their names, as JSON holds them."""
@@ -130,6 +134,7 @@ def stray_patches(
                 float(np.median(off[patch])),
                 here[patch[np.argmin(middle)]].copy(),
                 bool(shown.mean() >= SHOWN_SHARE),
+                patch,
             )
         )
     return tuple(sorted(found, key=lambda patch: -patch.area)), off

@@ -334,11 +334,26 @@ def achieved_text(achieved: Mapping[str, Any]) -> str:
     for name, found in achieved["segments"].items():
         shift = " ".join(f"{c:+6.2f}" for c in found["translation_mm"])
         axis = ", ".join(f"{c:+.2f}" for c in found["axis"])
+        how = (
+            f"vertex by vertex, rigid to {found['rms_mm']:.2f} mm rms"
+            if found["method"] == "vertices"
+            else f"laid on the bone to {found['rms_mm']:.2f} mm rms ({found['share']:.0%} of it)"
+        )
         lines.append(
-            f"  {escaped(name):<14} {shift}  {found['angle_degrees']:5.2f}° about ({axis}), "
-            f"laid on the bone to {found['rms_mm']:.2f} mm rms ({found['share']:.0%} of it)"
+            f"  {escaped(name):<14} {shift}  {found['angle_degrees']:5.2f}° about ({axis}), {how}"
+            f"{_size_text(found.get('shape'))}"
         )
     return "\n".join(lines)
+
+
+def _size_text(shape: Mapping[str, Any] | None) -> str:
+    """The size after with its interval, and how many directions the shape leaves open."""
+    if shape is None:
+        return ""
+    low, high = shape["scale_interval"]
+    n_open = len(shape["open"])
+    left = f"; {n_open} of 6 directions open" if n_open else ""
+    return f", size {shape['scale']:.3f} ({low:.3f} to {high:.3f}){left}"
 
 
 def _print_report(folder: Path, name: str | None) -> None:

@@ -48,12 +48,12 @@ STAYS = 3.0
 FEW = 0.05
 # What is left of a motion if the bone is mirrored first, as a share of what is left if it is not.
 MIRRORED = 0.1
-# What is left where vertices cannot be followed. Bones with the same triangles go vertex by vertex
-# in an achieved plan too, so that naming them there is not enough.
+# What is left where vertices cannot be followed. Vertices out of order are refused in an achieved
+# plan too, so that naming such bones there is not enough.
 BY_SHAPE = (
     'or align the bone by shape: plan = "achieved", with the bone after in [postoperative.bones] '
-    "segmented or remeshed on its own (it then moves rigidly, or is refused where it fits badly; a "
-    "mesh with the same triangles as before is followed vertex by vertex there as well)"
+    "segmented or remeshed on its own (it then moves rigidly, and a change of size is reported "
+    "with its interval)"
 )
 # Vertices that a fit is made of.
 SAMPLES = 5000

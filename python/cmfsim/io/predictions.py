@@ -92,7 +92,24 @@ _SOLUTION = table(
     },
     dict.fromkeys(("error_bound", "error_estimate"), optional(number(0.0, 1e12))),
 )
-_FIT = table({"rms_mm": number(0.0, 1e6), "worst_mm": number(0.0, 1e6), "share": number(0.0, 1.0)})
+_SIZE = number(0.1, 10.0)
+_FIT = table(
+    {
+        **dict.fromkeys(("rms_mm", "worst_mm", "median_mm", "p95_mm"), number(0.0, 1e6)),
+        "share": number(0.0, 1.0),
+    },
+    {
+        "shape": table(
+            {
+                "scale": _SIZE,
+                "scale_interval": listing(_SIZE, length=2),
+                "eigenvalue_ratio": number(0.0, 1.0),
+                "open": listing(plain),
+            }
+        ),
+        "slip_mm": number(0.0, 1e6),
+    },
+)
 _YOUNG, _POISSON = number(*YOUNG_RANGE), number(-1.0, MOST_POISSON)
 _MUSCLE = table({"young_along": _YOUNG, "young_across": _YOUNG, "poisson": _POISSON})
 _WIDTH, _SHARE = number(0.0, 1e6), number(0.0, 1.0)

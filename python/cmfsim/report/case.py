@@ -261,15 +261,27 @@ def _achieved(achieved: Values | None) -> list[Note | Table | Figure]:
             name,
             *(number(found[f"{key}_mm"]) for key in ("rms", "worst", "median", "p95")),
             f"{found['share']:.0%}",
+            _size(found.get("shape")),
         )
         for name, found in achieved["segments"].items()
     )
     caption = (
         "The plan was read from the bones after the operation: remaining distance between each "
         "segment and that bone, mm, and the share of its vertices that lie on it. RMS and maximum "
-        "are of those vertices, median and 95th percentile of all."
+        "are of those vertices, median and 95th percentile of all. Size: after the operation as a "
+        "share of before, with its 95 % interval; it is not part of the motion. Empty: the motion "
+        "follows from paired vertices alone."
     )
-    return [Table(("segment", "RMS", "largest", "median", "P95", "share"), rows, caption)]
+    heads = ("segment", "RMS", "largest", "median", "P95", "share", "size")
+    return [Table(heads, rows, caption)]
+
+
+def _size(shape: Values | None) -> str:
+    """The size of a segment after the operation, with its interval."""
+    if shape is None:
+        return ""
+    low, high = shape["scale_interval"]
+    return f"{shape['scale']:.3f} ({low:.3f} to {high:.3f})"
 
 
 def _evaluation_sections(evaluation: Values | None, figures: Sequence[Figure]) -> list[Section]:

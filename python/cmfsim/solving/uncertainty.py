@@ -73,7 +73,9 @@ ADDED = (
     Source("thickness change", 0.05, "share", "assumed: share of the depth of the soft tissue"),
     Source("segmentation threshold", 0.25, "mm", "assumed: half a voxel of 0.5 mm"),
     Source("scan noise", 0.2, "mm", "assumed: noise of a surface scan"),
-    Source("form of the model", 0.5, "mm", "assumed: half the mean error on virtual patients P1 to P4"),
+    Source(
+        "form of the model", 0.5, "mm", "assumed: half the mean error on virtual patients P1 to P4"
+    ),
 )
 # What no derivative gives, and what stands for it.
 NOT_COVERED = (

@@ -9,27 +9,26 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cmfsim.bones import part_segment
-from cmfsim.bones.motion import (
-    RemovedBone,
-    smooth_motion,
-    sound_motion,
-    torn_pieces,
-    without_removed,
-)
-from cmfsim.bones.stray import REACH, StrayPatch
+from cmfsim.bones.motion import smooth_motion, sound_motion, torn_pieces, without_removed
 from cmfsim.checks import Floats
 from cmfsim.doctor.moved import check_pairs
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface
 from cmfsim.pipeline.building.inputs import motion_source, read_motion
+from cmfsim.pipeline.building.motion_findings import (
+    motion_findings,
+    plan_key,
+    removed_finding,
+)
 from cmfsim.pipeline.building.postoperative import REFERENCES, Postoperative, read_postoperative
 from cmfsim.surfaces.repair import clean_surface
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.finding import Finding
+from cmfsim.values.frozen import frozen_mapping
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:
-    from cmfsim.bones.achieved import AchievedPlan
+    from cmfsim.bones.achieved import AchievedMotion, AchievedPlan
 
 __all__ = ["PlannedBones", "planned_bones"]
 
@@ -47,7 +46,7 @@ class PlannedBones:
         Of the segments that the plan moves.
     findings : tuple of Finding
     achieved : AchievedPlan or None
-        How they were found, where the plan is the achieved one and was searched for.
+        How they were found, where the plan is the achieved one.
     sources : mapping of str to str
         Where each motion comes from and how it was understood, in words.
     """
@@ -97,8 +96,13 @@ def _with_motions(
     case: Case,
     segments: tuple[BoneSegment, ...],
     motions: Motions,
-    achieved: AchievedPlan | None = None,
+    measured: dict[str, AchievedMotion] | None = None,
 ) -> PlannedBones:
+    """The segments with their motions, parted where these are torn.
+
+    With `measured`, motions by vertices come from surfaces after the operation: what vertices slid
+    along the bone is taken off, and what was found is entered there.
+    """
     findings: list[Finding] = []
     parted: list[BoneSegment] = []
     planned: dict[str, Floats | MovedSurface] = {}
@@ -109,12 +113,41 @@ def _with_motions(
             if motion is not None:
                 planned[segment.name] = motion
             continue
-        pieces = _parted(case, segment, motion, findings)
-        for piece, its_own in pieces:
+        motion = sound_motion(motion)
+        # Vertices over resected bone are squeezed, as if torn off: the whole is asked first.
+        whole = _by_shape(segment.name, motion, measured, is_still=segment.name in REFERENCES)
+        if whole is not None:
+            parted.append(segment)
+            planned[segment.name] = whole
+            continue
+        for piece, its_own in _parted(case, segment, motion, findings):
             parted.append(piece)
-            kept = _without_removed(case, segment.name, piece.name, its_own, findings)
-            planned[piece.name] = _quiet(case, segment.name, piece.name, kept, findings)
-    return PlannedBones(tuple(parted), planned, tuple(findings), achieved)
+            still = piece.name in REFERENCES
+            known = _by_shape(piece.name, its_own, measured, is_still=still)
+            if known is None:
+                kept = _without_removed(case, segment.name, piece.name, its_own, findings)
+                known = _quiet(case, segment.name, piece.name, kept, findings)
+            planned[piece.name] = known
+    return PlannedBones(tuple(parted), planned, tuple(findings))
+
+
+def _by_shape(
+    name: str,
+    motion: MovedSurface,
+    measured: dict[str, AchievedMotion] | None,
+    *,
+    is_still: bool,
+) -> Floats | MovedSurface | None:
+    """The motion of a piece without slip, if the bone after is the bone before that moved."""
+    if measured is None:
+        return None
+    from cmfsim.bones.achieved import measure_pair  # noqa: PLC0415
+
+    after = SurfaceData(motion.moved_vertices, motion.surface.triangles)
+    found = measure_pair(motion.surface, after, is_still=is_still)
+    measured[name] = found
+    # Rigid to the last vertex, or of another shape: vertices are followed.
+    return found.plan if found.method == "shape" else None
 
 
 def _achieved_bones(
@@ -122,8 +155,8 @@ def _achieved_bones(
 ) -> PlannedBones:
     """The segments with the motions that the bones after the operation tell (paper 3, Figure 5).
 
-    A bone with the same triangles after says where each vertex went; any other segment is laid on
-    the bone of its name, or on all of them.
+    A bone with the same triangles after says where each vertex went, less what vertices slid along
+    it; any other segment is laid on the bone of its name, or on all of them.
     """
     names = [segment.name for segment in segments]
     by_vertex = {
@@ -131,7 +164,7 @@ def _achieved_bones(
         for name in names
         if name in after.bones and (moved := _same_bone(case, name, after.bones[name])) is not None
     }
-    noticed = [found for name, moved in by_vertex.items() for found in _paired(case, name, moved)]
+    pairs = {name: _paired(case, name, moved) for name, moved in by_vertex.items()}
     searched = [segment for segment in segments if segment.name not in by_vertex]
     reference = next((name for name in REFERENCES if name in names), None)
     if searched and reference is not None and reference not in by_vertex:
@@ -149,13 +182,14 @@ def _achieved_bones(
             f"{case.where(f'postoperative.bones.{unknown[0]}')}: there is no bone or segment "
             f"{unknown[0]!r}; use one of: {', '.join(names)}"
         )
-    achieved: AchievedPlan | None = None
+    from cmfsim.bones.achieved import AchievedPlan, achieved_plan  # noqa: PLC0415
+
     motions: dict[str, Floats | MovedSurface] = dict(by_vertex)
+    measured: dict[str, AchievedMotion] = {}
+    achieved = AchievedPlan(measured, np.eye(4), None)
     if searched:
         bones = {name: clean_surface(surface) for name, surface in after.bones.items()}
         whole = _joined(list(bones.values()))
-        from cmfsim.bones.achieved import achieved_plan  # noqa: PLC0415
-
         achieved = achieved_plan(
             {s.name: s for s in (*still, *(s for s in searched if s not in still))},
             {s.name: bones.get(s.name, whole) for s in searched},
@@ -163,18 +197,27 @@ def _achieved_bones(
             beside=[s.surface for s in segments if s not in searched],
         )
         motions |= {name: found for name, found in achieved.plan.items() if name != reference}
-    made = _with_motions(case, segments, motions, achieved)
-    noticed += [
-        _removed_finding(case, name, name, patch, "note")
-        for name, found in ({} if achieved is None else achieved.motions).items()
-        for patch in found.removed
+    made = _with_motions(case, segments, motions, measured)
+    motions_found = {**achieved.motions, **measured}
+    noticed = [
+        finding
+        for name, found in pairs.items()
+        for finding in found
+        # By shape the size is known with an interval, and is no part of the motion.
+        if not (finding.code == "moved-scaled" and measured[name].method == "shape")
     ]
-    noticed += [
-        _stray_finding(case, name, patch, still=name == reference)
-        for name, found in ({} if achieved is None else achieved.motions).items()
-        for patch in found.stray
-    ]
-    return replace(made, findings=(*made.findings, *noticed))
+    skull = next((motions_found[n].fit for n in REFERENCES if n in motions_found), None)
+    for name, found in motions_found.items():
+        # A torn bone's pieces are numbered after it.
+        bone = name if name in names else name.rsplit("_", 1)[0]
+        noticed += motion_findings(
+            found, name, case.where(plan_key(case, bone)), skull, is_still=name in REFERENCES
+        )
+    return replace(
+        made,
+        findings=(*made.findings, *noticed),
+        achieved=replace(achieved, motions=frozen_mapping(motions_found)),
+    )
 
 
 def _sources(case: Case) -> tuple[str, ...]:
@@ -203,7 +246,7 @@ def _paired(case: Case, name: str, moved: MovedSurface) -> list[Finding]:
     CaseError
         (also `ValueError`) Its surfaces are no bone that moved: mirrored, shuffled, in two units.
     """
-    found = list(check_pairs(name, case.where(_plan_key(case, name)), moved))
+    found = list(check_pairs(name, case.where(plan_key(case, name)), moved))
     for finding in found:
         if finding.severity == "error":
             raise CaseInputError(f"{finding.where}: {finding.what}; {finding.fix}")
@@ -228,7 +271,6 @@ def _parted(
     case: Case, segment: BoneSegment, motion: MovedSurface, findings: list[Finding]
 ) -> list[tuple[BoneSegment, MovedSurface]]:
     """The pieces of a segment that moved apart, each with its motion."""
-    motion = sound_motion(motion)
     pieces = torn_pieces(motion)
     if len(pieces) == 1:
         return [(segment, pieces[0])]
@@ -238,7 +280,7 @@ def _parted(
         Finding.note(
             "motion-torn",
             f"{segment.name} moved as {len(made)} pieces: {', '.join(p.name for p in made)}",
-            where=case.where(_plan_key(case, segment.name)),
+            where=case.where(plan_key(case, segment.name)),
             why="between them neighbouring vertices moved apart by millimetres, so that the bone "
             "was "
             "cut there: no tissue is joined to the gap, and each piece has its contact surface",
@@ -246,10 +288,6 @@ def _parted(
         )
     )
     return [(piece, named[piece.name]) for piece in made]
-
-
-def _plan_key(case: Case, name: str) -> str:
-    return f"postoperative.bones.{name}" if case.achieved else f"plan.{name}"
 
 
 def _numbered(name: str, number: int) -> str:
@@ -261,65 +299,9 @@ def _without_removed(
 ) -> MovedSurface:
     """The motion in which removed bone moves nothing, and a finding for each patch of it."""
     sound, removed = without_removed(motion)
-    findings += [_removed_finding(case, bone, name, patch, "warning") for patch in removed]
+    where = case.where(plan_key(case, bone))
+    findings += [removed_finding(name, where, patch, "warning") for patch in removed]
     return sound
-
-
-def _removed_finding(
-    case: Case, bone: str, name: str, patch: RemovedBone, severity: str
-) -> Finding:
-    at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
-    used = "its vertices are not used" if severity == "warning" else "it had no say in the motion"
-    return Finding(
-        severity=severity,
-        code="bone-removed",
-        what=f"{patch.area:.0f} mm² of {name} about ({at}) mm are no longer there after the "
-        "operation, "
-        f"by up to {patch.depth:.1f} mm: taken as removed bone, not as motion",
-        where=case.where(_plan_key(case, bone)),
-        why="bone that is ground away does not pull the tissue over it: that tissue follows the "
-        "rest "
-        f"of the segment; {used}",
-        fix="look at the bone there; if it was pushed in (fracture, impaction), give that part as "
-        "a "
-        "bone of its own",
-    )
-
-
-def _stray_finding(case: Case, name: str, patch: StrayPatch, *, still: bool) -> Finding:
-    """A piece of a segment that its motion does not lay on the bone after the operation."""
-    at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
-    piece = f"{patch.area / 100.0:.1f} cm² of {name} about ({at}) mm"
-    if patch.has_bone:
-        what = (
-            f"{piece} lie off the bone after the operation, by {patch.distance:.1f} mm (median): "
-            "bone is there, displaced: it moved otherwise than the segment, or what is left of it "
-            "lies deeper"
-        )
-        fix = (
-            "if that piece was cut (genioplasty, split maxilla), make it a segment of its own in "
-            "[[osteotomies]]; else check whether bone was removed there"
-        )
-    else:
-        what = (
-            f"{piece} have no bone after the operation within {REACH:g} mm that faces alike "
-            f"({patch.distance:.1f} mm to the nearest, median): removed, outside the scan, or "
-            "moved further"
-        )
-        fix = (
-            "check whether bone was removed there and whether the scan after shows that place; if "
-            "the piece was cut and moved, make it a segment of its own in [[osteotomies]]"
-        )
-    # A smaller scan after the operation cuts off the skull nearly always, which moves nothing.
-    return Finding(
-        severity="note" if still and not patch.has_bone else "warning",
-        code="achieved-piece-off",
-        what=what,
-        where=case.where(_plan_key(case, name)),
-        why="the piece had no say in the motion, and moves with the rest of the segment all the "
-        "same: the face over it may be wrong by that distance",
-        fix=fix,
-    )
 
 
 def _quiet(
@@ -332,7 +314,7 @@ def _quiet(
             Finding.note(
                 "motion-noisy",
                 f"the vertices of {name} moved with {noise:.2f} mm of noise, which is averaged out",
-                where=case.where(_plan_key(case, bone)),
+                where=case.where(plan_key(case, bone)),
                 why="bone does not bend from one vertex to the next; tissue would be crumpled on "
                 "it",
                 fix="nothing to do",

@@ -1,0 +1,145 @@
+"""What surfaces with the same triangles before and after say by their shape, vertices aside.
+
+A template that was fitted to each scan has vertices that slid along the bone, and squeezes those of
+resected bone on to the stump. Neither is motion. Where the bone after has the shape of the bone
+before, moved and perhaps scaled, it is that which moved.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import Surface, rigid_fit
+from cmfsim.bones.motion import RemovedBone, missing_patches
+from cmfsim.bones.shape_fit import (
+    LEAST_SIGMA,
+    TO_SIGMA,
+    TUKEY,
+    ShapeFit,
+    fit_shape,
+    vertex_areas,
+)
+from cmfsim.bones.stray import StrayPatch, stray_patches
+from cmfsim.checks import Floats
+from cmfsim.errors import RegistrationError
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = ["PairedShape", "paired_shape"]
+
+# A vertex lies on the bone after if it is this near, mm: the surfaces of two scans are known to
+# half a millimetre each.
+LIES = 1.0
+# A patch off the bone is a piece that moved otherwise if its own vertices' rigid motion lays this
+# share of them this near to the bone after, mm: two and a half times noise of 0.3 mm. The end of a
+# bone, squeezed flat on to the stump, stands off it by its height.
+OWN, OWN_SHARE = 0.75, 0.8
+# Rounds of weights for the motion to begin with: a fifth of the vertices that went 4 mm elsewhere
+# are left out by then.
+TRIM_ROUNDS = 20
+# The motion is that of one rigid bone if so much of the area lies on the bone after or was removed,
+# and so much lies on it. The rest are thin walls and rims of cuts.
+RIGID_SHARE, LEAST_LYING = 0.95, 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class PairedShape:
+    """A bone before, laid by shape on the same mesh after.
+
+    Attributes
+    ----------
+    fit : ShapeFit
+    is_rigid : bool
+        Whether the bone after is the bone before, moved rigidly, but for size and removed bone.
+    slip : float, mm
+        How far vertices slid along the surface, median.
+    slid_free : (n, 3) float64, mm
+        The vertices after without slip and change of size: each where the rigid motion takes it,
+        and from there as far along the normal as the bone after lies off.
+    removed : tuple of RemovedBone
+    stray : tuple of StrayPatch
+    """
+
+    fit: ShapeFit
+    is_rigid: bool
+    slip: float
+    slid_free: Floats
+    removed: tuple[RemovedBone, ...]
+    stray: tuple[StrayPatch, ...]
+
+
+def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
+    """How a bone lies on the same mesh after, judged by shape.
+
+    Parameters
+    ----------
+    before, after : SurfaceData
+        The same triangles in the same order.
+
+    Raises
+    ------
+    RegistrationError
+        (also `ValueError`) Vertices that lie on one line; see `fit_shape` too.
+    MeshError
+        (also `ValueError`) A triangle without area after.
+    """
+    here, there = np.asarray(before.vertices), np.asarray(after.vertices)
+    bone = Surface(after.vertices, after.triangles, crease_angle=after.crease_angle)
+    fit = fit_shape(before, bone, _trimmed_motion(here, there))
+    carried = _carried(fit.similarity, here)
+    closest, normals, _ = bone.closest(carried)
+    # Whatever lies off the mesh after is known: the mesh shows all that is left.
+    removed = missing_patches(before, bone, fit.similarity, shown=np.inf)
+    stray = stray_patches(before, bone, fit.similarity, fit.sigma)[0]
+    on = fit.off <= LIES
+    gone = np.zeros(len(here), dtype=bool)
+    for patch in removed:
+        gone[patch.vertices] = True
+    areas = vertex_areas(before)
+    total = areas.sum()
+    moved = _carried(fit.matrix, here)
+    rest = np.where(gone[:, None], 0.0, closest - carried)
+    along = there - carried
+    along -= (along * normals).sum(axis=1, keepdims=True) * normals
+    kept = fit.kept & ~gone
+    return PairedShape(
+        fit,
+        bool(
+            areas[on | gone].sum() >= RIGID_SHARE * total
+            and areas[on & ~gone].sum() >= LEAST_LYING * total
+            and not any(
+                _is_displaced(here, there, bone, patch.vertices) for patch in (*removed, *stray)
+            )
+        ),
+        float(np.median(np.linalg.norm(along[kept], axis=1))) if kept.any() else 0.0,
+        moved + rest,
+        removed,
+        # What was removed is named once.
+        () if removed else stray,
+    )
+
+
+def _trimmed_motion(here: Floats, there: Floats) -> Floats:
+    """The rigid motion of most vertices, whatever the others did (Tukey's biweight)."""
+    fit = rigid_fit(here, there)
+    for _ in range(TRIM_ROUNDS):
+        off = np.asarray(fit.residuals)
+        reach = TUKEY * max(TO_SIGMA * float(np.median(off)), LEAST_SIGMA)
+        fit = rigid_fit(here, there, weights=(1.0 - np.minimum(off / reach, 1.0) ** 2) ** 2)
+    return np.asarray(fit.matrix)
+
+
+def _is_displaced(here: Floats, there: Floats, bone: Surface, patch: NDArray[np.int64]) -> bool:
+    """Whether a patch that the bone's motion lays off it moved as one, and was not removed."""
+    try:
+        own = np.asarray(rigid_fit(here[patch], there[patch]).matrix)
+    except RegistrationError:
+        # Squeezed to a point or a line.
+        return False
+    moved = _carried(own, here[patch])
+    off = np.linalg.norm(bone.closest(moved)[0] - moved, axis=1)
+    return bool((off <= OWN).mean() >= OWN_SHARE)
+
+
+def _carried(matrix: Floats, points: Floats) -> Floats:
+    return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3])

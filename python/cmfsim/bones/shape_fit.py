@@ -1,0 +1,370 @@
+"""The motion of a bone by its shape alone: robust steps to tangent planes, with a change of size.
+
+Only distances along the normals of the bone after the operation count. Vertices of a template that
+was fitted to each scan, which slid along the surface, therefore turn nothing.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import Surface
+from cmfsim.checks import Floats, frozen
+from cmfsim.errors import RegistrationInputError
+from cmfsim.values.frozen import Frozen
+from cmfsim.values.motion import rigid_motion
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = [
+    "LEAST_SIGMA",
+    "OPEN",
+    "TO_SIGMA",
+    "TUKEY",
+    "OpenDirection",
+    "ShapeFit",
+    "fit_shape",
+    "vertex_areas",
+]
+
+# Tukey's constant, with which the biweight is 95 % as efficient as least squares on normal noise,
+# and what makes the median of absolute values a standard deviation (Huber 1981).
+TUKEY, TO_SIGMA = 4.685, 1.4826
+# The least standard deviation that weights are made with, mm: the best surfaces of scans. Below it,
+# triangles of clean surfaces would part sound vertices from one another.
+LEAST_SIGMA = 0.1
+# Points that a fit is made of: 0.3 mm of noise leaves 0.003 mm in a shift.
+MOST_POINTS = 20000
+# Steps end when one moves no point by more than this, mm (rms), a thousandth of the accuracy that
+# is promised; noise swaps partners below it.
+REST, MOST_STEPS = 1e-4, 100
+# A direction is open if the normal equations hold it by less than this share of the best: an error
+# of the surface is then seven times as large in it as in the best. A noisy ball reaches 0.015.
+OPEN = 0.02
+# Blocks of the jackknife, a power of two, and Student's t of 31 degrees of freedom (95 %).
+BLOCKS, STUDENT = 32, 2.04
+# How well the surface of a bone is known all round, mm: thresholds and triangles of two scans move
+# it in or out together, which no block shows. 0.1 mm is a third of a small voxel.
+ALL_ROUND = 0.1
+# Pairs that the fit needs: seven unknowns with room to tell a sound one.
+LEAST_PAIRS = 50
+# Sizes that may be one bone in two scans. Beyond, it is another unit or another bone.
+LEAST_SIZE, MOST_SIZE = 0.85, 1.15
+
+
+@dataclass(frozen=True, eq=False)
+class OpenDirection(Frozen):
+    """A motion of a bone that its shape hardly shows, as the turn of a ball.
+
+    Attributes
+    ----------
+    turn, shift : (3,) float64
+        The turn about the middle of the bone, times the radius of the bone, and the shift; both
+        together of unit length.
+    ratio : float
+        How well the shape holds it, as a share of how well it holds what it holds best: the ratio
+        of eigenvalues of the normal equations.
+    """
+
+    turn: Floats
+    shift: Floats
+    ratio: float
+
+    @property
+    def is_turn(self) -> bool:
+        """Whether it is more of a turn than of a shift."""
+        return bool(np.linalg.norm(self.turn) >= np.linalg.norm(self.shift))
+
+    @property
+    def axis(self) -> Floats:
+        """Unit vector of the turn's axis, or of the shift."""
+        main = self.turn if self.is_turn else self.shift
+        return np.asarray(main / np.linalg.norm(main))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as JSON holds them."""
+        return {
+            "kind": "turn" if self.is_turn else "shift",
+            "axis": self.axis.tolist(),
+            "eigenvalue_ratio": self.ratio,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeFit(Frozen):
+    """How a bone lies on the bone after the operation, by shape.
+
+    Attributes
+    ----------
+    matrix : (4, 4) float64, mm
+        The rigid motion. A change of size is about the middle of the segment's vertices, which it
+        leaves where the rigid motion takes it.
+    scale : float
+        Size after, as a share of the size before.
+    scale_interval : tuple of float
+        Low and high end of its 95 % interval: block jackknife, and a surface that is known to
+        0.1 mm all round.
+    eigenvalue_ratio : float
+        Of the normal equations of the rigid motion: smallest to largest.
+    open : tuple of OpenDirection
+        What the shape leaves open; there the motion is the one that the search began with.
+    sigma : float, mm
+        Standard deviation of the distances along normals, robust.
+    off : (n,) float64, mm
+        Distance of each vertex, moved and scaled, from the bone after.
+    kept : (n,) bool
+        Vertices near enough to have a say, on bone that faces alike.
+    middle : (3,) float64, mm
+        Of the segment's vertices, before.
+    """
+
+    matrix: Floats
+    scale: float
+    scale_interval: tuple[float, float]
+    eigenvalue_ratio: float
+    open: tuple[OpenDirection, ...]
+    sigma: float
+    off: Floats
+    kept: NDArray[np.bool_]
+    middle: Floats
+
+    @property
+    def image(self) -> Floats:
+        """Where the rigid motion takes the middle, (3,) mm."""
+        return np.asarray(self.matrix[:3, :3] @ self.middle + self.matrix[:3, 3])
+
+    @property
+    def similarity(self) -> Floats:
+        """The motion with the change of size, (4, 4) mm."""
+        found = self.matrix.copy()
+        found[:3, :3] *= self.scale
+        found[:3, 3] += (1.0 - self.scale) * (self.matrix[:3, :3] @ self.middle)
+        return found
+
+    @property
+    def rms(self) -> float:
+        """Of the distances of the vertices that had a say, mm."""
+        return float(np.sqrt((self.off[self.kept] ** 2).mean())) if self.kept.any() else np.inf
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values with units in their names, as JSON holds them."""
+        return {
+            "scale": self.scale,
+            "scale_interval": list(self.scale_interval),
+            "eigenvalue_ratio": self.eigenvalue_ratio,
+            "open": [direction.as_dict() for direction in self.open],
+            "sigma_mm": self.sigma,
+        }
+
+
+def fit_shape(
+    segment: SurfaceData,
+    bone: Surface,
+    start: Floats,
+    *,
+    max_angle: float = 60.0,
+    most_points: int = MOST_POINTS,
+) -> ShapeFit:
+    """The motion that lays a segment on the bone after the operation, by the shape of both.
+
+    Parameters
+    ----------
+    segment : SurfaceData
+        Before.
+    bone : Surface
+        After.
+    start : (4, 4) float64, mm
+        Rigid motion to begin with. What the shape leaves open stays as it is there.
+    max_angle : float, degrees
+        Between normals of partners.
+    most_points : int
+        Vertices that the fit is made of.
+
+    Returns
+    -------
+    ShapeFit
+
+    Raises
+    ------
+    RegistrationError
+        (also `ValueError`) Fewer partners than unknowns; a size that is no bone's in two scans.
+
+    Notes
+    -----
+    Steps to tangent planes (Chen & Medioni 1992) of a similarity, weighted by area and Tukey's
+    biweight of the distances (Huber 1981; as iterative closest points, Fitzgibbon 2003). Directions
+    in which the normal equations have small eigenvalues are left alone (Zhang, Kaess & Singh 2016).
+    The interval of the size leaves out one block of neighbouring vertices after the other (Künsch
+    1989), as distances of neighbours are not independent.
+    """
+    points = np.asarray(segment.vertices)
+    middle = points.mean(axis=0)
+    own = Surface(segment.vertices, segment.triangles)
+    whole = _Sample(points - middle, np.asarray(own.vertex_normals), vertex_areas(segment))
+    # Any order of vertices in the file gives points from all over the segment.
+    few = whole.some(np.random.default_rng(0).permutation(len(points))[:most_points])
+    radius = float(np.sqrt((few.arms**2).sum(axis=1).mean()))
+    facing = np.cos(np.radians(max_angle))
+    start = np.asarray(start)
+    pose = _Pose(start[:3, :3], start[:3, :3] @ middle + start[:3, 3], 1.0)
+    for _ in range(MOST_STEPS):
+        step = _Equations(few, bone, pose, radius, facing).step()
+        pose = pose.stepped(step, radius)
+        if not LEAST_SIZE < pose.scale < MOST_SIZE:
+            raise RegistrationInputError(
+                f"the bone after the operation is {pose.scale:.3g} times as large as the segment "
+                f"(allowed {LEAST_SIZE:g} to {MOST_SIZE:g}): check the units of both, and whether "
+                "they are the same bone"
+            )
+        if float(np.linalg.norm(step)) <= REST:
+            break
+    last = _Equations(few, bone, pose, radius, facing)
+    pairs = _Pairs(whole, bone, pose, facing)
+    matrix = np.eye(4)
+    matrix[:3, :3] = pose.turn
+    matrix[:3, 3] = pose.image - pose.turn @ middle
+    return ShapeFit(
+        frozen(matrix),
+        pose.scale,
+        last.interval(pose.scale),
+        last.ratio,
+        last.open,
+        last.sigma,
+        frozen(pairs.off),
+        frozen(pairs.alike & (pairs.off < TUKEY * last.sigma)),
+        frozen(middle),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    """Where a segment lies: turned and scaled about its middle, and where that is."""
+
+    turn: Floats
+    image: Floats
+    scale: float
+
+    def of(self, arms: Floats) -> Floats:
+        return np.asarray(self.scale * arms @ self.turn.T + self.image)
+
+    def stepped(self, step: Floats, radius: float) -> "_Pose":
+        angle = float(np.linalg.norm(step[:3])) / radius
+        turn = self.turn
+        if angle > 0.0:
+            turn = rigid_motion(angle=np.degrees(angle), axis=step[:3])[:3, :3] @ turn
+        return _Pose(turn, self.image + step[3:6], self.scale * (1.0 + float(step[6]) / radius))
+
+
+class _Sample:
+    """Vertices of a segment about its middle, with normals and the areas that they stand for."""
+
+    def __init__(self, arms: Floats, normals: Floats, areas: Floats) -> None:
+        self.arms, self.normals, self.areas = arms, normals, areas
+
+    def some(self, chosen: NDArray[np.int64]) -> "_Sample":
+        return _Sample(self.arms[chosen], self.normals[chosen], self.areas[chosen])
+
+
+class _Pairs:
+    """The points of the bone after that are nearest to a sample in a pose."""
+
+    def __init__(self, sample: _Sample, bone: Surface, pose: _Pose, facing: float) -> None:
+        self.moved = pose.of(sample.arms)
+        closest, self.facing, _ = bone.closest(self.moved)
+        apart = self.moved - closest
+        self.off: Floats = np.linalg.norm(apart, axis=1)
+        self.rest: Floats = (apart * self.facing).sum(axis=1)
+        self.alike = ((sample.normals @ pose.turn.T) * self.facing).sum(axis=1) >= facing
+
+
+class _Equations:
+    """Normal equations of a step: turn times radius, shift, growth of the radius, all in mm."""
+
+    def __init__(
+        self, sample: _Sample, bone: Surface, pose: _Pose, radius: float, facing: float
+    ) -> None:
+        pairs = _Pairs(sample, bone, pose, facing)
+        if int(pairs.alike.sum()) < LEAST_PAIRS:
+            raise RegistrationInputError(
+                f"{int(pairs.alike.sum())} vertices of the segment have bone after the operation "
+                f"that faces as they do; {LEAST_PAIRS} are needed: check that both are in one "
+                "frame and that normals of both point outwards"
+            )
+        self.sigma = max(TO_SIGMA * float(np.median(pairs.off[pairs.alike])), LEAST_SIGMA)
+        size = np.minimum(pairs.off / (TUKEY * self.sigma), 1.0)
+        self.weight = sample.areas * (1.0 - size**2) ** 2 * pairs.alike
+        arms = pairs.moved - pose.image
+        self.rows = _rows(arms, pairs.facing, radius)
+        self.rest, self.arms, self.radius = pairs.rest, sample.arms, radius
+        # Noise tilts the normals of either surface and seems to hold a ball against turning. In the
+        # product of both surfaces' rows it averages out.
+        own = _rows(arms, sample.normals @ pose.turn.T, radius)
+        both = (own[:, :6] * self.weight[:, None]).T @ self.rows[:, :6]
+        values, vectors = np.linalg.eigh(0.5 * (both + both.T))
+        shares = values / values[-1]
+        held = shares >= OPEN
+        self.ratio = max(float(shares[0]), 0.0)
+        self.open = tuple(
+            OpenDirection(vectors[:3, n].copy(), vectors[3:, n].copy(), max(float(shares[n]), 0.0))
+            for n in np.flatnonzero(~held)
+        )
+        # Unknowns that are solved for: the directions that the shape holds, and the size.
+        basis = np.zeros((7, int(held.sum()) + 1))
+        basis[:6, :-1], basis[6, -1] = vectors[:, held], 1.0
+        rows = self.rows @ basis
+        inverse = np.linalg.pinv((rows * self.weight[:, None]).T @ rows, hermitian=True)
+        self.has_size = bool(0.0 < inverse[-1, -1] * OPEN * values[-1] < 1.0)
+        self.basis = basis if self.has_size else basis[:, :-1]
+
+    def step(self, keep: NDArray[np.bool_] | None = None) -> Floats:
+        """The step, (7,) mm; of some of the points."""
+        return self._solved(self.rest, slice(None) if keep is None else keep)
+
+    def interval(self, scale: float) -> tuple[float, float]:
+        """The 95 % interval of the size; all that is allowed where the shape leaves it open."""
+        if not self.has_size:
+            return LEAST_SIZE, MOST_SIZE
+        block = _blocks(self.arms)
+        found = np.array([self.step(block != n)[6] for n in range(BLOCKS)])
+        variance = (BLOCKS - 1) / BLOCKS * float(((found - found.mean()) ** 2).sum())
+        thicker = self._solved(np.full(len(self.rest), -ALL_ROUND), slice(None))[6]
+        half = STUDENT * scale * float(np.hypot(np.sqrt(variance), thicker)) / self.radius
+        return scale - half, scale + half
+
+    def _solved(self, rest: Floats, keep: NDArray[np.bool_] | slice) -> Floats:
+        rows = self.rows[keep] @ self.basis
+        weighted = (rows * self.weight[keep, None]).T
+        solved = np.linalg.lstsq(weighted @ rows, -weighted @ rest[keep], rcond=None)[0]
+        return np.asarray(self.basis @ solved)
+
+
+def _rows(arms: Floats, normals: Floats, radius: float) -> Floats:
+    """How far turn, shift and growth by 1 mm move points along their normals, (n, 7)."""
+    turns = np.cross(arms, normals) / radius
+    return np.column_stack([turns, normals, (arms * normals).sum(axis=1) / radius])
+
+
+def _blocks(points: Floats) -> NDArray[np.int64]:
+    """The number of the block of neighbours that each point is in: halves of halves, by length."""
+    blocks = [np.arange(len(points))]
+    while len(blocks) < BLOCKS:
+        halves = []
+        for block in blocks:
+            axis = int(np.argmax(np.ptp(points[block], axis=0)))
+            order = block[np.argsort(points[block, axis], kind="stable")]
+            halves += [order[: len(order) // 2], order[len(order) // 2 :]]
+        blocks = halves
+    number = np.empty(len(points), dtype=np.int64)
+    for n, block in enumerate(blocks):
+        number[block] = n
+    return number
+
+
+def vertex_areas(surface: SurfaceData) -> Floats:
+    """A third of the triangles round each vertex, mm²."""
+    vertices = np.asarray(surface.vertices)
+    triangles = np.asarray(surface.triangles).astype(np.int64)
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return np.asarray(np.bincount(triangles.ravel(), np.repeat(areas / 3.0, 3), len(vertices)))

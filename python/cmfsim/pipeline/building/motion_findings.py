@@ -1,0 +1,184 @@
+"""Findings about how bones moved in an operation: removed, displaced, scaled, slid, left open."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cmfsim.bones.motion import RemovedBone
+from cmfsim.bones.shape_fit import OPEN, OpenDirection, ShapeFit
+from cmfsim.bones.stray import REACH, StrayPatch
+from cmfsim.io import Case
+from cmfsim.values.finding import Finding
+
+if TYPE_CHECKING:
+    from cmfsim.bones.achieved import AchievedMotion
+
+__all__ = ["motion_findings", "plan_key", "removed_finding"]
+
+# A size that differs by less was segmented otherwise, and is not reported. From the second on it is
+# a warning, as for bones that are followed vertex by vertex.
+NOTED, SCALED = 0.01, 0.03
+# Slip of vertices that is not reported, mm: noise of the scans does as much.
+SLID = 0.5
+
+
+def plan_key(case: Case, name: str) -> str:
+    """The key of the case file that the motion of a bone comes from."""
+    return f"postoperative.bones.{name}" if case.achieved else f"plan.{name}"
+
+
+def motion_findings(
+    found: AchievedMotion, name: str, where: str, skull: ShapeFit | None, *, is_still: bool
+) -> Iterator[Finding]:
+    """Findings about the motion of a segment that was read off the bone after the operation.
+
+    `skull` is how the bone that was left alone lies on the one after, where it is known.
+    """
+    by_shape = found.method != "vertices"
+    if by_shape:
+        severity = "warning" if found.method == "shape" else "note"
+        yield from (removed_finding(name, where, patch, severity) for patch in found.removed)
+        yield from (_stray_finding(name, where, patch, is_still=is_still) for patch in found.stray)
+    fit = found.fit
+    if fit is None:
+        return
+    if not by_shape:
+        if not is_still:
+            yield _bent_finding(name, where, fit)
+        return
+    yield from _size_findings(name, where, fit, None if is_still else skull)
+    yield from (_open_finding(name, where, way, found.method) for way in fit.open)
+    if found.slip > SLID:
+        yield Finding.note(
+            "motion-slip",
+            f"the vertices of {name} slid along its surface by {found.slip:.1f} mm (median)",
+            where=where,
+            why="its shape after is its shape before, moved: the slip is of the mesh that was "
+            "fitted, not of the bone, and is taken off",
+            fix="nothing to do",
+        )
+
+
+def _size_findings(
+    name: str, where: str, fit: ShapeFit, skull: ShapeFit | None
+) -> Iterator[Finding]:
+    """A change of size with its interval, and what it does to the motion."""
+    low, high = fit.scale_interval
+    change = abs(fit.scale - 1.0)
+    is_sure = not low <= 1.0 <= high
+    if change < (NOTED if is_sure else SCALED):
+        return
+    common = ""
+    if skull is not None and _is_scaled(skull):
+        shift = (skull.scale - 1.0) * (fit.image - skull.image)
+        common = (
+            f"; the skull is {skull.scale:.3g} times as large as well, and if the whole scan is, "
+            f"({', '.join(f'{x:+.1f}' for x in shift)}) mm of the motion are not the bone's"
+        )
+    yield Finding(
+        severity="warning" if is_sure and change > SCALED else "note",
+        code="moved-scaled",
+        what=f"{name} is {fit.scale:.3g} times as large after as before (95 % interval {low:.3f} "
+        f"to {high:.3f}, by its shape)",
+        where=where,
+        why="bone does not grow in an operation, so that the scans are calibrated or segmented "
+        f"differently by {change:.1%}; the motion is that of the middle of the bone, without the "
+        f"change of size{common}",
+        fix="check the voxel sizes of both scans and the thresholds of both segmentations, and "
+        "measure again",
+    )
+
+
+def _is_scaled(fit: ShapeFit) -> bool:
+    low, high = fit.scale_interval
+    return abs(fit.scale - 1.0) >= NOTED and not low <= 1.0 <= high
+
+
+def _open_finding(name: str, where: str, way: OpenDirection, method: str) -> Finding:
+    """A motion of the bone that its shape hardly shows."""
+    axis = ", ".join(f"{x:+.2f}" for x in way.axis)
+    words = f"a turn about the axis ({axis})" if way.is_turn else f"a shift along ({axis})"
+    left = (
+        "what the vertices say, slip along the bone included"
+        if method == "shape"
+        else "where the search began: that part of it may not have been found at all"
+    )
+    return Finding.warning(
+        "motion-open",
+        f"the shape of {name} hardly shows {words}: eigenvalue ratio {way.ratio:.3f}, "
+        f"{OPEN:g} is needed",
+        where=where,
+        why=f"its motion in that direction is {left}",
+        fix="give a larger or less symmetric part of the bone, teeth included, or the motion as "
+        "numbers in [plan]",
+    )
+
+
+def _bent_finding(name: str, where: str, fit: ShapeFit) -> Finding:
+    """A bone that is followed vertex by vertex, as no rigid motion lays it on the bone after."""
+    return Finding.warning(
+        "motion-bent",
+        f"{name} has another shape after the operation: its best rigid motion, with the size that "
+        f"fits best, leaves {np.quantile(fit.off, 0.95):.1f} mm (95th percentile)",
+        where=where,
+        why="bone does not bend in an operation; each vertex is followed, and if the mesh slid "
+        "along the bone, that counts as motion",
+        fix="if a piece was cut, make it a segment of its own in [[osteotomies]]; else check both "
+        "segmentations, and look at the picture of the plan",
+    )
+
+
+def removed_finding(name: str, where: str, patch: RemovedBone, severity: str) -> Finding:
+    """A patch of bone that is not there after the operation."""
+    at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
+    used = "its vertices are not used" if severity == "warning" else "it had no say in the motion"
+    return Finding(
+        severity=severity,
+        code="bone-removed",
+        what=f"{patch.area:.0f} mm² of {name} about ({at}) mm are no longer there after the "
+        f"operation, by up to {patch.depth:.1f} mm: taken as removed bone, not as motion",
+        where=where,
+        why="bone that is ground away does not pull the tissue over it: that tissue follows the "
+        f"rest of the segment; {used}",
+        fix="look at the bone there; if it was pushed in (fracture, impaction), give that part as "
+        "a bone of its own",
+    )
+
+
+def _stray_finding(name: str, where: str, patch: StrayPatch, *, is_still: bool) -> Finding:
+    """A piece of a segment that its motion does not lay on the bone after the operation."""
+    at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
+    piece = f"{patch.area / 100.0:.1f} cm² of {name} about ({at}) mm"
+    if patch.has_bone:
+        what = (
+            f"{piece} lie off the bone after the operation, by {patch.distance:.1f} mm (median): "
+            "bone is there, displaced: it moved otherwise than the segment, or what is left of it "
+            "lies deeper"
+        )
+        fix = (
+            "if that piece was cut (genioplasty, split maxilla), make it a segment of its own in "
+            "[[osteotomies]]; else check whether bone was removed there"
+        )
+    else:
+        what = (
+            f"{piece} have no bone after the operation within {REACH:g} mm that faces alike "
+            f"({patch.distance:.1f} mm to the nearest, median): removed, outside the scan, or "
+            "moved further"
+        )
+        fix = (
+            "check whether bone was removed there and whether the scan after shows that place; if "
+            "the piece was cut and moved, make it a segment of its own in [[osteotomies]]"
+        )
+    # A smaller scan after the operation cuts off the skull nearly always, which moves nothing.
+    return Finding(
+        severity="note" if is_still and not patch.has_bone else "warning",
+        code="achieved-piece-off",
+        what=what,
+        where=where,
+        why="the piece had no say in the motion, and moves with the rest of the segment all the "
+        "same: the face over it may be wrong by that distance",
+        fix=fix,
+    )
