@@ -11,8 +11,9 @@ use super::small_blocks::add_transposed_product;
 
 /// A row that has no place in a [`Sums`].
 const UNSEEN: u32 = u32::MAX;
-/// Coarse rows per parallel task.
-const ROWS_PER_TASK: usize = 32;
+/// Coarse rows per parallel task: with about 25 blocks in a row, its result stays below the size from which the
+/// system's allocator maps fresh pages for each request.
+const ROWS_PER_TASK: usize = 16;
 
 /// A coarse matrix in double precision, kept only until the next level is built.
 #[derive(Debug)]
@@ -55,11 +56,15 @@ pub(super) fn galerkin<const N: usize, A: SystemRows<N>>(
     let upper: Vec<UpperRows> = (0..tasks)
         .into_par_iter()
         .map_init(
-            || (Sums::new(a.n_rows()), Sums::new(p.n_coarse)),
-            |(images, products), task| {
+            || Scratch {
+                images: Sums::new(a.n_rows()),
+                products: Sums::new(p.n_coarse),
+                blocks: Vec::new(),
+            },
+            |scratch, task| {
                 let first = task * ROWS_PER_TASK;
                 let rows = first..p.n_coarse.min(first + ROWS_PER_TASK);
-                widest(Product { a, p, transposed, rows, images, products })
+                widest(Product { a, p, transposed, rows, scratch })
             },
         )
         .collect();
@@ -108,24 +113,33 @@ impl<const R: usize> Sums<R> {
     }
 }
 
+/// Buffers of one thread.
+struct Scratch<const N: usize> {
+    /// V_j of one row.
+    images: Sums<N>,
+    /// One row of the product.
+    products: Sums<MODES>,
+    /// The rows of one task: a buffer that grows with every task would ask for memory again and again.
+    blocks: Vec<ModeBlock>,
+}
+
 /// A range of rows of the upper triangle of the product.
 struct Product<'a, const N: usize, A: SystemRows<N>> {
     a: &'a A,
     p: &'a Prolongator<N>,
     transposed: &'a TransposedIndex,
     rows: std::ops::Range<usize>,
-    /// V_j of one row.
-    images: &'a mut Sums<N>,
-    /// One row of the product.
-    products: &'a mut Sums<MODES>,
+    scratch: &'a mut Scratch<N>,
 }
 
 impl<const N: usize, A: SystemRows<N>> Kernel for Product<'_, N, A> {
     type Output = UpperRows;
     #[inline(always)]
     fn run(self) -> UpperRows {
-        let Self { a, p, transposed, rows, images, products } = self;
+        let Self { a, p, transposed, rows, scratch } = self;
+        let Scratch { images, products, blocks } = scratch;
         let (row_start, columns) = (a.row_start(), a.columns());
+        blocks.clear();
         let mut upper = UpperRows {
             lengths: Vec::with_capacity(rows.len()),
             columns: Vec::new(),
@@ -153,12 +167,12 @@ impl<const N: usize, A: SystemRows<N>> Kernel for Product<'_, N, A> {
             }
             upper.lengths.push(products.rows.len());
             upper.columns.extend_from_slice(&products.rows);
-            upper.blocks.extend_from_slice(&products.blocks);
+            blocks.extend_from_slice(&products.blocks);
             images.clear();
             products.clear();
         }
         upper.flops = 2 * MODES * N * (N * fine_products + MODES * coarse_products);
-        upper.blocks.shrink_to_fit();
+        upper.blocks = blocks.clone();
         upper
     }
 }

@@ -74,7 +74,8 @@ impl Default for MultigridOptions {
         Self {
             strength: 0.08,
             smoother_degree: 2,
-            prolongator_damping: 1.6,
+            // Of 4/3 to 1.6, what takes the fewest iterations on shells and heads (25 to 28).
+            prolongator_damping: 1.4,
             coarsest_rows: 64,
             max_levels: 12,
         }
