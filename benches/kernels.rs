@@ -5,7 +5,8 @@
 //! Bytes are counted from the data structures: each array once for every pass over it, as if nothing
 //! stayed in cache between passes and nothing was fetched twice within one. The bandwidth is measured in
 //! the same run, with arrays larger than the caches. Times are medians. A ratio below one means that the
-//! caches hold part of the data from one call to the next; a factor does arithmetic, not traffic.
+//! caches hold part of the data from one call to the next; a factor does arithmetic, not traffic. Parts of the
+//! multigrid's set-up that compute also show how many operations they do per second.
 
 #![allow(missing_docs)]
 
@@ -22,7 +23,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use mtm_core::{
-    BlockMatrix, MassTensors, Multigrid, MultigridOptions, Preconditioner, Symbolic, tet_tensor,
+    BlockMatrix, MassTensors, Multigrid, MultigridOptions, Preconditioner, SetUpPart, Symbolic,
+    tet_tensor,
 };
 use rayon::prelude::*;
 use shell::Shell;
@@ -38,25 +40,38 @@ const LARGEST_FACTOR: usize = 6 << 30;
 
 /// One line of the table.
 struct Line {
-    kernel: &'static str,
+    kernel: String,
     bytes: usize,
+    /// Additions and multiplications; 0 where they are not counted.
+    flops: usize,
     seconds: f64,
+}
+
+impl Line {
+    /// The line of a kernel whose operations are not counted.
+    fn of(kernel: &str, bytes: usize, seconds: f64) -> Self {
+        Self { kernel: kernel.to_owned(), bytes, flops: 0, seconds }
+    }
 }
 
 fn main() {
     let all = rayon::current_num_threads();
     println!(
-        "| tets | threads | bandwidth GB/s | kernel | MB moved | bound ms | time ms | ratio |"
+        "| tets | threads | bandwidth GB/s | kernel | MB moved | bound ms | time ms | ratio | Gflop/s |"
     );
-    println!("|---:|---:|---:|---|---:|---:|---:|---:|");
+    println!("|---:|---:|---:|---|---:|---:|---:|---:|---:|");
     for threads in if all == 1 { vec![1] } else { vec![1, all] } {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
         let bandwidth = pool.install(stream_bandwidth);
         for n_tets in scene::sizes() {
             for line in pool.install(|| kernels(n_tets)) {
                 let bound = line.bytes as f64 / bandwidth;
+                let rate = match line.flops {
+                    0 => "–".to_owned(),
+                    flops => format!("{:.1}", 1e-9 * flops as f64 / line.seconds),
+                };
                 println!(
-                    "| {n_tets} | {threads} | {:.1} | {} | {:.1} | {:.3} | {:.3} | {:.1} |",
+                    "| {n_tets} | {threads} | {:.1} | {} | {:.1} | {:.3} | {:.3} | {:.1} | {rate} |",
                     1e-9 * bandwidth,
                     line.kernel,
                     1e-6 * line.bytes as f64,
@@ -97,8 +112,38 @@ fn median(mut call: impl FnMut()) -> f64 {
             begin.elapsed().as_secs_f64()
         })
         .collect();
+    middle(&mut seconds)
+}
+
+fn middle(seconds: &mut [f64]) -> f64 {
     seconds.sort_by(f64::total_cmp);
-    seconds[REPEATS / 2]
+    seconds[seconds.len() / 2]
+}
+
+/// A line for each part of the multigrid's set-up, and one for all of it.
+fn set_up_lines(set_up: impl Fn() -> Multigrid) -> Vec<Line> {
+    drop(set_up());
+    let mut whole = Vec::new();
+    let runs: Vec<Vec<SetUpPart>> = (0..REPEATS)
+        .map(|_| {
+            let begin = Instant::now();
+            let multigrid = set_up();
+            whole.push(begin.elapsed().as_secs_f64());
+            multigrid.set_up_parts().to_vec()
+        })
+        .collect();
+    let mut lines: Vec<Line> = (0..runs[0].len())
+        .map(|k| {
+            let mut seconds: Vec<f64> = runs.iter().map(|parts| parts[k].seconds).collect();
+            let SetUpPart { name, bytes, flops, .. } = runs[0][k];
+            Line { kernel: format!("set-up: {name}"), bytes, flops, seconds: middle(&mut seconds) }
+        })
+        .collect();
+    let sum = |of: fn(&Line) -> usize| lines.iter().map(of).sum();
+    let (bytes, flops) = (sum(|line| line.bytes), sum(|line| line.flops));
+    let kernel = "set-up of the multigrid".to_owned();
+    lines.push(Line { kernel, bytes, flops, seconds: middle(&mut whole) });
+    lines
 }
 
 fn matrix_bytes(a: &BlockMatrix) -> usize {
@@ -117,7 +162,7 @@ fn kernels(n_tets: usize) -> Vec<Line> {
         positions.iter().map(|x| [0, 1, 2].map(|i| (0.03 * x[i]).sin())).collect();
     let mut product = vec![[0.0; 3]; n];
     let mut lines = Vec::new();
-    let mut line = |kernel, bytes, seconds| lines.push(Line { kernel, bytes, seconds });
+    let mut line = |kernel: &str, bytes, seconds| lines.push(Line::of(kernel, bytes, seconds));
 
     // Corners, gradients from positions, material and fibre in; nothing but a sum out.
     let element_bytes = mesh.n_tets() * (16 + 6 * 8) + mesh.n_nodes() * 24;
@@ -154,6 +199,12 @@ fn kernels(n_tets: usize) -> Vec<Line> {
     line("smoother sweep, all levels", (more_bytes - bytes) / 2, sweep);
     line("multigrid cycle", bytes, seconds);
 
+    let options = MultigridOptions::default();
+    lines.extend(set_up_lines(|| {
+        Multigrid::new(&matrix, &positions, &[], &options).expect("a held body")
+    }));
+
+    let mut line = |kernel: &str, bytes, seconds| lines.push(Line::of(kernel, bytes, seconds));
     let symbolic = Arc::new(Symbolic::new(&matrix, &[]).expect("an elimination order"));
     if symbolic.factor_bytes() <= LARGEST_FACTOR {
         let factored = || symbolic.factor(&matrix).expect("a held body");

@@ -115,16 +115,16 @@ impl Iterative {
         }
     }
 
-    /// Conjugate gradients with `a`, whose trial is cached in `trial`.
+    /// Conjugate gradients with `a` and a preconditioner, whose trial is cached in `trial`.
     fn confirmed<'a>(
         &'a self,
-        a: &'a dyn Operator,
+        (a, preconditioner): (&'a dyn Operator, &'a dyn Preconditioner),
         trial: &'a OnceLock<Trial>,
         interrupted: Interrupt<'a>,
     ) -> Confirmed<'a> {
         Confirmed {
             a,
-            preconditioner: &self.multigrid,
+            preconditioner,
             trial,
             doubtful: self.doubtful,
             relative: self.tolerance,
@@ -147,11 +147,12 @@ impl Iterative {
         if is_zero(b) {
             return Ok(vec![[0.0; 3]; b.len()]);
         }
-        let tolerance = self.tolerance * self.reach(b, solve.scale);
+        let begun = Begun::new(&self.multigrid, b);
+        let tolerance = self.tolerance * begun.reach(solve.scale);
         if self.sweeps {
             return self.relax_to_bound(&self.matrix, b, tolerance, solve);
         }
-        let confirmed = self.confirmed(&self.matrix, &self.trial, solve.interrupted);
+        let confirmed = self.confirmed((&self.matrix, &begun), &self.trial, solve.interrupted);
         let found = self.solution(&confirmed, b, tolerance)?;
         solve.effort.error_estimate = found.error_estimate_mm;
         solve.effort.add(found.iterations, found.residual_history);
@@ -166,14 +167,15 @@ impl Iterative {
         allowed: f64,
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<[f64; 3]>> {
-        let far = self.reach(b, 0.0);
+        let begun = Begun::new(&self.multigrid, b);
+        let far = begun.reach(0.0);
         if far == 0.0 {
             return Ok(vec![[0.0; 3]; b.len()]);
         }
         let tolerance = allowed.max(self.tolerance * far);
         let confirmed = Confirmed {
             relative: tolerance / far,
-            ..self.confirmed(&self.matrix, &self.trial, interrupted)
+            ..self.confirmed((&self.matrix, &begun), &self.trial, interrupted)
         };
         Ok(self.solution(&confirmed, b, tolerance)?.solution)
     }
@@ -210,7 +212,8 @@ impl Iterative {
             let rows = vec![[0.0; 3]; b.len()];
             return Ok(Advance { rows, solved: true, is_carried: false });
         }
-        let length = *trail.reach.get_or_insert_with(|| self.reach(&b, solve.scale));
+        let length =
+            *trail.reach.get_or_insert_with(|| Begun::new(&self.multigrid, &b).reach(solve.scale));
         let length = conditions.constraints.iter().fold(length, |m, c| m.max(c.offset.abs()));
         let tolerance = self.tolerance * length;
         if self.sweeps {
@@ -231,7 +234,8 @@ impl Iterative {
         let (found, solved) = loop {
             let product =
                 ProjectedProduct::new(&self.matrix, &constraints, &springs).with_links(links);
-            let confirmed = self.confirmed(&product, &trail.trial, solve.interrupted);
+            let confirmed =
+                self.confirmed((&product, &self.multigrid), &trail.trial, solve.interrupted);
             match confirmed.solve(&b, &start, &options, leave.enough, &mut trail.seen)? {
                 Reached::Solution(found) => break (found, true),
                 Reached::Step(found) => break (found, false),
@@ -264,14 +268,6 @@ impl Iterative {
             is_carried = carry_on(&product, &b, &unheld, leave.reach, &mut rows);
         }
         Ok(Advance { rows, solved, is_carried })
-    }
-
-    /// Reference length of the tolerance, mm. Loads move the body even where bone does not: one cycle gives the
-    /// order of magnitude of that motion.
-    fn reach(&self, b: &[[f64; 3]], scale: f64) -> f64 {
-        let mut first = vec![[0.0; 3]; b.len()];
-        self.multigrid.apply(b, &mut first);
-        first.iter().fold(scale, |m, v| m.max(norm(*v)))
     }
 
     fn options(&self, tolerance: f64) -> PcgOptions {
@@ -314,7 +310,7 @@ impl Iterative {
             };
             let start = vec![[0.0; 3]; b.len()];
             let trial = OnceLock::new();
-            let confirmed = self.confirmed(matrix, &trial, solve.interrupted);
+            let confirmed = self.confirmed((matrix, &self.multigrid), &trial, solve.interrupted);
             let left = Confirmed { relative: MEASURED_SHARE, ..confirmed }
                 .solve(&rest, &start, &options, None, &mut Spectrum::default())
                 .and_then(Reached::into_outcome)
@@ -329,6 +325,39 @@ impl Iterative {
                 return Err(no_rest(most, error, tolerance));
             }
             goal *= (0.5 * tolerance / error).min(0.5);
+        }
+    }
+}
+
+/// The preconditioner of a system whose first cycle has been run: conjugate gradients that start from rest begin
+/// with the same one.
+struct Begun<'a> {
+    multigrid: &'a Multigrid,
+    b: &'a [[f64; 3]],
+    /// The cycle applied to `b`, mm.
+    first: Vec<[f64; 3]>,
+}
+
+impl<'a> Begun<'a> {
+    fn new(multigrid: &'a Multigrid, b: &'a [[f64; 3]]) -> Self {
+        let mut first = vec![[0.0; 3]; b.len()];
+        multigrid.apply(b, &mut first);
+        Self { multigrid, b, first }
+    }
+
+    /// Reference length of the tolerance, mm, at least `scale`. Loads move the body even where bone does not: one
+    /// cycle gives the order of magnitude of that motion.
+    fn reach(&self, scale: f64) -> f64 {
+        self.first.iter().fold(scale, |m, v| m.max(norm(*v)))
+    }
+}
+
+impl Preconditioner for Begun<'_> {
+    fn apply(&self, r: &[[f64; 3]], z: &mut [[f64; 3]]) {
+        if r == self.b {
+            z.copy_from_slice(&self.first);
+        } else {
+            self.multigrid.apply(r, z);
         }
     }
 }

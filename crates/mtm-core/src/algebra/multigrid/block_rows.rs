@@ -25,7 +25,7 @@ impl SystemRows<3> for BlockMatrix {
     fn columns(&self) -> &[u32] {
         &self.columns
     }
-    #[inline]
+    #[inline(always)]
     fn block(&self, position: usize) -> [[f64; 3]; 3] {
         let b = &self.blocks[position];
         [[b[0], b[1], b[2]], [b[3], b[4], b[5]], [b[6], b[7], b[8]]]

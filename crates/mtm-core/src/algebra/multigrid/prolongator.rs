@@ -2,12 +2,16 @@
 
 use rayon::prelude::*;
 
+use crate::algebra::simd::{Kernel, widest};
+
 use super::aggregation::{Aggregates, UNASSIGNED};
-use super::block_rows::{row_index, running_sum, split_rows};
+use super::block_rows::{RowsPart, row_index, running_sum, split_rows};
 use super::rigid_modes::MODES;
 use super::scaled_matrix::ScaledMatrix;
+use super::scaling::Scaling;
+use super::small_blocks::add_transposed_product;
 
-/// A prolongator in double precision, rows of N×6 blocks.
+/// A prolongator in double precision, rows of N×6 blocks, to unknowns that are not scaled.
 #[derive(Debug)]
 pub(super) struct Prolongator<const N: usize> {
     pub(super) row_start: Vec<usize>,
@@ -17,12 +21,14 @@ pub(super) struct Prolongator<const N: usize> {
 }
 
 impl<const N: usize> Prolongator<N> {
-    /// P = (I − ω Ã) P₀, one row of blocks per fine row; Ã is `a`, P₀ `tentative` and ω `damping`.
+    /// P' = Sᵀ P with P = (I − ω Ã) P₀, one row of blocks per fine row; Ã is `a`, P₀ `tentative`, ω `damping` and
+    /// S `scaling`: from coarse unknowns to those that are not scaled.
     pub(super) fn smoothed(
         a: &ScaledMatrix<N>,
         aggregates: &Aggregates,
         tentative: &[[[f64; MODES]; N]],
         damping: f64,
+        scaling: &Scaling<N>,
     ) -> Self {
         let of = &aggregates.of_row;
         let n = a.n_rows();
@@ -44,48 +50,27 @@ impl<const N: usize> Prolongator<N> {
         let total = row_start[n];
         let mut columns = vec![0_u32; total];
         let mut blocks = vec![[[0.0; MODES]; N]; total];
-        let column_parts = split_rows(&mut columns, &row_start, a.rows_per_task);
-        let block_parts = split_rows(&mut blocks, &row_start, a.rows_per_task);
-        column_parts.into_par_iter().zip(block_parts).for_each(|(columns, blocks)| {
-            let first = row_start[columns.rows.start];
-            for i in columns.rows.clone() {
-                let range = row_start[i] - first..row_start[i + 1] - first;
-                let columns = &mut columns.data[range.clone()];
-                let blocks = &mut blocks.data[range];
-                let mut used = 0;
-                for k in a.row_start[i]..a.row_start[i + 1] {
-                    let j = a.columns[k] as usize;
-                    let aggregate = of[j];
-                    if aggregate == UNASSIGNED {
-                        continue;
-                    }
-                    let slot = columns[..used].iter().position(|&c| c == aggregate);
-                    let slot = slot.unwrap_or_else(|| {
-                        columns[used] = aggregate;
-                        used += 1;
-                        used - 1
-                    });
-                    let out = &mut blocks[slot];
-                    let block = &a.blocks[k];
-                    for c in 0..N {
-                        for r in 0..N {
-                            let value = -damping * f64::from(block[c][r]);
-                            for m in 0..MODES {
-                                out[r][m] += value * tentative[j][c][m];
-                            }
-                        }
-                    }
-                    if i == j {
-                        for r in 0..N {
-                            for m in 0..MODES {
-                                out[r][m] += tentative[i][r][m];
-                            }
-                        }
-                    }
-                }
-            }
-        });
+        split_rows(&mut columns, &row_start, a.rows_per_task)
+            .into_par_iter()
+            .zip(split_rows(&mut blocks, &row_start, a.rows_per_task))
+            .for_each(|(columns, blocks)| {
+                let row_start = &row_start[columns.rows.start..=columns.rows.end];
+                widest(SmoothedRows {
+                    a,
+                    of,
+                    tentative,
+                    damping,
+                    scaling,
+                    row_start,
+                    columns,
+                    blocks,
+                });
+            });
         Self { row_start, columns, blocks, n_coarse: aggregates.count }
+    }
+
+    pub(super) fn memory_bytes(&self) -> usize {
+        self.row_start.len() * 8 + self.columns.len() * (4 + 8 * MODES * N)
     }
 
     /// Positions of the blocks of Pᵀ in P.
@@ -107,6 +92,60 @@ impl<const N: usize> Prolongator<N> {
             }
         }
         TransposedIndex { start, rows, positions }
+    }
+}
+
+/// A range of rows of [`Prolongator::smoothed`], which begins at `row_start`.
+struct SmoothedRows<'a, const N: usize> {
+    a: &'a ScaledMatrix<N>,
+    of: &'a [u32],
+    tentative: &'a [[[f64; MODES]; N]],
+    damping: f64,
+    scaling: &'a Scaling<N>,
+    row_start: &'a [usize],
+    columns: RowsPart<'a, u32>,
+    blocks: RowsPart<'a, [[f64; MODES]; N]>,
+}
+
+impl<const N: usize> Kernel for SmoothedRows<'_, N> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        let Self { a, of, tentative, damping, scaling, row_start, columns, blocks } = self;
+        for (i, range) in columns.rows.clone().zip(row_start.windows(2)) {
+            let range = range[0] - row_start[0]..range[1] - row_start[0];
+            let columns = &mut columns.data[range.clone()];
+            let blocks = &mut blocks.data[range];
+            let mut used = 0;
+            for k in a.row_start[i]..a.row_start[i + 1] {
+                let j = a.columns[k] as usize;
+                let aggregate = of[j];
+                if aggregate == UNASSIGNED {
+                    continue;
+                }
+                let slot = columns[..used].iter().position(|&c| c == aggregate);
+                let slot = slot.unwrap_or_else(|| {
+                    columns[used] = aggregate;
+                    used += 1;
+                    used - 1
+                });
+                // Blocks of Ã are stored by columns.
+                let step = a.blocks[k].map(|column| column.map(|v| -damping * f64::from(v)));
+                add_transposed_product(&mut blocks[slot], &step, &tentative[j]);
+                if i == j {
+                    for (out, row) in
+                        blocks[slot].as_flattened_mut().iter_mut().zip(tentative[i].as_flattened())
+                    {
+                        *out += row;
+                    }
+                }
+            }
+            for block in blocks {
+                let smoothed = *block;
+                *block = [[0.0; MODES]; N];
+                add_transposed_product(block, &scaling.inverse_factors[i], &smoothed);
+            }
+        }
     }
 }
 

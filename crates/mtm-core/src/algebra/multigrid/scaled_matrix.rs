@@ -6,7 +6,7 @@ use crate::algebra::error_bound::tridiagonal_extremes;
 use crate::algebra::row_sums::dot;
 use crate::algebra::simd::{Kernel, widest};
 
-use super::block_rows::{ENTRIES_PER_TASK, SystemRows, split_rows};
+use super::block_rows::{ENTRIES_PER_TASK, RowsPart, SystemRows, split_rows};
 use super::scaling::{Scaling, scaled_block};
 use super::small_blocks::block_row_product;
 
@@ -36,7 +36,7 @@ impl<const N: usize> ScaledMatrix<N> {
         self.row_start.len() * 8 + self.columns.len() * (4 + 4 * N * N)
     }
 
-    /// The system `a`, scaled, with its largest eigenvalue.
+    /// The system `a`, scaled; its largest eigenvalue is not known yet.
     pub(super) fn new(a: &impl SystemRows<N>, scaling: &Scaling<N>) -> Self {
         let row_start = a.row_start().to_vec();
         let entries = a.columns().len() * N * N;
@@ -44,24 +44,10 @@ impl<const N: usize> ScaledMatrix<N> {
         let columns = a.columns().to_vec();
         let mut blocks = vec![[[0.0_f32; N]; N]; columns.len()];
         let s = &scaling.inverse_factors;
-        split_rows(&mut blocks, &row_start, rows_per_task).into_par_iter().for_each(|part| {
-            for i in part.rows.clone() {
-                for k in row_start[i]..row_start[i + 1] {
-                    let j = columns[k] as usize;
-                    let scaled = scaled_block(&s[i], &a.block(k), &s[j], i <= j);
-                    let out = &mut part.data[k - row_start[part.rows.start]];
-                    for c in 0..N {
-                        for r in 0..N {
-                            out[c][r] = scaled[r][c] as f32;
-                        }
-                    }
-                }
-            }
-        });
-        let mut scaled =
-            Self { row_start, columns, blocks, largest_eigenvalue: 1.0, rows_per_task };
-        scaled.largest_eigenvalue = EIGENVALUE_SAFETY * scaled.estimate_eigenvalue();
-        scaled
+        split_rows(&mut blocks, &row_start, rows_per_task)
+            .into_par_iter()
+            .for_each(|part| widest(ScaledRows { a, s, part }));
+        Self { row_start, columns, blocks, largest_eigenvalue: 1.0, rows_per_task }
     }
 
     /// Row `i` of A x.
@@ -69,6 +55,19 @@ impl<const N: usize> ScaledMatrix<N> {
     pub(super) fn row_product(&self, i: usize, x: &[[f64; N]]) -> [f64; N] {
         let range = self.row_start[i]..self.row_start[i + 1];
         block_row_product(&self.columns[range.clone()], &self.blocks[range], x)
+    }
+
+    /// Estimates the largest eigenvalue, with a margin.
+    pub(super) fn find_largest_eigenvalue(&mut self) {
+        self.largest_eigenvalue = EIGENVALUE_SAFETY * self.estimate_eigenvalue();
+    }
+
+    /// Traffic and operations of [`find_largest_eigenvalue`](Self::find_largest_eigenvalue).
+    pub(super) fn eigenvalue_cost(&self) -> (usize, usize) {
+        // Four vectors are read or written by the product and three by the sums.
+        let vectors = 7 * 8 * N * self.n_rows();
+        let step = (self.memory_bytes() + vectors, 2 * N * N * self.columns.len());
+        (LANCZOS_STEPS * step.0, LANCZOS_STEPS * step.1)
     }
 
     /// Largest eigenvalue of the scaled matrix by a few Lanczos steps from a fixed start.
@@ -125,6 +124,35 @@ impl<const N: usize> ScaledMatrix<N> {
             return 1.0;
         }
         tridiagonal_extremes(&diagonal, &off_squared)[1].max(1.0)
+    }
+}
+
+/// A range of rows of S A Sᵀ.
+struct ScaledRows<'a, const N: usize, A: SystemRows<N>> {
+    a: &'a A,
+    s: &'a [[[f64; N]; N]],
+    part: RowsPart<'a, [[f32; N]; N]>,
+}
+
+impl<const N: usize, A: SystemRows<N>> Kernel for ScaledRows<'_, N, A> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        let Self { a, s, part } = self;
+        let (row_start, columns) = (a.row_start(), a.columns());
+        let first = row_start[part.rows.start];
+        for i in part.rows {
+            for k in row_start[i]..row_start[i + 1] {
+                let j = columns[k] as usize;
+                let scaled = scaled_block(&s[i], &a.block(k), &s[j], i <= j);
+                let out = &mut part.data[k - first];
+                for c in 0..N {
+                    for r in 0..N {
+                        out[c][r] = scaled[r][c] as f32;
+                    }
+                }
+            }
+        }
     }
 }
 

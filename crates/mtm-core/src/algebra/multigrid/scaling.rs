@@ -63,7 +63,7 @@ fn factor<const N: usize>(a: &[[f64; N]; N]) -> ([[f64; N]; N], [[f64; N]; N], b
 }
 
 /// `S_i A S_jᵀ`, associated so that the block at the transposed position is its transpose in every bit.
-#[inline]
+#[inline(always)]
 pub(super) fn scaled_block<const N: usize>(
     s_i: &[[f64; N]; N],
     a: &[[f64; N]; N],

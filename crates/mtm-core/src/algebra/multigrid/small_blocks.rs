@@ -41,7 +41,7 @@ pub(super) fn block_row_product<const C: usize, const R: usize>(
 }
 
 /// `out += a b`.
-#[inline]
+#[inline(always)]
 pub(super) fn add_product<const R: usize, const K: usize, const C: usize>(
     out: &mut [[f64; C]; R],
     a: &[[f64; K]; R],
@@ -57,7 +57,7 @@ pub(super) fn add_product<const R: usize, const K: usize, const C: usize>(
 }
 
 /// `out += aᵀ b`.
-#[inline]
+#[inline(always)]
 pub(super) fn add_transposed_product<const K: usize, const R: usize, const C: usize>(
     out: &mut [[f64; C]; R],
     a: &[[f64; R]; K],

@@ -4,10 +4,11 @@ use rayon::prelude::*;
 
 use crate::algebra::simd::{Kernel, widest};
 
+use super::block_rows::{RowsPart, split_rows};
 use super::prolongator::{Prolongator, TransposedIndex};
 use super::rigid_modes::MODES;
 use super::scaling::Scaling;
-use super::small_blocks::block_row_product;
+use super::small_blocks::{add_transposed_product, block_row_product};
 
 /// Prolongation and restriction between two levels, both in scaled unknowns.
 #[derive(Debug)]
@@ -25,34 +26,19 @@ pub(super) struct Transfer<const N: usize> {
 }
 
 impl<const N: usize> Transfer<N> {
-    /// P Sᵀ with the coarse scaling S.
+    /// Lᵀ P' Sᵀ with L the fine factors, P' `p` and S the coarse inverse factors: between scaled unknowns.
     pub(super) fn new(
-        p: &Prolongator<N>,
-        transposed: &TransposedIndex,
-        scaling: &Scaling<MODES>,
+        p: Prolongator<N>,
+        transposed: TransposedIndex,
+        fine: &Scaling<N>,
+        coarse: &Scaling<MODES>,
         rows_per_task: usize,
     ) -> Self {
-        let fine_blocks: Vec<[[f32; N]; MODES]> = p
-            .blocks
-            .par_iter()
-            .zip(&p.columns)
-            .with_min_len(1024)
-            .map(|(block, &column)| {
-                let s = &scaling.inverse_factors[column as usize];
-                let mut out = [[0.0; N]; MODES];
-                for c in 0..MODES {
-                    for r in 0..N {
-                        // Row c of the lower triangular S.
-                        let mut sum = 0.0;
-                        for m in 0..=c {
-                            sum += block[r][m] * s[c][m];
-                        }
-                        out[c][r] = sum as f32;
-                    }
-                }
-                out
-            })
-            .collect();
+        let mut fine_blocks = vec![[[0.0_f32; N]; MODES]; p.blocks.len()];
+        split_rows(&mut fine_blocks, &p.row_start, rows_per_task)
+            .into_par_iter()
+            .for_each(|part| widest(ScaledRows { p: &p, fine, coarse, part }));
+        drop(p.blocks);
         let coarse_blocks = transposed
             .positions
             .par_iter()
@@ -71,11 +57,11 @@ impl<const N: usize> Transfer<N> {
         let n_coarse = transposed.start.len() - 1;
         let coarse_per_task = (rows_per_task * n_coarse / p.row_start.len()).max(1);
         Self {
-            fine_start: p.row_start.clone(),
-            fine_columns: p.columns.clone(),
+            fine_start: p.row_start,
+            fine_columns: p.columns,
             fine_blocks,
-            coarse_start: transposed.start.clone(),
-            coarse_columns: transposed.rows.clone(),
+            coarse_start: transposed.start,
+            coarse_columns: transposed.rows,
             coarse_blocks,
             rows_per_task,
             coarse_per_task,
@@ -103,6 +89,41 @@ impl<const N: usize> Transfer<N> {
             let (columns, blocks) = (&self.fine_columns[..], &self.fine_blocks[..]);
             widest(Products { start, columns, blocks, x: coarse, out });
         });
+    }
+}
+
+/// A range of rows of the blocks of [`Transfer::new`].
+struct ScaledRows<'a, const N: usize> {
+    p: &'a Prolongator<N>,
+    fine: &'a Scaling<N>,
+    coarse: &'a Scaling<MODES>,
+    part: RowsPart<'a, [[f32; N]; MODES]>,
+}
+
+impl<const N: usize> Kernel for ScaledRows<'_, N> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        let Self { p, fine, coarse, part } = self;
+        let first = p.row_start[part.rows.start];
+        for i in part.rows {
+            for k in p.row_start[i]..p.row_start[i + 1] {
+                let mut scaled = [[0.0; MODES]; N];
+                add_transposed_product(&mut scaled, &fine.factors[i], &p.blocks[k]);
+                let s = &coarse.inverse_factors[p.columns[k] as usize];
+                let out = &mut part.data[k - first];
+                for c in 0..MODES {
+                    for r in 0..N {
+                        // Row c of the lower triangular S.
+                        let mut sum = 0.0;
+                        for m in 0..=c {
+                            sum += scaled[r][m] * s[c][m];
+                        }
+                        out[c][r] = sum as f32;
+                    }
+                }
+            }
+        }
     }
 }
 
