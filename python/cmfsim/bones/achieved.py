@@ -291,9 +291,7 @@ def measure_pair(
         return replace(found, fit=shape.fit, slip=shape.slip, stray=shape.stray)
     if is_still:
         moved = MovedSurface(before, shape.slid_free)
-        return _by_shape(
-            "vertices", before, shape.fit, centre, is_rigid=False, moved=moved, **known
-        )
+        return _by_shape("shape", before, shape.fit, centre, is_rigid=False, moved=moved, **known)
     return _by_shape("shape", before, shape.fit, centre, moved=found.moved, **known)
 
 
