@@ -98,6 +98,8 @@ def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
     areas = vertex_areas(before)
     total = areas.sum()
     moved = _carried(fit.matrix, here)
+    large = [patch.vertices for patch in removed if patch.area >= LEAST_STRAY]
+    large += [patch.vertices for patch in stray]
     rest = np.where(gone[:, None], 0.0, closest - carried)
     along = there - carried
     along -= (along * normals).sum(axis=1, keepdims=True) * normals
@@ -107,10 +109,7 @@ def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
         bool(
             areas[on | gone].sum() >= RIGID_SHARE * total
             and areas[on & ~gone].sum() >= LEAST_LYING * total
-            and not any(
-                patch.area >= LEAST_STRAY and _is_displaced(here, there, bone, patch.vertices)
-                for patch in (*removed, *stray)
-            )
+            and not any(_is_displaced(here, there, bone, patch) for patch in large)
         ),
         float(np.median(np.linalg.norm(along[kept], axis=1))) if kept.any() else 0.0,
         moved + rest,
