@@ -30,7 +30,7 @@ from cmfsim.checks import (
     check_one_of,
     frozen,
 )
-from cmfsim.errors import RegistrationInputError
+from cmfsim.errors import RegistrationError, RegistrationInputError
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import RigidMotion, decompose_motion, rigid_matrix
@@ -266,7 +266,8 @@ def measure_pair(
 
     Where the bone after has the shape of the bone before, the motion is the rigid one that lays
     the one on the other, whatever the vertices did along it; a bone that was left alone keeps
-    what it changed along its normals. Where it has another shape, vertices are followed.
+    what it changed along its normals. Where it has another shape, or none that can be compared
+    (`fit` is None then), vertices are followed.
 
     Parameters
     ----------
@@ -280,20 +281,22 @@ def measure_pair(
     Raises
     ------
     RegistrationError
-        See `measure_motion` and `fit_shape`.
+        See `measure_motion`.
     """
     found = measure_motion(before, after, centre=centre)
     if found.is_rigid:
         return found
-    shape = paired_shape(before, after)
+    try:
+        shape = paired_shape(before, after)
+    except RegistrationError as error:
+        _LOG.warning("vertices are followed, as shapes cannot be compared: %s", error)
+        return found
     known = {"removed": shape.removed, "stray": shape.stray, "slip": shape.slip}
     if not shape.is_rigid:
         return replace(found, fit=shape.fit, slip=shape.slip, stray=shape.stray)
     if is_still:
         moved = MovedSurface(before, shape.slid_free)
-        return _by_shape(
-            "vertices", before, shape.fit, centre, is_rigid=False, moved=moved, **known
-        )
+        return _by_shape("shape", before, shape.fit, centre, is_rigid=False, moved=moved, **known)
     return _by_shape("shape", before, shape.fit, centre, moved=found.moved, **known)
 
 

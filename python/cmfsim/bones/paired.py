@@ -20,7 +20,7 @@ from cmfsim.bones.shape_fit import (
     fit_shape,
     vertex_areas,
 )
-from cmfsim.bones.stray import StrayPatch, stray_patches
+from cmfsim.bones.stray import LEAST_STRAY, StrayPatch, stray_patches
 from cmfsim.checks import Floats
 from cmfsim.errors import RegistrationError
 from cmfsim.values.surface_data import SurfaceData
@@ -32,7 +32,7 @@ __all__ = ["PairedShape", "paired_shape"]
 LIES = 1.0
 # A patch off the bone is a piece that moved otherwise if its own vertices' rigid motion lays this
 # share of them this near to the bone after, mm: two and a half times noise of 0.3 mm. The end of a
-# bone, squeezed flat on to the stump, stands off it by its height.
+# bone, squeezed flat on to the stump, stands off it by its height. Crumbs at its rim do not count.
 OWN, OWN_SHARE = 0.75, 0.8
 # Rounds of weights for the motion to begin with: a fifth of the vertices that went 4 mm elsewhere
 # are left out by then.
@@ -98,6 +98,8 @@ def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
     areas = vertex_areas(before)
     total = areas.sum()
     moved = _carried(fit.matrix, here)
+    large = [patch.vertices for patch in removed if patch.area >= LEAST_STRAY]
+    large += [patch.vertices for patch in stray]
     rest = np.where(gone[:, None], 0.0, closest - carried)
     along = there - carried
     along -= (along * normals).sum(axis=1, keepdims=True) * normals
@@ -107,9 +109,7 @@ def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
         bool(
             areas[on | gone].sum() >= RIGID_SHARE * total
             and areas[on & ~gone].sum() >= LEAST_LYING * total
-            and not any(
-                _is_displaced(here, there, bone, patch.vertices) for patch in (*removed, *stray)
-            )
+            and not any(_is_displaced(here, there, bone, patch) for patch in large)
         ),
         float(np.median(np.linalg.norm(along[kept], axis=1))) if kept.any() else 0.0,
         moved + rest,

@@ -40,8 +40,8 @@ MOST_POINTS = 20000
 # is promised; noise swaps partners below it.
 REST, MOST_STEPS = 1e-4, 100
 # A direction is open if the normal equations hold it by less than this share of the best: an error
-# of the surface is then seven times as large in it as in the best. A noisy ball reaches 0.015.
-OPEN = 0.02
+# of the surface is then ten times as large in it as in the best. A noisy ball reaches 0.007.
+OPEN = 0.01
 # Blocks of the jackknife, a power of two, and Student's t of 31 degrees of freedom (95 %).
 BLOCKS, STUDENT = 32, 2.04
 # How well the surface of a bone is known all round, mm: thresholds and triangles of two scans move

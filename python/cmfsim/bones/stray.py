@@ -17,7 +17,7 @@ from cmfsim.checks import Floats
 from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["REACH", "StrayPatch", "stray_patches"]
+__all__ = ["LEAST_STRAY", "REACH", "StrayPatch", "stray_patches"]
 
 # A vertex is off if it lies further from the bone than this, mm, three times what a segmented bone
 # is known to, and than so many times the rms of the fit: noise does that to one vertex in 10 000.

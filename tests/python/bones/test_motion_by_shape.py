@@ -91,7 +91,7 @@ def test_a_shape_that_leaves_turns_open_says_so(noise):
         found = measure_pair(before, after)
         assert len(found.fit.open) == n_open
         assert all(way.is_turn for way in found.fit.open)
-        assert found.fit.eigenvalue_ratio < 0.02
+        assert found.fit.eigenvalue_ratio < 0.01
     assert abs(found.fit.open[0].axis[:3] @ MOTION[:3, :3] @ [0, 0, 1]) > 0.99
     kind = found.as_dict()["shape"]["open"][0]["kind"]
     assert kind == "turn"

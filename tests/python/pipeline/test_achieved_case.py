@@ -232,6 +232,20 @@ def test_a_chin_that_is_no_segment_bends_the_jaw_and_is_a_warning(tmp_path):
     assert "[[osteotomies]]" in finding.fix
 
 
+def test_paired_bones_of_sizes_that_are_no_bone_s_are_followed_and_named(tmp_path):
+    """0.7 times as large: no shape is compared; both warnings say that vertices are followed."""
+    head = operated(rounds=3)
+    after = head.surfaces["mandible_after"]
+    vertices = np.asarray(after.vertices)
+    middle = vertices.mean(axis=0)
+    small = cmfsim.SurfaceData(middle + 0.7 * (vertices - middle), after.triangles)
+    head.surfaces["mandible_after"] = small
+    found = achieved_bones(head, tmp_path)
+    assert isinstance(found.motions["mandible"], cmfsim.MovedSurface)
+    codes = [f.code for f in found.findings if f.severity == "warning"]
+    assert sorted(codes) == ["moved-scaled", "motion-bent"]
+
+
 def test_a_smooth_bone_leaves_a_turn_open_and_is_a_warning(tmp_path):
     """An ellipsoid of almost equal axes, remeshed: its turn cannot be seen."""
     head = operated(rounds=4)

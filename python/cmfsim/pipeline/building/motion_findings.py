@@ -43,10 +43,8 @@ def motion_findings(
         yield from (removed_finding(name, where, patch, severity) for patch in found.removed)
         yield from (_stray_finding(name, where, patch, is_still=is_still) for patch in found.stray)
     fit = found.fit
-    if fit is None:
-        return
-    if not by_shape:
-        if not is_still:
+    if not by_shape or fit is None:
+        if not (is_still or found.is_rigid):
             yield _bent_finding(name, where, fit)
         return
     yield from _size_findings(name, where, fit, None if is_still else skull)
@@ -117,12 +115,17 @@ def _open_finding(name: str, where: str, way: OpenDirection, method: str) -> Fin
     )
 
 
-def _bent_finding(name: str, where: str, fit: ShapeFit) -> Finding:
+def _bent_finding(name: str, where: str, fit: ShapeFit | None) -> Finding:
     """A bone that is followed vertex by vertex, as no rigid motion lays it on the bone after."""
+    left = (
+        "no rigid motion lays it on the bone after"
+        if fit is None
+        else "its best rigid motion, with the size that fits best, leaves "
+        f"{np.quantile(fit.off, 0.95):.1f} mm (95th percentile)"
+    )
     return Finding.warning(
         "motion-bent",
-        f"{name} has another shape after the operation: its best rigid motion, with the size that "
-        f"fits best, leaves {np.quantile(fit.off, 0.95):.1f} mm (95th percentile)",
+        f"{name} has another shape after the operation: {left}",
         where=where,
         why="bone does not bend in an operation; each vertex is followed, and if the mesh slid "
         "along the bone, that counts as motion",
