@@ -394,7 +394,7 @@ regions = [{segment = "mandible", centre = [0, -160, 1450], radius = 9}]
 
 def test_landmarks_that_span_no_arch_are_refused(jaw):
     arch = arch_head.arch()
-    with pytest.raises(cmfsim.CaseError, match="span no arch"):
+    with pytest.raises(cmfsim.CaseError, match="do not span an arch"):
         dataclasses.replace(arch, tip=arch.left)
     with pytest.raises(cmfsim.CaseError, match="no bone within"):
         cmfsim.contact_sheet(

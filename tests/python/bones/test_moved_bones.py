@@ -159,7 +159,7 @@ SPOILT = {
         (lambda v, t: (v[:-1], t[(t < len(v) - 1).all(axis=1)]), "has 161 vertices"),
         (lambda v, t: (v, t[::-1]), "at other vertices"),
     ],
-    "moved-scrambled": [(shuffled, "the edges of mandible point elsewhere")],
+    "moved-scrambled": [(shuffled, "the edges of mandible point in other directions")],
     "moved-scaled": [
         (lambda v, t: (v / 1000.0, t), "0.001 times as large"),
         (lambda v, t: (v * 1.1, t), "1.1 times as large"),

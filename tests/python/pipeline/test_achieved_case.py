@@ -129,7 +129,7 @@ def test_another_size_of_paired_bones_is_reported_with_its_figure(ratio, tmp_pat
         (lambda v: v / 10.0, "0.1 times as large after as before (median of its edges): that is"),
         (
             lambda v: np.random.default_rng(0).permutation(v),
-            "the edges of mandible point elsewhere",
+            "the edges of mandible point in other directions",
         ),
         (lambda v: v * [-1.0, 1.0, 1.0], "mandible is mirrored after against before"),
     ],
@@ -277,7 +277,7 @@ def test_surfaces_in_another_frame_are_laid_on_by_the_skull(rounds, tmp_path):
     [
         ('"achieved"', '"achived"', "case.toml:3: plan is 'achived': tables [plan.SEGMENT]"),
         ('"achieved"', "3", "case.toml:3: plan is 3"),
-        (BONES, "", "case.toml:3: plan is achieved, and there is no bone"),
+        (BONES, "", "case.toml:3: plan is achieved, but there is no bone"),
         ('skin = "face_after.ply"', 'image = "ct.nrrd"', "is given together with image"),
     ],
 )
