@@ -176,7 +176,7 @@ def test_a_crooked_face_agrees_with_itself():
     crooked["gonion_L"] = crooked["gonion_L"] + [0, 12, 0]
     (finding,) = checks.check_landmarks("skull", crooked, "", None)
     assert finding.code == "landmark-asymmetric"
-    assert finding.what.startswith("gonion_L and gonion_R are no mirror images")
+    assert finding.what.startswith("gonion_L and gonion_R deviate from mirror symmetry")
 
 
 def test_few_landmarks_are_judged_by_their_distance_alone(head):

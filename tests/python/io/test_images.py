@@ -144,7 +144,7 @@ def test_files_that_are_no_volume_are_refused(tmp_path):
     (tmp_path / "empty.nrrd").write_bytes(b"")
     _refused(tmp_path / "empty.nrrd", "empty")
     (tmp_path / "text.nii").write_text("not an image")
-    _refused(tmp_path / "text.nii", "no image")
+    _refused(tmp_path / "text.nii", "not a readable image")
     (tmp_path / "folder").mkdir()
     _refused(tmp_path / "folder", "no DICOM")
     sitk.WriteImage(sitk.JoinSeries([_itk(), _itk()]), str(tmp_path / "four.nii"))

@@ -147,7 +147,7 @@ LINEAR = '<LinearTransform id="t1" name="A" matrixTransformToParent="{}"/>'
 @pytest.mark.parametrize(
     ("transform", "words"),
     [
-        ("", "does not have"),
+        ("", "is not in the scene"),
         ('<LinearTransform id="t1" name="A" references="transform:t1;"/>', "its own parent"),
         ('<LinearTransform id="t1" name="A" matrixTransformToParent="1 0 0"/>', "16 are needed"),
         (
@@ -162,7 +162,7 @@ LINEAR = '<LinearTransform id="t1" name="A" matrixTransformToParent="{}"/>'
         (
             '<LinearTransform id="t1" name="A" references="storage:s2;"/>'
             + storage("gone.h5", 2, "Transform"),
-            "is not there",
+            "does not exist",
         ),
     ],
 )

@@ -300,9 +300,9 @@ def test_binary_and_absent_files_and_wrong_frames_are_named(tmp_path):
         cmfsim.read_transform(tmp_path / "c.tfm", frame="RAS")
     text = (tmp_path / "c.tfm").read_text(encoding="utf-8").replace("# mm, LPS, to-parent\n", "")
     (tmp_path / "c.tfm").write_text(text, encoding="utf-8")
-    with pytest.raises(cmfsim.CaseError, match="LPS always"):
+    with pytest.raises(cmfsim.CaseError, match="always LPS"):
         cmfsim.read_transform(tmp_path / "c.tfm", direction="to-parent", frame="RAS")
-    with pytest.raises(cmfsim.CaseError, match="LPS always"):
+    with pytest.raises(cmfsim.CaseError, match="always LPS"):
         cmfsim.write_transform(tmp_path / "c.tfm", np.eye(4), direction="to-parent", frame="RAS")
     with pytest.raises(cmfsim.CaseError, match='state direction = "from-parent" for 3D Slicer'):
         cmfsim.write_transform(tmp_path / "c.tfm", np.eye(4))

@@ -189,7 +189,11 @@ def test_without_sliding_the_product_is_exact_for_every_plan(planning):
 
 def test_a_prediction_is_planned_again_as_the_model_solves_it(planning, reference):
     plan = {"maxilla": other_plan(planning)["maxilla"]}
-    again, exact = reference.replan(plan), planning.solve(plan)
+    # A planning model keeps what its reference lifts off the bone, a new prediction does not.
+    kept = dataclasses.replace(
+        reference, patient=dataclasses.replace(reference.patient, lifted=None)
+    )
+    again, exact = kept.replan(plan), planning.solve(plan)
     np.testing.assert_allclose(again.skin_displacements, exact.skin_displacements, atol=1e-6)
     # Segments that are not named stay, and nothing is said of where the case's motions came from.
     np.testing.assert_array_equal(again.scene.plan["mandible_body"], np.eye(4))

@@ -182,7 +182,7 @@ def test_a_failure_is_recorded_and_not_tried_again(tmp_path, monkeypatch):
 def test_failures_are_in_the_record_and_counted(tmp_path, monkeypatch, capsys):
     """D002 fails: it stays in population.json with the reason, in its part, and is named."""
 
-    def outcomes(jobs, _):
+    def outcomes(jobs, *_):
         for job in reversed(jobs):
             yield job, "made", "stalls" if job.index == 2 else ""
 
@@ -196,7 +196,7 @@ def test_failures_are_in_the_record_and_counted(tmp_path, monkeypatch, capsys):
     )
     assert found.named("made", "train") == ("D001", "D004")
     # A smaller count later takes nobody away.
-    monkeypatch.setattr(population_folder, "_made", lambda jobs, _: outcomes(jobs, 1))
+    monkeypatch.setattr(population_folder, "_made", lambda jobs, *_: outcomes(jobs, 1))
     cmfsim.virtual_population(tmp_path, 1, seed=3)
     assert cmfsim.Population.load(tmp_path) == found
 
