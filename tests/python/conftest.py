@@ -4,6 +4,8 @@ import os
 import signal
 from pathlib import Path
 
+from hypothesis import HealthCheck, settings
+
 # A shell that runs the suite in the background has it ignore Ctrl-C, which some tests send.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -12,6 +14,17 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 # in every process wait for one another a hundred times as long as such a product takes. NumPy reads
 # this when it is imported, which no plugin has done yet; commands that tests start inherit it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# A commit passes or fails whenever it is run: hypothesis draws the same examples every time, unless
+# CMFSIM_TEST_RANDOM=1 asks for new ones.
+settings.register_profile(
+    "cmfsim",
+    deadline=None,
+    derandomize=os.environ.get("CMFSIM_TEST_RANDOM") != "1",
+    max_examples=40,
+    suppress_health_check=list(HealthCheck),
+)
+settings.load_profile("cmfsim")
 
 # The files that take longest, first: a process that meets one of them last works on it alone, while
 # the others have nothing left to do. `make test` keeps this order (--no-loadscope-reorder).

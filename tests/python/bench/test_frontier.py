@@ -37,7 +37,7 @@ WORDS = ["--model", "H", "--elements", "p1", "--kinematics", *KINEMATICS, "--edg
 costs = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=14)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(costs)
 def test_the_front_is_what_brute_force_finds(pairs):
     """Small whole numbers, so that there are ties in one cost and in both."""

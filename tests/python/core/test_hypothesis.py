@@ -2,17 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 import cmfsim
 import meshes
-
-settings.register_profile(
-    "cmfsim", deadline=None, max_examples=40, suppress_health_check=list(HealthCheck)
-)
-settings.load_profile("cmfsim")
 
 moduli = st.floats(1e-3, 1e3)
 ratios = st.floats(0.0, 0.495)

@@ -140,7 +140,7 @@ def test_lips_with_a_gap_between_them_are_two_bodies():
     assert bodies(cmfsim.mesh_from_level(closed, cmfsim.MeshOptions(4.0)).mesh) == 1
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=20)
 @given(
     seed=st.integers(0, 2**32 - 1),
     edge=st.floats(2.0, 6.0),
@@ -148,7 +148,11 @@ def test_lips_with_a_gap_between_them_are_two_bodies():
     spacing=st.tuples(*[st.floats(0.6, 1.6)] * 3),
 )
 def test_no_tet_is_flatter_than_ten_degrees(seed, edge, refinements, spacing):
-    """Of any smooth blob; the boundary within a quarter edge of where it should be on average."""
+    """Of any smooth blob; the boundary within a quarter edge of where it should be on average.
+
+    A blob's bumps are as wide as the knots of its noise, four voxels. An edge that spans more
+    cannot follow them: its error is measured against how many bumps it spans.
+    """
     ndimage = pytest.importorskip("scipy.ndimage")
     noise = np.random.default_rng(seed).uniform(-1.0, 1.0, (4, 5, 4))
     values = np.pad(ndimage.zoom(noise, 4, order=3), 3, constant_values=-1.0).astype(np.float32)
@@ -159,7 +163,8 @@ def test_no_tet_is_flatter_than_ten_degrees(seed, edge, refinements, spacing):
     level = np.maximum(values, np.clip(5.0 - distance, -1.0, 1.0)).astype(np.float32)
     made = cmfsim.mesh_from_level(grid.with_values(level), cmfsim.MeshOptions(edge, refinements))
     assert made.report.min_dihedral >= LEAST
-    assert made.report.boundary_error_mean <= edge / 4.0
+    bumps_spanned = max(1.0, edge / (4.0 * min(spacing)))
+    assert made.report.boundary_error_mean <= bumps_spanned * edge / 4.0
     assert np.asarray(made.mesh.volumes).min() > 0.0
 
 

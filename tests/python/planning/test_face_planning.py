@@ -207,7 +207,7 @@ def test_targets_that_cannot_be_met_are_refused(planning):
             cmfsim.plan_for_face(planning, wish, search)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**31))
 def test_the_search_ends_where_another_does(seed):
     """Bounded linear and mildly curved problems, against SciPy's trust-region method."""
