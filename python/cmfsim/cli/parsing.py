@@ -29,6 +29,13 @@ from cmfsim.values.solver_options import CONTACTS
 
 __all__ = ["make_parser"]
 
+# How `predict` and `evaluate` take models.
+MODEL_CHOICES: dict[str, Any] = {
+    "metavar": "MODEL",
+    "choices": (*MODELS, "all"),
+    "action": "append",
+}
+
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of every command; `options.run` is the function that does it."""
@@ -146,13 +153,39 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
 
 
 def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentParser) -> None:
-    models = {"metavar": "MODEL", "choices": (*MODELS, "all"), "action": "append"}
+    _add_predict(commands, changed)
+    _add_plan(commands, changed)
+    _add_evaluate(commands, changed)
+    _add_sensitivity(commands, changed)
+    study = commands.add_parser(
+        "study",
+        parents=[common],
+        help="predict and evaluate every case of a cohort with every model",
+    )
+    study.add_argument("cohort", metavar="COHORT", type=Path, help="cohort.toml, or its folder")
+    study.add_argument(
+        "--workers", metavar="N", type=int, help="number of cases processed at a time"
+    )
+    study.add_argument(
+        "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
+    )
+    study.add_argument("--fresh", action="store_true", help="repeat finished cases")
+    study.set_defaults(run=study_commands.study)
+
+    report = commands.add_parser(
+        "report", parents=[common], help="regenerate the report of a folder of results"
+    )
+    report.add_argument("folder", metavar="FOLDER", type=Path, help="folder written by predict")
+    report.set_defaults(run=study_commands.report)
+
+
+def _add_predict(commands: Any, changed: argparse.ArgumentParser) -> None:
     predict = commands.add_parser(
         "predict", parents=[changed], help="predict the face after the operation"
     )
     predict.add_argument(
         "--model",
-        **models,
+        **MODEL_CHOICES,
         help="H (homogeneous), M (muscles), H+S or M+S (with sliding), or all; may be repeated "
         "(default M+S)",
     )
@@ -160,8 +193,11 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         "--plan", metavar="PLAN", type=Path, help="plan.toml to use instead of the case's plan"
     )
     add_band_options(predict)
+    _add_output_options(predict)
     predict.set_defaults(run=study_commands.predict)
 
+
+def _add_plan(commands: Any, changed: argparse.ArgumentParser) -> None:
     plan = commands.add_parser(
         "plan",
         parents=[changed],
@@ -205,24 +241,31 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     plan.add_argument("--no-open", action="store_true", help="do not open the page")
     plan.set_defaults(run=plan_command.plan)
 
+
+def _add_evaluate(commands: Any, changed: argparse.ArgumentParser) -> None:
     evaluate = commands.add_parser(
         "evaluate", parents=[changed], help="predict the face, and compare it with the real one"
     )
-    evaluate.add_argument("--model", **models, help="as in predict (default all)")
+    evaluate.add_argument("--model", **MODEL_CHOICES, help="as in predict (default all)")
     evaluate.add_argument(
         "--fit-thickness",
         action="store_true",
         help="fit one change of thickness (swelling, weight) where nothing was operated on, and "
         "state the errors with it as well",
     )
-    # For a study's own processes: they end when what started them does.
-    for command in (predict, evaluate):
-        command.add_argument("--no-report", action="store_true", help="do not write report.html")
-        command.add_argument(
-            "--slicer", action="store_true", help="also write prediction.mrb for 3D Slicer"
-        )
+    _add_output_options(evaluate)
     evaluate.set_defaults(run=study_commands.evaluate)
 
+
+def _add_output_options(command: argparse.ArgumentParser) -> None:
+    """Which files `predict` and `evaluate` write."""
+    command.add_argument("--no-report", action="store_true", help="do not write report.html")
+    command.add_argument(
+        "--slicer", action="store_true", help="also write prediction.mrb for 3D Slicer"
+    )
+
+
+def _add_sensitivity(commands: Any, changed: argparse.ArgumentParser) -> None:
     sensitivity = commands.add_parser(
         "sensitivity", parents=[changed], help="measure the effect of landmark errors on the face"
     )
@@ -246,27 +289,6 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         help="landmarks placed again by hand, one file per trial, instead of random ones",
     )
     sensitivity.set_defaults(run=study_commands.sensitivity)
-
-    study = commands.add_parser(
-        "study",
-        parents=[common],
-        help="predict and evaluate every case of a cohort with every model",
-    )
-    study.add_argument("cohort", metavar="COHORT", type=Path, help="cohort.toml, or its folder")
-    study.add_argument(
-        "--workers", metavar="N", type=int, help="number of cases processed at a time"
-    )
-    study.add_argument(
-        "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
-    )
-    study.add_argument("--fresh", action="store_true", help="repeat finished cases")
-    study.set_defaults(run=study_commands.study)
-
-    report = commands.add_parser(
-        "report", parents=[common], help="regenerate the report of a folder of results"
-    )
-    report.add_argument("folder", metavar="FOLDER", type=Path, help="folder written by predict")
-    report.set_defaults(run=study_commands.report)
 
 
 def _add_scene_commands(commands: Any, common: argparse.ArgumentParser) -> None:

@@ -71,20 +71,21 @@ def cranium_shape() -> Blend:
 
     It is the same for all: people differ by the map of the whole head, by mandible and skin.
     """
-    nose = Blend(
-        (
-            # Pear-shaped opening, wider below, and the nasal cavity behind it.
-            Step("join", Egg((4.6, -90, -11), (8.2, 16, 8.8))),
-            Step("join", Egg((0, -94, 0), (6.5, 16, 10.5)), 4.0),
-            Step(
-                "join",
-                Tube(np.array([[3.5, -88, -8, 7.5], [4, -60, -8, 9.0], [5, -36, -8, 8.0]])),
-                5.0,
-            ),
-        ),
-        Box((0, -115, -25), (18, -26, 10)),
-    )
     steps = (
+        *_vault(),
+        *_midface(),
+        *_orbits_and_arches(),
+        *_alveolar_process(),
+        *_nose(),
+        # Joint sockets, with room for the disc about the condyle.
+        Step("cut", Egg(CONDYLE, (12.0, 7.6, 7.0)), 1.5),
+    )
+    return Blend(steps, Box((0, -104, -46), (74, 98, 132)))
+
+
+def _vault() -> tuple[Step, ...]:
+    """Vault, skull base and brow, with the hollow of the temples behind its rim."""
+    return (
         Step("join", Egg((0, 2, 48), (70, 93, 60), (70, 91, 80), power=2.3)),
         # Skull base down to the occiput, sphenoid, mastoid and the condyles of the neck.
         Step("join", Egg((0, 20, -2), (48, 52, 22)), 12.0),
@@ -107,6 +108,12 @@ def cranium_shape() -> Blend:
         ),
         # Temples are hollow behind the rim.
         Step("cut", Egg((67, -43, 18), (14, 21, 25)), 8.0),
+    )
+
+
+def _midface() -> tuple[Step, ...]:
+    """Body of the maxilla, cheekbone and floor of the orbit."""
+    return (
         # Midface: body of the maxilla, cheekbone, floor of the orbit.
         Step("join", Egg((0, -58, -4), (33, 31, 22), power=2.6), 8.0),
         Step("join", Egg((18, -62, -14), (17, 21, 18), power=2.3), 8.0),
@@ -130,6 +137,12 @@ def cranium_shape() -> Blend:
             4.0,
         ),
         Step("join", _tube([[47, -62, -14, 4.5], [36, -62, -24, 5], [29, -60, -30, 5]]), 6.0),
+    )
+
+
+def _orbits_and_arches() -> tuple[Step, ...]:
+    """The orbits with their lateral walls, and the zygomatic arches."""
+    return (
         # Orbits: open cones towards the optic canal.
         Step(
             "cut", Egg((32, -74, 18.5), (18.5, 20, 16.5), power=2.3, turn=turn_about("z", 14)), 3.0
@@ -159,6 +172,12 @@ def cranium_shape() -> Blend:
             ),
             4.0,
         ),
+    )
+
+
+def _alveolar_process() -> tuple[Step, ...]:
+    """Upper alveolar process and palate, pterygoid processes and canine fossa."""
+    return (
         # Alveolar process and palate.
         Step("join", _arch(UPPER_ARCH, -23.0, 6.2, 11.0), 5.0),
         Step("join", Egg((0, -62, -19), (24, 26, 4)), 5.0),
@@ -166,6 +185,12 @@ def cranium_shape() -> Blend:
         Step("join", _tube([[17, -38, 2, 7], [17, -40, -14, 5], [18, -41, -28, 3.5]]), 6.0),
         # Canine fossa.
         Step("cut", Egg((25, -88, -16), (9, 9, 9)), 8.0),
+    )
+
+
+def _nose() -> tuple[Step, ...]:
+    """Nasal bones, the opening under them, septum and nasal spine."""
+    return (
         # Nasal bones, then the opening under them.
         Step(
             "join",
@@ -185,7 +210,7 @@ def cranium_shape() -> Blend:
             ),
             5.0,
         ),
-        Step("cut", nose, 2.5),
+        Step("cut", _nasal_opening(), 2.5),
         # Septum and the spine in front of it.
         Step(
             "join",
@@ -193,10 +218,24 @@ def cranium_shape() -> Blend:
             1.0,
         ),
         Step("join", _tube([[0, -88, -21, 3.0], [0, -93.5, -19.5, 1.6]]), 3.0),
-        # Joint sockets, with room for the disc about the condyle.
-        Step("cut", Egg(CONDYLE, (12.0, 7.6, 7.0)), 1.5),
     )
-    return Blend(steps, Box((0, -104, -46), (74, 98, 132)))
+
+
+def _nasal_opening() -> Blend:
+    """The bony opening of the nose and the cavity behind it."""
+    return Blend(
+        (
+            # Pear-shaped opening, wider below, and the nasal cavity behind it.
+            Step("join", Egg((4.6, -90, -11), (8.2, 16, 8.8))),
+            Step("join", Egg((0, -94, 0), (6.5, 16, 10.5)), 4.0),
+            Step(
+                "join",
+                Tube(np.array([[3.5, -88, -8, 7.5], [4, -60, -8, 9.0], [5, -36, -8, 8.0]])),
+                5.0,
+            ),
+        ),
+        Box((0, -115, -25), (18, -26, 10)),
+    )
 
 
 def _arch(curve: tuple[tuple[float, float], ...], z: float, thick: float, high: float) -> FlatTube:

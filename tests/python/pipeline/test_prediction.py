@@ -226,7 +226,7 @@ def test_a_study_keeps_what_is_finished_and_reports_what_fails(
 def test_what_the_solution_notices_is_a_finding_of_the_prediction(predictions, monkeypatch):
     pytest.importorskip("jinja2")
     made = predictions["H"]
-    noticed = cmfsim.Finding.warning("inverted-tets", "3 of 9 tets rest inverted", where="here")
+    noticed = cmfsim.Finding.warning("inverted-tets", "3 of 9 tets are inverted", where="here")
     summary = {**made.result.summary, "findings": [dataclasses.asdict(noticed)]}
     result = dataclasses.replace(made.result, summary=summary)
     monkeypatch.setattr("cmfsim.solving.models.solved_scene", lambda *_: (result, None))
@@ -237,8 +237,8 @@ def test_what_the_solution_notices_is_a_finding_of_the_prediction(predictions, m
     # findings, and what is more than a note at the top as well.
     page = render_page(case_document([made.summary, prediction.summary]))
     top, _, listed = page.partition("<main>")
-    assert top.count("3 of 9 tets rest inverted") == 1
-    assert listed.count("3 of 9 tets rest inverted") == 1
+    assert top.count("3 of 9 tets are inverted") == 1
+    assert listed.count("3 of 9 tets are inverted") == 1
     for finding in made.patient.findings:
         assert listed.count(escape(finding.what)) == 1
 
