@@ -166,6 +166,8 @@ pub struct Constraints<'a> {
     /// Error that the answer may have, as a share of the change that the conditions cause; 0 for an answer
     /// within the tolerance of the solver.
     pub share: f64,
+    /// Error that the forces of springs of negative stiffness may have, as a share of their change.
+    pub spring_share: f64,
     /// How far, mm, springs of negative stiffness may carry any node from its position in the body without
     /// them.
     pub reach: f64,

@@ -36,6 +36,10 @@ const MOST_CARRY: f64 = 4.0;
 /// surfaces: the next conditions differ by about as much.
 const ROUGH_SHARE: f64 = 0.1;
 const FINE_SHARE: f64 = 1e-4;
+/// Smallest relative error of the forces of springs in a step, which the next step corrects; and their error in
+/// what may be the last step, over the imbalance allowed at its end.
+const SPRING_ERROR: f64 = 1e-3;
+const LAST_SPRING_SHARE: f64 = 0.01;
 /// Number of steps at the beginning after which nodes far off their surfaces may be moved back onto them.
 const MOST_APPROACHES: usize = 8;
 /// Maximum number of moves along the normals that bring nodes back onto their surfaces.
@@ -64,6 +68,8 @@ const BALANCE_SHARE: f64 = 0.1;
 /// Ratio of the imbalance to its limit below which the next step is solved to full accuracy, since it reduces
 /// the imbalance far more.
 const NEAR: f64 = 30.0;
+/// Share of the limit of the imbalance below which a step from far away may be the last.
+const CHANCE_SHARE: f64 = 0.01;
 /// Gap and imbalance too small to be visible on a face, in mm and over the diagonal of the mesh: a state within
 /// these limits is returned even if the steps run out.
 const UNSEEN: f64 = 0.02;
@@ -116,15 +122,17 @@ impl Sliding {
         let mut penalty = FIRST_PENALTY;
         let (mut stalls, mut near) = (0, false);
         let mut carry = FIRST_CARRY * seats.reach();
-        let (mut left, mut approaches) = (f64::INFINITY, 0);
+        // A plan near the one it starts from is solved as accurately as its first gaps are small.
+        let first = begin.map(|_| farthest(&state.touches, &active));
+        let (mut left, mut approaches) = (first.unwrap_or(f64::INFINITY), 0);
         let mut iteration = 0;
         loop {
             iteration += 1;
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
-            let share = problem.share(left, near);
-            let response = problem.step(&state, &active, carry, share, body)?;
+            let shares = problem.shares(left, near);
+            let response = problem.step(&state, &active, carry, shares, body)?;
             let is_first = approaches == iteration - 1 && approaches < MOST_APPROACHES;
             let next = (is_first && iteration < options.max_iterations)
                 .then(|| problem.put_back(&response, &active))
@@ -153,12 +161,15 @@ impl Sliding {
             let changed = held != active;
             let (gap, unbalanced) = problem.left(&state, &active);
             left = gap.max(unbalanced);
+            // A step from far away that happens to end in balance is followed by one from near, whose end is
+            // as accurate as Newton's method makes it.
+            let from_near = near || unbalanced <= CHANCE_SHARE * problem.balance();
             near = way == 1.0
                 && !changed
                 && !response.is_carried
                 && gap <= self.gap_limit(options)
                 && unbalanced <= NEAR * problem.balance();
-            let done = near && response.solved && unbalanced <= problem.balance();
+            let done = near && from_near && response.solved && unbalanced <= problem.balance();
             if done || iteration == options.max_iterations || stalls > MOST_STALLS {
                 let will_do = response.solved && gap.max(unbalanced) <= problem.unseen();
                 if !(done || will_do) {
@@ -256,7 +267,7 @@ impl Problem<'_> {
         state: &State,
         active: &[bool],
         reach: f64,
-        share: f64,
+        (share, spring_share): (f64, f64),
         body: &mut dyn Body,
     ) -> Result<Response> {
         let rows = self.rows(state, active);
@@ -275,6 +286,7 @@ impl Problem<'_> {
                 springs: &springs,
                 about: &state.displacements,
                 share,
+                spring_share,
                 reach,
             };
             match body.respond(&conditions) {
@@ -290,16 +302,19 @@ impl Problem<'_> {
         }
     }
 
-    /// Relative accuracy of the next step, `left` mm from a solution.
-    fn share(&self, left: f64, near: bool) -> f64 {
+    /// Relative accuracy of the next step, `left` mm from a solution, and that of the forces of its springs.
+    fn shares(&self, left: f64, near: bool) -> (f64, f64) {
         if near {
-            return 0.0;
+            // What the springs leave open must fit into the balance.
+            let needed = LAST_SPRING_SHARE * self.balance() / left;
+            return (0.0, needed.clamp(SPRING_ERROR, ROUGH_SHARE));
         }
-        match self.options.mode {
+        let share = match self.options.mode {
             // Small forces decide which nodes lift off.
             ContactMode::Unilateral => FINE_SHARE,
             ContactMode::Bilateral => (left / self.seats.reach()).clamp(FINE_SHARE, ROUGH_SHARE),
-        }
+        };
+        (share, share.max(SPRING_ERROR))
     }
 
     /// The state with nodes that have left their surfaces moved back onto them; none if they are near enough,

@@ -40,6 +40,7 @@ impl FrozenContact {
             springs,
             about: &[],
             share: 0.0,
+            spring_share: 0.0,
             reach: f64::INFINITY,
         });
         let unstable: Vec<Spring> = springs.iter().filter(|s| s.stiffness < 0.0).copied().collect();

@@ -31,6 +31,9 @@ const MAX_DENSE_SLIDING: usize = 2500;
 /// Maximum number of sliding nodes for which the flexibility along the normals at rest is kept: 8 bytes a pair.
 const MAX_KEPT_SLIDING: usize = 6000;
 
+/// Relative error of the loads of unstable springs in a plan operator: no further step corrects them.
+const OPERATOR_SPRING_SHARE: f64 = 1e-5;
+
 /// One row of three for each unknown node.
 type Rows = Vec<[f64; 3]>;
 
@@ -289,6 +292,7 @@ impl System {
                 springs: &springs,
                 about: &still,
                 share: 0.0,
+                spring_share: OPERATOR_SPRING_SHARE,
                 reach,
             })
         };

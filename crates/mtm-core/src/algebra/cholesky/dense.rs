@@ -1,6 +1,9 @@
 //! Sliding contact by the dense end of the factor: the flexibility of the sliding nodes and its normal part.
 
+use rayon::prelude::*;
+
 use super::symmetric::{DenseFactor, DenseSymmetric, Rough};
+use crate::algebra::simd::{Kernel, widest};
 
 /// The flexibility of the tail nodes: the whole interaction of the sliding nodes.
 pub struct TailFlexibility {
@@ -89,6 +92,111 @@ impl TailFlexibility {
     }
 }
 
+impl TailFlexibility {
+    /// The flexibility between `directions` (tail node and unit vector, nodes ascending) in single precision,
+    /// with `softness` (mm/N) added to its diagonal; `memory`: of an earlier one.
+    pub fn rough_flexibility(
+        &self,
+        directions: &[(usize, [f64; 3])],
+        softness: &[f64],
+        memory: Vec<f32>,
+    ) -> Rough {
+        let scale: Vec<f64> = directions
+            .par_iter()
+            .zip(softness)
+            .map(|(&(node, axis), soft)| (self.own(node, axis) + soft).sqrt())
+            .collect();
+        // In the units of the rough flexibility and of the result, both of which have ones on the diagonal.
+        let weights: Vec<[f32; 3]> = directions
+            .iter()
+            .zip(&scale)
+            .map(|(&(node, axis), s)| {
+                std::array::from_fn(|a| (axis[a] * self.rough.scale(3 * node + a) / s) as f32)
+            })
+            .collect();
+        let nodes: Vec<usize> = directions.iter().map(|(node, _)| *node).collect();
+        let matrix = DenseSymmetric::from_columns_in(memory, nodes.len(), |c, column| {
+            let columns = [0, 1, 2].map(|b| self.rough.column(3 * nodes[c] + b));
+            let (nodes, weights) = (&nodes[c..], &weights[c..]);
+            widest(Project { columns, nodes, weights, column });
+            column[0] = 1.0;
+        });
+        Rough::from_scaled(matrix, scale)
+    }
+}
+
+/// One column of a flexibility between directions, from the three columns of the flexibility of its node.
+struct Project<'a> {
+    /// From the diagonal down.
+    columns: [&'a [f32]; 3],
+    /// Node of the direction and of those after it, ascending.
+    nodes: &'a [usize],
+    /// Direction of each.
+    weights: &'a [[f32; 3]],
+    column: &'a mut [f32],
+}
+
+impl Kernel for Project<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        let Self { columns: [c0, c1, c2], nodes, weights, column } = self;
+        let [w0, w1, w2] = weights[0];
+        // The displacements of all later nodes under a force along the direction. The block on the diagonal is
+        // stored as its lower triangle.
+        let mut along = vec![0.0_f32; c0.len()];
+        along[0] = c0[0] * w0 + c0[1] * w1 + c0[2] * w2;
+        along[1] = c0[1] * w0 + c1[0] * w1 + c1[1] * w2;
+        along[2] = c0[2] * w0 + c1[1] * w1 + c2[0] * w2;
+        let later = along[3..].iter_mut().zip(&c0[3..]).zip(&c1[2..]).zip(&c2[1..]);
+        for (((out, a), b), c) in later {
+            *out = a * w0 + b * w1 + c * w2;
+        }
+        for ((out, &i), w) in column.iter_mut().zip(nodes).zip(weights) {
+            let v = &along[3 * (i - nodes[0])..][..3];
+            *out = v[0] * w[0] + v[1] * w[1] + v[2] * w[2];
+        }
+    }
+}
+
 fn vectors(values: &[f64]) -> Vec<[f64; 3]> {
     values.chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    /// Several directions at a node, none at another, softness, and memory of a larger matrix: as assembled in
+    /// double precision, to six digits.
+    #[test]
+    fn rough_flexibility_between_directions_equals_the_exact_one() {
+        let wave = |i: usize, j: usize| ((1 + i * j + i + j) as f64 * 0.37).sin();
+        let n = 21;
+        let matrix = DenseSymmetric::from_columns(n, |c, column| {
+            for (r, v) in (c..).zip(column.iter_mut()) {
+                let size = |i: usize| 10.0_f64.powi((i % 5) as i32 - 2);
+                *v = size(r) * size(c) * if r == c { n as f64 } else { wave(r, c) };
+            }
+        });
+        let rows = (0..n as u32 / 3).collect();
+        let tail = TailFlexibility { rough: Rough::of(&matrix), flexibility: matrix, rows };
+        let unit = |a: f64, b: f64| [a.sin() * b.cos(), a.sin() * b.sin(), a.cos()];
+        let directions: Vec<(usize, [f64; 3])> = [0, 0, 1, 2, 2, 2, 4, 6, 6]
+            .iter()
+            .enumerate()
+            .map(|(k, &node)| (node, unit(0.3 + k as f64, 1.7 * k as f64)))
+            .collect();
+        let softness: Vec<f64> = (0..directions.len()).map(|k| (k % 3) as f64 * 0.4).collect();
+        let (nodes, axes): (Vec<usize>, Vec<[f64; 3]>) = directions.iter().copied().unzip();
+        let exact = tail.normal_flexibility(&nodes, &axes, &softness);
+        let rough = tail.rough_flexibility(&directions, &softness, vec![f32::NAN; 400]);
+        let x: Vec<f64> =
+            (0..directions.len()).map(|k| (k as f64).cos() / exact.column(k)[0].sqrt()).collect();
+        let expected = exact.multiply(&x);
+        for (k, (a, b)) in expected.iter().zip(rough.multiply(&x)).enumerate() {
+            assert!((a - b).abs() <= 1e-6 * exact.column(k)[0].sqrt(), "{k}: {a:e} {b:e}");
+        }
+    }
 }

@@ -20,13 +20,13 @@ use faer::{Conj, MatMut};
 
 pub use dense::TailFlexibility;
 pub use normal::{
-    Begun, Moved, NormalFactor, NormalForces, Precision, Preconditioner, Progress, ROUGH, RowKey,
-    Wanted, conjugate_gradients, hopeless,
+    Found, NormalFactor, Precision, Preconditioner, Progress, ROUGH, RowKey, conjugate_gradients,
+    hopeless,
 };
 pub use reach::Reach;
 use structure::{minimum_degree, supernodal_structure};
 use sweep::Sweep;
-pub use symmetric::{DenseFactor, DenseSymmetric};
+pub use symmetric::{DenseFactor, DenseSymmetric, Rough};
 use workspace::{out_of_memory, parallelism};
 
 use crate::algebra::blocks::BlockMatrix;

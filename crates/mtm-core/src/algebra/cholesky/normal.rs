@@ -1,16 +1,12 @@
 //! Contact forces under normals that change from one solve to the next.
 //!
 //! The normal flexibility Nᵀ S⁻¹ N of a solve differs from that of an earlier one only by the rotation of the
-//! normals in between: conjugate gradients preconditioned with the earlier one need a few products. Each
-//! product also gives the displacements, so that the matrix need not be assembled.
-//!
-//! Products may be approximate: their error is detected by an exact product, from which the steps continue
-//! (iterative refinement; Wilkinson 1963).
+//! normals in between: conjugate gradients preconditioned with the earlier one need a few products.
+
+use std::sync::Arc;
 
 use super::symmetric::{DenseFactor, DenseSymmetric, Rough, dot};
 
-/// Number of steps after which a new factorisation is cheaper than further steps.
-const MOST_STEPS: usize = 12;
 /// Number of steps from which the total is predicted: later steps converge at least as fast.
 const TRIAL_STEPS: usize = 5;
 /// Share of the residual down to which approximate products are trusted.
@@ -81,43 +77,14 @@ pub enum Precision {
     Exact,
 }
 
-/// The effect of forces along the rows.
-pub struct Moved {
-    /// Displacement along each row, mm.
+/// Forces along rows, found by conjugate gradients.
+pub struct Found {
+    /// Force of each row.
+    pub forces: Vec<f64>,
+    /// Their whole product: displacement along each row, and along whatever else the product gives.
     pub along: Vec<f64>,
-    /// Displacement of every node, mm.
-    pub nodes: Vec<[f64; 3]>,
-    /// Accuracy of the displacements.
-    pub precision: Precision,
-}
-
-/// Starting point of conjugate gradients.
-pub struct Begun {
-    /// Force of each row.
-    pub forces: Vec<f64>,
-    /// Their effect.
-    pub moved: Moved,
-}
-
-/// Forces along the rows, N, and their effect.
-pub struct NormalForces {
-    /// Force of each row.
-    pub forces: Vec<f64>,
-    /// Displacement of every node under them, mm.
-    pub nodes: Vec<[f64; 3]>,
-    /// Accuracy of these displacements.
-    pub precision: Precision,
-    /// Whether the forces are [`Wanted::exact`] under exact products.
-    pub solved: bool,
-}
-
-/// Accuracy required of a solution.
-#[derive(Clone, Copy)]
-pub struct Wanted {
-    /// Relative error in the energy norm at which the solution counts as exact.
-    pub exact: f64,
-    /// Norm of the residual, see [`Preconditioner::measure`], that suffices for now; 0 if none does.
-    pub enough: f64,
+    /// Displacement along each row that is still missing.
+    pub left: Vec<f64>,
 }
 
 /// Progress of conjugate gradients.
@@ -126,81 +93,61 @@ pub struct Progress {
     pub step: usize,
     /// Norm of the residual relative to that at the start.
     pub fallen: f64,
-    /// Relative error in the energy norm.
-    pub error: f64,
-    /// The error at which the iteration ends.
+    /// The same at which the iteration ends.
     pub goal: f64,
 }
 
-/// Whether further steps cost more than a factorisation, judged by the decrease of the error so far.
-pub fn hopeless(progress: &Progress) -> bool {
-    let Progress { step, fallen, error, goal } = *progress;
-    let rest = (MOST_STEPS as f64 - step as f64) / step.max(1) as f64;
-    step >= MOST_STEPS || step >= TRIAL_STEPS && error * fallen.powf(rest) > goal
+/// Whether more steps than `most` are needed, judged by the decrease of the residual so far.
+pub fn hopeless(progress: &Progress, most: usize) -> bool {
+    let Progress { step, fallen, goal } = *progress;
+    step >= most || step >= TRIAL_STEPS && fallen.powf(most as f64 / step as f64) > goal
 }
 
-/// x with A x = `goals` by conjugate gradients, starting from `begun`.
+/// x with A x = `goals` by conjugate gradients, until what is missing measures `enough` or less, see
+/// [`Preconditioner::measure`].
 ///
-/// `product`: the effect of forces along the rows, including A x along them.
+/// `product`: displacement along each row under forces along them, and along anything else of interest.
 ///
 /// # Errors
-/// The remaining relative error in the energy norm, if `give_up` held, or if `product` proved not to be that of
-/// a positive definite matrix.
+/// What is missing over what was at the start, if `give_up` held, or if `product` proved not to be that of a
+/// positive definite matrix.
 pub fn conjugate_gradients(
-    mut product: impl FnMut(&[f64], Precision) -> Moved,
-    preconditioner: &Preconditioner<'_>,
+    mut product: impl FnMut(&[f64]) -> Vec<f64>,
+    preconditioner: &Preconditioner,
     goals: &[f64],
-    begun: Begun,
-    wanted: Wanted,
+    enough: f64,
     give_up: impl Fn(&Progress) -> bool,
-) -> Result<NormalForces, f64> {
-    let Begun { forces: mut x, moved: Moved { along, mut nodes, mut precision } } = begun;
-    let open = |along: Vec<f64>| goals.iter().zip(along).map(|(g, v)| g - v).collect();
-    let mut r: Vec<f64> = open(along);
+) -> Result<Found, f64> {
+    let (mut x, mut along, mut r) = (vec![0.0; goals.len()], Vec::new(), goals.to_vec());
     let mut z = preconditioner.apply(&r);
     let mut p = z.clone();
     let mut rz = dot(&r, &z);
-    let (first, mut renewed, mut step) = (rz, rz, 0);
-    let mut enough = wanted.enough;
+    let (first, mut step) = (rz, 0);
     loop {
-        // xᵀA x = xᵀ(g − r): the size of the solution in the same norm.
-        let size: f64 = x.iter().zip(goals.iter().zip(&r)).map(|(x, (g, r))| x * (g - r)).sum();
-        let error = (rz / size).sqrt();
-        let solved = rz == 0.0 || error <= wanted.exact;
-        if !solved && rz.sqrt() <= enough || solved && precision == Precision::Exact {
-            return Ok(NormalForces { forces: x, nodes, precision, solved });
+        // At least one step, so that the product is known.
+        if rz == 0.0 || step > 0 && rz.sqrt() <= enough {
+            if along.is_empty() {
+                along = product(&x);
+            }
+            return Ok(Found { forces: x, along, left: r });
         }
-        let goal = wanted.exact.max(enough / size.sqrt());
-        if give_up(&Progress { step, fallen: (rz / first).sqrt(), error, goal }) {
-            return Err(error);
+        let fallen = (rz / first).sqrt();
+        if give_up(&Progress { step, fallen, goal: enough / first.sqrt() }) {
+            return Err(fallen);
         }
-        let doubtful = solved || rz.sqrt() <= ROUGH * renewed.sqrt();
-        if doubtful && precision == Precision::Rough {
-            let there = product(&x, Precision::Exact);
-            (nodes, precision) = (there.nodes, there.precision);
-            r = open(there.along);
-            z = preconditioner.apply(&r);
-            rz = dot(&r, &z);
-            renewed = rz;
-            // This close to the end, the solution is completed instead of continuing with another set of
-            // normals.
-            enough = 0.0;
-            p.clone_from(&z);
-            continue;
-        }
-        let Moved { along, nodes: moved, precision: of_step } = product(&p, Precision::Rough);
-        precision = precision.min(of_step);
-        let curvature = dot(&p, &along);
+        let moved = product(&p);
+        along.resize(moved.len(), 0.0);
+        let curvature = dot(&p, &moved[..p.len()]);
         // Also false for NaN.
         if !(curvature > 0.0 && rz.is_finite()) {
-            return Err(error);
+            return Err(fallen);
         }
         let alpha = rz / curvature;
         for i in 0..x.len() {
             x[i] += alpha * p[i];
-            r[i] -= alpha * along[i];
+            r[i] -= alpha * moved[i];
         }
-        for (to, v) in nodes.as_flattened_mut().iter_mut().zip(moved.as_flattened()) {
+        for (to, v) in along.iter_mut().zip(&moved) {
             *to += alpha * v;
         }
         z = preconditioner.apply(&r);
@@ -215,16 +162,16 @@ pub fn conjugate_gradients(
 }
 
 /// The kept factorisation on the rows it contains, the diagonal on the others: positive definite for any rows.
-pub struct Preconditioner<'a> {
-    kept: &'a NormalFactor,
+pub struct Preconditioner {
+    kept: Arc<NormalFactor>,
     /// Row of the factorisation that corresponds to each row of the matrix.
     row: Vec<u32>,
     diagonal: Vec<f64>,
 }
 
-impl<'a> Preconditioner<'a> {
+impl Preconditioner {
     /// `kept` on those of `keys` that it contains, `diagonal` (above 0) on the others.
-    pub fn new(diagonal: Vec<f64>, keys: &[RowKey], kept: &'a NormalFactor) -> Self {
+    pub fn new(diagonal: Vec<f64>, keys: &[RowKey], kept: Arc<NormalFactor>) -> Self {
         let mut places: Vec<(RowKey, u32)> =
             kept.keys.iter().enumerate().map(|(row, &key)| (key, row as u32)).collect();
         places.sort_unstable();
@@ -235,11 +182,9 @@ impl<'a> Preconditioner<'a> {
         Self { kept, row, diagonal }
     }
 
-    /// Approximation of A⁻¹ r, and its norm √(rᵀz).
-    pub fn measure(&self, r: &[f64]) -> (Vec<f64>, f64) {
-        let z = self.apply(r);
-        let measure = dot(r, &z).sqrt();
-        (z, measure)
+    /// √(rᵀ z), where z is the approximation of A⁻¹ r.
+    pub fn measure(&self, r: &[f64]) -> f64 {
+        dot(r, &self.apply(r)).max(0.0).sqrt()
     }
 
     fn apply(&self, r: &[f64]) -> Vec<f64> {
@@ -284,32 +229,29 @@ mod tests {
         (0..n).map(|i| (i, 0)).collect()
     }
 
-    /// At least as exact as contact requires at its end.
-    const EXACT: Wanted = Wanted { exact: 1e-12, enough: 0.0 };
+    /// As accurate as contact requires at its end.
+    const EXACT: f64 = 1e-12;
+    const MOST: usize = 12;
 
-    /// Forces by conjugate gradients from zero, preconditioned with `kept`.
+    /// Forces by conjugate gradients, preconditioned with `kept`; the product also gives twice itself.
     fn found(
         now: &DMatrix<f64>,
         keys: &[RowKey],
         goals: &[f64],
-        kept: &NormalFactor,
-        wanted: Wanted,
-    ) -> Result<NormalForces, f64> {
+        kept: &Arc<NormalFactor>,
+        share: f64,
+    ) -> Result<Found, f64> {
         let matrix = lower(now);
         let diagonal = (0..now.nrows()).map(|i| now[(i, i)]).collect();
-        let rough = Rough::of(&matrix);
-        let product = |x: &[f64], precision| {
-            let along = match precision {
-                Precision::Rough => rough.multiply(x),
-                Precision::Exact => matrix.multiply(x),
-            };
-            let nodes = along.iter().map(|&v| [v, 2.0 * v, 0.0]).collect();
-            Moved { nodes, along, precision }
+        let product = |x: &[f64]| {
+            let along = matrix.multiply(x);
+            let twice: Vec<f64> = along.iter().map(|v| 2.0 * v).collect();
+            [along, twice].concat()
         };
-        let preconditioner = Preconditioner::new(diagonal, keys, kept);
-        let forces = vec![0.0; goals.len()];
-        let begun = Begun { moved: product(&forces, Precision::Exact), forces };
-        conjugate_gradients(product, &preconditioner, goals, begun, wanted, hopeless)
+        let preconditioner = Preconditioner::new(diagonal, keys, kept.clone());
+        let enough = share * preconditioner.measure(goals);
+        let give_up = |progress: &Progress| hopeless(progress, MOST);
+        conjugate_gradients(product, &preconditioner, goals, enough, give_up)
     }
 
     /// Rows that the kept factorisation contains, rows that it lacks, and rows that have been removed: each
@@ -331,31 +273,39 @@ mod tests {
             }
             let exact = picked.clone().cholesky().unwrap().solve(&b);
             for kept in [factor(), factor().inverse()] {
-                let found = found(&picked, &keys, b.as_slice(), &kept, EXACT).unwrap();
-                assert!(found.solved);
+                let found = found(&picked, &keys, b.as_slice(), &Arc::new(kept), EXACT).unwrap();
                 let error = (DVector::from_vec(found.forces.clone()) - &exact).amax();
                 assert!(error <= 1e-10 * exact.amax(), "{error:e}");
                 let moved = &picked * DVector::from_vec(found.forces);
-                for (v, g) in found.nodes.iter().zip(&moved) {
-                    assert!((v[0] - g).abs() <= 1e-14 && (v[1] - 2.0 * g).abs() <= 1e-14);
+                for (i, g) in moved.iter().enumerate() {
+                    assert!((found.along[i] - g).abs() <= 1e-13);
+                    assert!((found.along[rows.len() + i] - 2.0 * g).abs() <= 2e-13);
+                    assert!((found.left[i] - (b[i] - g)).abs() <= 1e-13);
                 }
             }
         }
     }
 
-    /// A solution that suffices for now is not exact, and is marked so; its residual is as small as requested.
+    /// What is missing is as small as requested, but not much smaller: no step is wasted.
     #[test]
     fn forces_are_as_good_as_wanted() {
         let n = 60;
         let (now, b) = (turned(n, 0.5), DVector::from_fn(n, |i, _| (i as f64 * 0.7).cos()));
-        let kept = NormalFactor::new(lower(&turned(n, 0.0)), keys(n)).unwrap();
-        let preconditioner = Preconditioner::new(vec![1.0; n], &keys(n), &kept);
-        let (_, first) = preconditioner.measure(b.as_slice());
-        let wanted = Wanted { enough: 1e-3 * first, ..EXACT };
-        let found = found(&now, &keys(n), b.as_slice(), &kept, wanted).unwrap();
+        let kept = Arc::new(NormalFactor::new(lower(&turned(n, 0.0)), keys(n)).unwrap());
+        let preconditioner = Preconditioner::new(vec![1.0; n], &keys(n), kept.clone());
+        let first = preconditioner.measure(b.as_slice());
+        let found = found(&now, &keys(n), b.as_slice(), &kept, 1e-3).unwrap();
         let left = &b - &now * DVector::from_vec(found.forces);
-        let (_, measure) = preconditioner.measure(left.as_slice());
-        assert!(!found.solved && measure <= 1.001 * wanted.enough, "{measure:e}");
+        let measure = preconditioner.measure(left.as_slice());
+        assert!(measure <= 1.001e-3 * first && measure >= 1e-9 * first, "{measure:e}");
+    }
+
+    /// Without displacements to cause there are no forces, and no division by zero.
+    #[test]
+    fn no_goals_need_no_forces() {
+        let kept = Arc::new(NormalFactor::new(lower(&turned(9, 0.0)), keys(9)).unwrap());
+        let found = found(&turned(9, 0.5), &keys(9), &[0.0; 9], &kept, EXACT).unwrap();
+        assert_eq!((found.forces, found.along), (vec![0.0; 9], vec![0.0; 18]));
     }
 
     /// An unsuitable factorisation is given up; a new one solves the system, as does its inverse.
@@ -364,7 +314,7 @@ mod tests {
         let n = 60;
         let size = |i: usize| 10.0_f64.powi((i % 9) as i32 - 4);
         let other = DMatrix::from_fn(n, n, |i, j| if i == j { size(i) } else { 0.0 });
-        let kept = NormalFactor::new(lower(&other), keys(n)).unwrap();
+        let kept = Arc::new(NormalFactor::new(lower(&other), keys(n)).unwrap());
         let now = turned(n, 0.5);
         let b = DVector::from_element(n, 1.0);
         assert!(found(&now, &keys(n), b.as_slice(), &kept, EXACT).is_err());
@@ -379,7 +329,7 @@ mod tests {
 
     #[test]
     fn indefinite_flexibility_is_refused_with_its_row() {
-        let kept = NormalFactor::new(lower(&DMatrix::identity(3, 3)), keys(3)).unwrap();
+        let kept = Arc::new(NormalFactor::new(lower(&DMatrix::identity(3, 3)), keys(3)).unwrap());
         let mut now = DMatrix::identity(3, 3);
         now[(2, 2)] = -1.0;
         assert!(found(&now, &keys(3), &[1.0; 3], &kept, EXACT).is_err());

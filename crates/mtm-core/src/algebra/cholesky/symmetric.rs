@@ -56,17 +56,6 @@ pub struct DenseFactor {
 }
 
 impl DenseSymmetric {
-    /// The matrix of `size` rows whose columns `fill` writes from the diagonal down, in parallel: `fill`
-    /// receives the column index and a slice of zeros.
-    pub fn from_columns(size: usize, fill: impl Fn(usize, &mut [f64]) + Sync) -> Self {
-        let mut values = vec![0.0; size * size];
-        values
-            .par_chunks_mut(size.max(1))
-            .enumerate()
-            .for_each(|(c, column)| fill(c, &mut column[c..]));
-        Self { size, values }
-    }
-
     /// The lower triangle of `values`, `size` columns of `size` entries.
     pub(super) fn from_lower(size: usize, values: Vec<f64>) -> Self {
         Self { size, values }
@@ -99,6 +88,26 @@ impl DenseSymmetric {
 }
 
 impl<T: Number> DenseSymmetric<T> {
+    /// The matrix of `size` rows whose columns `fill` writes from the diagonal down, in parallel: `fill`
+    /// receives the column index and a slice of zeros.
+    pub fn from_columns(size: usize, fill: impl Fn(usize, &mut [T]) + Sync) -> Self {
+        Self::from_columns_in(vec![T::default(); size * size], size, fill)
+    }
+
+    /// The same in `values`, memory of an earlier matrix: `fill` receives what it holds.
+    pub fn from_columns_in(
+        mut values: Vec<T>,
+        size: usize,
+        fill: impl Fn(usize, &mut [T]) + Sync,
+    ) -> Self {
+        values.resize(size * size, T::default());
+        values
+            .par_chunks_mut(size.max(1))
+            .enumerate()
+            .for_each(|(c, column)| fill(c, &mut column[c..]));
+        Self { size, values }
+    }
+
     /// Bytes held.
     pub fn bytes(&self) -> usize {
         size_of_val(&self.values[..])
@@ -185,6 +194,27 @@ pub struct Rough {
 }
 
 impl Rough {
+    /// A matrix D A D with `scale` on the diagonal of D, from A with ones on its diagonal.
+    pub(super) fn from_scaled(matrix: DenseSymmetric<f32>, scale: Vec<f64>) -> Self {
+        Self { matrix, scale }
+    }
+
+    /// Column `c` of A in D A D, from the diagonal down.
+    #[inline(always)]
+    pub(super) fn column(&self, c: usize) -> &[f32] {
+        self.matrix.column(c)
+    }
+
+    /// Square root of the diagonal entry of row `r`.
+    pub(super) fn scale(&self, r: usize) -> f64 {
+        self.scale[r]
+    }
+
+    /// The memory of the matrix, for another.
+    pub fn into_memory(self) -> Vec<f32> {
+        self.matrix.values
+    }
+
     /// `matrix` to seven digits.
     pub fn of(matrix: &DenseSymmetric) -> Self {
         let n = matrix.size;

@@ -1,53 +1,61 @@
 //! How sliding nodes respond to constraints if the factorisation of the body without them is available.
 //!
-//! Contact forces λ along the normals N follow from (Nᵀ A⁻¹ N) λ = g − Nᵀ u_free, solved by conjugate gradients
-//! with the matrix at rest as preconditioner. Until the closest points converge, the iterations stop early and
-//! start from the last displacements: two or three products for each set of normals, of which all but two per
-//! plan are approximate.
+//! Contact forces λ along the normals N follow from (Nᵀ F N) λ = g − Nᵀ u_free, where F = A⁻¹ is the flexibility
+//! of the sliding nodes. Normals change with each step of contact. If there are few sliding nodes, F is stored,
+//! and the flexibility along the normals and the axes of springs, a ninth of it or a quarter, is assembled for
+//! each step in single precision. Conjugate gradients run in it, preconditioned with the matrix at rest. The sum
+//! of their forces is then applied to the nodes: by an approximate product in early steps, otherwise by exact
+//! ones, from which the forces are corrected (iterative refinement; Wilkinson 1963).
 //!
-//! If there are few sliding nodes, their whole flexibility A⁻¹ is stored for the products, and the matrix of
-//! new normals is assembled and factorised if too many products would be needed. If there are many, products
-//! are computed by sweeps through the part of the factor that the nodes reach. This takes less time to set up
-//! and less memory, but springs and second walls, which the matrix at rest does not include, can require a
-//! hundred of them.
+//! If there are many sliding nodes, products are computed by sweeps through the part of the factor that the
+//! nodes reach. This takes less time to set up and less memory, but every product takes as long as a solve.
 
+mod along;
+mod inner;
 mod krylov;
 mod rows;
 
-use crate::algebra::cholesky::{
-    Begun, Factor, Moved, NormalFactor, NormalForces, Precision, Preconditioner, Progress, ROUGH,
-    Reach, RowKey, TailFlexibility, Wanted, conjugate_gradients, hopeless,
-};
+use std::sync::Arc;
+
+use along::Along;
+use inner::{Aim, Found, Inner};
+
+use crate::algebra::cholesky::{Factor, NormalFactor, Precision, ROUGH, Reach, TailFlexibility};
 use crate::contact::{Constraints, ContactRow, Sliding, Spring};
-use crate::error::{MtmError, Result, Shortfall};
-use crate::vector::{add, dot, scaled, sub};
+use crate::error::{MtmError, Result};
+use crate::vector::{add, dot, norm, scaled, sub};
 use krylov::{Krylov, length};
 use rows::pushes;
 pub(crate) use rows::{Rows, singular};
 
-/// Maximum number of steps with sweeps: ten are needed on smooth bone, a hundred on teeth.
+/// Maximum number of conjugate gradient steps with sweeps, and with an assembled matrix: ten are needed on smooth
+/// bone, a hundred on teeth. A new factorisation takes as long as sixty products of the matrix.
 const MOST_SWEEPS: usize = 1000;
-/// Error that approximate products may accumulate, as a share of the remaining change, before an exact product
-/// is needed.
-const DOUBT_SHARE: f64 = 0.1;
-/// Relative accuracy of the loads of unstable springs if no further step corrects them.
-const LOAD_SHARE: f64 = 1e-5;
-/// Maximum number of conjugate gradient steps for these loads.
+const MOST_PRODUCTS: usize = 60;
+/// Accuracy of a step above which approximate products do for the nodes as well.
+const ROUGH_STEP: f64 = 1e-2;
+/// Maximum number of times that forces found with approximate products are corrected by an exact one; each takes
+/// six digits off their error.
+const MOST_ROUNDS: usize = 6;
+/// Multiple of the error allowed up to which a step is accepted as it is.
+const NEARLY: f64 = 2.0;
+/// Share of the error of a round above which further rounds would only change rounding errors.
+const STALLED: f64 = 0.5;
+/// Maximum number of directions in which loads of unstable springs are sought.
 const MOST_LOAD_STEPS: usize = 60;
-/// Relative error of the response to a trial direction that is allowed in a step.
-const PROBE_ERROR: f64 = 1e-3;
-/// Size of trial loads relative to the contact forces: large enough for their effect to exceed rounding errors
-/// by far.
-const PROBE_SHARE: f64 = 1e-2;
+/// Largest relative error of the response to one of them.
+const MOST_PROBE_ERROR: f64 = 0.1;
 /// Relative error of contact forces, in the energy norm, at which only rounding errors are left.
 const ROUNDING: f64 = 1e-14;
+/// Rounding error of a displacement, in roundings of the largest.
+const ROUNDINGS: f64 = 64.0;
 /// Share of the contact tolerance by which the final contact forces may be in error, relative to all of them.
-const EXACT_SHARE: f64 = 1e-2;
+const EXACT_SHARE: f64 = 1e-4;
 
 /// Data kept for sliding nodes: their flexibility, and the inverse of its part along the normals at rest.
 pub(crate) struct ContactFactor {
     flexibility: Flexibility,
-    rest: NormalFactor,
+    rest: Arc<NormalFactor>,
 }
 
 /// Displacements of sliding nodes under forces on them.
@@ -77,9 +85,10 @@ impl ContactFactor {
             springs: &[],
             about: &[],
             share: 0.0,
+            spring_share: 0.0,
             reach: f64::INFINITY,
         });
-        let rest = rows.factor(&tail)?.inverse();
+        let rest = Arc::new(rows.factor(&tail)?.inverse());
         Ok(Self { flexibility: Flexibility::Dense(tail), rest })
     }
 
@@ -94,7 +103,7 @@ impl ContactFactor {
         }
         let keys = order.iter().map(|&i| (i, 0)).collect();
         let rest = NormalFactor::new(normal, keys).map_err(|at| singular(rows[order[at]]))?;
-        let rest = rest.inverse();
+        let rest = Arc::new(rest.inverse());
         Ok(Self { flexibility: Flexibility::Sweeps { reach, rows, own }, rest })
     }
 
@@ -133,12 +142,9 @@ impl ContactFactor {
             pushed,
             moved,
             precision: Precision::Exact,
-            doubt: 0.0,
-            enough: 0.0,
             work,
+            memory: Vec::new(),
             made: None,
-            last: Vec::new(),
-            carried: None,
         }
     }
 
@@ -159,31 +165,17 @@ pub(crate) struct Answers<'a> {
     swept: Vec<f64>,
     /// Displacements of the sliding nodes without contact forces, mm.
     free: Vec<[f64; 3]>,
-    /// Forces on each node in the last response.
+    /// Forces on each node in the last response, N.
     pushed: Vec<[f64; 3]>,
     /// Their contribution to the displacements, mm, and its accuracy.
     moved: Vec<[f64; 3]>,
     precision: Precision,
-    /// Error accumulated by approximate products, in the norm of the preconditioner.
-    doubt: f64,
-    /// Accuracy required of the last response, in the same norm.
-    enough: f64,
     /// Zeros for the sweeps.
     work: Vec<f64>,
+    /// Memory of the last assembled matrix.
+    memory: Vec<f32>,
     /// The last factorisation made for this plan, if the one at rest was not good enough.
-    made: Option<NormalFactor>,
-    /// Rows of the last response, ascending, with their forces.
-    last: Vec<(RowKey, f64)>,
-    /// Loads due to unstable springs.
-    carried: Option<Carried>,
-}
-
-/// Loads on the sliding nodes.
-struct Carried {
-    /// N.
-    loads: Vec<[f64; 3]>,
-    /// Their contribution to the displacements, mm.
-    moved: Vec<[f64; 3]>,
+    made: Option<Arc<NormalFactor>>,
 }
 
 /// Response of the sliding nodes to contact conditions.
@@ -198,7 +190,7 @@ pub(crate) struct Answer {
     pub is_carried: bool,
 }
 
-impl<'a> Answers<'a> {
+impl Answers<'_> {
     /// The response of the sliding nodes to conditions `c`, with the relative accuracy that `c` requests;
     /// `tolerance`: of contact, over the size of the scene.
     ///
@@ -208,109 +200,143 @@ impl<'a> Answers<'a> {
     /// springs that make the body unstable.
     ///
     /// # Errors
-    /// `NotPositiveDefinite` if the loads make the body unstable and their reach is unlimited.
+    /// `NotPositiveDefinite` if the loads make the body unstable and their reach is unlimited, or if the rows
+    /// are degenerate.
     pub fn respond(&mut self, c: &Constraints<'_>, tolerance: f64) -> Result<Answer> {
         let unstable: Vec<Spring> =
             c.springs.iter().filter(|s| s.stiffness < 0.0).copied().collect();
         let rows = Rows::new(c);
-        let exact = ROUNDING.max(EXACT_SHARE * tolerance);
-        self.carried = None;
-        let mut found = self.forces(&rows, Aim::Share(c.share), exact)?;
-        let mut is_carried = false;
-        if !unstable.is_empty() {
-            let enough = Aim::Measure(self.enough);
-            let loads;
-            (loads, is_carried) = self.loads(&unstable, c, &rows, exact)?;
-            self.carry(&unstable, &loads, Precision::Exact);
-            found = self.forces(&rows, enough, exact)?;
+        let mut inner = self.inner(&rows, &unstable);
+        let found = self.balanced(c, &rows, &unstable, &mut inner, tolerance);
+        if inner.is_made {
+            self.made = Some(inner.kept.clone());
         }
-        let mut forces = self.pushed.clone();
-        if let Some(Carried { loads, .. }) = &self.carried {
-            for (f, load) in forces.iter_mut().zip(loads) {
-                *f = add(*f, *load);
-            }
-        }
-        Ok(Answer { displacements: self.displacements(), forces, solved: found.solved, is_carried })
+        (self.memory, self.work) = inner.into_memory();
+        let (solved, is_carried) = found?;
+        let (displacements, forces) = (self.displacements(), self.pushed.clone());
+        Ok(Answer { displacements, forces, solved, is_carried })
     }
 
-    /// Loads along `unstable` springs, N, and whether the springs had to be softened.
-    fn loads(
+    /// Brings the nodes into balance; whether their forces are exact, and whether springs had to be softened.
+    fn balanced(
         &mut self,
-        unstable: &[Spring],
         c: &Constraints<'_>,
         rows: &Rows,
-        exact: f64,
-    ) -> Result<(Vec<f64>, bool)> {
-        // In a step, the next step corrects what is left; for an operator there is no next step.
-        let is_step = c.reach.is_finite();
-        let share = if is_step { c.share.max(PROBE_ERROR) } else { LOAD_SHARE };
-        let (aim, precision) = if is_step {
-            (Aim::Share(share), Precision::Rough)
-        } else {
-            (Aim::Share(0.0), Precision::Exact)
-        };
-        let root: Vec<f64> = unstable.iter().map(|s| (-s.stiffness).sqrt()).collect();
-        let here = self.displacements();
-        let stretch = unstable.iter().map(|s| dot(s.axis, here[s.node]) - s.goal);
-        let open: Vec<f64> = stretch.zip(&root).map(|(v, r)| v * r).collect();
-        let size = length(&open);
-        let most = self.pushed.iter().map(|f| dot(*f, *f)).sum::<f64>().sqrt();
-        let (base, mut answered) = (self.pose(), Vec::new());
-        let mut krylov = Krylov::new(size);
-        let mut next: Vec<f64> = open.iter().map(|v| v / size).collect();
-        while size > 0.0 && krylov.basis.len() < MOST_LOAD_STEPS.min(unstable.len()) {
-            let q: Vec<f64> = next.iter().zip(&root).map(|(v, r)| v * r).collect();
-            // Scaled to the size of the responses known so far.
-            let up = PROBE_SHARE * most / length(&q);
-            let loads: Vec<f64> = q.iter().map(|q| q * up).collect();
-            self.take(base.clone());
-            self.carry(unstable, &loads, precision);
-            self.forces(rows, aim, exact)?;
-            answered.push((up, self.pose()));
-            let there = self.displacements();
-            let moved: Vec<[f64; 3]> =
-                there.iter().zip(&here).map(|(a, b)| scaled(sub(*a, *b), 1.0 / up)).collect();
-            let answer = unstable.iter().zip(&root).map(|(s, r)| r * dot(s.axis, moved[s.node]));
-            let answer = answer.collect();
-            next = krylov.push(next, answer, moved);
-            krylov.soften(c.reach);
-            if krylov.left <= share * size {
+        unstable: &[Spring],
+        inner: &mut Inner<'_>,
+        tolerance: f64,
+    ) -> Result<(bool, bool)> {
+        let exact = ROUNDING.max(EXACT_SHARE * tolerance);
+        let precision = if c.share >= ROUGH_STEP { Precision::Rough } else { Precision::Exact };
+        let n = self.free.len();
+        // The last forces, turned with their normals.
+        let mut forces = rows.turned(&self.pushed, c.rows.len());
+        self.push(pushes(n, &rows.rows, &forces), precision);
+        let mut open = rows.open(&self.displacements(), &forces);
+        let mut measure = inner.measure(&open);
+        let aim = if precision == Precision::Rough { c.share * measure } else { 0.0 };
+        let (mut loads, mut is_carried) = (vec![0.0; unstable.len()], false);
+        for round in 0..MOST_ROUNDS {
+            let enough = aim.max(ROUGH * measure).max(exact * self.size());
+            let mut found = inner.solve(&open, Aim::Measure(enough))?;
+            if round == 0 && !unstable.is_empty() {
+                (loads, is_carried) = self.loads(c, unstable, inner, &mut found)?;
+                let more = inner.solve(&found.left, Aim::Measure(enough))?;
+                add_to(&mut found.forces, 1.0, &more.forces);
+            }
+            add_to(&mut forces, 1.0, &found.forces);
+            let mut now = pushes(n, &rows.rows, &forces);
+            for (s, z) in unstable.iter().zip(&loads) {
+                now[s.node] = add(now[s.node], scaled(s.axis, *z));
+            }
+            self.push(now, precision);
+            open = rows.open(&self.displacements(), &forces);
+            let before = std::mem::replace(&mut measure, inner.measure(&open));
+            let is_exact = measure <= exact * self.size() || self.is_rounding(&open);
+            if is_exact && self.precision == Precision::Exact {
+                return Ok((true, is_carried));
+            }
+            if is_exact || measure <= NEARLY * aim || measure > STALLED * before {
                 break;
             }
         }
-        if c.reach.is_infinite() && (krylov.softness > 0.0 || krylov.left > share * size) {
+        Ok((false, is_carried))
+    }
+
+    /// Loads along `unstable` springs, N, and whether the springs had to be softened; `found`, the forces along
+    /// the rows without them, becomes those with them.
+    fn loads(
+        &self,
+        c: &Constraints<'_>,
+        unstable: &[Spring],
+        inner: &mut Inner<'_>,
+        found: &mut Found,
+    ) -> Result<(Vec<f64>, bool)> {
+        let n = found.forces.len();
+        let root: Vec<f64> = unstable.iter().map(|s| (-s.stiffness).sqrt()).collect();
+        let stretch = unstable.iter().zip(&found.along[n..]).map(|(s, more)| {
+            dot(s.axis, add(self.free[s.node], self.moved[s.node])) + more - s.goal
+        });
+        let start: Vec<f64> = stretch.zip(&root).map(|(v, r)| v * r).collect();
+        let size = length(&start);
+        let mut krylov = Krylov::new(size);
+        let mut answered: Vec<Found> = Vec::new();
+        let mut next: Vec<f64> = start.iter().map(|v| v / size).collect();
+        while size > 0.0 && krylov.basis.len() < MOST_LOAD_STEPS.min(unstable.len()) {
+            let mut push = vec![0.0; n];
+            push.extend(next.iter().zip(&root).map(|(v, r)| v * r));
+            let there = inner.multiply(&push);
+            let goals: Vec<f64> = there[..n].iter().map(|v| -v).collect();
+            // Later directions contribute less, so that errors of their responses count less (Simoncini &
+            // Szyld 2003). An operator has no next step that corrects them.
+            let most = if c.reach.is_finite() { MOST_PROBE_ERROR } else { ROUGH };
+            let error = (c.spring_share * size / krylov.left).min(most);
+            let answer = inner.solve(&goals, Aim::Share(error))?;
+            let moved: Vec<f64> =
+                there[n..].iter().zip(&answer.along[n..]).map(|(a, b)| a + b).collect();
+            let product = moved.iter().zip(&root).map(|(v, r)| v * r).collect();
+            next = krylov.push(next, product, by_node(unstable, &moved));
+            answered.push(answer);
+            krylov.soften(c.reach);
+            if krylov.left <= c.spring_share * size {
+                break;
+            }
+        }
+        let is_open = krylov.softness > 0.0 || krylov.left > c.spring_share * size;
+        if c.reach.is_infinite() && is_open {
             return Err(unheld());
         }
-        // Responses are linear: their sum is close to the final one.
-        let mut sum = base.clone();
-        for (y, (up, pose)) in krylov.solution.iter().zip(&answered) {
-            sum.add(y / up, pose, &base);
-        }
-        self.take(sum);
-        self.doubt = f64::INFINITY;
         let mut loads = vec![0.0; unstable.len()];
-        for (y, q) in krylov.solution.iter().zip(&krylov.basis) {
+        for ((y, q), answer) in krylov.solution.iter().zip(&krylov.basis).zip(&answered) {
             for ((z, q), root) in loads.iter_mut().zip(q).zip(&root) {
                 *z += y * q * root;
             }
+            add_to(&mut found.forces, *y, &answer.forces);
+            add_to(&mut found.left, *y, &answer.left);
         }
         Ok((loads, krylov.softness > 0.0))
     }
 
-    /// Applies loads z along unstable springs to the body.
-    fn carry(&mut self, unstable: &[Spring], z: &[f64], precision: Precision) {
-        let mut loads = vec![[0.0; 3]; self.free.len()];
-        for (s, z) in unstable.iter().zip(z) {
-            loads[s.node] = add(loads[s.node], scaled(s.axis, *z));
-        }
-        let moved = match (&self.contact.flexibility, precision) {
-            (Flexibility::Dense(tail), Precision::Rough) => tail.respond_roughly(&loads),
-            (Flexibility::Dense(tail), Precision::Exact) => tail.respond(&loads),
-            (Flexibility::Sweeps { reach, .. }, _) => {
-                self.factor.respond(reach, &loads, &mut self.work)
+    /// The rows and the axes of `unstable` springs, ready to be solved for.
+    fn inner<'r>(&mut self, rows: &'r Rows, unstable: &[Spring]) -> Inner<'r>
+    where
+        Self: 'r,
+    {
+        let kept = self.made.as_ref().unwrap_or(&self.contact.rest).clone();
+        let diagonal = self.diagonal(rows);
+        match &self.contact.flexibility {
+            Flexibility::Dense(tail) => {
+                let memory = std::mem::take(&mut self.memory);
+                let along = Along::assembled(tail, rows, unstable, memory);
+                Inner::new(along, rows, (diagonal, kept), MOST_PRODUCTS, Some(tail))
             }
-        };
-        self.carried = Some(Carried { loads, moved });
+            Flexibility::Sweeps { reach, .. } => {
+                let work = std::mem::take(&mut self.work);
+                let body = (self.factor, reach, self.free.len());
+                let along = Along::by_sweeps(body, rows, unstable, work);
+                Inner::new(along, rows, (diagonal, kept), MOST_SWEEPS, None)
+            }
+        }
     }
 
     /// Displacements of the sliding nodes without contact, mm.
@@ -318,125 +344,52 @@ impl<'a> Answers<'a> {
         &self.free
     }
 
-    /// Displacements without the forces of the rows, mm.
-    fn unpushed(&self) -> Vec<[f64; 3]> {
-        match &self.carried {
-            Some(Carried { moved, .. }) => {
-                self.free.iter().zip(moved).map(|(f, a)| add(*f, *a)).collect()
-            }
-            None => self.free.clone(),
-        }
-    }
-
     /// Displacements after the last response, mm.
     fn displacements(&self) -> Vec<[f64; 3]> {
-        self.unpushed().iter().zip(&self.moved).map(|(f, m)| add(*f, *m)).collect()
+        self.free.iter().zip(&self.moved).map(|(f, m)| add(*f, *m)).collect()
     }
 
-    /// Contact forces and their effect, as a state to start from.
-    fn pose(&self) -> Pose {
-        Pose { last: self.last.clone(), pushed: self.pushed.clone(), moved: self.moved.clone() }
+    /// Size of the forces in the energy norm.
+    fn size(&self) -> f64 {
+        self.pushed.iter().zip(&self.moved).map(|(f, m)| dot(*f, *m)).sum::<f64>().max(0.0).sqrt()
     }
 
-    fn take(&mut self, pose: Pose) {
-        (self.last, self.pushed, self.moved) = (pose.last, pose.pushed, pose.moved);
+    /// Whether `open`, what is missing along rows, mm, is no more than the rounding errors of displacements.
+    fn is_rounding(&self, open: &[f64]) -> bool {
+        let most = |moved: &[[f64; 3]]| moved.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
+        let limit = ROUNDINGS * f64::EPSILON * (most(&self.free) + most(&self.moved));
+        open.iter().all(|v| v.abs() <= limit)
     }
 
-    /// Contact forces along `rows`, with their contribution to the displacements: with the accuracy of `aim`,
-    /// or to the share `exact` of the whole.
-    fn forces(&mut self, rows: &Rows, aim: Aim, exact: f64) -> Result<NormalForces> {
-        let kept = self.made.as_ref().unwrap_or(&self.contact.rest);
-        let preconditioner = Preconditioner::new(self.diagonal(rows), &rows.keys, kept);
-        let before = |key: &RowKey| {
-            self.last.binary_search_by(|(k, _)| k.cmp(key)).map_or(0.0, |at| self.last[at].1)
-        };
-        let mut start: Vec<f64> = rows.keys.iter().map(before).collect();
-        // What the last displacements leave open, assuming that the forces do not turn with the normals.
-        let goals = rows.missing(&self.unpushed());
-        let there = rows.along(&self.moved, &start);
-        let open: Vec<f64> = goals.iter().zip(there).map(|(g, v)| g - v).collect();
-        let (change, measure) = preconditioner.measure(&open);
-        for (x, v) in start.iter_mut().zip(change) {
-            *x += v;
-        }
-        let (n, work) = (self.free.len(), &mut self.work);
-        let mut respond = |pushes: &[[f64; 3]], precision| match &self.contact.flexibility {
-            Flexibility::Dense(tail) if precision == Precision::Rough => {
-                (tail.respond_roughly(pushes), precision)
-            }
-            Flexibility::Dense(tail) => (tail.respond(pushes), precision),
-            Flexibility::Sweeps { reach, .. } => {
-                (self.factor.respond(reach, pushes, work), Precision::Exact)
-            }
-        };
-        // The error of an approximate product is a small share of the change, until the remaining change is
-        // just as small.
-        let now = pushes(n, &rows.rows, &start);
-        let (nodes, precision) = if self.doubt > DOUBT_SHARE * measure {
-            self.doubt = 0.0;
-            respond(&now, Precision::Exact)
+    /// Replaces the forces on the nodes, N.
+    ///
+    /// Approximate products are of changes, which are smaller; the first exact one after them is of all.
+    fn push(&mut self, forces: Vec<[f64; 3]>, precision: Precision) {
+        if self.precision < precision {
+            self.moved = self.respond_to(&forces, precision);
+            self.precision = precision;
         } else {
-            let change: Vec<_> = now.iter().zip(&self.pushed).map(|(a, b)| sub(*a, *b)).collect();
-            let (change, precision) = respond(&change, Precision::Rough);
-            let nodes = self.moved.iter().zip(change).map(|(a, b)| add(*a, b)).collect();
-            (nodes, precision.min(self.precision))
-        };
-        let begun = Begun {
-            moved: Moved { along: rows.along(&nodes, &start), nodes, precision },
-            forces: start,
-        };
-        let product = |x: &[f64], precision| {
-            let (nodes, precision) = respond(&pushes(n, &rows.rows, x), precision);
-            Moved { along: rows.along(&nodes, x), nodes, precision }
-        };
-        let enough = match aim {
-            Aim::Share(share) => share * measure,
-            Aim::Measure(enough) => enough,
-        };
-        self.enough = enough;
-        let wanted = Wanted { exact, enough };
-        let found = match &self.contact.flexibility {
-            Flexibility::Dense(tail) => {
-                let near =
-                    conjugate_gradients(product, &preconditioner, &goals, begun, wanted, hopeless);
-                match near {
-                    Ok(found) => found,
-                    Err(_) => {
-                        let made = rows.factor(tail)?;
-                        let forces = made.solve(goals);
-                        let nodes = tail.respond(&pushes(n, &rows.rows, &forces));
-                        self.made = Some(made);
-                        let precision = Precision::Exact;
-                        NormalForces { forces, nodes, precision, solved: true }
-                    }
-                }
+            let change: Vec<_> =
+                forces.iter().zip(&self.pushed).map(|(a, b)| sub(*a, *b)).collect();
+            let change = self.respond_to(&change, precision);
+            for (to, v) in self.moved.iter_mut().zip(change) {
+                *to = add(*to, v);
             }
-            Flexibility::Sweeps { .. } => {
-                let give_up = |progress: &Progress| progress.step >= MOST_SWEEPS;
-                conjugate_gradients(product, &preconditioner, &goals, begun, wanted, give_up)
-                    .map_err(|error| MtmError::NotConverged {
-                        method: "contact by sweeps",
-                        iterations: MOST_SWEEPS,
-                        shortfall: Shortfall {
-                            quantity: "the error of the contact nodes",
-                            value: error,
-                            limit: exact,
-                            unit: " mm",
-                        },
-                        advice: "use method=\"pcg\"; contact normals or walls may be degenerate",
-                    })?
+            self.precision = precision;
+        }
+        self.pushed = forces;
+    }
+
+    fn respond_to(&mut self, forces: &[[f64; 3]], precision: Precision) -> Vec<[f64; 3]> {
+        match (&self.contact.flexibility, precision) {
+            (Flexibility::Dense(tail), Precision::Rough) => tail.respond_roughly(forces),
+            (Flexibility::Dense(tail), Precision::Exact) => tail.respond(forces),
+            (Flexibility::Sweeps { reach, .. }, _) => {
+                // Not while the iterations of a step hold the memory.
+                self.work.resize(self.swept.len(), 0.0);
+                self.factor.respond(reach, forces, &mut self.work)
             }
-        };
-        self.moved.clone_from(&found.nodes);
-        self.precision = found.precision;
-        self.doubt = match found.precision {
-            Precision::Rough => self.doubt + ROUGH * measure,
-            Precision::Exact => 0.0,
-        };
-        self.pushed = pushes(n, &rows.rows, &found.forces);
-        self.last = rows.keys.iter().copied().zip(found.forces.iter().copied()).collect();
-        self.last.sort_unstable_by_key(|(key, _)| *key);
-        Ok(found)
+        }
     }
 
     /// Flexibility of each row on its own, mm/N.
@@ -467,37 +420,24 @@ impl<'a> Answers<'a> {
     }
 }
 
-/// Accuracy required of the forces.
-#[derive(Clone, Copy)]
-enum Aim {
-    /// Relative to the change that the rows cause.
-    Share(f64),
-    /// Absolute, in the norm of the preconditioner.
-    Measure(f64),
-}
-
-/// Contact forces of a response, and their effect.
-#[derive(Clone)]
-struct Pose {
-    last: Vec<(RowKey, f64)>,
-    pushed: Vec<[f64; 3]>,
-    moved: Vec<[f64; 3]>,
-}
-
-impl Pose {
-    /// Adds `share` of the difference between `to` and `from`, for the same rows.
-    fn add(&mut self, share: f64, to: &Self, from: &Self) {
-        for (own, (to, from)) in self.last.iter_mut().zip(to.last.iter().zip(&from.last)) {
-            own.1 += share * (to.1 - from.1);
-        }
-        let more = |own: &mut Vec<[f64; 3]>, to: &[[f64; 3]], from: &[[f64; 3]]| {
-            for (own, (to, from)) in own.iter_mut().zip(to.iter().zip(from)) {
-                *own = add(*own, scaled(sub(*to, *from), share));
-            }
-        };
-        more(&mut self.pushed, &to.pushed, &from.pushed);
-        more(&mut self.moved, &to.moved, &from.moved);
+/// Adds `share` of `change` to `to`.
+fn add_to(to: &mut [f64], share: f64, change: &[f64]) {
+    for (to, v) in to.iter_mut().zip(change) {
+        *to += share * v;
     }
+}
+
+/// Displacement of each node with springs, mm, from that along each axis; springs of a node follow one another.
+fn by_node(springs: &[Spring], moved: &[f64]) -> Vec<[f64; 3]> {
+    let mut out: Vec<[f64; 3]> = Vec::new();
+    for (i, (s, v)) in springs.iter().zip(moved).enumerate() {
+        let way = scaled(s.axis, *v);
+        match out.last_mut() {
+            Some(last) if i > 0 && springs[i - 1].node == s.node => *last = add(*last, way),
+            _ => out.push(way),
+        }
+    }
+    out
 }
 
 /// The error for contact forces that drive nodes by more than the body can resist.

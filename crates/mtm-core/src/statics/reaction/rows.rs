@@ -40,10 +40,18 @@ impl Rows {
         self.rows.iter().zip(&self.goals).map(|(r, g)| g - dot(r.normal, free[r.node])).collect()
     }
 
-    /// Displacement along each row if the nodes move by `nodes` and the forces along the rows are `forces`.
-    pub(super) fn along(&self, nodes: &[[f64; 3]], forces: &[f64]) -> Vec<f64> {
-        let along = |((r, s), f): ((&ContactRow, &f64), &f64)| dot(r.normal, nodes[r.node]) + s * f;
-        self.rows.iter().zip(&self.softness).zip(forces).map(along).collect()
+    /// Displacement along each row that is missing if the nodes have moved by `displacements` under `forces`
+    /// along the rows.
+    pub(super) fn open(&self, displacements: &[[f64; 3]], forces: &[f64]) -> Vec<f64> {
+        let missing = self.missing(displacements);
+        missing.iter().zip(self.softness.iter().zip(forces)).map(|(v, (s, f))| v - s * f).collect()
+    }
+
+    /// Forces along the rows to start from: those of the nodes along the first `n_contact` rows; springs are
+    /// linearised about a state in which they exert none.
+    pub(super) fn turned(&self, forces: &[[f64; 3]], n_contact: usize) -> Vec<f64> {
+        let contact = self.rows[..n_contact].iter().map(|r| dot(r.normal, forces[r.node]));
+        contact.chain(self.rows[n_contact..].iter().map(|_| 0.0)).collect()
     }
 
     /// Nᵀ S⁻¹ N with the softness.

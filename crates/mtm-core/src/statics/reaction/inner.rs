@@ -1,0 +1,108 @@
+//! Forces along contact rows, by conjugate gradients in the flexibility along them.
+
+use std::sync::Arc;
+
+use super::along::Along;
+use super::rows::Rows;
+use crate::algebra::cholesky::{
+    NormalFactor, Preconditioner, Progress, TailFlexibility, conjugate_gradients, hopeless,
+};
+use crate::error::{MtmError, Result, Shortfall};
+
+pub(super) use crate::algebra::cholesky::Found;
+
+/// Accuracy required of the forces.
+#[derive(Clone, Copy)]
+pub(super) enum Aim {
+    /// Relative to what the rows ask for.
+    Share(f64),
+    /// Absolute, in the norm of the preconditioner.
+    Measure(f64),
+}
+
+/// The rows of one step with their preconditioner.
+pub(super) struct Inner<'a> {
+    along: Along<'a>,
+    rows: &'a Rows,
+    diagonal: Vec<f64>,
+    /// The factorisation that preconditions, and whether it was made for these rows.
+    pub kept: Arc<NormalFactor>,
+    pub is_made: bool,
+    preconditioner: Preconditioner,
+    most: usize,
+    /// The flexibility for a new factorisation, if it is stored.
+    tail: Option<&'a TailFlexibility>,
+}
+
+impl<'a> Inner<'a> {
+    /// `most`: number of steps after which a solve is given up.
+    pub fn new(
+        along: Along<'a>,
+        rows: &'a Rows,
+        (diagonal, kept): (Vec<f64>, Arc<NormalFactor>),
+        most: usize,
+        tail: Option<&'a TailFlexibility>,
+    ) -> Self {
+        let preconditioner = Preconditioner::new(diagonal.clone(), &rows.keys, kept.clone());
+        Self { along, rows, diagonal, kept, is_made: false, preconditioner, most, tail }
+    }
+
+    /// Displacement along each row and axis under forces along them.
+    pub fn multiply(&mut self, forces: &[f64]) -> Vec<f64> {
+        self.along.multiply(forces)
+    }
+
+    /// Size of displacements along the rows: the energy norm of the forces that the preconditioner takes for
+    /// their cause.
+    pub fn measure(&self, open: &[f64]) -> f64 {
+        self.preconditioner.measure(open)
+    }
+
+    /// Forces along the rows that cause the displacements `goals` along them.
+    ///
+    /// # Errors
+    /// `NotPositiveDefinite` if the rows are degenerate, `NotConverged`.
+    pub fn solve(&mut self, goals: &[f64], aim: Aim) -> Result<Found> {
+        let enough = |inner: &Self| match aim {
+            Aim::Share(share) => share * inner.measure(goals),
+            Aim::Measure(enough) => enough,
+        };
+        let first = self.iterate(goals, enough(self));
+        let (Err(_), Some(tail), false) = (&first, self.tail, self.is_made) else {
+            return first;
+        };
+        self.kept = Arc::new(self.rows.factor(tail)?);
+        self.is_made = true;
+        let diagonal = self.diagonal.clone();
+        self.preconditioner = Preconditioner::new(diagonal, &self.rows.keys, self.kept.clone());
+        self.iterate(goals, enough(self))
+    }
+
+    fn iterate(&mut self, goals: &[f64], enough: f64) -> Result<Found> {
+        let Self { along, preconditioner, most, tail, .. } = self;
+        let can_factor = tail.is_some();
+        let give_up = |progress: &Progress| match can_factor {
+            true => hopeless(progress, *most),
+            false => progress.step >= *most,
+        };
+        let product = |forces: &[f64]| along.multiply(forces);
+        conjugate_gradients(product, preconditioner, goals, enough, give_up).map_err(|left| {
+            MtmError::NotConverged {
+                method: "contact forces",
+                iterations: *most,
+                shortfall: Shortfall {
+                    quantity: "the error of the contact nodes, relative to the change",
+                    value: left,
+                    limit: enough,
+                    unit: "",
+                },
+                advice: "use method=\"pcg\"; contact normals may be degenerate",
+            }
+        })
+    }
+
+    /// Memory for the next one.
+    pub fn into_memory(self) -> (Vec<f32>, Vec<f64>) {
+        self.along.into_memory()
+    }
+}
