@@ -5,6 +5,7 @@ from typing import Any
 
 from cmfsim.evaluation import NO_CHANGE, ErrorTable
 from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
+from cmfsim.report.labels import MEASURES
 
 __all__ = ["PAPER_AVERAGES", "study_document", "table3_text"]
 
@@ -68,6 +69,7 @@ def table3_text(study: Values, table: ErrorTable) -> str:
     if study["note"]:
         blocks.append(f"**{_plain_line(study['note'])}**")
     blocks.append(TABLE_3_CAPTION)
+    blocks += _measures(study["cases"])
     blocks.append(table.markdown())
     blocks += _tests(table, models)
     absent = [case["name"] for case in study["cases"] if case["name"] not in table.patients]
@@ -79,6 +81,20 @@ def table3_text(study: Values, table: ErrorTable) -> str:
     blocks.append("\n".join("| " + " | ".join(row) + " |" for row in rows))
     blocks.append(PAPER_NOTE)
     return "\n\n".join(blocks) + "\n"
+
+
+def _measures(cases: Sequence[Values]) -> list[str]:
+    """How the distances of which cases were measured: those of two methods cannot be compared."""
+    by_method: dict[str, list[str]] = {}
+    for case in cases:
+        entry = case["evaluation"].get("no_change", {})
+        method = entry.get("comparison", {}).get("method")
+        if method in MEASURES:
+            by_method.setdefault(method, []).append(case["name"])
+    if len(by_method) == 1:
+        return [f"Measured {MEASURES[method]}." for method in by_method]
+    found = [f"{', '.join(names)}: {MEASURES[method]}." for method, names in by_method.items()]
+    return [f"**Measured in two ways, so that averages mix them.** {' '.join(found)}"] * bool(found)
 
 
 def _plain_line(text: str) -> str:
@@ -144,7 +160,7 @@ def _error_blocks(
         "Mean ± SD over the whole face, mm (as the paper's Table 3); the last column takes the "
         "face before the operation as the prediction.",
     )
-    return (table, *figures)
+    return (table, *(Note(line.replace("**", "")) for line in _measures(done)), *figures)
 
 
 def _region_blocks(done: Sequence[Values], models: tuple[str, ...]) -> tuple[Note | Table, ...]:

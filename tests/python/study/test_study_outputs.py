@@ -12,6 +12,8 @@ import pytest
 import cmfsim
 import phantom_case
 from cmfsim.cli import main
+from cmfsim.report import render_page, study_document
+from cmfsim.report.study import table3_text
 
 pytest.importorskip("skimage")
 pytest.importorskip("jinja2")
@@ -175,6 +177,23 @@ def test_table_3_rounds_the_same_figures_and_averages_patients_alike(folder, row
     for model in MODELS:
         assert f"{PAPER_AVERAGES[model]:.2f}" in papers
     assert "Patients, scans and landmarks differ" in papers
+
+
+def test_distances_measured_in_two_ways_are_not_passed_off_as_one(folder):
+    """A patient without landmarks has smaller distances, to closest points."""
+    text = (folder / "study" / "table3.md").read_text(encoding="utf-8")
+    assert "Measured from the point that a spline through the skin's landmarks leads to" in text
+    assert "two ways" not in text
+    first, second, gone = cmfsim.run_study(cmfsim.Cohort.load(folder), workers=1).outcomes
+    other = json.loads(json.dumps(second.evaluation))
+    other["no_change"]["comparison"]["method"] = "closest"
+    mixed = replace(second, evaluation=other)
+    report = cmfsim.StudyReport(cmfsim.Cohort.load(folder), (first, mixed, gone), 1.0)
+    told = table3_text(report.as_dict(), cmfsim.study_table(report))
+    assert "**Measured in two ways, so that averages mix them.**" in told
+    assert "P2: from the closest point" in told
+    page = render_page(study_document(report.as_dict()))
+    assert "Measured in two ways" in page
 
 
 def test_figures_show_every_patient_and_model(folder):
