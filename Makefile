@@ -26,7 +26,7 @@ PYTHON_DIRS := python tests/python scripts examples benches fuzz slicer
 CORE_FEATURES := --features mtm-core/metis
 
 .DEFAULT_GOAL := help
-.PHONY: help build test test-rust test-python lint format wheel notices bench peers stability elements frontier fuzz demo docs clean
+.PHONY: help build test test-rust test-python lint format wheel notices bench peers stability elements frontier fuzz demo docs tutorials clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sort | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 16
@@ -107,6 +107,9 @@ demo: $(BUILD_STAMP) ## predict a face after surgery, and open its report
 
 docs: $(DOCS_STAMP) ## build the documentation into site/ (runs the tutorials, a minute or two)
 	"$(BIN)/mkdocs" build --strict
+
+tutorials: $(DOCS_STAMP) ## run the tutorials and save them with what they print and draw
+	"$(PY)" scripts/save_tutorials.py
 
 clean: ## remove everything that make has made
 	rm -rf "$(VENV)" target site .cache cmfsim-demo .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist

@@ -211,6 +211,8 @@ from cmfsim.study import StudyReport as StudyReport
 from cmfsim.study import landmark_trials as landmark_trials
 from cmfsim.study import run_study as run_study
 from cmfsim.study import sensitivity as sensitivity
+from cmfsim.study import study_table as study_table
+from cmfsim.study import write_study_report as write_study_report
 from cmfsim.surfaces.checks import SurfaceReport as SurfaceReport
 from cmfsim.surfaces.checks import check_surface as check_surface
 from cmfsim.surfaces.levels import contact_surface as contact_surface

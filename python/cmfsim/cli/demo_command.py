@@ -51,6 +51,9 @@ def demo(options: argparse.Namespace) -> int:
         print(json.dumps(answer, allow_nan=False))
         return DONE
     print(f"case    {escaped(str(made.case.file))}")
+    for finding in notices.findings:
+        if finding.code == "landmarks-proposed":
+            print(f"note    {escaped(finding.what)}")
     print(f"report  {escaped(str(page))}")
     print(f"time    {seconds:.0f} s")
     notices.summarise(str(page))

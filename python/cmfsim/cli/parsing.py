@@ -161,8 +161,12 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         "study",
         parents=[common],
         help="predict and evaluate every case of a cohort with every model",
+        epilog="Tables and figures of Kim et al. (2010) are written below the cohort's folder: "
+        "study.csv, table3.md, figure9.png, figure10.png, and report.html (docs/kim2010.md).",
     )
-    study.add_argument("cohort", metavar="COHORT", type=Path, help="cohort.toml, or its folder")
+    study.add_argument(
+        "cohort", metavar="COHORT", type=Path, help="cohort.toml, or a folder of cases"
+    )
     study.add_argument(
         "--workers", metavar="N", type=int, help="number of cases processed at a time"
     )

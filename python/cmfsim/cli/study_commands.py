@@ -25,9 +25,8 @@ from cmfsim.pipeline.outputs import (
 )
 from cmfsim.pipeline.predicting import predict_models
 from cmfsim.pipeline.preparation import prepare
-from cmfsim.study import CaseOutcome, StudyReport, run_study
+from cmfsim.study import CaseOutcome, StudyReport, run_study, write_study_report
 from cmfsim.study import sensitivity as landmark_sensitivity
-from cmfsim.study.outputs import write_study_report
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import MODELS, Prediction
 

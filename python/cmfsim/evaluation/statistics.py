@@ -72,6 +72,29 @@ class DistanceStatistics:
             "within": {f"{limit:g} mm": share for limit, share in self.within.items()},
         }
 
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "DistanceStatistics":
+        """The figures of which `as_dict` gave these values.
+
+        Raises
+        ------
+        CaseError
+            (also `ValueError`) A figure is missing.
+        """
+        plain = ("count", "outliers")
+        lengths = ("mean", "std", "median", "rms", "p90", "p95", "max", "signed_mean", "signed_std")
+        try:
+            lower, upper = values["quartiles_mm"]
+            within = {float(k.removesuffix(" mm")): v for k, v in values["within"].items()}
+            return cls(
+                **{name: values[name] for name in plain},
+                **{name: values[f"{name}_mm"] for name in lengths},
+                within=MappingProxyType(within),
+                quartiles=(lower, upper),
+            )
+        except KeyError as error:
+            raise CaseInputError(f"figures of distances lack {error.args[0]!r}") from error
+
 
 def distance_statistics(
     signed: ArrayLike, *, weights: ArrayLike | None = None, limits: tuple[float, ...] = LIMITS

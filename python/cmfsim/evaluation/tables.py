@@ -32,6 +32,8 @@ COLUMNS = (
     "outliers",
 )
 AVERAGE = "average"
+# Stands where a patient has no figure.
+NOTHING = "–"
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +45,7 @@ class ErrorTable:
     patients, models, regions : tuple of str
         "whole" is the first region.
     cells : mapping of (patient, region, model) to DistanceStatistics
-        A region that a patient has no vertex in is absent.
+        A region that a patient has no vertex in is absent, and so is a model that failed.
     """
 
     patients: tuple[str, ...]
@@ -51,8 +53,23 @@ class ErrorTable:
     regions: tuple[str, ...]
     cells: Mapping[tuple[str, str, str], DistanceStatistics]
 
+    def complete(self, region: str = WHOLE) -> tuple[str, ...]:
+        """The patients with every model: models are averaged and tested over the same ones."""
+        check_one_of("region", region, self.regions)
+        return tuple(
+            patient
+            for patient in self.patients
+            if all((patient, region, model) in self.cells for model in self.models)
+        )
+
     def average(self, model: str, region: str = WHOLE) -> float:
-        """The mean of the patients' means, mm, each patient with the same weight."""
+        """The mean of the means of the complete patients, mm, each with the same weight.
+
+        Raises
+        ------
+        CaseError
+            (also `ValueError`) No patient has every model; an unknown model or region.
+        """
         return float(np.mean(self._means(model, region)))
 
     def wilcoxon(self, first: str, second: str, region: str = WHOLE) -> PairedTest:
@@ -93,31 +110,46 @@ class ErrorTable:
 
     def text(self, region: str = WHOLE) -> str:
         """Mean ± SD, 90th and 95th percentile, mm, as Table 3 of Kim et al. (2010) has them."""
-        check_one_of("region", region, self.regions)
-        lines = []
-        for patient in self.patients:
-            cells = []
-            for model in self.models:
-                cell = self.cells.get((patient, region, model))
-                cells.append(
-                    "–"
-                    if cell is None
-                    else f"{cell.mean:.2f} ± {cell.std:.2f}  P90 {cell.p90:.2f}  P95 {cell.p95:.2f}"
-                )
-            lines.append([patient, *cells])
-        lines.append([AVERAGE, *(f"{self.average(m, region):.2f}" for m in self.models)])
-        lines.insert(0, [f"{region}, mm", *self.models])
+        lines = self._lines(region)
         widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
         return "\n".join(
             "   ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip()
             for line in lines
         )
 
+    def markdown(self, region: str = WHOLE) -> str:
+        """The same as a table in Markdown."""
+        head, *rows = self._lines(region)
+        lines = [head, ["---", *["---:"] * len(self.models)], *rows]
+        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+    def _lines(self, region: str) -> list[list[str]]:
+        """The cells of the table, its head first and the average last."""
+        check_one_of("region", region, self.regions)
+        lines = [[f"{region}, mm", *self.models]]
+        for patient in self.patients:
+            found = [self.cells.get((patient, region, model)) for model in self.models]
+            cells = [
+                NOTHING
+                if cell is None
+                else f"{cell.mean:.2f} ± {cell.std:.2f}  P90 {cell.p90:.2f}  P95 {cell.p95:.2f}"
+                for cell in found
+            ]
+            lines.append([patient, *cells])
+        whole, count = self.complete(region), len(self.patients)
+        name = AVERAGE if len(whole) == count else f"{AVERAGE} of {len(whole)} of {count}"
+        means = [f"{self.average(m, region):.2f}" if whole else NOTHING for m in self.models]
+        return [*lines, [name, *means]]
+
     def _means(self, model: str, region: str) -> list[float]:
         check_one_of("model", model, self.models)
-        check_one_of("region", region, self.regions)
-        keys = [(patient, region, model) for patient in self.patients]
-        return [self.cells[key].mean for key in keys if key in self.cells]
+        patients = self.complete(region)
+        if not patients:
+            raise CaseInputError(
+                f"no patient has an error of each of {', '.join(self.models)} in {region!r}: there "
+                "is nothing to average"
+            )
+        return [self.cells[patient, region, model].mean for patient in patients]
 
 
 def error_table(patients: Mapping[str, ModelComparison]) -> ErrorTable:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from cmfsim.checks import as_text, check_one_of
 from cmfsim.errors import CaseInputError
+from cmfsim.io.case_files import CASE_FILE
 from cmfsim.io.files import FORMAT_VERSION, is_there
 from cmfsim.io.tables import read_tables
 from cmfsim.values.prediction import MODELS
@@ -15,6 +16,8 @@ __all__ = ["COHORT_FORMAT", "Cohort"]
 COHORT_FORMAT = "cmfsim-cohort"
 # What a cohort's file is called where its folder alone is given.
 COHORT_FILE = "cohort.toml"
+# Where results go, below the folder of the cohort.
+OUTPUT = "study"
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class Cohort:
     ----------
     name : str
     file : Path
-        The cohort file.
+        The cohort file; in a folder without one, where it would be.
     cases : mapping of str to Path
         The case file of each patient, by the patient's name.
     models : tuple of str
@@ -61,7 +64,8 @@ class Cohort:
         Parameters
         ----------
         path : path
-            Of the file, or of a folder that holds a `cohort.toml`.
+            Of the file, or of a folder that holds a `cohort.toml`. A folder without one stands for
+            the cases in its folders, `NAME/case.toml`, with all models.
 
         Returns
         -------
@@ -73,12 +77,12 @@ class Cohort:
             The file does not exist. Cases that it names are not looked for.
         CaseError
             (also `ValueError`) Not TOML, an unknown key, a case twice, an unknown model: with file,
-            line and key.
+            line and key; a folder without a cohort file or cases.
         """
         path = Path(path)
         if is_there(path) and path.is_dir():
             if not (path / COHORT_FILE).exists():
-                raise CaseInputError(f"{path.resolve()}: is a folder without a {COHORT_FILE}")
+                return cls._of_cases_in(path)
             path = path / COHORT_FILE
         document = read_tables(path).only(
             "format", "version", "name", "note", "models", "cases", "output"
@@ -93,7 +97,7 @@ class Cohort:
         if not isinstance(models, list) or not models or set(models) - set(MODELS):
             document.fail("models", f"is {models!r}: a list of {', '.join(MODELS)} is needed")
         folder = path.parent
-        output = document.text("output", "study")
+        output = document.text("output", OUTPUT)
         if Path(output).is_absolute() or ".." in Path(output).parts:
             document.fail("output", f"is {output!r}: name a folder below the cohort's own")
         cases: dict[str, Path] = {}
@@ -103,7 +107,7 @@ class Cohort:
             name = table.text("name", file.parent.name or file.stem)
             if name in cases:
                 table.fail("name" if "name" in table else "file", f"is a second case {name!r}")
-            if not all(c.isalnum() or c in "_-+" for c in name):
+            if not _is_name(name):
                 table.fail("name" if "name" in table else "file", f"{name!r}: letters, digits, _-+")
             cases[name] = file
         if not cases:
@@ -116,3 +120,27 @@ class Cohort:
             folder / output,
             document.text("note").strip() if "note" in document else "",
         )
+
+    @classmethod
+    def _of_cases_in(cls, folder: Path) -> "Cohort":
+        """All cases in the folders of a folder."""
+        files = sorted(folder.glob(f"*/{CASE_FILE}"))
+        if not files:
+            raise CaseInputError(
+                f"{folder.resolve()}: is a folder without a {COHORT_FILE}, and no folder in it "
+                f"has a {CASE_FILE}"
+            )
+        for file in files:
+            if not _is_name(file.parent.name):
+                raise CaseInputError(
+                    f"{file.parent}: is no name for a case: letters, digits, _-+; rename the "
+                    f"folder, or write a {COHORT_FILE}"
+                )
+        cases = {file.parent.name: file for file in files}
+        name = folder.resolve().name or "cohort"
+        return cls(name, folder / COHORT_FILE, cases, MODELS, folder / OUTPUT)
+
+
+def _is_name(name: str) -> bool:
+    """Whether a case may have this name: results lie in a folder of it."""
+    return all(c.isalnum() or c in "_-+" for c in name)

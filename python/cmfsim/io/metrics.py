@@ -26,6 +26,7 @@ from cmfsim.io.summaries import (
 from cmfsim.values.prediction import MODELS
 
 __all__ = [
+    "AGAIN",
     "EVALUATION_FILE",
     "REPORT_FILE",
     "is_evaluation_file",
@@ -39,7 +40,7 @@ __all__ = [
 EVALUATION_FILE = "metrics.json"
 REPORT_FILE = "report.html"
 EVALUATION_FILES = re.compile(
-    r"metrics\.(json|csv)|errors\.png|error-(H|M|H\+S|M\+S)\.png|report\.html"
+    r"metrics\.(json|csv)|errors\.png|error-(H|M|H\+S|M\+S)\.(png|vtp)|report\.html"
 )
 AGAIN = "run cmfsim evaluate again"
 # A picture of a report above this size is none of ours, bytes.

@@ -11,7 +11,12 @@ from cmfsim.pictures.anatomy import (
 )
 from cmfsim.pictures.bands import picture_band
 from cmfsim.pictures.charts import MODEL_COLOURS, chart_errors
-from cmfsim.pictures.distances import DISTANCE_LIMIT, distance_colour, picture_distances
+from cmfsim.pictures.distances import (
+    DISTANCE_LIMIT,
+    distance_colour,
+    picture_distance_grid,
+    picture_distances,
+)
 from cmfsim.pictures.faces import picture_plan, picture_prediction
 from cmfsim.pictures.landmarks import picture_landmarks
 from cmfsim.pictures.muscles import picture_muscles
@@ -29,6 +34,7 @@ __all__ = [
     "has_screen",
     "picture_anatomy",
     "picture_band",
+    "picture_distance_grid",
     "picture_distances",
     "picture_landmarks",
     "picture_muscles",

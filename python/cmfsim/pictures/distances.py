@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.checks import Floats, as_floats, as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
-from cmfsim.pictures.skin_ends import skin_ends, trimmed
+from cmfsim.pictures.skin_ends import SkinEnds, skin_ends, trimmed
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["DISTANCE_LIMIT", "distance_colour", "picture_distances"]
+__all__ = ["DISTANCE_LIMIT", "distance_colour", "picture_distance_grid", "picture_distances"]
 
 # Ends of the colour bar, mm (Kim et al. 2010, Figure 10).
 DISTANCE_LIMIT = 5.0
@@ -24,6 +24,11 @@ NOT_EVALUATED = "#cfcac2"
 # Left round the evaluated vertices, as a share of their extent.
 MARGIN = 0.12
 STEPS = 256
+# Of one face among many, pixels.
+CELL = (440, 370)
+GRID_LEGEND = (
+    "blue: prediction behind the skin after the operation, red: in front, grey: not evaluated"
+)
 
 
 def picture_distances(
@@ -78,24 +83,12 @@ def picture_distances(
     ]
     if not shown.all():
         legend.append(("not evaluated", NOT_EVALUATED))
-    table = np.array([_rgb(x, limit) for x in np.linspace(-limit, limit, STEPS)], dtype=np.uint8)
 
     def paint(plotter: Any, view: View) -> None:
         surface = polydata(vertices, skin.triangles)
         surface["distance"] = np.where(shown, values, np.nan)
-        surface = trimmed(surface, ends)
-        last = view.direction == "left"
-        plotter.add_mesh(
-            surface,
-            scalars="distance",
-            cmap=_lookup(table, limit),
-            smooth_shading=True,
-            ambient=0.45,
-            diffuse=0.6,
-            specular=0.0,
-            show_scalar_bar=False,
-        )
-        if last:
+        _add_skin(plotter, trimmed(surface, ends), limit)
+        if view.direction == "left":
             add_scale_bar(plotter, (0.84, 0.27), 5, "%+.1f")
 
     views = (
@@ -104,6 +97,105 @@ def picture_distances(
         View("left", "left"),
     )
     draw(path, views, corners, size, paint, legend=legend)
+
+
+def picture_distance_grid(
+    path: str | os.PathLike[str],
+    faces: Mapping[str, Mapping[str, tuple[SurfaceData, ArrayLike]]],
+    *,
+    limit: float = DISTANCE_LIMIT,
+    cell: tuple[int, int] = CELL,
+) -> None:
+    """Writes a picture of signed distances on many faces: a row a patient, a column a model.
+
+    All faces are drawn from the front and at one scale; the mean size of the distances is printed
+    below each.
+
+    Parameters
+    ----------
+    path : path
+        Ends in `.png`.
+    faces : mapping of str to mapping of str to (SurfaceData, (v,) float64)
+        By patient, then by model: the predicted skin with the signed distances of its vertices, mm,
+        masked where nothing was evaluated. A model that a patient lacks leaves its place empty.
+    limit : float, mm
+        Ends of the colour bar.
+    cell : (int, int), pixels
+        Size of each face.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) PyVista or OpenGL is missing, no face, another number of distances than
+        vertices, none to show, another ending.
+
+    Examples
+    --------
+    >>> import cmfsim.pictures
+    >>> cmfsim.pictures.picture_distance_grid(
+    ...     "figure10.png",
+    ...     {"P1": {"H": (skin_h, errors_h), "M+S": (skin_ms, errors_ms)}},
+    ... )  # doctest: +SKIP
+    """
+    as_positive("limit", limit)
+    models = list(dict.fromkeys(model for by_model in faces.values() for model in by_model))
+    if not models:
+        raise CaseInputError("there are no faces to draw")
+    panels: dict[str, tuple[Any, SkinEnds] | None] = {}
+    half = np.zeros(3)
+    for patient, by_model in faces.items():
+        for model in models:
+            if model not in by_model:
+                panels[f"{patient}  {model}: no result"] = None
+                continue
+            surface, ends, extent, mean = _centred(*by_model[model])
+            panels[f"{patient}  {model}   mean {mean:.2f} mm"] = surface, ends
+            half = np.maximum(half, extent)
+    last = next(reversed(panels))
+
+    def paint(plotter: Any, view: View) -> None:
+        panel = panels[view.caption]
+        if panel is not None:
+            _add_skin(plotter, trimmed(*panel), limit)
+        if view.caption == last:
+            add_scale_bar(plotter, (0.87, 0.3), 5, "%+.1f")
+
+    half = (1.0 + 2.0 * MARGIN) * half
+    draw(
+        path,
+        [View("front", caption) for caption in panels],
+        np.array([-half, half]),
+        (cell[0] * len(models), cell[1] * len(faces)),
+        paint,
+        columns=len(models),
+        words=(GRID_LEGEND,),
+    )
+
+
+def _centred(skin: SurfaceData, distances: ArrayLike) -> tuple[Any, SkinEnds, Floats, float]:
+    """A skin about the middle of its evaluated part, its ends, half that extent, its mean."""
+    vertices = np.asarray(skin.vertices)
+    values, shown = _values(distances, len(vertices))
+    low, high = bounds([vertices[shown]])
+    moved = SurfaceData(vertices - 0.5 * (low + high), skin.triangles)
+    surface = polydata(moved.vertices, skin.triangles)
+    surface["distance"] = np.where(shown, values, np.nan)
+    return surface, skin_ends(moved), 0.5 * (high - low), float(np.abs(values[shown]).mean())
+
+
+def _add_skin(plotter: Any, surface: Any, limit: float) -> None:
+    """Adds a skin coloured by its "distance"."""
+    table = np.array([_rgb(x, limit) for x in np.linspace(-limit, limit, STEPS)], dtype=np.uint8)
+    plotter.add_mesh(
+        surface,
+        scalars="distance",
+        cmap=_lookup(table, limit),
+        smooth_shading=True,
+        ambient=0.45,
+        diffuse=0.6,
+        specular=0.0,
+        show_scalar_bar=False,
+    )
 
 
 def distance_colour(distance: float, limit: float = DISTANCE_LIMIT) -> str:

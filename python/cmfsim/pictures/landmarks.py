@@ -2,29 +2,34 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats
+from cmfsim.checks import Floats, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.anatomy import SKIN_COLOUR, segment_colours
 from cmfsim.pictures.canvas import View, bounds, draw, polydata, pyvista_module
+from cmfsim.pictures.labels import Label, add_labels, column_width
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["picture_landmarks"]
 
-LANDMARK_SIZE = (2100, 1500)
+# Of a view, pixels.
+VIEW_SIZE = (700, 700)
 SURE_COLOUR, DOUBTFUL_COLOUR = "#1f4fd8", "#d62728"
 # Radius of a point, mm; a doubtful one is a cube of that half edge.
 RADIUS = 2.0
-LABEL_SIZE = 13
-# From a point to its name, mm.
-LABEL_GAP = 3.0
-# What is drawn about the points, mm, and how far points stand in front of the surface.
-ROOM, LIFT = 22.0, 2.5
-VIEWS = (("front", (0.0, -1.0, 0.0)), ("left", (1.0, 0.0, 0.0)), ("right", (-1.0, 0.0, 0.0)))
+# What is drawn above and below the points and beside them, mm, and how far points stand in front of
+# the surface.
+ROOM, BESIDE, LIFT = 22.0, 6.0, 2.5
+# Of a view's width that the head has at least, however long the names.
+LEAST_SHARE = 0.3
+VIEWS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
+    {"front": (0.0, -1.0, 0.0), "left": (1.0, 0.0, 0.0), "right": (-1.0, 0.0, 0.0)}
+)
 
 
 def picture_landmarks(
@@ -34,12 +39,14 @@ def picture_landmarks(
     landmarks: Mapping[str, Mapping[str, ArrayLike]],
     *,
     doubtful: Mapping[str, Sequence[str]] | None = None,
-    size: tuple[int, int] = LANDMARK_SIZE,
+    views: Sequence[str] = tuple(VIEWS),
+    size: tuple[int, int] | None = None,
 ) -> None:
     """Writes a picture of landmarks with their names: skull above, skin below, from three sides.
 
     Points that are doubtful are red cubes, the others blue balls. A side view shows the points of
-    its side and of the midline.
+    its side and of the midline. Names stand in columns at the sides of a view, joined to their
+    points by lines, so that none covers another.
 
     Parameters
     ----------
@@ -51,12 +58,16 @@ def picture_landmarks(
         Under "skull" and "skin".
     doubtful : mapping of str to sequence of str, optional
         The names of doubtful ones, under "skull" and "skin".
-    size : (int, int), pixels
+    views : sequence of str
+        Of "front", "left", "right": those to draw.
+    size : (int, int), pixels, optional
+        Of the picture; 700 by 700 for each view if left out.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) PyVista or OpenGL is missing, no landmark, another ending.
+        (also `ValueError`) PyVista or OpenGL is missing, no landmark, no view or an unknown one,
+        another ending.
 
     Examples
     --------
@@ -71,7 +82,15 @@ def picture_landmarks(
     if not points:
         raise CaseInputError("there is no landmark to draw")
     everywhere = [np.array(list(sites.values())) for sites in points.values()]
-    corners = bounds(everywhere) + np.array([[-ROOM], [ROOM]])
+    if not views:
+        raise CaseInputError("there is no view to draw: give one of front, left, right")
+    for view in views:
+        check_one_of("view", view, tuple(VIEWS))
+    if size is None:
+        size = (VIEW_SIZE[0] * len(views), VIEW_SIZE[1] * len(points))
+    names = [name for sites in points.values() for name in sites]
+    columns = 2.0 * column_width(names) / (size[0] / len(views))
+    corners = _room(bounds(everywhere), columns)
     wrong = {kind: set((doubtful or {}).get(kind, ())) for kind in points}
     colours = segment_colours(list(bones))
 
@@ -84,12 +103,20 @@ def picture_landmarks(
             _add(plotter, skin, SKIN_COLOUR)
         _add_points(plotter, view, points[kind], wrong[kind])
 
-    views = [View(name, f"{kind}, {name}") for kind in points for name, _ in VIEWS]
+    panels = [View(name, f"{kind}, {name}") for kind in points for name in views]
     count = sum(len(names) for names in wrong.values())
     words = [
         f"Blue balls: landmarks. Red cubes with red names: doubtful ones ({count}) to look at."
     ]
-    draw(path, views, corners, size, paint, columns=len(VIEWS), words=words)
+    draw(path, panels, corners, size, paint, columns=len(views), words=words)
+
+
+def _room(box: Floats, columns: float) -> Floats:
+    """A box about points with room for columns of names that take a share of each view's width."""
+    middle, half = box.mean(axis=0), 0.5 * (box[1] - box[0])
+    wide = (half[:2] + BESIDE) / max(1.0 - columns, LEAST_SHARE)
+    half = np.array([*wide, half[2] + ROOM])
+    return np.array([middle - half, middle + half])
 
 
 def _add(plotter: Any, surface: SurfaceData, colour: str) -> None:
@@ -98,7 +125,7 @@ def _add(plotter: Any, surface: SurfaceData, colour: str) -> None:
 
 def _add_points(plotter: Any, view: View, points: Mapping[str, Floats], doubtful: set[str]) -> None:
     pv = pyvista_module()
-    toward = np.array(dict(VIEWS)[view.direction])
+    toward = np.array(VIEWS[view.direction])
     hidden = {"left": "_R", "right": "_L"}.get(view.direction)
     shown = {n: p for n, p in points.items() if hidden is None or not n.endswith(hidden)}
     for name, place in shown.items():
@@ -108,20 +135,11 @@ def _add_points(plotter: Any, view: View, points: Mapping[str, Floats], doubtful
         else:
             mark = pv.Sphere(radius=RADIUS, center=at)
         plotter.add_mesh(mark, color=DOUBTFUL_COLOUR if name in doubtful else SURE_COLOUR)
-    for colour, names in (
-        ("black", [n for n in shown if n not in doubtful]),
-        (DOUBTFUL_COLOUR, [n for n in shown if n in doubtful]),
-    ):
-        if names:
-            beside = LABEL_GAP * np.cross((0.0, 0.0, 1.0), toward)
-            places = np.array([shown[n] for n in names]) + 10.0 * LIFT * toward + beside
-            plotter.add_point_labels(
-                places,
-                names,
-                font_size=LABEL_SIZE,
-                text_color=colour,
-                shape_opacity=0.5,
-                shape_color="white",
-                show_points=False,
-                always_visible=True,
-            )
+    add_labels(
+        plotter,
+        toward,
+        [
+            Label(name, place, DOUBTFUL_COLOUR if name in doubtful else "black")
+            for name, place in shown.items()
+        ],
+    )

@@ -226,6 +226,8 @@ def evaluate(
     comparison = compared.models()
     unmoved, why = compared.unmoved()
     notes = (*landmarks.findings, *why)
+    if predictions[0].patient.landmarks_are_found and postoperative.landmarks:
+        notes = (*notes, _landmarks_unused())
     thickness = fitted = None
     if fit_thickness:
         if unmoved is None:
@@ -257,7 +259,9 @@ class _Compared:
     def models(self, thickening: Floats | None = None) -> ModelComparison:
         """Every model against the face after, by regions; distances by landmarks of both."""
         before = self.predictions[0].skin_before
-        ours = self.predictions[0].patient.landmarks.get("skin", {})
+        patient = self.predictions[0].patient
+        # Landmarks that were found automatically place regions, and no distance depends on them.
+        ours = {} if patient.landmarks_are_found else patient.landmarks.get("skin", {})
         theirs = self.after_landmarks
         both = bool(ours) and bool(theirs)
         regions = skin_regions(before.vertices, self.landmarks) if self.landmarks else {}
@@ -292,6 +296,19 @@ class _Compared:
         first = self.predictions[0]
         bones = [segment.surface for segment in first.patient.segments]
         return tissue_depth(first.skin_before.vertices, bones)
+
+
+def _landmarks_unused() -> Finding:
+    return Finding.note(
+        "landmarks-after-unused",
+        "the landmarks of the face after the operation are not used: those before it were found "
+        "automatically",
+        where="postoperative.landmarks",
+        why="Distances are those to the closest point, which does not see skin that slid along "
+        "itself; an error of a proposed landmark would count as an error of the prediction.",
+        fix="Place the skin landmarks before the operation as well, and name the file under "
+        "[landmarks].",
+    )
 
 
 def _not_shown(reason: str) -> Finding:

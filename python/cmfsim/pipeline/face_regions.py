@@ -39,17 +39,28 @@ def face_landmarks(patient: PatientModel) -> FaceLandmarks:
     ----------
     patient : PatientModel
     """
-    given = patient.landmarks.get("skin", {})
-    if all(name in given for name in SKIN_LANDMARKS):
-        return FaceLandmarks(given)
+    known = patient.landmarks.get("skin", {})
+    if patient.landmarks_are_found:
+        errors = {
+            name: site["error"] for name, site in patient.summary["landmarks"]["skin"].items()
+        }
+        return _proposed(known, errors)
+    if all(name in known for name in SKIN_LANDMARKS):
+        return FaceLandmarks(known)
     try:
-        found = propose_landmarks(*head_surfaces(patient.anatomy))
+        found = propose_landmarks(*head_surfaces(patient.anatomy)).skin
     except CmfsimError as error:
         return FaceLandmarks({}, (_none(str(error)),))
-    missing = [name for name in SKIN_LANDMARKS if name not in found.skin]
+    points = {name: site.point for name, site in found.items()}
+    return _proposed(points, {name: site.error for name, site in found.items()})
+
+
+def _proposed(points: Mapping[str, Floats], errors: Mapping[str, float]) -> FaceLandmarks:
+    """Proposed points, with what to know of them; none where one is missing."""
+    missing = [name for name in SKIN_LANDMARKS if name not in points]
     if missing:
         return FaceLandmarks({}, (_none(f"{', '.join(missing)} were not found"),))
-    worst = max(found.skin[name].error for name in SKIN_LANDMARKS)
+    worst = max(errors[name] for name in SKIN_LANDMARKS)
     note = Finding.note(
         "regions-proposed",
         "regions of the face are placed by proposed landmarks, each expected to be right to "
@@ -59,7 +70,7 @@ def face_landmarks(patient: PatientModel) -> FaceLandmarks:
         "uncertain.",
         fix="Look at them with cmfsim landmarks, and save them.",
     )
-    return FaceLandmarks({name: found.skin[name].point for name in SKIN_LANDMARKS}, (note,))
+    return FaceLandmarks({name: points[name] for name in SKIN_LANDMARKS}, (note,))
 
 
 def _none(reason: str) -> Finding:

@@ -32,6 +32,7 @@ from cmfsim.io.predictions import (
     read_prediction_picture,
     stale_results,
 )
+from cmfsim.io.skin_errors import skin_errors_file, write_skin_errors
 from cmfsim.io.slicer_output import SLICER_FILE, write_slicer_bundle
 from cmfsim.io.summaries import write_summary
 from cmfsim.muscles.template import joined_surface
@@ -52,6 +53,7 @@ from cmfsim.values.prediction import MODELS, Prediction
 __all__ = [
     "WrittenPrediction",
     "WrittenResults",
+    "optional_pictures",
     "write_case_report",
     "write_report_page",
     "write_results",
@@ -214,7 +216,7 @@ def _more_files(prediction: Prediction, folder: Path, *, pictures: bool, slicer:
 
 def _draw(prediction: Prediction, folder: Path) -> list[str]:
     drawn: list[str] = []
-    with _pictures():
+    with optional_pictures():
         for name, draw in _pictures_of(prediction):
             draw(folder / name)
             drawn.append(name)
@@ -239,7 +241,7 @@ def _pictures_of(prediction: Prediction) -> Iterator[tuple[str, Callable[[Path],
 
 
 @contextlib.contextmanager
-def _pictures() -> Iterator[None]:
+def optional_pictures() -> Iterator[None]:
     """Lets results be written without pictures where these cannot be drawn, and reports it."""
     try:
         yield
@@ -253,7 +255,11 @@ def _fill_evaluation(fresh: Path, evaluation: CaseEvaluation) -> dict[str, Any]:
     names = ["metrics.csv"]
     table = error_table({evaluation.predictions[0].name: comparison})
     (fresh / names[0]).write_text(table.csv(), encoding="utf-8")
-    with _pictures():
+    for prediction in evaluation.predictions:
+        names.append(skin_errors_file(prediction.model))
+        errors = comparison.errors[prediction.model]
+        write_skin_errors(fresh / names[-1], prediction.skin, comparison.vertices, errors)
+    with optional_pictures():
         for prediction in evaluation.predictions:
             model = prediction.model
             found = comparison.comparisons[model]

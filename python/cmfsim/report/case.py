@@ -7,7 +7,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.report.band import band_section
 from cmfsim.report.causes import not_operated_blocks, statistics_table, thickness_blocks
 from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
-from cmfsim.report.labels import MESH, MUSCLES, labelled
+from cmfsim.report.labels import MEASURES, MESH, MUSCLES, labelled
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import Finding
 from cmfsim.values.finding_groups import counted, grouped
@@ -328,6 +328,9 @@ def _mean_table(evaluation: Values) -> Table:
         for region in regions
     )
     caption = "Mean distance from the face after the operation, mm, by region and model."
+    method = next(iter(entries.values())).get("comparison", {}).get("method")
+    if method in MEASURES:
+        caption += f" Measured {MEASURES[method]}."
     return Table(("region", *entries), rows, caption)
 
 

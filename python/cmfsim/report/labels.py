@@ -1,8 +1,16 @@
-"""What the figures of a mesh and of its muscles are called in a report, with their units."""
+"""What figures and methods are called in a report, with their units."""
 
 from collections.abc import Mapping
 
-__all__ = ["MESH", "MUSCLES", "labelled"]
+__all__ = ["MEASURES", "MESH", "MUSCLES", "labelled"]
+
+# How a distance between skins was measured, by the method of `compare_skins`.
+MEASURES: Mapping[str, str] = {
+    "landmarks": "from the point that a spline through the skin's landmarks leads to, as in the "
+    "paper",
+    "closest": "from the closest point, which does not see skin that slid along itself: smaller "
+    "than through landmarks",
+}
 
 # mm³ in a cm³, and one in a hundred.
 CUBIC, PERCENT = 1e-3, 100.0

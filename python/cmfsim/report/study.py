@@ -3,9 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from cmfsim.evaluation import NO_CHANGE, ErrorTable
 from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
+from cmfsim.report.labels import MEASURES
 
-__all__ = ["PAPER_AVERAGES", "study_document"]
+__all__ = ["PAPER_AVERAGES", "study_document", "table3_text"]
 
 Values = Mapping[str, Any]
 
@@ -48,6 +50,70 @@ def study_document(study: Values, *, figures: Sequence[Figure] = ()) -> Document
     return Document(title, subtitle, facts, sections, alerts=_alerts(study["cases"]))
 
 
+def table3_text(study: Values, table: ErrorTable) -> str:
+    """Table 3 of Kim et al. (2010) for a study, in Markdown, with the means that the paper states.
+
+    Parameters
+    ----------
+    study : mapping
+        `StudyReport.as_dict()`.
+    table : ErrorTable
+        Of the same study.
+
+    Returns
+    -------
+    str
+    """
+    models = tuple(study["models"])
+    blocks = [f"# {_plain_line(study['cohort'])}: errors by patient and model"]
+    if study["note"]:
+        blocks.append(f"**{_plain_line(study['note'])}**")
+    blocks.append(TABLE_3_CAPTION)
+    blocks += _measures(study["cases"])
+    blocks.append(table.markdown())
+    blocks += _tests(table, models)
+    absent = [case["name"] for case in study["cases"] if case["name"] not in table.patients]
+    if absent:
+        blocks.append(f"Failed, and in no figure of this table: {', '.join(absent)}.")
+    paper = _paper_table(models)
+    rows = [paper.columns, ("---", *["---:"] * len(models)), *paper.rows]
+    blocks.append(f"## The paper's patients\n\n{paper.caption}")
+    blocks.append("\n".join("| " + " | ".join(row) + " |" for row in rows))
+    blocks.append(PAPER_NOTE)
+    return "\n\n".join(blocks) + "\n"
+
+
+def _measures(cases: Sequence[Values]) -> list[str]:
+    """How the distances of which cases were measured: those of two methods cannot be compared."""
+    by_method: dict[str, list[str]] = {}
+    for case in cases:
+        entry = case["evaluation"].get("no_change", {})
+        method = entry.get("comparison", {}).get("method")
+        if method in MEASURES:
+            by_method.setdefault(method, []).append(case["name"])
+    if len(by_method) == 1:
+        return [f"Measured {MEASURES[method]}." for method in by_method]
+    found = [f"{', '.join(names)}: {MEASURES[method]}." for method, names in by_method.items()]
+    return [f"**Measured in two ways, so that averages mix them.** {' '.join(found)}"] * bool(found)
+
+
+def _plain_line(text: str) -> str:
+    """A cohort's own words as one line in which Markdown finds nothing to mark up."""
+    line = " ".join(text.split())
+    return "".join(f"\\{c}" if c in "\\`*_[]<>#|!" else c for c in line)
+
+
+def _tests(table: ErrorTable, models: tuple[str, ...]) -> list[str]:
+    """Whether the first model and the last differ over patients."""
+    if len(models) < 2 or len(table.complete()) < LEAST_TESTED:
+        return []
+    test = table.wilcoxon(models[0], models[-1])
+    return [
+        f"Wilcoxon's signed-rank test of {models[0]} and {models[-1]}, patient by patient: "
+        f"p = {test.p:.3g}. {test.caveat}".strip()
+    ]
+
+
 def _alerts(cases: Sequence[Values]) -> list[Alert]:
     """What is doubtful about the figures of each case; cases that failed first."""
     alerts = [
@@ -63,6 +129,13 @@ def _alerts(cases: Sequence[Values]) -> list[Alert]:
     return alerts
 
 
+TABLE_3_CAPTION = (
+    "Distance of the predicted skin from the skin after the operation over the whole face, mm: "
+    f"mean ± SD, 90th and 95th percentile. {NO_CHANGE!r} takes the face before the operation as "
+    "the prediction. Averages give each patient the same weight."
+)
+# Patients from which on a test of two models is printed: of one there is nothing to test.
+LEAST_TESTED = 2
 PAPER_NOTE = (
     "Kim et al. (2010), Table 3. Patients, scans and landmarks differ: the two tables show whether "
     "the errors are of similar size, not which program is better."
@@ -87,7 +160,7 @@ def _error_blocks(
         "Mean ± SD over the whole face, mm (as the paper's Table 3); the last column takes the "
         "face before the operation as the prediction.",
     )
-    return (table, *figures)
+    return (table, *(Note(line.replace("**", "")) for line in _measures(done)), *figures)
 
 
 def _region_blocks(done: Sequence[Values], models: tuple[str, ...]) -> tuple[Note | Table, ...]:

@@ -18,7 +18,9 @@ from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Case, Cohort, finish_writing
 from cmfsim.io.cluster import on_cluster
 from cmfsim.io.folders import check_below, check_writable
-from cmfsim.io.metrics import read_evaluation
+from cmfsim.io.metrics import AGAIN, read_evaluation
+from cmfsim.io.skin_errors import skin_errors_file
+from cmfsim.io.summaries import checked_file
 from cmfsim.pipeline.evaluating import evaluation_key
 
 __all__ = ["CaseJob", "CaseOutcome", "StudyReport", "run_study"]
@@ -182,6 +184,9 @@ def _kept(name: str, file: Path, output: Path, models: tuple[str, ...]) -> CaseO
         finish_writing(output)
         written = read_evaluation(output)
         key = evaluation_key(Case.load(file), models)
+        # The study's figures are drawn from these.
+        for model in written["models"]:
+            checked_file(output, written, skin_errors_file(model), AGAIN)
     except (OSError, ValueError, CmfsimError):
         return None
     return _outcome(name, "kept", 0.0, written) if written["key"] == key else None

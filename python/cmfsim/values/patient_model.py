@@ -54,7 +54,7 @@ class PatientModel(Frozen):
     fibre : (m, 3) float64 or None
         Unit direction of the fibres of each tet; zero where there is no muscle.
     landmarks : mapping of str to mapping of str to (3,) float64, mm
-        "skull" and "skin", where given.
+        "skull" and "skin", where given or found (`landmarks_are_found`).
     lifted : LiftedTissue or None
         What is lifted off the cranium above a Le Fort I cut: `scene.fixed` has of it what the plan
         presses against the bone.
@@ -85,6 +85,11 @@ class PatientModel(Frozen):
     findings: tuple[Finding, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
     detailed_skin: Callable[[], SurfaceData | None] | None = None
+
+    @property
+    def landmarks_are_found(self) -> bool:
+        """Whether the landmarks were found automatically: the case names none."""
+        return "landmarks" in self.summary
 
     @property
     def skin_nodes(self) -> NDArray[np.uint32]:

@@ -10,6 +10,7 @@ import pytest
 
 import cmfsim
 from cmfsim.cli import main
+from cmfsim.phantom import make_head
 from cmfsim.phantom.demo import read_demo_truth, write_demo_case
 from cmfsim.phantom.demo.patient import DEMO_PARAMETERS
 
@@ -43,7 +44,7 @@ def test_the_demo_reports_every_model(folder):
 
 def test_upper_lip_comes_forward_and_chin_goes_back(folder):
     """P is backwards: the maxilla comes 5 mm forwards, the mandible 3.5 mm back."""
-    marks = cmfsim.read_landmarks(folder / "skin.mrk.json")
+    marks = make_head(DEMO_PARAMETERS).skin_landmarks
     for model in ("H", "M", "M+S"):
         before, after = read_skin(folder / "out" / model)
         moved = after - before
@@ -56,6 +57,70 @@ def test_upper_lip_comes_forward_and_chin_goes_back(folder):
         assert np.linalg.norm(at("nasion")) < 0.5
         # No spike: nothing moves farther than any point of the bones does.
         assert np.linalg.norm(moved, axis=1).max() < 9.0
+
+
+def test_the_demo_brings_no_landmarks_and_states_how_they_were_found(folder):
+    """It runs as a real case does: from surfaces and a plan, with a note of the expected error."""
+    assert not list(folder.glob("*.json"))
+    named = cmfsim.Case.load(folder / "case.toml").landmarks
+    assert (named.skull, named.skin) == (None, None)
+    page = (folder / "out/report.html").read_text(encoding="utf-8")
+    assert "46 landmarks were found automatically" in page
+    assert "Measured from the closest point" in page
+    evaluation = json.loads((folder / "out/metrics.json").read_text(encoding="utf-8"))
+    assert "regions-proposed" in {f["code"] for f in evaluation["findings"]}
+    # No distance depends on a landmark that nobody placed.
+    methods = {entry["comparison"]["method"] for entry in evaluation["models"].values()}
+    assert methods == {"closest"}
+    assert {"chin", "upper lip", "nose"} <= set(evaluation["models"]["M"]["regions"])
+
+
+def test_landmarks_after_without_any_before_are_not_used_and_that_is_stated(tmp_path):
+    """Points that were proposed before and placed after would count their own error."""
+    made = write_demo_case(tmp_path / "new", edge_length=14.0)
+    cmfsim.write_landmarks(tmp_path / "new/after.mrk.json", made.truth.landmarks)
+    text = made.case.file.read_text(encoding="utf-8")
+    skin = 'skin = "after.ply"\n'
+    assert text.count(skin) == 1
+    made.case.file.write_text(
+        text.replace(skin, skin + 'landmarks = "after.mrk.json"\n'), encoding="utf-8"
+    )
+    case = cmfsim.Case.load(made.case.file)
+    found = cmfsim.evaluate(case, "H", check=False, anatomy=made.anatomy)
+    assert {c.method for c in found.comparison.comparisons.values()} == {"closest"}
+    assert "landmarks-after-unused" in {finding.code for finding in found.findings}
+
+
+def test_the_face_is_as_good_as_with_the_exact_landmarks(tmp_path):
+    """Both predictions against the truth, by the paper's distance through exact landmarks."""
+    made = write_demo_case(tmp_path / "new", edge_length=10.0)
+    head, file = make_head(DEMO_PARAMETERS), made.case.file
+    cmfsim.write_landmarks(file.parent / "skull.mrk.json", head.skull_landmarks)
+    cmfsim.write_landmarks(file.parent / "skin.mrk.json", head.skin_landmarks)
+    text = file.read_text(encoding="utf-8")
+    exact = file.with_name("exact.toml")
+    exact.write_text(
+        text + '\n[landmarks]\nskull = "skull.mrk.json"\nskin = "skin.mrk.json"\n', encoding="utf-8"
+    )
+    marks, errors, faces = head.skin_landmarks, [], []
+    for path in (exact, file):
+        case = cmfsim.Case.load(path)
+        (found,) = cmfsim.predict_models(case, "M", check=False, anatomy=made.anatomy)
+        assert found.patient.landmarks_are_found == (path == file)
+        report = cmfsim.compare_models(
+            found.skin_before,
+            {"M": np.asarray(found.skin.vertices)},
+            made.truth.skin,
+            landmarks=(marks, made.truth.landmarks),
+            mask="face",
+        )
+        errors.append(report.statistics["M"].mean)
+        faces.append(np.asarray(found.face.vertices))
+    assert abs(errors[1] - errors[0]) < 0.05
+    apart = np.linalg.norm(faces[1] - faces[0], axis=1)
+    # Against hand-placed landmarks the skin may change by 0.15 mm on average.
+    assert 0.0 < apart.mean() < 0.05
+    assert np.percentile(apart, 99) < 0.5
 
 
 def read_skin(folder):
@@ -134,14 +199,15 @@ def test_a_known_face_becomes_the_postoperative_one(folder, tmp_path):
     """The demo's case then names what `cmfsim evaluate` compares with."""
     surface, after = cmfsim.io.read_parts(folder / "out/M")["skin"]["skin"]
     skin = cmfsim.SurfaceData(after, surface.triangles)
-    marks = cmfsim.read_landmarks(folder / "skin.mrk.json")
+    marks = make_head(DEMO_PARAMETERS).skin_landmarks
     path = truth_of(skin, marks, tmp_path / "truth.npz")
     made = write_demo_case(tmp_path / "new", edge_length=12.0, truth=path)
     assert made.case.postoperative is not None
     assert "in silico" in made.case.note
     read = cmfsim.read_surface(made.case.postoperative.skin)
     np.testing.assert_allclose(read.vertices, after, atol=1e-4)
-    assert list(cmfsim.read_landmarks(made.case.postoperative.landmarks)) == list(marks)
+    assert made.case.postoperative.landmarks is None
+    assert list(made.truth.landmarks) == list(marks)
 
 
 @pytest.mark.parametrize(

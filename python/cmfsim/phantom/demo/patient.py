@@ -8,7 +8,7 @@ import numpy as np
 
 from cmfsim.checks import as_positive
 from cmfsim.errors import CaseInputError
-from cmfsim.io import Case, write_landmarks, write_surface
+from cmfsim.io import Case, write_surface
 from cmfsim.io.files import replacing
 from cmfsim.phantom import HeadParameters, PhantomHead, make_head
 from cmfsim.phantom.demo.truth import DemoTruth, read_demo_truth
@@ -44,7 +44,8 @@ MARK = "# cmfsim demo: written by this command, and overwritten by it."
 NOTE = (
     "No patient: a synthetic head (class III) and an operation of ordinary size. Skin, bones and "
     "airway come straight from the formulas that define the head, so nothing was scanned or "
-    "segmented (cmfsim phantom writes a head with its CT). The tets are coarse, for speed."
+    "segmented (cmfsim phantom writes a head with its CT). Landmarks are found automatically, more "
+    "exactly than on real heads. The tets are coarse, for speed."
 )
 IN_SILICO = (
     " The face after the operation is computed as well, by other equations on a finer mesh with "
@@ -66,10 +67,7 @@ skin = "skin.ply"
 cranium = "cranium.ply"
 mandible = "mandible.ply"
 
-[landmarks]
-skull = "skull.mrk.json"
-skin = "skin.mrk.json"
-
+# No [landmarks]: they are found automatically. Look at them: cmfsim landmarks case.toml
 [[osteotomies]]
 procedure = "le_fort_1"
 
@@ -101,7 +99,6 @@ folder = "out"
 AFTER = """\
 [postoperative]
 skin = "after.ply"
-landmarks = "after.mrk.json"
 
 """
 
@@ -126,7 +123,7 @@ class DemoCase:
 def write_demo_case(
     folder: str | os.PathLike[str], *, edge_length: float = 6.0, truth: Path | None = None
 ) -> DemoCase:
-    """The embedded case, written as `case.toml` with surfaces and landmarks.
+    """The embedded case, written as `case.toml` with surfaces, and without any landmark.
 
     Parameters
     ----------
@@ -168,11 +165,8 @@ def write_demo_case(
     options = SurfaceOptions(max_triangles=MOST_TRIANGLES, smoothing=0)
     for name, level in {"skin": anatomy.skin, **anatomy.bones}.items():
         write_surface(folder / f"{name}.ply", surface_of_level(name, level, options))
-    write_landmarks(folder / "skull.mrk.json", head.skull_landmarks)
-    write_landmarks(folder / "skin.mrk.json", head.skin_landmarks)
     if after is not None:
         write_surface(folder / "after.ply", after.skin)
-        write_landmarks(folder / "after.mrk.json", after.landmarks)
     return DemoCase(Case.load(folder / "case.toml"), anatomy, after)
 
 
