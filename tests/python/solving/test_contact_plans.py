@@ -42,7 +42,7 @@ def test_random_plans_converge_in_few_steps(scene, plans):
     """The small twin of benches/contact_plans.py."""
     assert len(plans) == 8
     tally = contact_plans.Tally("phantom", "H+S", scene.n_tets, 0)
-    contact_plans.run(tally, scene, plans, "auto")
+    contact_plans.run(tally, scene, plans)
     assert not tally.failures
     assert max(tally.steps) <= 30
     assert np.median(tally.steps) <= 10
