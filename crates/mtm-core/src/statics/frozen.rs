@@ -7,9 +7,8 @@
 //! is stable with the springs.
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use rayon::prelude::*;
 
-use crate::algebra::cholesky::{DenseSymmetric, NormalFactor, TailFlexibility};
+use crate::algebra::cholesky::{DenseFactor, DenseSymmetric, TailFlexibility};
 use crate::contact::{Constraints, ContactRow, Spring};
 use crate::error::Result;
 use crate::statics::reaction::{Rows, singular, unheld};
@@ -18,7 +17,8 @@ use crate::vector::{add, dot, scaled};
 /// The factors for conditions that stay the same.
 pub(crate) struct FrozenContact {
     rows: Rows,
-    normal: NormalFactor,
+    /// Nᵀ F N.
+    normal: DenseFactor,
     unstable: Vec<Spring>,
     /// Nᵀ F A, a column for each unstable spring.
     coupling: Vec<Vec<f64>>,
@@ -54,31 +54,28 @@ impl FrozenContact {
         let part = DenseSymmetric::from_columns(n, |c, column| {
             column.copy_from_slice(&whole.column(c)[..n - c]);
         });
-        let normal = NormalFactor::new(part, rows.keys.clone())
-            .map_err(|at| singular(tail.row(rows.rows[at].node) as u32))?;
+        let factor = part.factor().map_err(|at| singular(tail.row(rows.rows[at].node) as u32))?;
         let coupling: Vec<Vec<f64>> = (0..unstable.len())
             .map(|m| (0..n).map(|c| whole.column(c)[n + m - c]).collect())
             .collect();
-        let answered: Vec<Vec<f64>> =
-            coupling.par_iter().map(|column| normal.solve(column.clone())).collect();
+        let by_rows = factor.projected(coupling.concat());
         let held = DMatrix::from_fn(unstable.len(), unstable.len(), |a, b| {
             let (low, high) = (a.min(b), a.max(b));
-            let by_rows: f64 = coupling[high].iter().zip(&answered[low]).map(|(g, x)| g * x).sum();
             let own = if a == b { -1.0 / unstable[a].stiffness } else { 0.0 };
-            own - whole.column(n + low)[high - low] + by_rows
+            own - whole.column(n + low)[high - low] + by_rows.column(low)[high - low]
         });
         let held = match unstable.is_empty() {
             true => None,
             false => Some(Cholesky::new(held).ok_or_else(unheld)?),
         };
-        Ok(Self { rows, normal, unstable, coupling, held })
+        Ok(Self { rows, normal: factor, unstable, coupling, held })
     }
 
     /// Force on each sliding node, N: `free` are the displacements without contact, `offsets` and `goals` the
     /// values prescribed for rows and springs, mm.
     pub fn forces(&self, free: &[[f64; 3]], c: &Constraints<'_>) -> Vec<[f64; 3]> {
-        let goals = Rows::new(c).missing(free);
-        let mut along = self.normal.solve(goals);
+        let mut along = Rows::new(c).missing(free);
+        self.normal.solve(&mut along);
         let mut out = vec![[0.0; 3]; free.len()];
         if let Some(held) = &self.held {
             let asked = c.springs.iter().filter(|s| s.stiffness < 0.0);
@@ -93,7 +90,8 @@ impl FrozenContact {
                     *p += g * z;
                 }
             }
-            for (f, p) in along.iter_mut().zip(self.normal.solve(pull)) {
+            self.normal.solve(&mut pull);
+            for (f, p) in along.iter_mut().zip(pull) {
                 *f -= p;
             }
             for (s, z) in self.unstable.iter().zip(loads.iter()) {

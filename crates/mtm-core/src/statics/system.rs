@@ -3,6 +3,8 @@
 
 use std::sync::Arc;
 
+use rayon::prelude::*;
+
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::{Factor, Symbolic};
 use crate::algebra::constraints::{Constraint, projected};
@@ -22,7 +24,7 @@ use crate::statics::settling::{
     Linked, Settle, Settled, Unfactored, direct_error, settled_by_flexibility, touching_needs_pcg,
 };
 use crate::statics::solution::Clock;
-use crate::vector::sub;
+use crate::vector::{add, sub};
 
 /// Maximum number of sliding nodes for which the whole flexibility is kept (three unknowns each, 12 bytes a
 /// pair: doubles and floats). A set of normals then costs a few dense products; with sweeps it costs a few
@@ -279,10 +281,8 @@ impl System {
             return columns.iter().zip(scales).map(solve).collect();
         };
         let still = vec![[0.0; 3]; sliding.nodes().len()];
+        let check = || if interrupted() { Err(MtmError::Interrupted) } else { Ok(()) };
         let conditions = |k: usize, solve: &mut dyn FnMut(&Constraints<'_>) -> Result<Rows>| {
-            if interrupted() {
-                return Err(MtmError::Interrupted);
-            }
             let (rows, offsets) = (frozen.rows, &frozen.offsets[k][..]);
             let springs = frozen.springs(k);
             let reach = f64::INFINITY;
@@ -296,28 +296,35 @@ impl System {
                 reach,
             })
         };
-        let flexible = |factor: &Factor, contact: &ContactFactor| {
-            let kept = contact.tail().map(|t| FrozenContact::new(t, frozen.rows, frozen.springs));
-            let kept = kept.transpose()?;
-            let solve = |(k, b): (usize, &Rows)| {
-                conditions(k, &mut |c| {
-                    let mut answers = contact.answers(factor, b);
-                    let forces = match &kept {
-                        Some(kept) => kept.forces(answers.free(), c),
-                        None => answers.respond(c, 0.0)?.forces,
-                    };
-                    Ok(answers.of_all(&forces))
-                })
-            };
-            columns.iter().enumerate().map(solve).collect()
+        let flexible = |factor: &Factor, contact: &ContactFactor, columns| match contact.tail() {
+            Some(tail) => {
+                let kept = FrozenContact::new(tail, frozen.rows, frozen.springs)?;
+                let forces = |k, free: &Rows| conditions(k, &mut |c| Ok(kept.forces(free, c)));
+                check()?;
+                all_together(factor, sliding, columns, forces)
+            }
+            None => {
+                let solve = |(k, b): (usize, &Rows)| {
+                    check()?;
+                    conditions(k, &mut |c| {
+                        let mut answers = contact.answers(factor, b);
+                        let forces = answers.respond(c, 0.0)?.forces;
+                        Ok(answers.of_all(&forces))
+                    })
+                };
+                columns.iter().enumerate().map(solve).collect()
+            }
         };
         match &self.kept {
-            Kept::Factor(factor) => flexible(factor, &ContactFactor::by_sweeps(factor, sliding)?),
-            Kept::Flexible { factor, contact } => flexible(factor, contact),
+            Kept::Factor(factor) => {
+                flexible(factor, &ContactFactor::by_sweeps(factor, sliding)?, columns)
+            }
+            Kept::Flexible { factor, contact } => flexible(factor, contact, columns),
             Kept::Matrix(system) => {
                 // All columns have the same constraints, so one trial serves them.
                 let mut trail = Trail::default();
                 let solve = |((k, b), &scale): ((usize, &Rows), &f64)| {
+                    check()?;
                     let mut solve = Solve::new(scale, interrupted);
                     conditions(k, &mut |c| {
                         trail.begin_again();
@@ -330,6 +337,32 @@ impl System {
             }
         }
     }
+}
+
+/// Displacements for all `columns`, first free and then under the contact `forces` that follow: two solves that
+/// read the factor once for all of them.
+fn all_together(
+    factor: &Factor,
+    sliding: &Sliding,
+    mut columns: Vec<Rows>,
+    forces: impl Fn(usize, &Rows) -> Result<Rows> + Sync,
+) -> Result<Vec<Rows>> {
+    factor.solve_many(&mut columns);
+    let rows: Vec<usize> = sliding.nodes().iter().map(|n| n.row as usize).collect();
+    let push = |(k, column): (usize, &Rows)| {
+        let free = rows.iter().map(|&row| column[row]).collect();
+        let mut push = vec![[0.0; 3]; column.len()];
+        for (&row, force) in rows.iter().zip(forces(k, &free)?) {
+            push[row] = force;
+        }
+        Ok(push)
+    };
+    let mut pushed: Vec<Rows> = columns.par_iter().enumerate().map(push).collect::<Result<_>>()?;
+    factor.solve_many(&mut pushed);
+    for (to, more) in columns.iter_mut().flatten().zip(pushed.iter().flatten()) {
+        *to = add(*to, *more);
+    }
+    Ok(columns)
 }
 
 /// The hierarchy for `matrix` with its sliding rows held along their normals at rest.

@@ -7,6 +7,7 @@ use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt;
 use faer::linalg::matmul::triangular::{self, BlockStructure};
 use faer::linalg::triangular_inverse::invert_lower_triangular;
+use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
 use faer::{Accum, Mat, MatMut, MatRef};
 use rayon::prelude::*;
 
@@ -272,6 +273,30 @@ impl DenseFactor {
         DenseSymmetric { size, values }
     }
 
+    /// Bᵀ A⁻¹ B, for the columns of B one after the other.
+    pub fn projected(&self, mut columns: Vec<f64>) -> DenseSymmetric {
+        let size = columns.len() / self.size.max(1);
+        let par = parallelism(self.size);
+        let lower = MatRef::from_column_major_slice(&self.values, self.size, self.size);
+        // B ← L⁻¹ B, then Bᵀ B.
+        let b = MatMut::from_column_major_slice_mut(&mut columns, self.size, size);
+        solve_lower_triangular_in_place(lower, b, par);
+        let b = MatRef::from_column_major_slice(&columns, self.size, size);
+        let mut values = vec![0.0; size * size];
+        triangular::matmul(
+            MatMut::from_column_major_slice_mut(&mut values, size, size),
+            BlockStructure::TriangularLower,
+            Accum::Replace,
+            b.transpose(),
+            BlockStructure::Rectangular,
+            b,
+            BlockStructure::Rectangular,
+            1.0,
+            par,
+        );
+        DenseSymmetric { size, values }
+    }
+
     /// Bytes held.
     pub fn bytes(&self) -> usize {
         8 * self.values.len()
@@ -405,8 +430,20 @@ mod tests {
             let exact = &dense * &x;
             assert!((product - &exact).amax() <= 1e-13 * exact.amax(), "{n}");
             let mut found = exact.as_slice().to_vec();
-            lower.factor().unwrap().solve(&mut found);
+            let factor = lower.factor().unwrap();
+            factor.solve(&mut found);
             assert!((DVector::from_vec(found) - &x).amax() <= 1e-12, "{n}");
+            // Of A itself and of x: A, A x and xᵀ A x.
+            let columns: Vec<f64> = dense.iter().chain(&exact).copied().collect();
+            let projected = factor.projected(columns);
+            for c in 0..n {
+                let column = projected.column(c);
+                for (r, v) in (c..n).zip(column) {
+                    assert!((v - dense[(r, c)]).abs() <= 1e-12 * n as f64, "{n}");
+                }
+                assert!((column[n - c] - exact[c]).abs() <= 1e-12 * exact.amax(), "{n}");
+            }
+            assert!((projected.column(n)[0] - x.dot(&exact)).abs() <= 1e-12 * n as f64 * n as f64);
         }
     }
 

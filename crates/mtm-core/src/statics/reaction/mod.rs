@@ -339,11 +339,6 @@ impl Answers<'_> {
         }
     }
 
-    /// Displacements of the sliding nodes without contact, mm.
-    pub fn free(&self) -> &[[f64; 3]] {
-        &self.free
-    }
-
     /// Displacements after the last response, mm.
     fn displacements(&self) -> Vec<[f64; 3]> {
         self.free.iter().zip(&self.moved).map(|(f, m)| add(*f, *m)).collect()
