@@ -11,6 +11,7 @@ pub(crate) mod overlap;
 pub(crate) mod pairs;
 pub(crate) mod planes;
 mod seat;
+mod walls;
 
 use crate::boundary::{Boundary, Gap, Motion};
 use crate::error::{MtmError, Result};

@@ -14,18 +14,16 @@
 //! with g linearised about the last state, and then updates λ ← max(0, λ − k g). The stiffness k only affects
 //! the number of rounds: the final forces and gaps do not depend on it.
 
-use std::collections::HashMap;
-use std::sync::Arc;
-
 use rayon::prelude::*;
 
 use crate::boundary::{Against, Boundary, Motion};
 use crate::contact::links::Link;
 use crate::contact::overlap::Overlap;
 use crate::contact::planes::{Meeting, Plane, Planes};
+use crate::contact::walls::{Moved, Outside, Wall};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::motion::RigidMotion;
-use crate::geometry::surface::{Closest, Surface};
+use crate::geometry::surface::Closest;
 use crate::mesh::TetMesh;
 use crate::vector::{add, dot, norm, scaled, sub};
 
@@ -62,24 +60,6 @@ struct Candidate {
     stiffness: f64,
     /// Gap at rest, mm; none beyond the border of its surface.
     at_rest: Option<f64>,
-}
-
-/// A surface that nodes may not enter.
-#[derive(Debug)]
-enum Wall {
-    /// A part of the boundary of the tissue, and the node of each vertex.
-    Tissue { surface: Surface, nodes: Vec<u32> },
-    /// The surface of a segment, or of bone that does not move.
-    Bone { surface: Arc<Surface>, segment: Option<usize> },
-}
-
-impl Wall {
-    fn surface(&self) -> &Surface {
-        match self {
-            Self::Tissue { surface, .. } => surface,
-            Self::Bone { surface, .. } => surface,
-        }
-    }
 }
 
 /// The surfaces of a scene that may touch, and the nodes that may touch them.
@@ -173,7 +153,7 @@ impl Pairs {
             let wall = match &pair.against {
                 Against::Tissue(triangles) => {
                     outside.check(p, triangles)?;
-                    tissue_wall(places, triangles)?
+                    Wall::of_tissue(places, triangles)?
                 }
                 Against::Bone { surface, segment } => {
                     let segments = boundary.segments();
@@ -488,61 +468,4 @@ fn out_of_range(pair: usize, node: u32, count: usize) -> MtmError {
         count,
         kind: ErrorKind::Boundary,
     }
-}
-
-/// A surface under a plan.
-enum Moved<'a> {
-    /// Points are moved back to the surface at rest.
-    Rigid(&'a Surface, RigidMotion),
-    Deformed(Surface),
-}
-
-/// The wall made of `triangles` of nodes, with vertices numbered in ascending order of node.
-fn tissue_wall(places: &[[f64; 3]], triangles: &[[u32; 3]]) -> Result<Wall> {
-    let mut nodes: Vec<u32> = triangles.iter().flatten().copied().collect();
-    nodes.sort_unstable();
-    nodes.dedup();
-    let number = |j: u32| nodes.partition_point(|&n| n < j) as u32;
-    let rows = triangles.iter().map(|t| t.map(number)).collect();
-    let vertices = nodes.iter().map(|&j| places[j as usize]).collect();
-    Ok(Wall::Tissue { surface: Surface::new(vertices, rows)?, nodes })
-}
-
-/// The boundary triangles of a mesh, whatever their orientation.
-struct Outside {
-    triangles: HashMap<[u32; 3], [u32; 3]>,
-}
-
-impl Outside {
-    fn new(mesh: &TetMesh) -> Self {
-        let sorted = |mut t: [u32; 3]| {
-            t.sort_unstable();
-            t
-        };
-        Self { triangles: mesh.boundary_triangles().iter().map(|&t| (sorted(t), t)).collect() }
-    }
-
-    /// Rejects triangles of a pair that are not on the boundary of the tissue, or face into it.
-    fn check(&self, pair: usize, triangles: &[[u32; 3]]) -> Result<()> {
-        for (row, triangle) in triangles.iter().enumerate() {
-            let mut key = *triangle;
-            key.sort_unstable();
-            let problem = match self.triangles.get(&key) {
-                None => "is no triangle of the mesh's boundary",
-                Some(out) if !same_turn(out, triangle) => {
-                    "faces into the tissue: reverse the order of its nodes"
-                }
-                Some(_) => continue,
-            };
-            let problem = format!("has triangle {row} of nodes {triangle:?}, which {problem}");
-            return Err(MtmError::TouchingPair { pair, problem });
-        }
-        Ok(())
-    }
-}
-
-/// Whether two triangles of the same nodes list them in the same cyclic order.
-fn same_turn(a: &[u32; 3], b: &[u32; 3]) -> bool {
-    let at = a.iter().position(|v| *v == b[0]).unwrap_or(0);
-    a[(at + 1) % 3] == b[1]
 }
