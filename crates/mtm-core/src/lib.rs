@@ -100,10 +100,11 @@ pub use mechanics::element::{Element, ElementNodes};
 pub use mechanics::hyperelastic::HyperelasticLaw;
 pub use mechanics::kinematics::Kinematics;
 pub use mechanics::material::{
-    Elastic, FibreElastic, FibreLaw, Lame, Mixing, Preset, Spencer, TetMaterial, Tissue, Voigt,
+    Elastic, FibreElastic, FibreLaw, Lame, Mixing, Preset, Spencer, Voigt,
 };
 pub use mechanics::strain_energy::{EnergyState, StrainEnergy, TangentKind};
 pub use mechanics::tensors::{EdgeTensors, MassTensors, tet_tensor};
+pub use mechanics::tissue::{TetMaterial, Tissue};
 pub use mesh::{MeshQuality, TetMesh};
 pub use meshing::crack::part;
 pub use meshing::signed_distance::signed_distance;

@@ -12,8 +12,9 @@ use nalgebra::{Cholesky, Matrix3, Matrix6, SymmetricEigen, Vector3};
 
 use crate::mechanics::hyperelastic::{HyperelasticLaw, PointResponse, Tangent, cofactor};
 use crate::mechanics::kinematics::Kinematics;
-use crate::mechanics::material::{Lame, TetMaterial, Voigt};
+use crate::mechanics::material::{Lame, Voigt};
 use crate::mechanics::polar::Polar;
+use crate::mechanics::tissue::TetMaterial;
 
 /// Sum of two principal stretches below which the rotation about the third axis is undefined: the tet is almost
 /// completely inverted.

@@ -10,3 +10,4 @@ pub(crate) mod polar;
 pub(crate) mod quadratic;
 pub mod strain_energy;
 pub mod tensors;
+pub mod tissue;

@@ -13,9 +13,8 @@ use nalgebra::{Matrix3, Vector6};
 use rayon::prelude::*;
 
 use crate::algebra::blocks::{Block, BlockMatrix};
-use crate::mechanics::material::{
-    Lame, Spencer, TetMaterial, Tissue, Voigt, voigt_eigenvalues, voigt_matrix,
-};
+use crate::mechanics::material::{Lame, Spencer, Voigt, voigt_eigenvalues, voigt_matrix};
+use crate::mechanics::tissue::{TetMaterial, Tissue};
 use crate::mesh::TetMesh;
 use crate::vector::add;
 

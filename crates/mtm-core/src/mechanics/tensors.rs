@@ -8,9 +8,10 @@ use rayon::prelude::*;
 use crate::algebra::blocks::{Block, BlockMatrix};
 use crate::error::{ErrorKind, MtmError, Result, check_displacements};
 use crate::mechanics::element::{Element, ElementNodes};
-use crate::mechanics::material::{Lame, Spencer, TetMaterial, Tissue, Voigt};
+use crate::mechanics::material::{Lame, Spencer, Voigt};
 use crate::mechanics::nodal_pressure::{Patches, split};
 use crate::mechanics::quadratic::quadratic_tensor;
+use crate::mechanics::tissue::{TetMaterial, Tissue};
 use crate::mesh::{TetGeometry, TetMesh};
 use crate::vector::dot;
 

@@ -3,7 +3,8 @@
 use rayon::prelude::*;
 
 use crate::error::Result;
-use crate::mechanics::material::{FibreLaw, Lame, Mixing, Preset, Spencer, Tissue, Voigt};
+use crate::mechanics::material::{FibreLaw, Lame, Mixing, Preset, Spencer, Voigt};
+use crate::mechanics::tissue::Tissue;
 use crate::muscles::equivalent::shares::{MuscleShares, TetShares};
 
 impl MuscleShares {
