@@ -13,6 +13,7 @@ use crate::boundary::Motion;
 use crate::contact::links::Link;
 use crate::contact::{Body, Constraints, ContactStart, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result};
+use crate::mechanics::kinematics::Kinematics;
 use crate::statics::effort::Solve;
 use crate::statics::iterative::{Advance, Iterative, Leave, Trail};
 use crate::statics::options::{Method, StaticOptions};
@@ -346,5 +347,22 @@ pub(crate) fn touching_needs_pcg(method: Method) -> MtmError {
         found: method.name().into(),
         known: "auto, pcg",
         kind: ErrorKind::Solver,
+    }
+}
+
+/// The method for a boundary with pairs that may touch: every round changes the matrix, and would need a new
+/// factorisation.
+pub(crate) fn method_for_touching(options: &StaticOptions) -> Result<Method> {
+    if options.kinematics != Kinematics::Linear {
+        return Err(MtmError::UnknownName {
+            what: "kinematics for a boundary with touching pairs",
+            found: options.kinematics.name().into(),
+            known: "linear",
+            kind: ErrorKind::Solver,
+        });
+    }
+    match options.method {
+        Method::Auto | Method::Pcg => Ok(Method::Pcg),
+        other => Err(touching_needs_pcg(other)),
     }
 }

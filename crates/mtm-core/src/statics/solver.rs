@@ -17,11 +17,11 @@ use crate::statics::newton::{Equilibrium, Slide};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::reduction::{NO_ROW, Reduction};
 use crate::statics::restraint::{self, Held};
-use crate::statics::settling::{Begin, Linked, Settle, touching_needs_pcg};
-use crate::statics::solution::{Clock, ContactResult, Solution, Timings};
+use crate::statics::settling::{Begin, Linked, Settle, method_for_touching};
+use crate::statics::solution::{Clock, Solution, Timings};
 use crate::statics::system::{BodyRows, Frozen, Solved, System};
 use crate::statics::touching::{Path, Prescribes, Touch};
-use crate::vector::{add, dot, norm, scaled, sub};
+use crate::vector::{add, norm, scaled};
 
 /// Multiple of the correction of a solution by factorisation that is taken as the error of the corrected one.
 const CORRECTION_SAFETY: f64 = 2.0;
@@ -398,116 +398,6 @@ impl StaticSolver {
         Ok((found, Touch::default()))
     }
 
-    /// Residual force at the unknown nodes relative to the forces that the plan introduces: forces of joined
-    /// nodes and loads on the unknown rows, contact forces, and the force that each held node alone would need
-    /// to follow its walls. Without the last term, walls that move a body without straining it would introduce
-    /// no force.
-    fn residual(
-        &self,
-        forces: &[[f64; 3]],
-        loads: Option<&[[f64; 3]]>,
-        (contact, touching): (Option<&ContactState>, &[[f64; 3]]),
-        b: &[[f64; 3]],
-    ) -> f64 {
-        let mut rest: Vec<[f64; 3]> = self
-            .reduction
-            .unknowns
-            .iter()
-            .map(|&j| {
-                let f = forces[j as usize];
-                loads.map_or(f, |rows| sub(f, rows[j as usize]))
-            })
-            .collect();
-        let mut scale: f64 = b.iter().map(|v| dot(*v, *v)).sum();
-        for (rest, push) in rest.iter_mut().zip(touching) {
-            *rest = sub(*rest, *push);
-        }
-        if let (Some(sliding), Some(state)) = (&self.sliding, contact) {
-            for (i, node) in sliding.nodes().iter().enumerate() {
-                let push = scaled(state.normals[i], state.forces[i]);
-                rest[node.row as usize] = sub(rest[node.row as usize], push);
-                scale += dot(push, push);
-            }
-            for row in &state.rows {
-                let j = sliding.nodes()[row.node].node as usize;
-                let k = self.tensors.matrix().diagonal_block(j);
-                let way = scaled(row.normal, dot(row.normal, state.displacements[row.node]));
-                let alone = [0, 1, 2].map(|i| dot([k[3 * i], k[3 * i + 1], k[3 * i + 2]], way));
-                scale += dot(alone, alone);
-            }
-        }
-        let sum: f64 = rest.iter().map(|v| dot(*v, *v)).sum();
-        if sum == 0.0 { 0.0 } else { (sum / scale.max(f64::MIN_POSITIVE)).sqrt() }
-    }
-
-    /// Rejects kinematics and boundaries without a linear map from what drives the body to its displacements:
-    /// `kinematics` and `boundary` are what the error calls them.
-    pub(crate) fn check_linear(
-        &self,
-        kinematics: &'static str,
-        boundary: &'static str,
-    ) -> Result<()> {
-        if self.kinematics() != Kinematics::Linear {
-            return Err(MtmError::UnknownName {
-                what: kinematics,
-                found: self.kinematics().name().into(),
-                known: "linear (no linear map gives the others; use solve)",
-                kind: ErrorKind::Solver,
-            });
-        }
-        if !self.node_kinds.touching().is_empty() {
-            return Err(MtmError::UnknownName {
-                what: boundary,
-                found: "touching pairs".into(),
-                known: "one without (what touches changes with the plan; use solve)",
-                kind: ErrorKind::Solver,
-            });
-        }
-        Ok(())
-    }
-
-    /// Rejects a starting solution of another mesh or boundary.
-    pub(crate) fn check_start(&self, start: &Solution) -> Result<()> {
-        let n = self.tensors.element_nodes().n_nodes();
-        let nodes = self.sliding.as_ref().map_or(0, |s| s.nodes().len());
-        let counts = [
-            ("displacements of the start", start.displacements.len(), n),
-            ("sliding nodes of the start", start.contact.nodes.len(), nodes),
-        ];
-        for (what, found, expected) in counts {
-            if found != expected {
-                return Err(MtmError::Length {
-                    what: what.into(),
-                    found,
-                    expected,
-                    why: "the start is a solution of the same solver",
-                    kind: ErrorKind::Boundary,
-                });
-            }
-        }
-        Ok(())
-    }
-
-    fn contact_result(&self, state: Option<ContactState>, motions: &[&Motion]) -> ContactResult {
-        let (Some(sliding), Some(state)) = (&self.sliding, state) else {
-            return ContactResult::default();
-        };
-        let at_rest = sliding.carried_back(motions, &state);
-        ContactResult {
-            nodes: sliding.nodes().iter().map(|n| n.node).collect(),
-            points: state.points,
-            normals: state.normals,
-            forces: state.forces,
-            gaps: state.gaps,
-            unbalanced: state.unbalanced,
-            at_rest,
-            converged: state.converged,
-            active: state.active,
-            rows: state.rows,
-            springs: state.springs,
-        }
-    }
-
     /// Contact at equilibrium for `plan`: the state about which the linear operator of re-planning is frozen.
     pub(crate) fn settled(
         &self,
@@ -550,23 +440,6 @@ impl Prescribes for StaticSolver {
 
     fn coupled(&self, u: &[[f64; 3]]) -> Vec<[f64; 3]> {
         self.coupled(u)
-    }
-}
-
-/// The method for a boundary with pairs that may touch: every round changes the matrix, and would need a new
-/// factorisation.
-fn method_for_touching(options: &StaticOptions) -> Result<Method> {
-    if options.kinematics != Kinematics::Linear {
-        return Err(MtmError::UnknownName {
-            what: "kinematics for a boundary with touching pairs",
-            found: options.kinematics.name().into(),
-            known: "linear",
-            kind: ErrorKind::Solver,
-        });
-    }
-    match options.method {
-        Method::Auto | Method::Pcg => Ok(Method::Pcg),
-        other => Err(touching_needs_pcg(other)),
     }
 }
 
