@@ -233,12 +233,12 @@ def measure_motion(
     as_positive("tolerance", tolerance)
     if not _same_triangles(before, after):
         raise RegistrationInputError(
-            f"the surfaces have other triangles: {len(np.asarray(before.triangles))} on "
-            f"{len(np.asarray(before.vertices))} vertices before, "
-            f"{len(np.asarray(after.triangles))} on {len(np.asarray(after.vertices))} after; a "
+            f"the surfaces have other triangles: {len(before.triangles)} on "
+            f"{len(before.vertices)} vertices before, "
+            f"{len(after.triangles)} on {len(after.vertices)} after; a "
             "motion by vertices needs the same, in the same order; achieved_plan searches instead"
         )
-    here, there = np.asarray(before.vertices), np.asarray(after.vertices)
+    here, there = before.vertices, after.vertices
     fit = rigid_fit(here, there)
     worst = float(fit.residuals.max())
     return AchievedMotion(
@@ -420,7 +420,7 @@ def _by_shape(
     return AchievedMotion(
         **{
             "matrix": fit.matrix,
-            "motion": decompose_motion(fit.matrix, _centre(centre, np.asarray(segment.vertices))),
+            "motion": decompose_motion(fit.matrix, _centre(centre, segment.vertices)),
             "method": method,
             "is_rigid": True,
             "rms": fit.rms,
@@ -464,13 +464,13 @@ def _targets(
 
 
 def _same_triangles(one: SurfaceData, other: SurfaceData) -> bool:
-    return len(np.asarray(one.vertices)) == len(np.asarray(other.vertices)) and np.array_equal(
-        np.asarray(one.triangles), np.asarray(other.triangles)
+    return len(one.vertices) == len(other.vertices) and np.array_equal(
+        one.triangles, other.triangles
     )
 
 
 def _transformed(surface: SurfaceData, matrix: Floats) -> SurfaceData:
-    vertices = np.asarray(surface.vertices) @ matrix[:3, :3].T + matrix[:3, 3]
+    vertices = surface.vertices @ matrix[:3, :3].T + matrix[:3, 3]
     return SurfaceData(vertices, surface.triangles, surface.crease_angle)
 
 

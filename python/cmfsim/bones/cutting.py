@@ -249,10 +249,10 @@ def _make_cut(
     low, high = block_of(bone > -limit)
     box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
     whole, bone = bone, bone[box]
-    part_grid = ImageData(bone, grid.spacing, grid.lowest + low * np.asarray(grid.spacing))
+    part_grid = ImageData(bone, grid.spacing, grid.lowest + low * grid.spacing)
     region = _scaled(cut, part_grid, limit)
     piece, rest = np.minimum(bone, region), np.minimum(bone, -region)
-    voxel = float(np.prod(np.asarray(grid.spacing)))
+    voxel = float(np.prod(grid.spacing))
     names = (cut.segment, rest_name)
     planes = ", ".join(sorted({p.name for group in cut.groups for p in group}))
     for name, part in ((cut.segment, piece), (rest_name, rest)):
@@ -306,7 +306,7 @@ def _scaled(cut: Cut, grid: ImageData, limit: float) -> Levels:
     """The depth in the region, of the size of a level, and straight across any cell it passes."""
     # Levels are clipped at `limit`. A plane clipped at less than a cell's diagonal would be bent
     # inside the cells that it cuts, and its zero would shift: so the diagonal becomes the limit.
-    diagonal = float(np.linalg.norm(np.asarray(grid.spacing)))
+    diagonal = float(np.linalg.norm(grid.spacing))
     depth = cut.region_on(grid) * (limit / diagonal)
     return np.clip(depth, -limit, limit).astype(np.float32)
 

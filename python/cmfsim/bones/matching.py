@@ -93,13 +93,13 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
         found = icp(
             segment,
             bone,
-            initial=_start(np.asarray(segment.vertices), bone, options),
+            initial=_start(segment.vertices, bone, options),
             trim=options.trim,
             max_angle=options.max_angle,
             max_iterations=MOST_STEPS,
             tolerance=REST,
         )
-        found_matrix = np.asarray(found.matrix, dtype=np.float64)
+        found_matrix = found.matrix
         fit = fit_shape(
             segment,
             bone,
@@ -179,4 +179,4 @@ def _start(vertices: Floats, bone: Surface, options: MatchOptions) -> Floats:
         )
         if best is None or fit.rms < best.rms:
             best = fit
-    return np.eye(4) if best is None else np.asarray(best.matrix)
+    return np.eye(4) if best is None else best.matrix

@@ -106,8 +106,8 @@ def sound_motion(motion: MovedSurface) -> MovedSurface:
     BoundaryError
         (also `ValueError`) No triangle is left.
     """
-    here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
-    triangles = np.asarray(motion.surface.triangles).astype(np.int64)
+    here, there = motion.surface.vertices, motion.moved_vertices
+    triangles = motion.surface.triangles.astype(np.int64)
     triangles = triangles[has_three_corners(triangles)]
     keep = np.ones(len(triangles), dtype=bool)
     keep[duplicate_triangles(triangles)] = False
@@ -136,8 +136,8 @@ def torn_pieces(motion: MovedSurface) -> tuple[MovedSurface, ...]:
     -------
     tuple of MovedSurface
     """
-    here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
-    triangles = np.asarray(motion.surface.triangles).astype(np.int64)
+    here, there = motion.surface.vertices, motion.moved_vertices
+    triangles = motion.surface.triangles.astype(np.int64)
     ends = edges_of(triangles).ends
     before, after = here[ends[:, 1]] - here[ends[:, 0]], there[ends[:, 1]] - there[ends[:, 0]]
     apart = np.linalg.norm(after - before, axis=1)
@@ -179,7 +179,7 @@ def smooth_motion(motion: MovedSurface) -> tuple[MovedSurface, float]:
     neighbours within some millimetres (Gaussian weights by area). A motion with less noise than a
     segmented bone is known to is given back as it is.
     """
-    here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
+    here, there = motion.surface.vertices, motion.moved_vertices
     rigid = _rigid(here, there)
     if rigid is None:
         return motion, 0.0
@@ -217,8 +217,8 @@ def without_removed(motion: MovedSurface) -> tuple[MovedSurface, tuple[RemovedBo
     that was joined to it goes on as if it were joined to the segment; that it sinks into the space
     afterwards is not computed.
     """
-    here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
-    triangles = np.asarray(motion.surface.triangles).astype(np.int64)
+    here, there = motion.surface.vertices, motion.moved_vertices
+    triangles = motion.surface.triangles.astype(np.int64)
     if len(here) < LEAST_FITTED:
         return motion, ()
     expected = _rest_of(here, there)
@@ -286,8 +286,8 @@ def missing_patches(
     tuple of RemovedBone
         The largest first; without what lies so far off that the scan after does not show it.
     """
-    here = np.asarray(segment.vertices)
-    triangles = np.asarray(segment.triangles).astype(np.int64)
+    here = segment.vertices
+    triangles = segment.triangles.astype(np.int64)
     moved = here @ np.asarray(matrix)[:3, :3].T + np.asarray(matrix)[:3, 3]
     off = np.linalg.norm(bone.closest(moved)[0] - moved, axis=1)
     far = np.flatnonzero((off > REMOVED_RIM) & (off < shown))
@@ -315,7 +315,7 @@ def _encloses(bone: Surface) -> bool:
     """Whether a surface is closed, but for triangles without area that were taken out of it."""
     if bone.is_closed:
         return True
-    vertices, triangles = np.asarray(bone.vertices), np.asarray(bone.triangles)
+    vertices, triangles = bone.vertices, bone.triangles
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     # The area vectors of a closed surface add up to nothing.
     open_area = 0.5 * np.linalg.norm(np.cross(b - a, c - a).sum(axis=0))
@@ -366,13 +366,13 @@ def _averaged(points: Floats, values: Floats) -> Floats:
 
 def _misses(one: MovedSurface, other: MovedSurface) -> float:
     """How far the motion of one piece takes the vertices of another from where they went, rms."""
-    vertices, went = np.asarray(other.surface.vertices), np.asarray(other.moved_vertices)
+    vertices, went = other.surface.vertices, other.moved_vertices
     step = -(-len(vertices) // SAMPLES)
     vertices, went = vertices[::step], went[::step]
     surface = one.surface
     bent = SurfaceMotion(Surface(surface.vertices, surface.triangles), one.moved_vertices)
     missed = [vertices + bent.displacement(vertices) - went]
-    rigid = _rigid(np.asarray(surface.vertices), np.asarray(one.moved_vertices))
+    rigid = _rigid(surface.vertices, one.moved_vertices)
     if rigid is not None:
         missed.append(vertices @ rigid[:3, :3].T + rigid[:3, 3] - went)
     return min(float(np.sqrt((m**2).sum(axis=1).mean())) for m in missed)
@@ -381,7 +381,7 @@ def _misses(one: MovedSurface, other: MovedSurface) -> float:
 def _rigid(here: Floats, there: Floats) -> Floats | None:
     """The best rigid motion; none where the vertices lie on a line."""
     try:
-        return np.asarray(rigid_fit(here, there).matrix, dtype=np.float64)
+        return rigid_fit(here, there).matrix
     except RegistrationError:
         return None
 
@@ -396,8 +396,8 @@ def _part(motion: MovedSurface, triangles: Integers) -> MovedSurface:
     """The motion of some of its triangles, with their vertices alone."""
     used, renumbered = np.unique(triangles, return_inverse=True)
     surface = SurfaceData(
-        np.asarray(motion.surface.vertices)[used],
+        motion.surface.vertices[used],
         renumbered.reshape(-1, 3),
         motion.surface.crease_angle,
     )
-    return MovedSurface(surface, np.asarray(motion.moved_vertices)[used])
+    return MovedSurface(surface, motion.moved_vertices[used])

@@ -83,7 +83,7 @@ def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
     MeshError
         (also `ValueError`) A triangle without area after.
     """
-    here, there = np.asarray(before.vertices), np.asarray(after.vertices)
+    here, there = before.vertices, after.vertices
     bone = Surface(after.vertices, after.triangles, crease_angle=after.crease_angle)
     fit = fit_shape(before, bone, _trimmed_motion(here, there))
     carried = _carried(fit.similarity, here)
@@ -123,16 +123,16 @@ def _trimmed_motion(here: Floats, there: Floats) -> Floats:
     """The rigid motion of most vertices, whatever the others did (Tukey's biweight)."""
     fit = rigid_fit(here, there)
     for _ in range(TRIM_ROUNDS):
-        off = np.asarray(fit.residuals)
+        off = fit.residuals
         reach = TUKEY * max(TO_SIGMA * float(np.median(off)), LEAST_SIGMA)
         fit = rigid_fit(here, there, weights=(1.0 - np.minimum(off / reach, 1.0) ** 2) ** 2)
-    return np.asarray(fit.matrix)
+    return fit.matrix
 
 
 def _is_displaced(here: Floats, there: Floats, bone: Surface, patch: NDArray[np.int64]) -> bool:
     """Whether a patch that the bone's motion lays off it moved as one, and was not removed."""
     try:
-        own = np.asarray(rigid_fit(here[patch], there[patch]).matrix)
+        own = rigid_fit(here[patch], there[patch]).matrix
     except RegistrationError:
         # Squeezed to a point or a line.
         return False
@@ -142,4 +142,4 @@ def _is_displaced(here: Floats, there: Floats, bone: Surface, patch: NDArray[np.
 
 
 def _carried(matrix: Floats, points: Floats) -> Floats:
-    return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3])
+    return points @ matrix[:3, :3].T + matrix[:3, 3]

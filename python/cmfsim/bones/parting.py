@@ -51,7 +51,7 @@ def part_segment(
     surfaces = [Surface(s.vertices, s.triangles) for s in pieces.values()]
     low = np.min([s.vertices.min(axis=0) for s in surfaces[1:]] or [level.highest], axis=0)
     high = np.max([s.vertices.max(axis=0) for s in surfaces[1:]] or [level.lowest], axis=0)
-    spacing = np.asarray(level.spacing)
+    spacing = level.spacing
     index = np.argwhere(values > -limit)
     points = level.lowest + index * spacing
     beside = ((points >= low - BESIDE) & (points <= high + BESIDE)).all(axis=1)

@@ -41,32 +41,33 @@ class CuttingPlane:
     [3.0]
     """
 
-    point: ArrayLike
-    normal: ArrayLike
-    name: str = "plane"
+    point: Floats
+    normal: Floats
+    name: str
 
-    def __post_init__(self) -> None:
-        as_text("plane name", self.name)
-        where = f"plane {self.name!r}"
-        point = as_point(f"{where} point", self.point)
-        normal = as_point(f"{where} normal", self.normal)
-        largest = float(np.abs(normal).max())
+    def __init__(self, point: ArrayLike, normal: ArrayLike, name: str = "plane") -> None:
+        as_text("plane name", name)
+        where = f"plane {name!r}"
+        place = as_point(f"{where} point", point)
+        direction = as_point(f"{where} normal", normal)
+        largest = float(np.abs(direction).max())
         if largest == 0.0:
             raise CaseInputError(f"{where} normal is (0, 0, 0): give a direction of any length")
-        normal = normal / largest
-        normal = normal / np.linalg.norm(normal)
-        normal.setflags(write=False)
-        object.__setattr__(self, "point", point)
-        object.__setattr__(self, "normal", normal)
+        direction = direction / largest
+        direction = direction / np.linalg.norm(direction)
+        direction.setflags(write=False)
+        object.__setattr__(self, "point", place)
+        object.__setattr__(self, "normal", direction)
+        object.__setattr__(self, "name", name)
 
     def distance(self, points: ArrayLike) -> Floats:
         """The signed distance of points (n, 3), mm: positive on the side of the normal."""
-        offset = as_rows("points", points, 3) - np.asarray(self.point)
-        return cast("Floats", offset @ np.asarray(self.normal))
+        offset = as_rows("points", points, 3) - self.point
+        return offset @ self.normal
 
     def distance_on(self, image: ImageData) -> Floats:
         """The signed distance at every voxel of an image's grid, (nx, ny, nz) mm."""
-        point, normal = np.asarray(self.point), np.asarray(self.normal)
+        point, normal = self.point, self.normal
         x, y, z = image.axes()
         dx, dy, dz = x - point[0], y - point[1], z - point[2]
         return cast("Floats", normal[0] * dx + normal[1] * dy + normal[2] * dz)

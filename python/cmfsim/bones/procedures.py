@@ -329,7 +329,7 @@ def _le_fort_3(
     frame = _upper_frame("le_fort_3", points)
     junction = _junction(points, frame, options["posterior"])
     top = points["nasion"] + options["height"] * frame.up
-    bottom = np.asarray(junction.point) + options["junction"] * frame.up
+    bottom = junction.point + options["junction"] * frame.up
     along = top - bottom
     along = _unit("le_fort_3", "nasion and the junction", along - (along @ frame.left) * frame.left)
     down = np.cross(frame.left, along)

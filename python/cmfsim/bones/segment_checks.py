@@ -73,9 +73,9 @@ def _key(segment: BoneSegment) -> bytes:
 
 def _check_lies_on_level(segment: BoneSegment, *, is_given: bool) -> None:
     level = segment.level
-    spacing = np.asarray(level.spacing, dtype=np.float64)
-    values = np.asarray(level.values)
-    vertices = np.asarray(segment.surface.vertices)
+    spacing = level.spacing
+    values = level.values
+    vertices = segment.surface.vertices
     inside = values > 0.0
     share = float(_on_zero_set(inside, (vertices - level.lowest) / spacing).mean())
     why = "its surface was exchanged or damaged on the way: report this as a defect of cmfsim"
@@ -121,10 +121,10 @@ def _on_zero_set(inside: NDArray[np.bool_], places: Floats) -> NDArray[np.bool_]
 
 
 def _volume(segment: BoneSegment) -> float:
-    vertices = np.asarray(segment.surface.vertices, dtype=np.float64)
+    vertices = segment.surface.vertices
     # About the middle, or rounding far from the origin would count.
     vertices = vertices - vertices.mean(axis=0)
-    a, b, c = (vertices[np.asarray(segment.surface.triangles)[:, k]] for k in range(3))
+    a, b, c = (vertices[segment.surface.triangles[:, k]] for k in range(3))
     return float(np.einsum("na,na->", a, np.cross(b, c))) / 6.0
 
 

@@ -132,7 +132,7 @@ class ShapeFit(Frozen):
     @property
     def image(self) -> Floats:
         """Where the rigid motion takes the middle, (3,) mm."""
-        return np.asarray(self.matrix[:3, :3] @ self.middle + self.matrix[:3, 3])
+        return self.matrix[:3, :3] @ self.middle + self.matrix[:3, 3]
 
     @property
     def similarity(self) -> Floats:
@@ -198,10 +198,10 @@ def fit_shape(
     The interval of the size leaves out one block of neighbouring vertices after the other (Künsch
     1989), as distances of neighbours are not independent.
     """
-    points = np.asarray(segment.vertices)
+    points = segment.vertices
     middle = points.mean(axis=0)
     own = Surface(segment.vertices, segment.triangles)
-    whole = _Sample(points - middle, np.asarray(own.vertex_normals), vertex_areas(segment))
+    whole = _Sample(points - middle, own.vertex_normals, vertex_areas(segment))
     # Any order of vertices in the file gives points from all over the segment.
     few = whole.some(np.random.default_rng(0).permutation(len(points))[:most_points])
     radius = float(np.sqrt((few.arms**2).sum(axis=1).mean()))
@@ -246,7 +246,7 @@ class _Pose:
     scale: float
 
     def of(self, arms: Floats) -> Floats:
-        return np.asarray(self.scale * arms @ self.turn.T + self.image)
+        return self.scale * arms @ self.turn.T + self.image
 
     def stepped(self, step: Floats, radius: float) -> "_Pose":
         angle = float(np.linalg.norm(step[:3])) / radius
@@ -363,8 +363,8 @@ def _blocks(points: Floats) -> NDArray[np.int64]:
 
 def vertex_areas(surface: SurfaceData) -> Floats:
     """A third of the triangles round each vertex, mm²."""
-    vertices = np.asarray(surface.vertices)
-    triangles = np.asarray(surface.triangles).astype(np.int64)
+    vertices = surface.vertices
+    triangles = surface.triangles.astype(np.int64)
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return np.asarray(np.bincount(triangles.ravel(), np.repeat(areas / 3.0, 3), len(vertices)))

@@ -147,8 +147,8 @@ def contact_sheet(
     made = surface_of_level(
         f"contact of {name}", image, SurfaceOptions(max_triangles=200_000, smoothing=0)
     )
-    points = grid.origin + np.asarray(made.vertices) @ grid.axes
-    triangles = np.asarray(made.triangles)
+    points = grid.origin + made.vertices @ grid.axes
+    triangles = made.triangles
     if np.linalg.det(grid.axes) < 0.0:
         triangles = triangles[:, ::-1]
     return ContactSheet(SurfaceData(points, triangles), relief, radius)
@@ -190,7 +190,7 @@ class _Grid:
         self.name, self.arch, self.options = name, arch, options
         self.axes: Floats = _frame(across, forwards, -out)
         self.origin: Floats = arch.middle
-        tip = self.axes @ (np.asarray(arch.tip) - self.origin)
+        tip = self.axes @ (arch.tip - self.origin)
         side = arch.half_width + options.beside + ROOM
         self.low = np.array([-side, -options.behind - ROOM, -options.above - ROOM + min(tip[2], 0)])
         self.high = np.array([side, tip[1] + ROOM, max(arch.depth_front, arch.depth_molars) + 5.0])
@@ -200,7 +200,7 @@ class _Grid:
         self.axes = _frame(across, forwards, normal)
         shift = float(self.axes[2] @ (edge - self.origin))
         self.origin = self.origin + shift * self.axes[2]
-        self.tip: Floats = self.axes @ (np.asarray(arch.tip) - self.origin)
+        self.tip: Floats = self.axes @ (arch.tip - self.origin)
         self.low[2] = -shift - options.above - ROOM + min(tip[2], 0)
         self.high[2] = BEYOND
         self._sample(bone)
@@ -263,7 +263,7 @@ class _Grid:
             plane = np.array([0.0, 0.0, float(np.median(found[:, 2]))])
         centre = found.mean(axis=0)
         centre[2] = plane[:2] @ centre[:2] + plane[2]
-        return self.origin + centre @ self.axes, np.asarray(normal @ self.axes)
+        return self.origin + centre @ self.axes, (normal @ self.axes)
 
     def at(self, axis: int, value: float) -> int:
         """The index of the grid line nearest to a coordinate."""
@@ -272,7 +272,7 @@ class _Grid:
 
     def beside(self, across: Floats) -> Mask:
         """Whether coordinates to the left lie at the arch, and not on zygoma."""
-        return np.asarray(np.abs(across) <= self.arch.half_width + self.options.beside)
+        return np.abs(across) <= self.arch.half_width + self.options.beside
 
     def zone(self) -> Mask:
         """Where tissue slides, on the grid with its margin."""
@@ -312,7 +312,7 @@ def _bridged(solid: Mask, radius: float) -> Mask:
     grown = _core.distance_image(wide, (SPACING,) * 3) <= radius
     kept = _core.distance_image(~grown, (SPACING,) * 3) > radius
     inner = tuple(slice(rim, -rim) for _ in range(3))
-    return np.asarray(kept[inner] | solid)
+    return kept[inner] | solid
 
 
 def _filled(grid: _Grid, solid: Mask) -> Mask:

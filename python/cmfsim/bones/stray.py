@@ -100,8 +100,8 @@ def stray_patches(
     off : (n,) float64, mm
         Distance of each vertex from the bone.
     """
-    here = np.asarray(segment.vertices)
-    triangles = np.asarray(segment.triangles).astype(np.int64)
+    here = segment.vertices
+    triangles = segment.triangles.astype(np.int64)
     turn, shift = np.asarray(matrix)[:3, :3], np.asarray(matrix)[:3, 3]
     moved = here @ turn.T + shift
     closest, facing, _ = bone.closest(moved)
@@ -115,7 +115,7 @@ def stray_patches(
         stray[asked[np.linalg.norm(nearest - here[asked], axis=1) <= CUT_FACE]] = False
     if not stray.any():
         return (), off
-    normals = np.asarray(Surface(segment.vertices, segment.triangles).vertex_normals)
+    normals = Surface(segment.vertices, segment.triangles).vertex_normals
     alike = ((normals @ turn.T) * facing).sum(axis=1) >= FACING
     ends = edges_of(triangles).ends
     label = connected_labels(ends[stray[ends].all(axis=1)], len(here))

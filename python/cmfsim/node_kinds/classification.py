@@ -326,7 +326,7 @@ def _on_planes(
         at_end = name in {"left", "posterior", "superior"}
         end = high[axis] if at_end else low[axis]
         # A level that is cut by the border ends half a voxel to one voxel inside it.
-        slack = float(np.asarray(anatomy.skin.spacing)[axis])
+        slack = float(anatomy.skin.spacing[axis])
         found |= np.abs(border.points[:, axis] - end) <= reach + slack
     return found
 

@@ -295,8 +295,7 @@ def _placed(landmarks: Mapping[str, Floats], noise: float, seed: list[int]) -> d
     """Landmarks as they are placed, off by noise along each axis."""
     generator = np.random.default_rng(seed)
     return {
-        label: np.asarray(point) + noise * generator.standard_normal(3)
-        for label, point in landmarks.items()
+        label: point + noise * generator.standard_normal(3) for label, point in landmarks.items()
     }
 
 
@@ -385,7 +384,7 @@ def _described(patient: VirtualPatient) -> dict[str, Any]:
 def _measured(truth: PostoperativeTruth) -> dict[str, Any]:
     """What the solution says of itself."""
     found = truth.equilibrium
-    moved = np.asarray(truth.skin.vertices) - np.asarray(truth.skin_before.vertices)
+    moved = truth.skin.vertices - truth.skin_before.vertices
     lips = truth.lips
     contact: dict[str, Any] = {}
     if lips is not None:
@@ -424,7 +423,7 @@ def _write_truth(
     for name in ("bones", "bones_before"):
         (folder / name).mkdir()
     for name, segment in truth.segments.items():
-        before, matrix = np.asarray(segment.surface.vertices), truth.motions[name]
+        before, matrix = segment.surface.vertices, truth.motions[name]
         after = before @ matrix[:3, :3].T + matrix[:3, 3]
         write_surface(folder / "bones_before" / f"{name}.ply", segment.surface)
         write_surface(

@@ -192,10 +192,10 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     motions = {name: _departure(patient, head, name) @ _motion(case, name) for name in segments}
 
     stage("opening bite and cuts")
-    distances = bone_distances(np.asarray(model.scene.nodes), segments)
+    distances = bone_distances(model.scene.nodes, segments)
     opened = _opened(
-        np.asarray(model.scene.nodes),
-        np.asarray(model.scene.tets),
+        model.scene.nodes,
+        model.scene.tets,
         model.kinds,
         distances,
         motions,
@@ -223,7 +223,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
         boundary,
         opened.kinds,
         distances=distances,
-        centres={name: np.asarray(s.surface.vertices).mean(axis=0) for name, s in segments.items()},
+        centres={name: s.surface.vertices.mean(axis=0) for name, s in segments.items()},
         plan=motions,
         bared=bared,
     )
@@ -234,7 +234,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
 
     stage("moving the skin")
     before = head.surface("skin", skin_spacing)
-    places, names = np.asarray(before.vertices), list(head.skin_landmarks)
+    places, names = before.vertices, list(head.skin_landmarks)
     points = np.array([head.skin_landmarks[name] for name in names])
     after = places + carried(places, nodes, tets, found.displacements)
     moved = points + carried(points, nodes, tets, found.displacements)

@@ -111,7 +111,7 @@ def face_sites(patient: PatientModel) -> FaceSites:
     needed = dict.fromkeys(name for measure in MEASURES for name in measure.sites)
     keys = {label_key(name): name for name in needed}
     given = {
-        keys.get(label_key(name), name): np.asarray(place, dtype=np.float64)
+        keys.get(label_key(name), name): place
         for name, place in patient.landmarks.get("skin", {}).items()
     }
     skin = {name: given[name] for name in needed if name in given}
@@ -304,9 +304,9 @@ def _upper_incisor(patient: PatientModel) -> BoneSite:
     skull = patient.landmarks.get("skull", {})
     if "supradentale" not in skull:
         raise LandmarkInputError("the case gives no skull landmark supradentale")
-    root = np.asarray(skull["supradentale"], dtype=np.float64)
+    root = skull["supradentale"]
     bearer = _upper_bearer(patient.segments)
-    vertices = np.asarray(bearer.surface.vertices)
+    vertices = bearer.surface.vertices
     away = vertices - root
     near = vertices[
         (np.abs(away[:, 0]) <= INCISOR_SIDE)

@@ -251,7 +251,7 @@ class _Space:
         if not self.free:
             raise CaseInputError("every segment follows another: nothing is free to move")
         skull = planning.patient.landmarks.get("skull", {})
-        surfaces = {s.name: np.asarray(s.surface.vertices) for s in planning.patient.segments}
+        surfaces = {s.name: s.surface.vertices for s in planning.patient.segments}
         self.skull, self.surfaces = skull, surfaces
         self.points = {name: self.stated(name, np.eye(4)).point for name in self.free}
         # What takes a follower from its leader's place to its own: the final bite.
@@ -264,11 +264,11 @@ class _Space:
         return clinical_motion(name, motion, landmarks=self.skull, vertices=self.surfaces.get(name))
 
     def numbers_of_reference(self) -> Floats:
-        rows = [self.stated(name, np.asarray(self.reference[name])) for name in self.free]
+        rows = [self.stated(name, self.reference[name]) for name in self.free]
         return np.array([getattr(row, number) for row in rows for number in NUMBERS])
 
     def plan(self, numbers: Floats) -> dict[str, Floats]:
-        plan = {name: np.asarray(motion) for name, motion in self.reference.items()}
+        plan = dict(self.reference)
         for index, name in enumerate(self.free):
             shift, turn = numbers[6 * index : 6 * index + 3], numbers[6 * index + 3 : 6 * index + 6]
             point = self.points[name]

@@ -106,7 +106,7 @@ def page_content(
     patient = planning.patient
     findings: list[Finding] = []
     skin = planning.skin_before
-    count = len(np.asarray(skin.vertices))
+    count = len(skin.vertices)
     if count > MOST_NODES:
         raise CaseInputError(
             f"the skin has {count} nodes, a page holds {MOST_NODES}: give a larger "
@@ -120,7 +120,7 @@ def page_content(
         "face": _singles(face.vertices),
         "face_triangles": _indices(face.triangles),
         **_operator(planning, reference),
-        **_carried("face", skin, np.asarray(face.vertices)),
+        **_carried("face", skin, face.vertices),
         **_carried("site", skin, _rows(sites.skin.values())),
         "sites": _singles(_rows(sites.skin.values())),
     }
@@ -168,18 +168,18 @@ def _rows(places: Any) -> Floats:
 
 def _fewer(name: str, surface: SurfaceData, most: int, findings: list[Finding]) -> SurfaceData:
     """The surface, simplified with a finding where it has more triangles than are drawn."""
-    count = len(np.asarray(surface.triangles))
+    count = len(surface.triangles)
     if count <= most:
         return surface
     fewer = simplified_surface(name, surface, most)
     there = Surface(surface.vertices, surface.triangles)
     closest, _, _ = there.closest(fewer.vertices)
-    away = float(np.linalg.norm(closest - np.asarray(fewer.vertices), axis=1).max())
+    away = float(np.linalg.norm(closest - fewer.vertices, axis=1).max())
     findings.append(
         Finding.note(
             "page-simplified",
             f"{name} has {count} triangles: the page draws "
-            f"{len(np.asarray(fewer.triangles))}, at most {away:.2f} mm away",
+            f"{len(fewer.triangles)}, at most {away:.2f} mm away",
             where=name,
             why="a page with all of them is slow to open and to send",
             fix="nothing: predictions are made with all of them",
@@ -245,7 +245,7 @@ def _carried(part: str, skin: SurfaceData, points: Floats) -> dict[str, NDArray[
     """How points hang on the skin: as `carried_points` of a prediction does it."""
     there = Surface(skin.vertices, skin.triangles)
     closest, _, triangles = there.closest(points)
-    corners = np.asarray(skin.vertices)[np.asarray(skin.triangles)[triangles]]
+    corners = skin.vertices[skin.triangles[triangles]]
     offset = points - closest
     share = carried_share(there, np.linalg.norm(offset, axis=1))
     return {
@@ -262,7 +262,7 @@ def _segments(planning: PlanningModel) -> list[dict[str, Any]]:
     boxes = segment_boxes(planning)
     found = []
     for name, centre in zip(planning.segments, planning.columns.centres, strict=True):
-        points = segment_points(name, skull, np.asarray(surfaces[name].vertices))
+        points = segment_points(name, skull, surfaces[name].vertices)
         found.append(
             {
                 "name": name,
@@ -270,7 +270,7 @@ def _segments(planning: PlanningModel) -> list[dict[str, Any]]:
                 "centre": centre.tolist(),
                 "box": [boxes[name].min(axis=0).tolist(), boxes[name].max(axis=0).tolist()],
                 "points": [{"label": p.label, "place": p.place.tolist()} for p in points],
-                "reference": np.asarray(planning.reference[name]).ravel().tolist(),
+                "reference": planning.reference[name].ravel().tolist(),
             }
         )
     return found
@@ -281,7 +281,7 @@ def _bones(
 ) -> list[dict[str, Any]]:
     """The bones, those that stay included; each gets triangles in proportion to what it has."""
     segments = planning.patient.segments
-    counts = [len(np.asarray(segment.surface.triangles)) for segment in segments]
+    counts = [len(segment.surface.triangles) for segment in segments]
     found: list[dict[str, Any]] = []
     for number, segment in enumerate(segments):
         most = max(LEAST_BONE, BONE_TRIANGLES * counts[number] // sum(counts))
@@ -365,7 +365,7 @@ def _teeth(planning: PlanningModel, arrays: dict[str, NDArray[Any]]) -> dict[str
             "upper": number.get(rows.upper),
             "lower": number.get(rows.lower),
             "origin": rows.depth.lowest.tolist(),
-            "spacing": float(np.asarray(rows.depth.spacing)[0]),
+            "spacing": float(rows.depth.spacing[0]),
             "shape": list(rows.depth.values.shape),
         },
         "occlusion_absent": "",
@@ -374,7 +374,7 @@ def _teeth(planning: PlanningModel, arrays: dict[str, NDArray[Any]]) -> dict[str
 
 def _framing(skin: SurfaceData, active: NDArray[Any]) -> dict[str, Any]:
     """Where the picture looks, and how much it shows, mm: what moves, and some of the head."""
-    vertices = np.asarray(skin.vertices)
+    vertices = skin.vertices
     moving = vertices[active] if len(active) else vertices
     low, high = moving.min(axis=0), moving.max(axis=0)
     return {

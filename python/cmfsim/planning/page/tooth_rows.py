@@ -111,10 +111,10 @@ def _bearer(segments: tuple[BoneSegment, ...], names: tuple[str, ...], jaw: str)
 
 def _row(bearer: BoneSegment, arch: DentalArch) -> Floats:
     """Vertices and middles of triangles of a bone where its teeth stand."""
-    vertices = np.asarray(bearer.surface.vertices)
-    points = np.concatenate([vertices, vertices[np.asarray(bearer.surface.triangles)].mean(axis=1)])
+    vertices = bearer.surface.vertices
+    points = np.concatenate([vertices, vertices[bearer.surface.triangles].mean(axis=1)])
     places = (points - arch.middle) @ arch.axes().T
-    front = float((np.asarray(arch.tip) - arch.middle) @ arch.axes()[1])
+    front = float((arch.tip - arch.middle) @ arch.axes()[1])
     chosen = points[
         (np.abs(places[:, 0]) <= arch.half_width + SIDE)
         & (places[:, 1] >= -BEHIND)
@@ -124,13 +124,13 @@ def _row(bearer: BoneSegment, arch: DentalArch) -> Floats:
     if not len(chosen):
         raise CaseInputError(f"the surface of {bearer.name} has no teeth at its arch")
     step = -(-len(chosen) // MOST_POINTS)
-    return np.asarray(chosen[::step])
+    return chosen[::step]
 
 
 def _depth(bearer: BoneSegment, places: Floats) -> Floats:
     """Depth of places inside a bone, mm; 0 outside."""
     surface = Surface(bearer.surface.vertices, bearer.surface.triangles)
-    inside = np.asarray(surface.winding_number(places)) > 0.5
+    inside = surface.winding_number(places) > 0.5
     depth = np.zeros(len(places))
     if inside.any():
         closest, _, _ = surface.closest(places[inside])

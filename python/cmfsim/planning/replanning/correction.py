@@ -116,7 +116,7 @@ class PlanCorrection:
 
     def displacements(self, plan: Mapping[str, ArrayLike]) -> Floats:
         """What is added to the operator's displacements under a plan, (k, 3) mm."""
-        return np.asarray(self.shapes @ self.amounts(plan))
+        return self.shapes @ self.amounts(plan)
 
     def at(self, nodes: NDArray[np.integer]) -> "PlanCorrection":
         """The correction of some of the nodes, by their places in the operator."""
@@ -181,7 +181,7 @@ def _turn(motion: Floats) -> Floats:
     sine = math.hypot(*twice)
     angle = math.atan2(sine, float(np.trace(motion[:3, :3])) - 1.0)
     # A half turn has no such axis; it is far beyond the plans that correct anything.
-    return np.asarray(twice * (angle / sine if sine > SMALL_SINE else 0.5))
+    return twice * (angle / sine if sine > SMALL_SINE else 0.5)
 
 
 def _covariance(a: Floats, b: Floats, length: float) -> Floats:

@@ -136,7 +136,7 @@ def segment_boxes(planning: PlanningModel) -> dict[str, Floats]:
     found = {}
     for segment in planning.patient.segments:
         if segment.name in planning.segments:
-            vertices = np.asarray(segment.surface.vertices)
+            vertices = segment.surface.vertices
             low, high = vertices.min(axis=0), vertices.max(axis=0)
             ends = np.array([[(n >> axis) & 1 for axis in range(3)] for n in range(8)])
             found[segment.name] = np.where(ends, high, low)
@@ -211,7 +211,7 @@ def plan_near(
 ) -> dict[str, Floats]:
     """A random plan around the reference: up to `shift` mm along each axis, and `turn` degrees."""
     boxes = segment_boxes(planning)
-    plan = {name: np.asarray(motion) for name, motion in planning.reference.items()}
+    plan = dict(planning.reference)
     for name in moving_segments(planning):
         centre = boxes[name].mean(axis=0)
         more = rigid_motion(

@@ -96,7 +96,7 @@ class PlanBand:
     def factor(self) -> Floats:
         """How many standard deviations the band has at each vertex, (k,); NaN where it has none."""
         band = self.at_reference
-        return np.asarray(np.ma.filled(band.half_width, np.nan) / np.asarray(band.sd))
+        return np.ma.filled(band.half_width, np.nan) / band.sd
 
 
 def _factor(band: SkinBand, factor: BandFactor | None) -> float:
@@ -145,7 +145,7 @@ def plan_band(planning: PlanningModel, reference: Prediction) -> PlanBand:
     moduli = [name for name in MODULI if name in band.parts]
     columns = planning.columns
     skin = reference.skin
-    normals = np.asarray(Surface(skin.vertices, skin.triangles).vertex_normals)
+    normals = Surface(skin.vertices, skin.triangles).vertex_normals
     rates = np.zeros((len(moduli), len(normals), NUMBERS * len(columns.segments)))
     if moduli:
         rates = _rates(planning, solution, moduli, normals)
