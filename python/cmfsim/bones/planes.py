@@ -18,7 +18,7 @@ __all__ = ["Cut", "CuttingPlane", "Procedure", "free_cut"]
 
 @dataclass(frozen=True, eq=False)
 class CuttingPlane:
-    """An unbounded plane that parts bone; its normal points into the piece that is cut off.
+    """An unbounded plane that cuts bone; its normal points into the piece that is cut off.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class Cut:
     groups : tuple of tuples of CuttingPlane
         Each group is a convex region; the piece is their union.
     sources : tuple of str
-        The piece is taken from the first of these bones or segments that there is.
+        The piece is cut from the first of these bones or segments that exists.
     rest : str or None
         What the source is called afterwards; None leaves its name.
     """
@@ -125,7 +125,7 @@ class Procedure:
     options : mapping of str to float
         The distances (mm) and angles (degrees) that placed the planes, defaults included.
     findings : tuple of Finding
-        What its placement should be looked at for.
+        What to check in its placement.
     """
 
     kind: str

@@ -233,7 +233,7 @@ def _points_wish(planning: PlanningModel, target: PointTarget) -> Wish:
     if not (share > 0.0).all():
         place = points[int(np.argmin(share))].round(1).tolist()
         raise CaseInputError(
-            f"target point {place} mm lies away from the tissue of the model: no plan moves it"
+            f"target point {place} mm lies outside the tissue of the model: no plan moves it"
         )
 
     def rows(places: Floats, _: Motions) -> Floats:

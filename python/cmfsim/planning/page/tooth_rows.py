@@ -1,7 +1,7 @@
 """Whether tooth rows pass through each other: depth of the lower teeth inside the upper ones.
 
-Points of the lower row are looked up in a grid of the depth inside the upper row's bone, in the
-place that it has before the operation: both move rigidly, so one grid serves every plan.
+Points of the lower row are looked up in a grid of the depth inside the upper row's bone, at its
+place before the operation: both move rigidly, so one grid serves every plan.
 """
 
 from collections.abc import Mapping
@@ -38,7 +38,7 @@ class ToothRows:
     Attributes
     ----------
     upper, lower : str
-        The segments that bear them; one that no plan moves stays.
+        The segments that bear them; a segment that the plan does not move stays.
     points : (n, 3) float64, mm
         Of the lower row, before the operation.
     depth : ImageData
@@ -82,7 +82,7 @@ def tooth_rows(patient: PatientModel) -> ToothRows:
     Raises
     ------
     CaseError
-        (also `ValueError`) No arches are known, or no segments that bear them.
+        (also `ValueError`) The arches, or the segments that bear them, are unknown.
     """
     arches = dental_arches(patient.anatomy, patient.segments, patient.landmarks.get("skull"))
     if "lower" not in arches.by_jaw:
@@ -110,7 +110,7 @@ def _bearer(segments: tuple[BoneSegment, ...], names: tuple[str, ...], jaw: str)
 
 
 def _row(bearer: BoneSegment, arch: DentalArch) -> Floats:
-    """Vertices and middles of triangles of a bone where its teeth stand."""
+    """Vertices and triangle centres of a bone at its teeth."""
     vertices = bearer.surface.vertices
     points = np.concatenate([vertices, vertices[bearer.surface.triangles].mean(axis=1)])
     places = (points - arch.middle) @ arch.axes().T

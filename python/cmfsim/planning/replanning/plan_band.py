@@ -1,11 +1,11 @@
 """The band of a planning model: how far to trust the skin under any rigid plan, by one product.
 
-The variance along the normal at a vertex is v + Σ_p (r_p + R_p q)². The constant v has what no plan
-changes, the errors of its execution and what lies along the normal, and, as at the reference plan,
-sources of tissue beyond the moduli. Of each modulus p, one standard deviation moves the skin by r_p
-at the reference; R_p are the rates of that with six numbers q of each segment, zero at the
-reference: the further shift of its centre and its further turn, to first order, with contact
-continued about the reference.
+The variance along the normal at a vertex is v + Σ_p (r_p + R_p q)². The constant v has the parts
+that do not depend on the plan (errors of its execution and errors along the normal) and, at their
+values for the reference plan, the tissue sources other than the moduli. One standard deviation of
+modulus p moves the skin by r_p at the reference; R_p are the rates of r_p with six numbers q of
+each segment, zero at the reference: the further shift of its centre and its further rotation, to
+first order, with contact linearised about the reference.
 """
 
 from collections.abc import Mapping
