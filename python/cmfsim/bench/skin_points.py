@@ -51,7 +51,7 @@ def skin_points(patient: PatientModel) -> tuple[Floats, Regions]:
             f"{patient.name}: predictions are compared on the detailed face, which is read from "
             "the image with scikit-image: pip install 'cmfsim[imaging]'"
         )
-    vertices = np.asarray(face.vertices)
+    vertices = face.vertices
     landmarks = patient.landmarks.get("skin", {})
     on_tissue = _on_tissue(patient, vertices)
     regions = {WHOLE: on_tissue}

@@ -12,8 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from cmfsim.bench.choice import Choice
 from cmfsim.bench.memory import peak_memory
 from cmfsim.bench.skin_points import read_points, skin_points, write_points
@@ -62,7 +60,7 @@ def _build(job: Mapping[str, Any]) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     for model in job["models"]:
         write_scene(folder / f"{model}.npz", model_scene(patient, model))
-    skin = {"nodes": patient.skin_nodes, "triangles": np.asarray(patient.skin.triangles)}
+    skin = {"nodes": patient.skin_nodes, "triangles": patient.skin.triangles}
     write_archive(folder / "skin.npz", SKIN_FORMAT, "skin", {}, skin)
     if job["points"] is not None:
         write_points(Path(job["points"]), *skin_points(patient))
@@ -84,9 +82,9 @@ def _solve(job: Mapping[str, Any]) -> dict[str, Any]:
     }
     _, arrays = read_archive(folder / "skin.npz", SKIN_FORMAT, "skin")
     nodes = member_of(arrays, "nodes")
-    skin = SurfaceData(np.asarray(scene.nodes)[nodes], member_of(arrays, "triangles"))
+    skin = SurfaceData(scene.nodes[nodes], member_of(arrays, "triangles"))
     points, _ = read_points(Path(job["points"]))
-    moved = carried_points(skin, np.asarray(result.displacements)[nodes], points)
+    moved = carried_points(skin, result.displacements[nodes], points)
     write_archive(Path(job["moved"]), MOVED_FORMAT, "moved", {}, {"displacements": moved})
     return answer
 

@@ -18,7 +18,7 @@ from cmfsim.values.calibration import BandFactor, Calibration, CalibrationCase
 
 __all__ = ["COVERAGE", "MethodBand", "calibrated_band"]
 
-# The share of patients that a band is to hold in each region.
+# The share of patients that a band must cover in each region.
 COVERAGE = 0.9
 GROUP = "virtual"
 NOTE = "in silico: {n} drawn virtual patients, {settings}"
@@ -26,7 +26,7 @@ NOTE = "in silico: {n} drawn virtual patients, {settings}"
 
 @dataclass(frozen=True)
 class MethodBand:
-    """How many of a method's standard deviations hold 90 % of patients, by region.
+    """How many of a method's standard deviations cover 90 % of patients, by region.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class MethodBand:
     cases : tuple of CalibrationCase
         The patients that it was calibrated on.
     settings : mapping
-        What the standard deviations depend on besides the patient.
+        What the standard deviations depend on apart from the patient.
     missing : tuple of str
         Patients of the calibration part without one.
     """
@@ -63,15 +63,15 @@ class MethodBand:
 def calibrated_band(
     method: str, folder: Path, patients: Sequence[BenchmarkPatient]
 ) -> MethodBand | None:
-    """The band of a method; None where it states no standard deviation of any of these patients.
+    """The band of a method; None if it states no standard deviation for any of these patients.
 
     Parameters
     ----------
     method : str
     folder : Path
-        Of all predictions.
+        The folder of all predictions.
     patients : sequence of BenchmarkPatient
-        The calibration part: none of those that are scored.
+        The calibration part; none of them may be scored.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def _check_settings(prediction: SkinPrediction, settings: str) -> None:
     if prediction.settings != settings:
         raise CaseInputError(
             f"its settings, {prediction.settings[:200]}, are not those of the patients before it: "
-            "predict all of them under the same"
+            "predict all patients with the same settings"
         )
 
 

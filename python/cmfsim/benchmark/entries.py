@@ -1,4 +1,4 @@
-"""The package's own entries: their predictions of a part of a population, made once."""
+"""The package's own entries: they predict a part of a population, each patient once."""
 
 import hashlib
 import json
@@ -44,7 +44,7 @@ __all__ = [
 
 NO_CHANGE, RATIOS, LEARNED, HYPERELASTIC = "no-change", "ratios", "pls", "hyperelastic"
 ENTRIES = (NO_CHANGE, RATIOS, LEARNED, *MODELS)
-# Entries that are made where they are named: they take longer.
+# Entries that are made only on request: they take longer.
 ON_REQUEST = (HYPERELASTIC,)
 # What the hyperelastic entry is but for its kinematics.
 HYPERELASTIC_MODEL = "M+S"
@@ -54,12 +54,12 @@ TIMES = ".seconds"
 
 @dataclass(frozen=True)
 class EntryFolder:
-    """Where the predictions of a population are.
+    """Where the predictions of a population are stored.
 
     Attributes
     ----------
     folder : Path
-        `predictions`; a method has a folder in it.
+        `predictions`, with a folder for each method.
     """
 
     folder: Path
@@ -93,19 +93,19 @@ class EntryFolder:
             file.write(text.encode())
 
     def took(self, method: str, patient: str, seconds: float) -> None:
-        """Writes how long a prediction took, beside it: no part of what is the same each time."""
+        """Writes the run time of a prediction to a file of its own, as it differs in every run."""
         path = self.file(method, patient, TIMES)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f"{seconds:.3f}\n", encoding="utf-8")
 
 
 def times_of(folder: Path, method: str, patients: Sequence[str]) -> dict[str, float]:
-    """The seconds that predictions took, where that was recorded: `PATIENT.seconds`.
+    """The run times of predictions, s, where they were recorded: `PATIENT.seconds`.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) A file that holds no number.
+        (also `ValueError`) A file that does not contain a number.
     """
     found = {}
     for patient in patients:
@@ -115,14 +115,14 @@ def times_of(folder: Path, method: str, patients: Sequence[str]) -> dict[str, fl
             try:
                 found[patient] = float(text)
             except ValueError as error:
-                raise CaseInputError(f"{path}: {text[:40]!r}: seconds, a number, needed") from error
+                raise CaseInputError(f"{path}: {text[:40]!r}: must be a number, s") from error
     return found
 
 
 def patient_entries(
     patient: str, folder: str, methods: Sequence[str], banded: Sequence[str] = ()
 ) -> None:
-    """Makes the entries of one patient that need no other patient.
+    """Predicts one patient by the entries that need no other patient.
 
     A model that fails is recorded with its reason.
 
@@ -132,7 +132,7 @@ def patient_entries(
         The patient's folder, and that of all predictions.
     methods : sequence of str
     banded : sequence of str
-        Models whose predictions get a standard deviation, from which a band is calibrated.
+        Models whose predictions state a standard deviation, from which a band is calibrated.
     """
     of = BenchmarkPatient(Path(patient).name, Path(patient))
     place, made_from = EntryFolder(Path(folder)), of.digest()
@@ -159,7 +159,7 @@ def _by_models(
     made_from: str,
 ) -> None:
     """The mechanical models: the patient is built once, and its time counts for each of them."""
-    # The truth is not even opened.
+    # The truth is never opened here.
     case = replace(patient.case, postoperative=None)
     begun = time.perf_counter()
     try:
@@ -204,7 +204,7 @@ def _entered(patient: BenchmarkPatient, prediction: Prediction, made_from: str) 
 
 
 def check_own(method: str, prediction: SkinPrediction, patient: BenchmarkPatient) -> None:
-    """Refuses an own entry of another version, or of a patient who was made again.
+    """Refuses an entry of the package made by another version, or for an earlier patient.
 
     Raises
     ------
@@ -214,26 +214,26 @@ def check_own(method: str, prediction: SkinPrediction, patient: BenchmarkPatient
     own = (*ENTRIES, *ON_REQUEST)
     if method in own and not prediction.made_from.endswith(patient.digest()):
         raise CaseInputError(
-            "was not made by this version from the patient as they are: predict it again "
-            f"(--entries {method}), or give a method of your own another name"
+            "was made by another version, or before the patient was made again: predict it "
+            f"again (--entries {method}), or give your own method another name"
         )
 
 
 def learned_entries(
     training: Sequence[BenchmarkPatient], patients: Sequence[BenchmarkPatient], folder: Path
 ) -> None:
-    """Makes the learned entry for patients, none of whom is in the training.
+    """Predicts patients by the learned entry; none of them may be in the training part.
 
-    Where there is nothing to learn from, that is recorded as its failure.
+    If there is nothing to learn from, the entry is recorded as failed.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) A patient of the training is to be predicted.
+        (also `ValueError`) A patient to predict is in the training part.
     """
     both = {patient.name for patient in training} & {patient.name for patient in patients}
     if both:
-        raise CaseInputError(f"{', '.join(sorted(both))}: learned from, and not to be predicted")
+        raise CaseInputError(f"{', '.join(sorted(both))}: in the training part, so not predicted")
     taught = hashlib.sha256("".join(p.digest(truth=True) for p in training).encode()).hexdigest()
     place = EntryFolder(folder)
     made_from = {patient.name: f"{taught} {patient.digest()}" for patient in patients}

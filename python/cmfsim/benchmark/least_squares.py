@@ -87,7 +87,7 @@ class PartialLeastSquares:
 
     def __call__(self, x: Floats) -> Floats:
         """The image of each row of x, (n, q)."""
-        return np.asarray(self.mean_y + (x - self.mean_x) @ self.coefficients)
+        return self.mean_y + (x - self.mean_x) @ self.coefficients
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,7 @@ def _features(patient: BenchmarkPatient) -> Floats:
     """The plan in numbers, mm."""
     moves = []
     for name, segments in FEATURES.items():
-        place = np.asarray(patient.skull_landmarks[name])
+        place = patient.skull_landmarks[name]
         matrix = patient.planned_motion(*segments)
         moves.append(matrix[:3, :3] @ place + matrix[:3, 3] - place)
     return np.concatenate(moves)

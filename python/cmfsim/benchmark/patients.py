@@ -57,12 +57,12 @@ class BenchmarkPatient:
     @property
     def skin(self) -> Floats:
         """Its vertices, (v, 3) mm."""
-        return np.asarray(self.surface.vertices)
+        return self.surface.vertices
 
     @cached_property
     def normals(self) -> Floats:
         """The unit normals of the skin before the operation, (v, 3)."""
-        return np.asarray(self.surface.vertex_normals)
+        return self.surface.vertex_normals
 
     @cached_property
     def case(self) -> Case:
@@ -88,7 +88,7 @@ class BenchmarkPatient:
     @cached_property
     def truth(self) -> Floats:
         """How each vertex truly moves, (v, 3) mm: in the test part, for no method to read."""
-        after = np.asarray(read_surface(self.folder / TRUE_SKIN).vertices)
+        after = read_surface(self.folder / TRUE_SKIN).vertices
         if after.shape != self.skin.shape:
             raise CaseInputError(
                 f"{self.name}: {SKIN} has {len(self.skin)} vertices and {TRUE_SKIN} has "
@@ -126,7 +126,7 @@ class BenchmarkPatient:
             if motion is not None:
                 if motion.matrix is None:
                     raise CaseInputError(f"{self.name}: the plan of {name} is no rigid motion")
-                return np.asarray(motion.matrix)
+                return motion.matrix
         return np.eye(4)
 
     def digest(self, *, truth: bool = False) -> str:

@@ -71,14 +71,14 @@ def predict_by_ratios(patient: BenchmarkPatient) -> Floats:
     still = np.vstack([[landmarks[name] for name in STILL], anchors])
     moves = np.array([_move(patient, ratio) for ratio in RATIOS])
     spline = ThinPlateSpline(np.vstack([moved, still]), np.vstack([moved + moves, still]))
-    displacement = np.asarray(spline(skin)) - skin
+    displacement = spline(skin) - skin
     displacement[far] = 0.0
     return displacement
 
 
 def _move(patient: BenchmarkPatient, ratio: Ratio) -> Floats:
     """How a landmark of the skin moves, mm."""
-    place = np.asarray(patient.skull_landmarks[ratio.bone])
+    place = patient.skull_landmarks[ratio.bone]
     matrix = patient.planned_motion(*ratio.segments)
     move = matrix[:3, :3] @ place + matrix[:3, 3] - place
-    return np.asarray((ratio.backwards if move[BACK] > 0.0 else ratio.forwards) * move)
+    return (ratio.backwards if move[BACK] > 0.0 else ratio.forwards) * move

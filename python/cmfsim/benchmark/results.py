@@ -36,9 +36,9 @@ class MethodResult:
     scores : mapping of str to mapping of str to RegionScore
         By patient, then by region.
     missing : tuple of str
-        Patients without a prediction, and `failed` those of them where the method says why.
+        Patients without a prediction; `failed` lists those for which the method gives a reason.
     band : MethodBand or None
-        What the calibration part says of its standard deviations, where it states any.
+        Calibration of its standard deviations on the calibration part, where it states any.
     """
 
     method: str
@@ -48,7 +48,7 @@ class MethodResult:
     band: MethodBand | None = None
 
     def figures(self, region: str, name: str) -> list[float]:
-        """A figure of each patient who has it."""
+        """The value of a figure for each patient who has it."""
         found = [getattr(scores[region], name) for scores in self.scores.values()]
         return [float(value) for value in found if value is not None]
 

@@ -127,7 +127,7 @@ def run_benchmark(
     if pending:
         raise CaseInputError(
             f"{', '.join(pending[:5])}{'…' if len(pending) > 5 else ''}: not made yet; run cmfsim "
-            "virtual-patients --count again, so that all methods meet the same patients"
+            "virtual-patients --count again, so that all methods are scored on the same patients"
         )
     patients = patients_of(place, population, [part])
     if not patients:
@@ -135,7 +135,7 @@ def run_benchmark(
     predictions = place / PREDICTIONS
     if part in band_parts:
         raise CaseInputError(
-            f"the part {part!r} is scored, and bands are calibrated on it: that would show "
+            f"the part {part!r} is scored, and bands are calibrated on it, which proves "
             "nothing; score another part, or name other band_parts"
         )
     calibrating = patients_of(place, population, band_parts)
@@ -191,7 +191,7 @@ def _predict_each(
 
 
 def _far(patients: Sequence[BenchmarkPatient]) -> tuple[str, ...]:
-    """The half of the patients whose truth departs farthest from what predictions can know."""
+    """The half of the patients whose truth differs most from what predictions can know."""
     known = [(p.departure, p.name) for p in patients if p.departure is not None]
     if len(known) < len(patients):
         return ()
@@ -212,7 +212,7 @@ def _result(
     patients: Sequence[BenchmarkPatient],
     calibrating: Sequence[BenchmarkPatient],
 ) -> MethodResult:
-    """The scores of a method, and for whom it has no prediction."""
+    """The scores of a method, and the patients for whom it has no prediction."""
     place = EntryFolder(folder)
     band = calibrated_band(method, folder, calibrating)
     factors = band.factors if band is not None else {}
@@ -233,7 +233,7 @@ def _result(
 
 
 def _write(folder: Path, table: BenchmarkTable, predictions: Path) -> tuple[Path, ...]:
-    """Writes the table in three forms, and the run times apart from it."""
+    """Writes the table in three forms, and the run times separately."""
     folder.mkdir(exist_ok=True)
     texts = {
         f"{table.part}.csv": table.csv(),

@@ -1,4 +1,4 @@
-"""What a method enters: a displacement for each vertex of a patient's skin, in one `.npz` file."""
+"""The entry of a method: a displacement for each vertex of a patient's skin, in a `.npz` file."""
 
 import os
 import zipfile
@@ -17,15 +17,15 @@ __all__ = ["SkinPrediction", "read_skin_prediction", "write_skin_prediction"]
 # Vertices of a prediction may differ by this from those of the patient's skin, mm: they are written
 # in single precision.
 SAME_PLACE = 0.01
-# No operation on the jaws moves skin farther, mm: a displacement beyond it has another unit, or is
-# the moved vertex itself.
+# No operation on the jaws moves skin further, mm: a larger displacement has another unit, or is the
+# position of the moved vertex.
 LARGEST_MOVE = 60.0
 MEMBERS = {"vertices", "displacement", "half_width", "sd", "settings", "made_from"}
 
 
 @dataclass(frozen=True, eq=False)
 class SkinPrediction:
-    """How a method has a patient's skin move.
+    """The motion of a patient's skin as a method predicts it.
 
     Attributes
     ----------
@@ -33,17 +33,16 @@ class SkinPrediction:
         Of `PATIENT/skin.ply`, in its order.
     displacement : (v, 3) float64, mm
     half_width : (v,) float64, mm, or None
-        Of a band along the normal, which the method states to hold 90 % of patients in each region
-        of the face. NaN where it states none.
+        Of a band along the normal that, according to the method, covers 90 % of patients in each
+        region of the face. NaN where it states none.
     sd : (v,) float64, mm, or None
-        In its place, the standard deviation along the normal that the method expects, above 0:
-        predictions of the part `calibration` then say how many of them hold 90 % of patients.
+        Instead of `half_width`, the expected standard deviation along the normal, above 0: the part
+        `calibration` then determines how many of them cover 90 % of patients.
     settings : str
-        What the standard deviation depends on besides the patient, as JSON: predictions whose
-        settings differ are not calibrated by one another.
+        What the standard deviation depends on apart from the patient, as JSON: predictions with
+        different settings do not calibrate one another.
     made_from : str
-        What the package's own entries were made from, so that they are not made again; empty in
-        others.
+        What the package's own entries were made from, to reuse them; empty for other methods.
     """
 
     vertices: Floats
@@ -63,12 +62,12 @@ class SkinPrediction:
         if len(length) and length[most] > LARGEST_MOVE:
             raise CaseInputError(
                 f"displacement[{most}] is {length[most]:.0f} mm long: up to {LARGEST_MOVE:g} mm is "
-                "allowed. Write mm, and where vertices move by, not where they move to"
+                "allowed. Use mm, and write displacements, not positions"
             )
         object.__setattr__(self, "vertices", places)
         object.__setattr__(self, "displacement", moves)
         if self.half_width is not None and self.sd is not None:
-            raise CaseInputError("has half_width and sd: give one of them")
+            raise CaseInputError("has both half_width and sd: give only one")
         if self.half_width is not None:
             widths = _lengths("half_width", self.half_width, len(places))
             object.__setattr__(self, "half_width", widths)
@@ -82,18 +81,18 @@ class SkinPrediction:
             object.__setattr__(self, "sd", deviations)
 
     def check_vertices(self, skin: ArrayLike) -> None:
-        """Refuses a prediction of another skin, or of the same in another order.
+        """Refuses a prediction of another skin, or of the same one in another order.
 
         Raises
         ------
         CaseError
-            (also `ValueError`) Names the first vertex that lies elsewhere.
+            (also `ValueError`) A vertex lies elsewhere; the message names the first one.
         """
         places = as_rows("skin", skin, 3)
         if len(places) != len(self.vertices):
             raise CaseInputError(
-                f"{len(self.vertices)} vertices, the patient's skin.ply has {len(places)}: was the "
-                "population made again, with another seed or resolution?"
+                f"{len(self.vertices)} vertices, but the patient's skin.ply has {len(places)}: was "
+                "the population made again, with another seed or resolution?"
             )
         away = np.linalg.norm(self.vertices - places, axis=1)
         bad = np.flatnonzero(away > SAME_PLACE)
@@ -106,7 +105,7 @@ class SkinPrediction:
 
 
 def _lengths(name: str, values: ArrayLike, count: int) -> Floats:
-    """Lengths from 0 on, or NaN."""
+    """Lengths of 0 or more, or NaN."""
     found = np.asarray(values, dtype=np.float64)
     if found.shape != (count,):
         raise CaseInputError(f"{name} has shape {found.shape}: ({count},) is needed")
@@ -154,8 +153,8 @@ def read_skin_prediction(path: str | os.PathLike[str]) -> SkinPrediction:
     ------
     FileNotFoundError
     CaseError
-        (also `ValueError`) No such archive, an array that is missing, unknown or not of its shape,
-        a displacement that is no number, or too long: with file, index and value.
+        (also `ValueError`) Not such an archive; an array that is missing, unknown or misshapen; a
+        displacement that is not a number, or too long: with file, index and value.
 
     Examples
     --------
@@ -174,12 +173,12 @@ def read_skin_prediction(path: str | os.PathLike[str]) -> SkinPrediction:
                 if unknown or missing:
                     raise CaseInputError(
                         f"has {', '.join(sorted(archive.files))}: vertices and displacement are "
-                        "needed, half_width or sd may be there"
+                        "needed, half_width or sd is optional"
                     )
                 found = {name: archive[name] for name in archive.files}
         except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
             if isinstance(error, CaseInputError):
                 raise
-            raise CaseInputError(f"is no .npz archive of arrays: {error}") from error
+            raise CaseInputError(f"is not an .npz archive of arrays: {error}") from error
         settings, made_from = (str(found.pop(name, "")) for name in ("settings", "made_from"))
         return SkinPrediction(**found, settings=settings, made_from=made_from)

@@ -56,8 +56,8 @@ class BenchmarkTable:
     settings : mapping
         Of the population.
     far : tuple of str
-        The half of the patients whose truth departs farthest from what predictions can know; empty
-        where that is not recorded.
+        The half of the patients whose truth differs most from what predictions can know; empty if
+        that is not recorded.
     """
 
     part: str
@@ -106,7 +106,7 @@ class BenchmarkTable:
         return json.dumps(self.as_dict(), indent=1, allow_nan=False) + "\n"
 
     def markdown(self) -> str:
-        """The tables to read: the face and the lips, each region, and what is missing."""
+        """The tables for readers: the face and the lips, each region, and what is missing."""
         count = len(self.patients)
         settings = ", ".join(f"{name} {value}" for name, value in self.settings.items())
         parts = [
@@ -146,7 +146,7 @@ class BenchmarkTable:
         return table((*titles, "worse than no change in"), [(*r, self._losses(r[0])) for r in rows])
 
     def _losses(self, method: str) -> str:
-        """Regions where a method's mean is above that of leaving the face as it was."""
+        """Regions where a method's mean error exceeds that of predicting no change."""
         named = {result.method: result for result in self.results}
         base, found = named.get(NO_CHANGE), named[method]
         if base is None or method == NO_CHANGE:
@@ -170,7 +170,7 @@ class BenchmarkTable:
         return table(("", *REGIONS), rows)
 
     def _missing(self) -> list[str]:
-        """What the figures leave out."""
+        """Patients missing from the figures."""
         found = []
         if self.without_truth:
             names = ", ".join(self.without_truth)

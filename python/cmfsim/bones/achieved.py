@@ -1,9 +1,9 @@
 """The plan that an operation achieved, from the bones before and after (paper 3, Figure 5).
 
-Scans are first laid on each other by the skull that was left alone (`register_volumes`). Then each
-bone segment is laid on the post-operative bone; what that takes is its motion, as Table 2 of the
-paper has it. Surfaces with the same triangles before and after need no search: their vertices say
-the motion, and their shape says which part of it is slip along the surface.
+The scans are first aligned by the part of the skull that was not operated on (`register_volumes`).
+Each bone segment is then registered to the post-operative bone, which gives its motion, as in Table
+2 of the paper. Surfaces with the same triangles before and after need no search: their vertices
+give the motion, and their shape shows how much of it is slip along the surface.
 """
 
 import logging
@@ -46,30 +46,31 @@ __all__ = [
 
 _LOG = logging.getLogger(__name__)
 
-# A motion counts as rigid if it takes every vertex this near to where it went, mm: a tenth of what
-# a segmented bone is known to, and far above the rounding of a surface file.
+# A motion counts as rigid if it reproduces the place of every vertex to this, mm: a tenth of the
+# accuracy of a segmented bone, and far above the rounding of a surface file.
 RIGID_TOLERANCE = 0.1
 Segments: TypeAlias = Mapping[str, SurfaceData | BoneSegment]
 
 
 @dataclass(frozen=True, eq=False)
 class AchievedMotion(Frozen):
-    """Where a bone segment went.
+    """The motion of one bone segment.
 
     Attributes
     ----------
     matrix : (4, 4) float64, mm
         The rigid motion, from before to after; the nearest one if it is not rigid.
     motion : RigidMotion
-        The same in a planner's numbers.
+        The same as translation and rotation.
     method : str
         "vertices" (same triangles before and after), "shape" (the same, vertices slid along the
         bone) or "icp".
     is_rigid : bool
         Whether the rigid motion is the whole motion; always for "shape" and "icp".
     rms, worst : float, mm
-        What the rigid motion leaves: distance of vertices from where they went ("vertices"), or of
-        the kept vertices from the post-operative bone, less the change of size ("shape", "icp").
+        Residual of the rigid motion: distance of the vertices from their places after the operation
+        ("vertices"), or of the kept vertices from the post-operative bone, with the change of size
+        removed ("shape", "icp").
     median, p95 : float, mm
         The same distances of all vertices, kept or not: median and 95th percentile.
     share : float
@@ -77,14 +78,14 @@ class AchievedMotion(Frozen):
     moved : MovedSurface or None
         The motion vertex by vertex, where the triangles are the same.
     removed : tuple of RemovedBone
-        Patches of the segment that are not there after the operation, where it was searched for:
-        they lie outside the bone after it. They have no say in the motion.
+        Patches of the segment that are missing after the operation: they lie outside the
+        post-operative bone. They do not count in the motion.
     stray : tuple of StrayPatch
-        Patches of 1 cm² and more that lie off the bone after the operation, where it was searched
-        for: they moved otherwise than the segment, or were removed.
+        Patches of 1 cm² and more that lie off the post-operative bone: they moved differently from
+        the segment, or were removed.
     fit : ShapeFit or None
-        How the segment lies on the bone after by shape: its change of size with an interval, and
-        the directions that its shape leaves open. None where the vertices said all.
+        The fit by shape to the post-operative bone: the change of size with an interval, and the
+        directions that the shape does not determine. None where the vertices determine everything.
     slip : float, mm
         How far vertices with the same triangles slid along the surface, median; 0 for "icp".
     """
@@ -135,16 +136,16 @@ class AchievedMotion(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class AchievedPlan(Frozen):
-    """What each bone segment did in an operation.
+    """The motions of all bone segments in an operation.
 
     Attributes
     ----------
     motions : mapping of str to AchievedMotion
     alignment : (4, 4) float64, mm
-        Takes the post-operative frame to the pre-operative one, the correction by the reference
-        segment included.
+        Maps the post-operative frame to the pre-operative one, including the correction by the
+        reference segment.
     correction : RigidMotion or None
-        What the reference segment took off the given alignment; None without a reference.
+        Correction of the given alignment by the reference segment; None without a reference.
     """
 
     motions: Mapping[str, AchievedMotion]
@@ -208,7 +209,7 @@ def measure_motion(
     centre : (3,) float64, mm, optional
         About which the turn is written. Default: the middle of the vertices before.
     tolerance : float, mm
-        The motion counts as rigid if the best rigid one takes each vertex this near.
+        The motion counts as rigid if the best rigid one reproduces every vertex to this.
 
     Returns
     -------
@@ -233,12 +234,12 @@ def measure_motion(
     as_positive("tolerance", tolerance)
     if not _same_triangles(before, after):
         raise RegistrationInputError(
-            f"the surfaces have other triangles: {len(np.asarray(before.triangles))} on "
-            f"{len(np.asarray(before.vertices))} vertices before, "
-            f"{len(np.asarray(after.triangles))} on {len(np.asarray(after.vertices))} after; a "
-            "motion by vertices needs the same, in the same order; achieved_plan searches instead"
+            f"the surfaces have different triangles: {len(before.triangles)} on "
+            f"{len(before.vertices)} vertices before, "
+            f"{len(after.triangles)} on {len(after.vertices)} after; a motion by vertices needs "
+            "the same triangles in the same order; use achieved_plan, which registers the surfaces"
         )
-    here, there = np.asarray(before.vertices), np.asarray(after.vertices)
+    here, there = before.vertices, after.vertices
     fit = rigid_fit(here, there)
     worst = float(fit.residuals.max())
     return AchievedMotion(
@@ -262,12 +263,12 @@ def measure_pair(
     centre: ArrayLike | None = None,
     is_still: bool = False,
 ) -> AchievedMotion:
-    """The motion between two surfaces with the same triangles, less what vertices slid.
+    """The motion between two surfaces with the same triangles, without slip of the vertices.
 
-    Where the bone after has the shape of the bone before, the motion is the rigid one that lays
-    the one on the other, whatever the vertices did along it; a bone that was left alone keeps
-    what it changed along its normals. Where it has another shape, or none that can be compared
-    (`fit` is None then), vertices are followed.
+    If the bone has the same shape before and after, the motion is the rigid one that aligns the
+    two, however the vertices slid along the surface; a bone that was not operated on keeps its
+    change along the normals. If the shapes differ, or cannot be compared (`fit` is then None), the
+    motion is that of the vertices.
 
     Parameters
     ----------
@@ -276,7 +277,7 @@ def measure_pair(
     centre : (3,) float64, mm, optional
         About which the turn is written. Default: the middle of the vertices before.
     is_still : bool
-        Whether the operation left the bone alone: what changes on it is no motion of one bone.
+        Whether the bone was not operated on: changes on it are then no motion of the bone.
 
     Raises
     ------
@@ -289,7 +290,7 @@ def measure_pair(
     try:
         shape = paired_shape(before, after)
     except RegistrationError as error:
-        _LOG.warning("vertices are followed, as shapes cannot be compared: %s", error)
+        _LOG.warning("using the vertices, because the shapes cannot be compared: %s", error)
         return found
     known = {"removed": shape.removed, "stray": shape.stray, "slip": shape.slip}
     if not shape.is_rigid:
@@ -318,19 +319,20 @@ def achieved_plan(
         Cut as the surgeon cut them, where they were before the operation.
     postoperative : SurfaceData, or mapping of str to SurfaceData
         The whole bone after the operation, or a surface for each segment. One with the triangles of
-        its segment gives the motion by vertices; else the segment is laid on it.
+        its segment gives the motion by vertices; otherwise the segment is registered to it.
     alignment : (4, 4) float64, mm, optional
-        Takes the post-operative frame to the pre-operative one: `register_volumes(after, before)`.
-        Default: one frame.
+        Maps the post-operative frame to the pre-operative one: `register_volumes(after, before)`.
+        Default: both are in one frame.
     reference : str, optional
-        A segment that the operation left alone, the cranium. What it takes to lay it on the
-        post-operative bone is taken off the alignment, and so off every other motion.
+        A segment that was not operated on, such as the cranium. Its residual motion corrects the
+        alignment, and is thus subtracted from every other motion.
     centres : mapping of str to (3,) float64, mm, optional
         About which turns are written. Default: the middle of each segment's vertices.
     options : MatchOptions, optional
     beside : sequence of SurfaceData
-        Segments before the operation whose motion is not asked for. A cut face towards one is no
-        bone that a scan shows, and is not reported as off the bone; those in `segments` are known.
+        Further segments before the operation, whose motion is not needed. A cut face towards one
+        of them is not visible in a scan, so it is not reported as off the bone; those in `segments`
+        are known already.
 
     Returns
     -------
@@ -339,17 +341,17 @@ def achieved_plan(
     Raises
     ------
     RegistrationError
-        A segment that does not fit, or too little of it; ICP does not come to rest; also
-        `ValueError`: no segment, a name that is nowhere, an alignment that is not rigid.
+        A segment that does not fit, or of which too little fits; ICP does not converge; also
+        `ValueError`: no segment, an unknown name, an alignment that is not rigid.
     MeshError
         (also `ValueError`) A surface with degenerate triangles.
 
     Notes
     -----
-    Trimmed iterative closest points (Besl & McKay 1992; Chetverikov et al. 2002), begun from where
-    the segment was and from 6 mm to each side, on the best of which it goes on; then a robust fit
-    to tangent planes in which the size may change. A change of size is about the segment's middle,
-    and no part of its motion.
+    Trimmed iterative closest points (Besl & McKay 1992; Chetverikov et al. 2002) start from the
+    segment's place before the operation and from 6 mm to each side, and continue from the best;
+    a robust fit to tangent planes follows, in which the size may change. A change of size is about
+    the segment's centre, and is not part of its motion.
 
     Examples
     --------
@@ -401,7 +403,7 @@ def _matched(
     centre: ArrayLike | None,
     others: Sequence[SurfaceData],
 ) -> AchievedMotion:
-    """The motion of a segment that was laid on the bone."""
+    """The motion of a segment that was registered to the bone."""
     stray, _ = stray_patches(segment, bone, fit.similarity, fit.rms, others)
     return _by_shape(
         "icp",
@@ -416,11 +418,11 @@ def _matched(
 def _by_shape(
     method: str, segment: SurfaceData, fit: ShapeFit, centre: ArrayLike | None, **known: Any
 ) -> AchievedMotion:
-    """The motion of a segment by its shape, with what else is known of it."""
+    """The motion of a segment by its shape, with everything else known about it."""
     return AchievedMotion(
         **{
             "matrix": fit.matrix,
-            "motion": decompose_motion(fit.matrix, _centre(centre, np.asarray(segment.vertices))),
+            "motion": decompose_motion(fit.matrix, _centre(centre, segment.vertices)),
             "method": method,
             "is_rigid": True,
             "rms": fit.rms,
@@ -437,7 +439,7 @@ def _by_shape(
 
 def _surfaces(segments: Segments) -> dict[str, SurfaceData]:
     if not segments:
-        raise RegistrationInputError("there is no segment to look for")
+        raise RegistrationInputError("segments is empty: give at least one")
     found: dict[str, SurfaceData] = {}
     for name, segment in segments.items():
         surface = segment.surface if isinstance(segment, BoneSegment) else segment
@@ -449,7 +451,7 @@ def _surfaces(segments: Segments) -> dict[str, SurfaceData]:
 def _targets(
     postoperative: SurfaceData | Mapping[str, SurfaceData], parts: Mapping[str, SurfaceData]
 ) -> Mapping[str, SurfaceData]:
-    """The post-operative surface that each segment is looked for on."""
+    """The post-operative surface to which each segment is registered."""
     if isinstance(postoperative, SurfaceData):
         return dict.fromkeys(parts, postoperative)
     missing = [name for name in parts if name not in postoperative]
@@ -464,13 +466,13 @@ def _targets(
 
 
 def _same_triangles(one: SurfaceData, other: SurfaceData) -> bool:
-    return len(np.asarray(one.vertices)) == len(np.asarray(other.vertices)) and np.array_equal(
-        np.asarray(one.triangles), np.asarray(other.triangles)
+    return len(one.vertices) == len(other.vertices) and np.array_equal(
+        one.triangles, other.triangles
     )
 
 
 def _transformed(surface: SurfaceData, matrix: Floats) -> SurfaceData:
-    vertices = np.asarray(surface.vertices) @ matrix[:3, :3].T + matrix[:3, 3]
+    vertices = surface.vertices @ matrix[:3, :3].T + matrix[:3, 3]
     return SurfaceData(vertices, surface.triangles, surface.crease_angle)
 
 

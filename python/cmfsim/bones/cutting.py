@@ -1,4 +1,4 @@
-"""Bones cut into segments: the levels of the pieces, and what became of crumbs."""
+"""Bones cut into segments: the levels of the pieces, and where small fragments go."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,9 +25,9 @@ __all__ = ["CutBones", "CutOptions", "cut_bones", "segments_from_surfaces"]
 Levels = NDArray[np.float32]
 # The upper jaw's cuts come before the lower's, the larger piece before the one inside it.
 ORDER = {"le_fort_3": 0, "le_fort_1": 1, "bsso": 2, "genioplasty": 3}
-# Half-width of the block of voxels that goes over with a crumb.
+# Half-width of the block of voxels that is transferred with a fragment.
 CRUMB_RIM = 2
-# Surfaces that are made at the same time.
+# Number of surfaces made concurrently.
 SURFACES_AT_ONCE = 2
 
 
@@ -38,8 +38,8 @@ class CutOptions:
     Attributes
     ----------
     crumb_volume : float, mm³
-        A piece that a cut leaves apart from its segment and that is smaller than this joins the
-        segment on the other side of the cut, which it still hangs on.
+        A fragment smaller than this that a cut separates from its segment is assigned to the
+        segment on the other side of the cut, to which it is still connected.
     surface : SurfaceOptions
 
     Raises
@@ -59,14 +59,14 @@ class CutOptions:
 
 @dataclass(frozen=True, eq=False)
 class CutBones:
-    """The segments of all bones, with what was noticed while cutting.
+    """The segments of all bones, with the findings of cutting.
 
     Attributes
     ----------
     segments : tuple of BoneSegment
         Uncut bones first, each under its own name.
     procedures : tuple of Procedure
-        As placed, with every plane and option.
+        As placed, with all planes and options.
     findings : tuple of Finding
     """
 
@@ -89,14 +89,14 @@ def cut_bones(
     landmarks: Mapping[str, ArrayLike] | None = None,
     options: CutOptions | None = None,
 ) -> CutBones:
-    """The bone segments that osteotomies make of bones.
+    """The segments into which osteotomies cut the bones.
 
     Parameters
     ----------
     bones : mapping of str to ImageData
         Levels (positive inside) on one grid: "cranium" and "mandible" for the standard procedures.
     procedures : sequence of Procedure, or mapping of procedure name to options
-        Standard ones are made from above to below, then the others as they stand.
+        Standard ones are made from top to bottom, then the others in their order.
     landmarks : mapping of str to (3,) float64, mm, optional
         Skull landmarks, LPS; needed where procedures are given by name.
     options : CutOptions, optional
@@ -110,15 +110,15 @@ def cut_bones(
     CaseError
         Two segments with the same surface, or one whose surface is not that of its level; also
         `ValueError`: no bone to cut, a cut that misses its bone or leaves nothing of it, two pieces
-        of one name.
+        with one name.
     LandmarkError
-        (also `ValueError`) A landmark missing; names it and the procedure.
+        (also `ValueError`) A missing landmark; the message names it and the procedure.
 
     Notes
     -----
-    A piece is the minimum of the bone's level and the planes' signed distances, the rest that of
-    the level and their negative: no voxel is lost or counted twice, and the cut lies on the plane
-    to a fraction of a voxel.
+    The level of a piece is the minimum of the bone's level and the planes' signed distances, and
+    that of the rest the minimum of the bone's level and their negative: no voxel is lost or counted
+    twice, and the cut lies on the plane to a fraction of a voxel.
 
     Examples
     --------
@@ -170,7 +170,7 @@ def cut_bones(
 def segments_from_surfaces(
     levels: Mapping[str, ImageData], surfaces: Mapping[str, SurfaceData]
 ) -> tuple[BoneSegment, ...]:
-    """The segments whose surfaces are ready: nothing is cut.
+    """Bone segments from surfaces that are given: nothing is cut.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def segments_from_surfaces(
         As in `Anatomy.bones`.
     surfaces : mapping of str to SurfaceData
         As in `Anatomy.surfaces`; a level without one gets the surface of its zero set, and "skin"
-        is left out.
+        is ignored.
 
     Returns
     -------
@@ -237,22 +237,22 @@ def _make_cut(
         have = ", ".join(repr(n) for n in pieces)
         raise CaseInputError(
             f"{procedure.kind} cuts {' or '.join(repr(s) for s in cut.sources if s != 'skull')}, "
-            f"but the bones are {have}: part the jaws (give landmarks to the segmentation), or "
+            f"but the bones are {have}: separate the jaws (give landmarks to the segmentation), or "
             "give the surfaces of the segments"
         )
     rest_name = cut.rest or source
     if cut.segment in pieces or (rest_name != source and rest_name in pieces):
-        raise CaseInputError(f"{procedure.kind} makes {cut.segment!r}, which there is already")
+        raise CaseInputError(f"{procedure.kind} makes {cut.segment!r}, which exists already")
     bone = pieces[source]
     limit = max(float(bone.max()), -float(bone.min()))
-    # Where the bone's level is at its limit, so are those of both pieces.
+    # Where the bone's level is clipped, so are those of both pieces.
     low, high = block_of(bone > -limit)
     box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
     whole, bone = bone, bone[box]
-    part_grid = ImageData(bone, grid.spacing, grid.lowest + low * np.asarray(grid.spacing))
+    part_grid = ImageData(bone, grid.spacing, grid.lowest + low * grid.spacing)
     region = _scaled(cut, part_grid, limit)
     piece, rest = np.minimum(bone, region), np.minimum(bone, -region)
-    voxel = float(np.prod(np.asarray(grid.spacing)))
+    voxel = float(np.prod(grid.spacing))
     names = (cut.segment, rest_name)
     planes = ", ".join(sorted({p.name for group in cut.groups for p in group}))
     for name, part in ((cut.segment, piece), (rest_name, rest)):
@@ -268,10 +268,10 @@ def _make_cut(
             findings.append(
                 Finding.note(
                     "osteotomy-crumbs",
-                    f"{len(moved)} pieces of {both[0]!r} that the cut parted from it, "
-                    f"{sum(moved) * voxel:.0f} mm³ in all, stay with {both[1]!r}",
+                    f"fragments that the cut separated from {both[0]!r}: {len(moved)}, "
+                    f"{sum(moved) * voxel:.0f} mm³ in all; they stay with {both[1]!r}",
                     where=procedure.kind,
-                    why="they would move with a bone that they do not hang on",
+                    why="they would move with a bone to which they are not connected",
                     fix="move the planes, or lower crumb_volume",
                 )
             )
@@ -279,11 +279,11 @@ def _make_cut(
             findings.append(
                 Finding.warning(
                     "osteotomy-parts",
-                    f"{both[0]!r} has {len(kept) + 1} separate parts; the smaller have "
-                    f"{', '.join(f'{n * voxel:.0f}' for n in kept)} mm³",
+                    f"{both[0]!r} has {len(kept) + 1} disconnected parts; the volumes of the "
+                    f"smaller ones are {', '.join(f'{n * voxel:.0f}' for n in kept)} mm³",
                     where=procedure.kind,
-                    why="parts that are not joined move together all the same",
-                    fix="look at the picture of the segments; move the planes",
+                    why="disconnected parts move together as one segment",
+                    fix="check the picture of the segments; move the planes",
                 )
             )
     names_now = list(pieces.items())
@@ -296,17 +296,17 @@ def _make_cut(
 
 
 def _within(whole: Levels, box: tuple[slice, ...], part: Levels, limit: float) -> Levels:
-    """A part on the whole grid, at its limit elsewhere."""
+    """A part of the grid on the whole grid, clipped elsewhere."""
     values = np.full(whole.shape, np.float32(-limit))
     values[box] = part
     return values
 
 
 def _scaled(cut: Cut, grid: ImageData, limit: float) -> Levels:
-    """The depth in the region, of the size of a level, and straight across any cell it passes."""
+    """The depth in the region, clipped as a level is, and linear in every cell it crosses."""
     # Levels are clipped at `limit`. A plane clipped at less than a cell's diagonal would be bent
     # inside the cells that it cuts, and its zero would shift: so the diagonal becomes the limit.
-    diagonal = float(np.linalg.norm(np.asarray(grid.spacing)))
+    diagonal = float(np.linalg.norm(grid.spacing))
     depth = cut.region_on(grid) * (limit / diagonal)
     return np.clip(depth, -limit, limit).astype(np.float32)
 
@@ -314,10 +314,10 @@ def _scaled(cut: Cut, grid: ImageData, limit: float) -> Levels:
 def _join_crumbs(
     piece: Levels, rest: Levels, bone: Levels, bound: float, most: int
 ) -> tuple[list[int], list[int]]:
-    """Gives small parts of a piece to the rest, in place; voxels of those given and of those left.
+    """Transfers small parts of a piece to the rest, in place; returns voxels transferred and left.
 
-    `bound` is the greatest size of a level, `most` the voxels of a small part.
-    Only parts that hang on the rest are given: what lay apart in the bone already stays.
+    `bound` is the value at which levels are clipped, `most` the voxels of a small part. Only parts
+    connected to the rest are transferred: what was disconnected before the cut stays.
     """
     ndimage = third_party("scipy.ndimage", "bones are cut", "imaging")
     block = np.ones((3, 3, 3), dtype=np.int8)

@@ -1,7 +1,7 @@
-"""Laying a bone segment on the post-operative bone.
+"""Registering a bone segment to the post-operative bone.
 
-Trimmed iterative closest points find the place; a robust fit that lets the size change ends there.
-Trimming a fixed share would leave out sound bone too, its noisier part.
+Trimmed iterative closest points find the pose; a robust fit, in which the size may change, refines
+it, because trimming a fixed share also discards sound bone, its noisier part.
 """
 
 import logging
@@ -20,31 +20,31 @@ __all__ = ["MatchOptions", "lay_on"]
 
 _LOG = logging.getLogger(__name__)
 
-# Points of the quick search for a start, and its steps from each.
+# Points of the quick search for a start, and its steps from each candidate.
 QUICK_POINTS = 400
 QUICK_STEPS = 20
-# Points of the quick fits that let the size change.
+# Points of the quick fits in which the size may change.
 SIZED_POINTS = 1500
-# The search rests when a step moves no point by more than this share of the segment's size, some
-# micrometres: a bone of another size swaps partners below it, and a robust fit follows.
+# The search has converged when a step moves no point by more than this share of the segment's size,
+# some micrometres: below it, a bone of another size only swaps partners, and a robust fit follows.
 REST = 1e-4
 MOST_STEPS = 300
 
 
 @dataclass(frozen=True)
 class MatchOptions:
-    """How a bone segment is laid on the post-operative bone.
+    """How a bone segment is registered to the post-operative bone.
 
     Attributes
     ----------
     trim : float
-        Share of the segment's vertices, those furthest from the bone, that have no say while the
-        place is searched: cut faces, plates, bone that was ground away. 0 to below 1.
+        Share of the segment's vertices, those furthest from the bone, that are ignored in the
+        search: cut faces, plates, bone that was ground away. 0 to below 1.
     reach : float, mm
-        The search also begins this far to each side along each axis, for segments that moved on to
-        a neighbour of their place; 0: only from where they were.
+        The search also starts this far to each side along each axis, for segments that moved far
+        enough to be matched to neighbouring bone; 0: only from the place before the operation.
     max_angle : float, degrees
-        Between normals of partners: keeps the inner side of a bone off its outer side.
+        Between normals of partners: prevents matches of the inner side of a bone to its outer side.
     max_rms : float, mm
         Of the partners at the end; a worse fit is an error.
     least_share : float
@@ -87,19 +87,19 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
     Raises
     ------
     RegistrationError
-        It does not fit, or too little of it; the search does not come to rest.
+        It does not fit, or too little of it does; the search does not converge.
     """
     try:
         found = icp(
             segment,
             bone,
-            initial=_start(np.asarray(segment.vertices), bone, options),
+            initial=_start(segment.vertices, bone, options),
             trim=options.trim,
             max_angle=options.max_angle,
             max_iterations=MOST_STEPS,
             tolerance=REST,
         )
-        found_matrix = np.asarray(found.matrix, dtype=np.float64)
+        found_matrix = found.matrix
         fit = fit_shape(
             segment,
             bone,
@@ -108,16 +108,16 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
         )
     except RegistrationError as error:
         raise RegistrationError(
-            f"segment {name!r} cannot be laid on the post-operative bone: {error}"
+            f"segment {name!r} cannot be registered to the post-operative bone: {error}"
         ) from error
     share = float(fit.kept.mean())
     if fit.rms > options.max_rms or share < options.least_share:
         raise RegistrationError(
             f"segment {name!r} does not fit the post-operative bone: {fit.rms:.2f} mm rms over "
             f"{share:.0%} of its vertices, with the size that fits best (allowed "
-            f"{options.max_rms:g} mm, at least {options.least_share:.0%}); see whether the scans "
-            "are aligned, whether the segment is cut as it was in the operation, and whether the "
-            "bone is all there; a larger trim leaves out plates and new bone"
+            f"{options.max_rms:g} mm, at least {options.least_share:.0%}); check that the scans "
+            "are aligned, that the segment is cut as it was in the operation, and that the scan "
+            "shows the whole bone; a larger trim ignores plates and new bone"
         )
     _LOG.info("segment %s: %.3f mm rms, %.0f %% kept", name, fit.rms, 100 * share)
     return fit
@@ -128,8 +128,8 @@ def _sized_start(
 ) -> Floats:
     """The best start of a fit in which the size may change.
 
-    A bone of another size may lie nearest when it is turned by degrees: the place that was found
-    at the same size competes with those that a quick fit finds from where the segment was.
+    A bone of another size may be closest when it is rotated by some degrees, so the pose found at
+    the same size competes with those that a quick fit finds from the place before the operation.
     """
     starts = [matrix, *(_shifted(shift) for shift in _shifts(options))]
     best, least = matrix, np.inf
@@ -139,7 +139,7 @@ def _sized_start(
                 segment, bone, start, max_angle=options.max_angle, most_points=SIZED_POINTS
             )
         except RegistrationError:
-            # From there it shrinks on to a part of the bone, or finds none.
+            # From there the fit shrinks to a part of the bone, or finds none.
             continue
         nearest = np.sort(fit.off)[: max(int((1.0 - options.trim) * len(fit.off)), 1)]
         if float(nearest.mean()) < least:
@@ -148,7 +148,7 @@ def _sized_start(
 
 
 def _shifts(options: MatchOptions) -> list[Floats]:
-    """Where a search begins: at the segment's place, and to each side of it."""
+    """Where a search starts: at the segment's place, and to each side of it."""
     shifts = [np.zeros(3)]
     if options.reach > 0.0:
         shifts += [sign * options.reach * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
@@ -163,7 +163,7 @@ def _shifted(shift: Floats) -> Floats:
 
 def _start(vertices: Floats, bone: Surface, options: MatchOptions) -> Floats:
     """The best of several short searches, from where the segment was and from either side."""
-    # Any order of vertices in the file gives points from all over the segment.
+    # Points from all over the segment, in whatever order the file has the vertices.
     order = np.random.default_rng(0).permutation(len(vertices))[:QUICK_POINTS]
     points = vertices[order]
     best: IcpFit | None = None
@@ -174,9 +174,9 @@ def _start(vertices: Floats, bone: Surface, options: MatchOptions) -> Floats:
             initial=_shifted(shift),
             trim=options.trim,
             max_iterations=QUICK_STEPS,
-            # Exactly as many steps as asked for: the search goes on from the best.
+            # Reaching the step limit is expected: the search continues from the best.
             tolerance=0.0,
         )
         if best is None or fit.rms < best.rms:
             best = fit
-    return np.eye(4) if best is None else np.asarray(best.matrix)
+    return np.eye(4) if best is None else best.matrix

@@ -1,11 +1,11 @@
-"""Bone motions that are given vertex by vertex: what they say about cuts, and how noisy they are.
+"""Bone motions given vertex by vertex: the cuts that they show, and their noise.
 
-A skull whose jaw was cut off and moved may come as one surface, before and after. Across the cut
-neighbouring vertices move apart, and the triangles between them are torn: what they cover is no
-bone. `torn_pieces` takes them out and gives the pieces that moved each as one.
+A skull whose jaw was cut and moved may be given as one surface, before and after. Across the cut,
+neighbouring vertices move apart, and the triangles between them are torn: they cover no bone.
+`torn_pieces` removes them and returns the pieces, each of which moved as one.
 
-Where bone was ground away, the vertices after lie inside the bone before: they went nowhere, their
-bone is gone. `without_removed` lets them follow the rest of the piece.
+Where bone was ground away, the vertices after the operation lie inside the bone before it. They did
+not move there: their bone is gone. `without_removed` lets them follow the rest of the piece.
 """
 
 from collections.abc import Callable
@@ -41,34 +41,34 @@ TEAR_SHARE = 0.3
 LEAST_AREA = 150.0
 # Two pieces moved as one if the motion of either takes the other's vertices this near, rms mm.
 ALIKE = 1.0
-# Vertices of a piece that are asked how another would move them.
+# Vertices of a piece at which the motion of another piece is evaluated.
 SAMPLES = 2000
 # Neighbourhood over which a noisy motion is averaged: the standard deviation of its weights, mm.
 # Some thirty vertices of a skull at 1.5 mm lie in it, and bone does not bend within it.
 AVERAGED = 3.0
 # Weights end here, in standard deviations.
 REACH = 2.0
-# Noise that is let be, mm rms: a tenth of what a segmented bone is known to.
+# Noise that is tolerated, mm rms: a tenth of the accuracy of a segmented bone.
 QUIET = 0.03
 
 # A patch of bone was removed if a vertex of it went further than the first from where the rest of
 # the piece would take it, mm, and lies deeper than the second inside the bone before; the patch
 # reaches as far as its vertices are off by the third: three times the noise of a segmented bone.
 REMOVED, REMOVED_DEPTH, REMOVED_RIM = 1.5, 0.75, 0.75
-# Such a patch ends abruptly: around it, this far, vertices are off by this share of its worst at
-# most (median). A bone that bends is off all around.
+# Such a patch ends abruptly: this far around it, the median deviation of vertices is at most this
+# share of the largest in the patch. A bone that bends deviates all around.
 RING, RING_SHARE = 6.0, 0.35
-# A larger share of a piece is not what is ground away, but how it moved.
+# A larger share of a piece was not ground away: it is how the piece moved.
 MOST_REMOVED = 0.2
 # Vertices that a motion is fitted to; rounds of fitting, each to the share of vertices nearest.
 LEAST_FITTED, FIT_ROUNDS, FIT_SHARE = 50, 20, 0.75
 # What lies further from the bone after than this, mm, is not shown by its scan; patches smaller
 # than this, mm², are corners of a cut.
 SHOWN, LEAST_PATCH = 10.0, 10.0
-# Holes of this share of the area, as the sum of all area vectors shows them, let inside and outside
-# be told apart all the same: a hundredth of the winding number.
+# With holes of this share of the area, measured by the sum of all area vectors, inside and outside
+# can still be distinguished: they change the winding number by a hundredth.
 CLOSED_SHARE = 0.01
-# Volume that a map must keep for its inverse to mean something.
+# Share of the volume that a map must keep for its inverse to be meaningful.
 LEAST_DETERMINANT = 0.1
 
 Integers = NDArray[np.int64]
@@ -76,16 +76,16 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class RemovedBone:
-    """A patch of bone that is not there after the operation.
+    """A patch of bone that is missing after the operation.
 
     Attributes
     ----------
     area : float, mm²
         Of the surface before.
     depth : float, mm
-        The greatest distance of a vertex from where the rest of the piece would have taken it.
+        The largest distance of a vertex from where the motion of the rest would have moved it.
     place : (3,) float64, mm
-        Where that is, before.
+        That vertex, before.
     vertices : (n,) int64
         Of the surface before, that lie in the patch.
     """
@@ -97,17 +97,17 @@ class RemovedBone:
 
 
 def sound_motion(motion: MovedSurface) -> MovedSurface:
-    """The motion without triangles that have no area before or after, or repeat others.
+    """The motion without degenerate triangles, before or after, and without duplicates.
 
-    A surface file has some; the motion of points near them is that of the triangles round them.
+    Surface files contain some; points near them move with the triangles around them.
 
     Raises
     ------
     BoundaryError
         (also `ValueError`) No triangle is left.
     """
-    here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
-    triangles = np.asarray(motion.surface.triangles).astype(np.int64)
+    here, there = motion.surface.vertices, motion.moved_vertices
+    triangles = motion.surface.triangles.astype(np.int64)
     triangles = triangles[has_three_corners(triangles)]
     keep = np.ones(len(triangles), dtype=bool)
     keep[duplicate_triangles(triangles)] = False
@@ -122,10 +122,10 @@ def sound_motion(motion: MovedSurface) -> MovedSurface:
 
 
 def torn_pieces(motion: MovedSurface) -> tuple[MovedSurface, ...]:
-    """The pieces of bone that moved each as one, the largest first; triangles of a tear in none.
+    """The pieces of bone, each of which moved as one, the largest first; without torn triangles.
 
-    Pieces hang together by edges that are not torn. Those that moved alike are one piece, whether
-    they hang together or not: islands of a skull stay with it.
+    A piece is connected by edges that are not torn. Those that moved alike are one piece, connected
+    or not: islands of a skull stay with it.
 
     Parameters
     ----------
@@ -136,8 +136,8 @@ def torn_pieces(motion: MovedSurface) -> tuple[MovedSurface, ...]:
     -------
     tuple of MovedSurface
     """
-    here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
-    triangles = np.asarray(motion.surface.triangles).astype(np.int64)
+    here, there = motion.surface.vertices, motion.moved_vertices
+    triangles = motion.surface.triangles.astype(np.int64)
     ends = edges_of(triangles).ends
     before, after = here[ends[:, 1]] - here[ends[:, 0]], there[ends[:, 1]] - there[ends[:, 0]]
     apart = np.linalg.norm(after - before, axis=1)
@@ -160,7 +160,7 @@ def torn_pieces(motion: MovedSurface) -> tuple[MovedSurface, ...]:
         else:
             alike.append(number)
     if len(groups) == 1:
-        # Crumbs and torn triangles of a bone that moved as one are not what it was cut into.
+        # Fragments and torn triangles of a bone that moved as one are not pieces cut from it.
         return (motion,)
     return tuple(
         _part(motion, sound[np.isin(piece, [large[n] for n in group])]) for group in groups
@@ -168,18 +168,18 @@ def torn_pieces(motion: MovedSurface) -> tuple[MovedSurface, ...]:
 
 
 def moves_as_one(one: MovedSurface, other: MovedSurface) -> bool:
-    """Whether the motion of either piece is the other's as well: as a rigid one, or bent."""
+    """Whether the motion of either piece fits the other as well, rigid or bent."""
     return any(_misses(a, b) <= ALIKE for a, b in ((one, other), (other, one)))
 
 
 def smooth_motion(motion: MovedSurface) -> tuple[MovedSurface, float]:
     """The motion without the noise of its vertices, and the size of that noise, mm rms.
 
-    The best rigid motion is kept as it is; what vertices deviate from it is averaged over their
-    neighbours within some millimetres (Gaussian weights by area). A motion with less noise than a
-    segmented bone is known to is given back as it is.
+    The best rigid motion is kept; the deviations of the vertices from it are averaged over their
+    neighbours within some millimetres (Gaussian weights by area). A motion with much less noise
+    than a segmented bone is returned unchanged.
     """
-    here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
+    here, there = motion.surface.vertices, motion.moved_vertices
     rigid = _rigid(here, there)
     if rigid is None:
         return motion, 0.0
@@ -194,10 +194,10 @@ def smooth_motion(motion: MovedSurface) -> tuple[MovedSurface, float]:
 
 
 def without_removed(motion: MovedSurface) -> tuple[MovedSurface, tuple[RemovedBone, ...]]:
-    """The motion with vertices over removed bone carried as the rest, and the patches they are of.
+    """The motion in which vertices over removed bone move with the rest, and the removed patches.
 
-    The rest is an affine map fitted to the vertices that agree best: a bone that bends a little, or
-    that is measured a few per cent too small, has lost nothing by that.
+    The motion of the rest is an affine map fitted to the vertices that agree best, so a bone that
+    bends a little, or is measured a few per cent too small, does not count as removed.
 
     Parameters
     ----------
@@ -214,11 +214,11 @@ def without_removed(motion: MovedSurface) -> tuple[MovedSurface, tuple[RemovedBo
     Notes
     -----
     Mechanics: bone that is ground away does not pull the tissue over it to the new surface. Tissue
-    that was joined to it goes on as if it were joined to the segment; that it sinks into the space
-    afterwards is not computed.
+    that was attached to it moves as if it were attached to the segment; that it later sinks into
+    the space is not modelled.
     """
-    here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
-    triangles = np.asarray(motion.surface.triangles).astype(np.int64)
+    here, there = motion.surface.vertices, motion.moved_vertices
+    triangles = motion.surface.triangles.astype(np.int64)
     if len(here) < LEAST_FITTED:
         return motion, ()
     expected = _rest_of(here, there)
@@ -228,7 +228,7 @@ def without_removed(motion: MovedSurface) -> tuple[MovedSurface, tuple[RemovedBo
     off = np.linalg.norm(there - went, axis=1)
     if not (off > REMOVED).any():
         return motion, ()
-    # In the frame before: where a vertex is now, as the rest of the bone sees it.
+    # In the frame before: the present place of a vertex relative to the rest of the bone.
     seen = back(there)
     surface = Surface(motion.surface.vertices, motion.surface.triangles)
     far = np.flatnonzero(off > REMOVED_RIM)
@@ -268,26 +268,26 @@ def without_removed(motion: MovedSurface) -> tuple[MovedSurface, tuple[RemovedBo
 def missing_patches(
     segment: SurfaceData, bone: Surface, matrix: Floats, *, shown: float = SHOWN
 ) -> tuple[RemovedBone, ...]:
-    """Patches of a segment that are not there once it is laid on the bone after the operation.
+    """Patches of a segment that are missing from the post-operative bone after registration.
 
     Parameters
     ----------
     segment : SurfaceData
         Before.
     bone : Surface
-        After; what is not closed by it encloses nothing, and nothing is then found.
+        After; a surface that is not closed encloses nothing, so nothing is found with it.
     matrix : (4, 4) float64, mm
-        The motion of the segment, or the similarity that lays it on the bone.
+        The motion of the segment, or the similarity that registers it to the bone.
     shown : float, mm
-        What lies further from the bone after is not known to be gone: its scan may end there.
+        What lies further from the post-operative bone may be outside its scan, not removed.
 
     Returns
     -------
     tuple of RemovedBone
-        The largest first; without what lies so far off that the scan after does not show it.
+        The largest first; without what lies too far away for the post-operative scan to show.
     """
-    here = np.asarray(segment.vertices)
-    triangles = np.asarray(segment.triangles).astype(np.int64)
+    here = segment.vertices
+    triangles = segment.triangles.astype(np.int64)
     moved = here @ np.asarray(matrix)[:3, :3].T + np.asarray(matrix)[:3, 3]
     off = np.linalg.norm(bone.closest(moved)[0] - moved, axis=1)
     far = np.flatnonzero((off > REMOVED_RIM) & (off < shown))
@@ -315,20 +315,20 @@ def _encloses(bone: Surface) -> bool:
     """Whether a surface is closed, but for triangles without area that were taken out of it."""
     if bone.is_closed:
         return True
-    vertices, triangles = np.asarray(bone.vertices), np.asarray(bone.triangles)
+    vertices, triangles = bone.vertices, bone.triangles
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    # The area vectors of a closed surface add up to nothing.
+    # The area vectors of a closed surface sum to zero.
     open_area = 0.5 * np.linalg.norm(np.cross(b - a, c - a).sum(axis=0))
     return bool(open_area <= CLOSED_SHARE * bone.area)
 
 
 def _rest_of(here: Floats, there: Floats) -> tuple[Floats, Callable[[Floats], Floats]] | None:
-    """Where the affine map of most vertices takes all of them, and that map's inverse."""
+    """The images of all vertices under the affine map of most of them, and the map's inverse."""
     middle = here.mean(axis=0)
     columns = np.column_stack([here - middle, np.ones(len(here))])
     kept = np.ones(len(here), dtype=bool)
     for _ in range(FIT_ROUNDS):
-        # A flat piece leaves the map across it open: the smallest one is taken.
+        # A flat piece does not determine the map across it: the smallest one is taken.
         coefficients = np.linalg.lstsq(columns[kept], there[kept], rcond=1e-6)[0]
         off = np.linalg.norm(columns @ coefficients - there, axis=1)
         nearest = off <= max(float(np.quantile(off, FIT_SHARE)), REMOVED_RIM / 3.0)
@@ -346,7 +346,7 @@ def _rest_of(here: Floats, there: Floats) -> tuple[Floats, Callable[[Floats], Fl
 
 
 def _averaged(points: Floats, values: Floats) -> Floats:
-    """The values averaged over neighbours in space, each point with its own among them."""
+    """The values averaged over neighbours in space, including the point itself."""
     tree = third_party(
         "scipy.spatial", "noise of a moved surface is averaged", "imaging", BoundaryInputError
     ).cKDTree(points)
@@ -365,14 +365,14 @@ def _averaged(points: Floats, values: Floats) -> Floats:
 
 
 def _misses(one: MovedSurface, other: MovedSurface) -> float:
-    """How far the motion of one piece takes the vertices of another from where they went, rms."""
-    vertices, went = np.asarray(other.surface.vertices), np.asarray(other.moved_vertices)
+    """The rms error of the motion of one piece, applied to the vertices of another."""
+    vertices, went = other.surface.vertices, other.moved_vertices
     step = -(-len(vertices) // SAMPLES)
     vertices, went = vertices[::step], went[::step]
     surface = one.surface
     bent = SurfaceMotion(Surface(surface.vertices, surface.triangles), one.moved_vertices)
     missed = [vertices + bent.displacement(vertices) - went]
-    rigid = _rigid(np.asarray(surface.vertices), np.asarray(one.moved_vertices))
+    rigid = _rigid(surface.vertices, one.moved_vertices)
     if rigid is not None:
         missed.append(vertices @ rigid[:3, :3].T + rigid[:3, 3] - went)
     return min(float(np.sqrt((m**2).sum(axis=1).mean())) for m in missed)
@@ -381,7 +381,7 @@ def _misses(one: MovedSurface, other: MovedSurface) -> float:
 def _rigid(here: Floats, there: Floats) -> Floats | None:
     """The best rigid motion; none where the vertices lie on a line."""
     try:
-        return np.asarray(rigid_fit(here, there).matrix, dtype=np.float64)
+        return rigid_fit(here, there).matrix
     except RegistrationError:
         return None
 
@@ -393,11 +393,11 @@ def _areas(vertices: Floats, triangles: Integers) -> Floats:
 
 
 def _part(motion: MovedSurface, triangles: Integers) -> MovedSurface:
-    """The motion of some of its triangles, with their vertices alone."""
+    """The motion of some of its triangles, and of their vertices only."""
     used, renumbered = np.unique(triangles, return_inverse=True)
     surface = SurfaceData(
-        np.asarray(motion.surface.vertices)[used],
+        motion.surface.vertices[used],
         renumbered.reshape(-1, 3),
         motion.surface.crease_angle,
     )
-    return MovedSurface(surface, np.asarray(motion.moved_vertices)[used])
+    return MovedSurface(surface, motion.moved_vertices[used])

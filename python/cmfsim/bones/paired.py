@@ -1,8 +1,8 @@
-"""What surfaces with the same triangles before and after say by their shape, vertices aside.
+"""The motion between surfaces with the same triangles, judged by shape instead of by vertices.
 
-A template that was fitted to each scan has vertices that slid along the bone, and squeezes those of
-resected bone on to the stump. Neither is motion. Where the bone after has the shape of the bone
-before, moved and perhaps scaled, it is that which moved.
+When a template is fitted to each scan, its vertices slide along the bone, and those of resected
+bone are squeezed onto the stump. Neither is motion. If the bone has the same shape before and
+after, moved and perhaps scaled, the rigid motion of that shape is the motion.
 """
 
 from dataclasses import dataclass
@@ -27,8 +27,8 @@ from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["PairedShape", "paired_shape"]
 
-# A vertex lies on the bone after if it is this near, mm: the surfaces of two scans are known to
-# half a millimetre each.
+# A vertex lies on the post-operative bone if it is this near, mm: the surface of each of the two
+# scans is accurate to half a millimetre.
 LIES = 1.0
 # A patch off the bone is a piece that moved otherwise if its own vertices' rigid motion lays this
 # share of them this near to the bone after, mm: two and a half times noise of 0.3 mm. The end of a
@@ -44,13 +44,13 @@ RIGID_SHARE, LEAST_LYING = 0.95, 0.6
 
 @dataclass(frozen=True, eq=False)
 class PairedShape:
-    """A bone before, laid by shape on the same mesh after.
+    """A bone registered by shape to the same mesh after the operation.
 
     Attributes
     ----------
     fit : ShapeFit
     is_rigid : bool
-        Whether the bone after is the bone before, moved rigidly, but for size and removed bone.
+        Whether the bone moved rigidly, apart from a change of size and removed bone.
     slip : float, mm
         How far vertices slid along the surface, median.
     slid_free : (n, 3) float64, mm
@@ -69,7 +69,7 @@ class PairedShape:
 
 
 def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
-    """How a bone lies on the same mesh after, judged by shape.
+    """The registration by shape of a bone to the same mesh after the operation.
 
     Parameters
     ----------
@@ -83,12 +83,12 @@ def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
     MeshError
         (also `ValueError`) A triangle without area after.
     """
-    here, there = np.asarray(before.vertices), np.asarray(after.vertices)
+    here, there = before.vertices, after.vertices
     bone = Surface(after.vertices, after.triangles, crease_angle=after.crease_angle)
     fit = fit_shape(before, bone, _trimmed_motion(here, there))
     carried = _carried(fit.similarity, here)
     closest, normals, _ = bone.closest(carried)
-    # Whatever lies off the mesh after is known: the mesh shows all that is left.
+    # The mesh shows all the bone that is left, so whatever lies off it is known to be off.
     removed = missing_patches(before, bone, fit.similarity, shown=np.inf)
     stray = stray_patches(before, bone, fit.similarity, fit.sigma)[0]
     on = fit.off <= LIES
@@ -114,25 +114,25 @@ def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
         float(np.median(np.linalg.norm(along[kept], axis=1))) if kept.any() else 0.0,
         moved + rest,
         removed,
-        # What was removed is named once.
+        # Removed bone is reported once.
         () if removed else stray,
     )
 
 
 def _trimmed_motion(here: Floats, there: Floats) -> Floats:
-    """The rigid motion of most vertices, whatever the others did (Tukey's biweight)."""
+    """The rigid motion of most vertices, robust against the others (Tukey's biweight)."""
     fit = rigid_fit(here, there)
     for _ in range(TRIM_ROUNDS):
-        off = np.asarray(fit.residuals)
+        off = fit.residuals
         reach = TUKEY * max(TO_SIGMA * float(np.median(off)), LEAST_SIGMA)
         fit = rigid_fit(here, there, weights=(1.0 - np.minimum(off / reach, 1.0) ** 2) ** 2)
-    return np.asarray(fit.matrix)
+    return fit.matrix
 
 
 def _is_displaced(here: Floats, there: Floats, bone: Surface, patch: NDArray[np.int64]) -> bool:
-    """Whether a patch that the bone's motion lays off it moved as one, and was not removed."""
+    """Whether a patch that the bone's motion leaves off the bone moved as one piece."""
     try:
-        own = np.asarray(rigid_fit(here[patch], there[patch]).matrix)
+        own = rigid_fit(here[patch], there[patch]).matrix
     except RegistrationError:
         # Squeezed to a point or a line.
         return False
@@ -142,4 +142,4 @@ def _is_displaced(here: Floats, there: Floats, bone: Surface, patch: NDArray[np.
 
 
 def _carried(matrix: Floats, points: Floats) -> Floats:
-    return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3])
+    return points @ matrix[:3, :3].T + matrix[:3, 3]

@@ -1,4 +1,4 @@
-"""A bone parted where it was cut in truth: along the places as near to one piece as to another."""
+"""A bone divided where it was actually cut: along the points equally near to two of its pieces."""
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -20,14 +20,14 @@ __all__ = ["part_segment"]
 # Beyond this distance from the box round a smaller piece, mm, bone belongs to the largest: the
 # hollows of a jaw reach no further over its surface.
 BESIDE = 15.0
-# A piece with less bone than this, mm³, holds no tissue of its own.
+# A piece with less bone than this, mm³, has no tissue attached to it alone.
 LEAST_VOLUME = 100.0
 
 
 def part_segment(
     segment: BoneSegment, pieces: Mapping[str, SurfaceData]
 ) -> tuple[BoneSegment, ...]:
-    """The pieces of a segment, each of the bone that lies nearest to its surface.
+    """The pieces of a segment: each has the bone that lies nearest to its surface.
 
     Parameters
     ----------
@@ -51,13 +51,13 @@ def part_segment(
     surfaces = [Surface(s.vertices, s.triangles) for s in pieces.values()]
     low = np.min([s.vertices.min(axis=0) for s in surfaces[1:]] or [level.highest], axis=0)
     high = np.max([s.vertices.max(axis=0) for s in surfaces[1:]] or [level.lowest], axis=0)
-    spacing = np.asarray(level.spacing)
+    spacing = level.spacing
     index = np.argwhere(values > -limit)
     points = level.lowest + index * spacing
     beside = ((points >= low - BESIDE) & (points <= high + BESIDE)).all(axis=1)
     index, points = index[beside], points[beside]
     distances = np.array([_distance(surface, points) for surface in surfaces])
-    # As a cut by planes is scaled: straight across the cells that it passes.
+    # Scaled as a cut by planes is: linear in the cells that it crosses.
     steep = limit / float(np.linalg.norm(spacing))
     voxel = float(np.prod(spacing))
     parted: dict[str, ImageData] = {}

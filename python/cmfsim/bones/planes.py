@@ -18,7 +18,7 @@ __all__ = ["Cut", "CuttingPlane", "Procedure", "free_cut"]
 
 @dataclass(frozen=True, eq=False)
 class CuttingPlane:
-    """An unbounded plane that parts bone; its normal points into the piece that is cut off.
+    """An unbounded plane that cuts bone; its normal points into the piece that is cut off.
 
     Attributes
     ----------
@@ -41,32 +41,33 @@ class CuttingPlane:
     [3.0]
     """
 
-    point: ArrayLike
-    normal: ArrayLike
-    name: str = "plane"
+    point: Floats
+    normal: Floats
+    name: str
 
-    def __post_init__(self) -> None:
-        as_text("plane name", self.name)
-        where = f"plane {self.name!r}"
-        point = as_point(f"{where} point", self.point)
-        normal = as_point(f"{where} normal", self.normal)
-        largest = float(np.abs(normal).max())
+    def __init__(self, point: ArrayLike, normal: ArrayLike, name: str = "plane") -> None:
+        as_text("plane name", name)
+        where = f"plane {name!r}"
+        place = as_point(f"{where} point", point)
+        direction = as_point(f"{where} normal", normal)
+        largest = float(np.abs(direction).max())
         if largest == 0.0:
             raise CaseInputError(f"{where} normal is (0, 0, 0): give a direction of any length")
-        normal = normal / largest
-        normal = normal / np.linalg.norm(normal)
-        normal.setflags(write=False)
-        object.__setattr__(self, "point", point)
-        object.__setattr__(self, "normal", normal)
+        direction = direction / largest
+        direction = direction / np.linalg.norm(direction)
+        direction.setflags(write=False)
+        object.__setattr__(self, "point", place)
+        object.__setattr__(self, "normal", direction)
+        object.__setattr__(self, "name", name)
 
     def distance(self, points: ArrayLike) -> Floats:
         """The signed distance of points (n, 3), mm: positive on the side of the normal."""
-        offset = as_rows("points", points, 3) - np.asarray(self.point)
-        return cast("Floats", offset @ np.asarray(self.normal))
+        offset = as_rows("points", points, 3) - self.point
+        return offset @ self.normal
 
     def distance_on(self, image: ImageData) -> Floats:
         """The signed distance at every voxel of an image's grid, (nx, ny, nz) mm."""
-        point, normal = np.asarray(self.point), np.asarray(self.normal)
+        point, normal = self.point, self.normal
         x, y, z = image.axes()
         dx, dy, dz = x - point[0], y - point[1], z - point[2]
         return cast("Floats", normal[0] * dx + normal[1] * dy + normal[2] * dz)
@@ -83,7 +84,7 @@ class Cut:
     groups : tuple of tuples of CuttingPlane
         Each group is a convex region; the piece is their union.
     sources : tuple of str
-        The piece is taken from the first of these bones or segments that there is.
+        The piece is cut from the first of these bones or segments that exists.
     rest : str or None
         What the source is called afterwards; None leaves its name.
     """
@@ -124,7 +125,7 @@ class Procedure:
     options : mapping of str to float
         The distances (mm) and angles (degrees) that placed the planes, defaults included.
     findings : tuple of Finding
-        What its placement should be looked at for.
+        What to check in its placement.
     """
 
     kind: str

@@ -3,7 +3,7 @@
 The rules follow the usual surgical descriptions (Bell 1975 for Le Fort I, Tessier 1971 for Le Fort
 III, Trauner and Obwegeser 1957 with Dal Pont 1961 for the sagittal split, Trauner and Obwegeser
 1957 for the chin); the distances below stand in for what a surgeon sees in the image, and each can
-be changed. Left and right are those of the landmarks' names, never the sign of a coordinate.
+be changed. Left and right follow the names of the landmarks, never the sign of a coordinate.
 """
 
 import math
@@ -29,8 +29,8 @@ UPPER_MOLAR_REACH = 11.0
 LOWER_CANINE_REACH = 18.0
 # Crown of a lower central incisor, mm (Wheeler): infradentale lies this much under the bite.
 LOWER_INCISOR_CROWN = 9.0
-# A chin piece lower than this is hard to hold with a plate, mm; where the symphysis is short the
-# clearance under the roots is given up before it, down to the least clearance.
+# A chin piece lower than this is hard to fix with a plate, mm; where the symphysis is short, the
+# clearance under the roots is reduced first, down to the least clearance.
 CHIN_HEIGHT = 8.0
 CHIN_LEAST_CLEARANCE = 1.0
 # The frontozygomatic suture lies this part of the way from the lower to the upper orbital rim.
@@ -48,8 +48,8 @@ _OPTIONS: Mapping[str, Mapping[str, tuple[float, float, float]]] = MappingProxyT
             "cant": (0.0, -30.0, 30.0),
             # Of the pterygomaxillary junction behind the second molars' landmarks.
             "posterior": (12.0, 2.0, 30.0),
-            # Of the buttress beside the second molars' landmarks; further out bone stays, so that
-            # the lower edge of the zygoma is not shaved.
+            # Of the buttress lateral to the second molars' landmarks; bone further out stays, so
+            # that the lower edge of the zygoma is not shaved.
             "width": (12.0, 5.0, 40.0),
         },
         "le_fort_3": {
@@ -172,7 +172,7 @@ def place_procedure(
     kind : str
         "le_fort_1", "le_fort_3", "bsso" or "genioplasty".
     landmarks : mapping of str to (3,) float64, mm
-        Skull landmarks, LPS; left and right as their labels say.
+        Skull landmarks, LPS; left and right as labelled.
     options : mapping of str to float, optional
         Distances (mm) and angles (degrees) other than the defaults of `procedure_options`.
 
@@ -329,7 +329,7 @@ def _le_fort_3(
     frame = _upper_frame("le_fort_3", points)
     junction = _junction(points, frame, options["posterior"])
     top = points["nasion"] + options["height"] * frame.up
-    bottom = np.asarray(junction.point) + options["junction"] * frame.up
+    bottom = junction.point + options["junction"] * frame.up
     along = top - bottom
     along = _unit("le_fort_3", "nasion and the junction", along - (along @ frame.left) * frame.left)
     down = np.cross(frame.left, along)
@@ -390,8 +390,8 @@ def _genioplasty(
                 f"the chin is {symphysis:.1f} mm high, so the cut passes {clearance:.1f} mm below "
                 f"the estimated roots instead of {wanted:.1f} mm",
                 where="genioplasty",
-                why="the piece is low, and the cut near the roots",
-                fix="look at the cut in the picture; set clearance, or give the plane",
+                why="the piece is low, and the cut is near the roots",
+                fix="check the cut in the picture; set clearance, or give the plane",
             ),
         )
     front = tip - (LOWER_CANINE_REACH + clearance) * frame.up

@@ -1,7 +1,7 @@
 """Whether each segment has its own surface: that of its level, and of no other segment.
 
-A surface that was exchanged on its way gives a face that looks right and is wrong. So what was made
-is compared with what it was made of.
+If surfaces are exchanged somewhere, the face looks right and is wrong. Each surface is therefore
+compared with the level that it was made from.
 """
 
 import hashlib
@@ -34,20 +34,20 @@ SAMPLES = 20_000
 
 
 def check_segments(segments: Sequence[BoneSegment], given: Collection[str] = ()) -> None:
-    """Raises an error if a segment has another's surface, or one that its level does not have.
+    """Raises an error if a segment has another's surface, or one that does not match its level.
 
     Parameters
     ----------
     segments : sequence of BoneSegment
     given : collection of str
-        Names of segments whose surface was not made of the level but the level of the surface: the
-        level is filled, so that the surface may have more walls than it, and other volume.
+        Names of segments whose level was made from the surface instead of the reverse: the level is
+        filled, so the surface may have more walls, and another volume.
 
     Raises
     ------
     CaseError
         Two segments have the same surface; the surface of a segment does not lie on the zero set of
-        its level, or encloses another volume. The text names the segments.
+        its level, or encloses another volume. The message names the segments.
     """
     known: dict[bytes, str] = {}
     for segment in segments:
@@ -56,7 +56,7 @@ def check_segments(segments: Sequence[BoneSegment], given: Collection[str] = ())
             raise CaseError(
                 f"segments {known[key]!r} and {segment.name!r} have the same surface, vertex for "
                 "vertex: one of them would move with the other's tissue; if the case names one "
-                "file for two bones, correct it, else report this as a defect of cmfsim"
+                "file for two bones, correct it; otherwise report this as a bug in cmfsim"
             )
         known[key] = segment.name
     for segment in segments:
@@ -73,12 +73,12 @@ def _key(segment: BoneSegment) -> bytes:
 
 def _check_lies_on_level(segment: BoneSegment, *, is_given: bool) -> None:
     level = segment.level
-    spacing = np.asarray(level.spacing, dtype=np.float64)
-    values = np.asarray(level.values)
-    vertices = np.asarray(segment.surface.vertices)
+    spacing = level.spacing
+    values = level.values
+    vertices = segment.surface.vertices
     inside = values > 0.0
     share = float(_on_zero_set(inside, (vertices - level.lowest) / spacing).mean())
-    why = "its surface was exchanged or damaged on the way: report this as a defect of cmfsim"
+    why = "its surface was exchanged or damaged in processing: report this as a bug in cmfsim"
     least = LEAST_GIVEN_SHARE if is_given else LEAST_SHARE
     if is_given:
         why = "check that each bone is given its own surface"
@@ -104,14 +104,14 @@ def _check_lies_on_level(segment: BoneSegment, *, is_given: bool) -> None:
 
 
 def _on_zero_set(inside: NDArray[np.bool_], places: Floats) -> NDArray[np.bool_]:
-    """Whether the cube of three voxels about each of some places, in voxels, holds both sides."""
+    """Whether the cube of three voxels around each place (in voxels) contains both sides."""
     places = places[:: -(-len(places) // SAMPLES)]
     index = np.rint(places).astype(np.intp)
     shape = np.array(inside.shape)
     some, every = np.zeros(len(index), dtype=bool), np.ones(len(index), dtype=bool)
     for step in np.ndindex(3, 3, 3):
         near = index + np.array(step) - 1
-        # What lies beyond the image is outside: surfaces close there.
+        # Beyond the image is outside: surfaces are closed at its border.
         within = ((near >= 0) & (near < shape)).all(axis=1)
         found = np.zeros(len(index), dtype=bool)
         found[within] = inside[tuple(near[within].T)]
@@ -121,10 +121,10 @@ def _on_zero_set(inside: NDArray[np.bool_], places: Floats) -> NDArray[np.bool_]
 
 
 def _volume(segment: BoneSegment) -> float:
-    vertices = np.asarray(segment.surface.vertices, dtype=np.float64)
-    # About the middle, or rounding far from the origin would count.
+    vertices = segment.surface.vertices
+    # Relative to the centre, because rounding far from the origin would count.
     vertices = vertices - vertices.mean(axis=0)
-    a, b, c = (vertices[np.asarray(segment.surface.triangles)[:, k]] for k in range(3))
+    a, b, c = (vertices[segment.surface.triangles[:, k]] for k in range(3))
     return float(np.einsum("na,na->", a, np.cross(b, c))) / 6.0
 
 

@@ -1,7 +1,7 @@
 """The motion of a bone by its shape alone: robust steps to tangent planes, with a change of size.
 
-Only distances along the normals of the bone after the operation count. Vertices of a template that
-was fitted to each scan, which slid along the surface, therefore turn nothing.
+Only distances along the normals of the post-operative bone count, so vertices of a fitted template
+that slid along the surface do not rotate the result.
 """
 
 from dataclasses import dataclass
@@ -32,30 +32,30 @@ __all__ = [
 # and what makes the median of absolute values a standard deviation (Huber 1981).
 TUKEY, TO_SIGMA = 4.685, 1.4826
 # The least standard deviation that weights are made with, mm: the best surfaces of scans. Below it,
-# triangles of clean surfaces would part sound vertices from one another.
+# the triangles of clean surfaces would separate sound vertices from one another.
 LEAST_SIGMA = 0.1
-# Points that a fit is made of: 0.3 mm of noise leaves 0.003 mm in a shift.
+# Points of a fit: 0.3 mm of noise then leaves an error of 0.003 mm in a shift.
 MOST_POINTS = 20000
-# Steps end when one moves no point by more than this, mm (rms), a thousandth of the accuracy that
-# is promised; noise swaps partners below it.
+# The fit has converged when a step moves the points by less than this, mm (rms), a thousandth of
+# the stated accuracy; below it, noise swaps partners.
 REST, MOST_STEPS = 1e-4, 100
-# A direction is open if the normal equations hold it by less than this share of the best: an error
-# of the surface is then ten times as large in it as in the best. A noisy ball reaches 0.007.
+# A direction is open if its eigenvalue is below this share of the largest: an error of the surface
+# is then ten times as large in it as in the best direction. A noisy ball reaches 0.007.
 OPEN = 0.01
 # Blocks of the jackknife, a power of two, and Student's t of 31 degrees of freedom (95 %).
 BLOCKS, STUDENT = 32, 2.04
-# How well the surface of a bone is known all round, mm: thresholds and triangles of two scans move
-# it in or out together, which no block shows. 0.1 mm is a third of a small voxel.
+# Accuracy of the surface of a bone as a whole, mm: thresholds and triangles of two scans shift all
+# of it in or out, which no block shows. 0.1 mm is a third of a small voxel.
 ALL_ROUND = 0.1
 # Pairs that the fit needs: seven unknowns with room to tell a sound one.
 LEAST_PAIRS = 50
-# Sizes that may be one bone in two scans. Beyond, it is another unit or another bone.
+# Ratios of size possible for one bone in two scans. Beyond them, the unit or the bone differs.
 LEAST_SIZE, MOST_SIZE = 0.85, 1.15
 
 
 @dataclass(frozen=True, eq=False)
 class OpenDirection(Frozen):
-    """A motion of a bone that its shape hardly shows, as the turn of a ball.
+    """A motion of a bone that its shape hardly determines, such as the rotation of a ball.
 
     Attributes
     ----------
@@ -63,8 +63,8 @@ class OpenDirection(Frozen):
         The turn about the middle of the bone, times the radius of the bone, and the shift; both
         together of unit length.
     ratio : float
-        How well the shape holds it, as a share of how well it holds what it holds best: the ratio
-        of eigenvalues of the normal equations.
+        How well the shape determines it, relative to the direction that it determines best: the
+        ratio of eigenvalues of the normal equations.
     """
 
     turn: Floats
@@ -73,7 +73,7 @@ class OpenDirection(Frozen):
 
     @property
     def is_turn(self) -> bool:
-        """Whether it is more of a turn than of a shift."""
+        """Whether it is more a turn than a shift."""
         return bool(np.linalg.norm(self.turn) >= np.linalg.norm(self.shift))
 
     @property
@@ -93,13 +93,13 @@ class OpenDirection(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class ShapeFit(Frozen):
-    """How a bone lies on the bone after the operation, by shape.
+    """The registration of a bone to the post-operative bone, by shape.
 
     Attributes
     ----------
     matrix : (4, 4) float64, mm
-        The rigid motion. A change of size is about the middle of the segment's vertices, which it
-        leaves where the rigid motion takes it.
+        The rigid motion. A change of size is about the centre of the segment's vertices, which it
+        does not move further.
     scale : float
         Size after, as a share of the size before.
     scale_interval : tuple of float
@@ -108,13 +108,13 @@ class ShapeFit(Frozen):
     eigenvalue_ratio : float
         Of the normal equations of the rigid motion: smallest to largest.
     open : tuple of OpenDirection
-        What the shape leaves open; there the motion is the one that the search began with.
+        What the shape does not determine; in these directions the motion is that of the start.
     sigma : float, mm
         Standard deviation of the distances along normals, robust.
     off : (n,) float64, mm
         Distance of each vertex, moved and scaled, from the bone after.
     kept : (n,) bool
-        Vertices near enough to have a say, on bone that faces alike.
+        Vertices that count: near enough, on bone with a similar normal.
     middle : (3,) float64, mm
         Of the segment's vertices, before.
     """
@@ -132,7 +132,7 @@ class ShapeFit(Frozen):
     @property
     def image(self) -> Floats:
         """Where the rigid motion takes the middle, (3,) mm."""
-        return np.asarray(self.matrix[:3, :3] @ self.middle + self.matrix[:3, 3])
+        return self.matrix[:3, :3] @ self.middle + self.matrix[:3, 3]
 
     @property
     def similarity(self) -> Floats:
@@ -144,7 +144,7 @@ class ShapeFit(Frozen):
 
     @property
     def rms(self) -> float:
-        """Of the distances of the vertices that had a say, mm."""
+        """Of the distances of the vertices that count, mm."""
         return float(np.sqrt((self.off[self.kept] ** 2).mean())) if self.kept.any() else np.inf
 
     def as_dict(self) -> dict[str, Any]:
@@ -166,7 +166,7 @@ def fit_shape(
     max_angle: float = 60.0,
     most_points: int = MOST_POINTS,
 ) -> ShapeFit:
-    """The motion that lays a segment on the bone after the operation, by the shape of both.
+    """The motion that registers a segment to the post-operative bone, by the shape of both.
 
     Parameters
     ----------
@@ -175,11 +175,11 @@ def fit_shape(
     bone : Surface
         After.
     start : (4, 4) float64, mm
-        Rigid motion to begin with. What the shape leaves open stays as it is there.
+        Rigid motion to start from. Directions that the shape does not determine keep its value.
     max_angle : float, degrees
         Between normals of partners.
     most_points : int
-        Vertices that the fit is made of.
+        Vertices used in the fit.
 
     Returns
     -------
@@ -188,21 +188,21 @@ def fit_shape(
     Raises
     ------
     RegistrationError
-        (also `ValueError`) Fewer partners than unknowns; a size that is no bone's in two scans.
+        (also `ValueError`) Fewer partners than unknowns; sizes that differ too much for one bone.
 
     Notes
     -----
     Steps to tangent planes (Chen & Medioni 1992) of a similarity, weighted by area and Tukey's
     biweight of the distances (Huber 1981; as iterative closest points, Fitzgibbon 2003). Directions
-    in which the normal equations have small eigenvalues are left alone (Zhang, Kaess & Singh 2016).
-    The interval of the size leaves out one block of neighbouring vertices after the other (Künsch
-    1989), as distances of neighbours are not independent.
+    in which the normal equations have small eigenvalues are not solved for (Zhang et al. 2016).
+    The interval of the size omits one block of neighbouring vertices at a time (Künsch 1989),
+    because the distances of neighbours are not independent.
     """
-    points = np.asarray(segment.vertices)
+    points = segment.vertices
     middle = points.mean(axis=0)
     own = Surface(segment.vertices, segment.triangles)
-    whole = _Sample(points - middle, np.asarray(own.vertex_normals), vertex_areas(segment))
-    # Any order of vertices in the file gives points from all over the segment.
+    whole = _Sample(points - middle, own.vertex_normals, vertex_areas(segment))
+    # Points from all over the segment, in whatever order the file has the vertices.
     few = whole.some(np.random.default_rng(0).permutation(len(points))[:most_points])
     radius = float(np.sqrt((few.arms**2).sum(axis=1).mean()))
     facing = np.cos(np.radians(max_angle))
@@ -239,14 +239,14 @@ def fit_shape(
 
 @dataclass(frozen=True, eq=False)
 class _Pose:
-    """Where a segment lies: turned and scaled about its middle, and where that is."""
+    """The pose of a segment: rotated and scaled about its centre, and where that lies."""
 
     turn: Floats
     image: Floats
     scale: float
 
     def of(self, arms: Floats) -> Floats:
-        return np.asarray(self.scale * arms @ self.turn.T + self.image)
+        return self.scale * arms @ self.turn.T + self.image
 
     def stepped(self, step: Floats, radius: float) -> "_Pose":
         angle = float(np.linalg.norm(step[:3])) / radius
@@ -257,7 +257,7 @@ class _Pose:
 
 
 class _Sample:
-    """Vertices of a segment about its middle, with normals and the areas that they stand for."""
+    """Vertices of a segment relative to its centre, with normals and the areas they represent."""
 
     def __init__(self, arms: Floats, normals: Floats, areas: Floats) -> None:
         self.arms, self.normals, self.areas = arms, normals, areas
@@ -267,7 +267,7 @@ class _Sample:
 
 
 class _Pairs:
-    """The points of the bone after that are nearest to a sample in a pose."""
+    """The points of the post-operative bone nearest to a sample in a pose."""
 
     def __init__(self, sample: _Sample, bone: Surface, pose: _Pose, facing: float) -> None:
         self.moved = pose.of(sample.arms)
@@ -287,9 +287,9 @@ class _Equations:
         pairs = _Pairs(sample, bone, pose, facing)
         if int(pairs.alike.sum()) < LEAST_PAIRS:
             raise RegistrationInputError(
-                f"{int(pairs.alike.sum())} vertices of the segment have bone after the operation "
-                f"that faces as they do; {LEAST_PAIRS} are needed: check that both are in one "
-                "frame and that normals of both point outwards"
+                f"{int(pairs.alike.sum())} vertices of the segment lie near post-operative bone "
+                f"with a similar normal; {LEAST_PAIRS} are needed: check that both are in one "
+                "frame and that the normals of both point outwards"
             )
         self.sigma = max(TO_SIGMA * float(np.median(pairs.off[pairs.alike])), LEAST_SIGMA)
         size = np.minimum(pairs.off / (TUKEY * self.sigma), 1.0)
@@ -297,8 +297,8 @@ class _Equations:
         arms = pairs.moved - pose.image
         self.rows = _rows(arms, pairs.facing, radius)
         self.rest, self.arms, self.radius = pairs.rest, sample.arms, radius
-        # Noise tilts the normals of either surface and seems to hold a ball against turning. In the
-        # product of both surfaces' rows it averages out.
+        # Noise tilts the normals of both surfaces, which makes even a ball seem to resist rotation.
+        # In the product of the rows of both surfaces it averages out.
         own = _rows(arms, sample.normals @ pose.turn.T, radius)
         both = (own[:, :6] * self.weight[:, None]).T @ self.rows[:, :6]
         values, vectors = np.linalg.eigh(0.5 * (both + both.T))
@@ -309,7 +309,7 @@ class _Equations:
             OpenDirection(vectors[:3, n].copy(), vectors[3:, n].copy(), max(float(shares[n]), 0.0))
             for n in np.flatnonzero(~held)
         )
-        # Unknowns that are solved for: the directions that the shape holds, and the size.
+        # Unknowns solved for: the directions that the shape determines, and the size.
         basis = np.zeros((7, int(held.sum()) + 1))
         basis[:6, :-1], basis[6, -1] = vectors[:, held], 1.0
         rows = self.rows @ basis
@@ -322,7 +322,7 @@ class _Equations:
         return self._solved(self.rest, slice(None) if keep is None else keep)
 
     def interval(self, scale: float) -> tuple[float, float]:
-        """The 95 % interval of the size; all that is allowed where the shape leaves it open."""
+        """The 95 % interval of the size; the allowed range where the shape leaves it open."""
         if not self.has_size:
             return LEAST_SIZE, MOST_SIZE
         block = _blocks(self.arms)
@@ -363,8 +363,8 @@ def _blocks(points: Floats) -> NDArray[np.int64]:
 
 def vertex_areas(surface: SurfaceData) -> Floats:
     """A third of the triangles round each vertex, mm²."""
-    vertices = np.asarray(surface.vertices)
-    triangles = np.asarray(surface.triangles).astype(np.int64)
+    vertices = surface.vertices
+    triangles = surface.triangles.astype(np.int64)
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return np.asarray(np.bincount(triangles.ravel(), np.repeat(areas / 3.0, 3), len(vertices)))

@@ -1,8 +1,8 @@
 """The labial and buccal sheet of a dental arch: what lips and cheeks slide on.
 
-Soft tissue does not feel the gaps between teeth or the edge that they bite with. The sheet is that
-of gums and crowns, bridged between teeth, smooth on the scale of the tissue's tets, and continued
-past the edge in the direction in which the labial face leads, so that no node slides round it.
+Soft tissue bridges the gaps between teeth and their incisal edges. The sheet follows gums and
+crowns, bridges the gaps, is smooth at the scale of the tissue's tets, and is extended past the edge
+in the direction of the labial face, so that no node slides around it.
 """
 
 from dataclasses import dataclass
@@ -48,9 +48,9 @@ TAPERED, STEEP = 8.0, 14.0
 BEHIND_TEETH = 8.0
 # The grid beyond the arch and its vestibule, mm: to the roots, and in front and at the sides.
 ROOM = 14.0
-# The edges of the teeth lie this far from the arch to the other one at most, as a share of the way.
+# The edges of the teeth lie at most at this share of the distance from the arch to the other one.
 MOST_EDGE = 0.65
-# Sectors of the arch in which the edge of the teeth is looked for.
+# Sectors of the arch in which the edge of the teeth is searched for.
 SECTORS = 16
 # Largest turn of the occlusal direction against the landmarks', cosine: 20°.
 LEAST_AGREEMENT = 0.94
@@ -71,7 +71,7 @@ class SheetOptions:
     behind : float, mm
         How far behind the second molars.
     beside : float, mm
-        How far beside them.
+        How far lateral to them.
     """
 
     radius: float = 2.0
@@ -90,7 +90,7 @@ class ContactSheet:
     Attributes
     ----------
     surface : SurfaceData
-        Closed: the labial sheet, and behind it what nothing slides on. Outward normals, mm.
+        Closed: the labial sheet, and behind it a back on which nothing slides. Outward normals, mm.
     relief : float, mm
         Standard deviation of the Gaussian that rounds it.
     radius : float, mm
@@ -114,8 +114,8 @@ def contact_sheet(
     name : str
         Of the bone, for messages.
     bone : ImageData
-        Level of the bone that bears the arch, before it is cut: positive inside. Cuts then leave no
-        ends on the sheet.
+        Level of the bone that bears the arch, before it is cut, so that cuts leave no edges on the
+        sheet; positive inside.
     arch : DentalArch
     options : SheetOptions, optional
 
@@ -147,8 +147,8 @@ def contact_sheet(
     made = surface_of_level(
         f"contact of {name}", image, SurfaceOptions(max_triangles=200_000, smoothing=0)
     )
-    points = grid.origin + np.asarray(made.vertices) @ grid.axes
-    triangles = np.asarray(made.triangles)
+    points = grid.origin + made.vertices @ grid.axes
+    triangles = made.triangles
     if np.linalg.det(grid.axes) < 0.0:
         triangles = triangles[:, ::-1]
     return ContactSheet(SurfaceData(points, triangles), relief, radius)
@@ -190,7 +190,7 @@ class _Grid:
         self.name, self.arch, self.options = name, arch, options
         self.axes: Floats = _frame(across, forwards, -out)
         self.origin: Floats = arch.middle
-        tip = self.axes @ (np.asarray(arch.tip) - self.origin)
+        tip = self.axes @ (arch.tip - self.origin)
         side = arch.half_width + options.beside + ROOM
         self.low = np.array([-side, -options.behind - ROOM, -options.above - ROOM + min(tip[2], 0)])
         self.high = np.array([side, tip[1] + ROOM, max(arch.depth_front, arch.depth_molars) + 5.0])
@@ -200,7 +200,7 @@ class _Grid:
         self.axes = _frame(across, forwards, normal)
         shift = float(self.axes[2] @ (edge - self.origin))
         self.origin = self.origin + shift * self.axes[2]
-        self.tip: Floats = self.axes @ (np.asarray(arch.tip) - self.origin)
+        self.tip: Floats = self.axes @ (arch.tip - self.origin)
         self.low[2] = -shift - options.above - ROOM + min(tip[2], 0)
         self.high[2] = BEYOND
         self._sample(bone)
@@ -263,7 +263,7 @@ class _Grid:
             plane = np.array([0.0, 0.0, float(np.median(found[:, 2]))])
         centre = found.mean(axis=0)
         centre[2] = plane[:2] @ centre[:2] + plane[2]
-        return self.origin + centre @ self.axes, np.asarray(normal @ self.axes)
+        return self.origin + centre @ self.axes, (normal @ self.axes)
 
     def at(self, axis: int, value: float) -> int:
         """The index of the grid line nearest to a coordinate."""
@@ -271,8 +271,8 @@ class _Grid:
         return int(np.clip(index, 0, self.shape[axis] - 1))
 
     def beside(self, across: Floats) -> Mask:
-        """Whether coordinates to the left lie at the arch, and not on zygoma."""
-        return np.asarray(np.abs(across) <= self.arch.half_width + self.options.beside)
+        """Whether lateral coordinates lie at the arch and not on the zygoma."""
+        return np.abs(across) <= self.arch.half_width + self.options.beside
 
     def zone(self) -> Mask:
         """Where tissue slides, on the grid with its margin."""
@@ -312,7 +312,7 @@ def _bridged(solid: Mask, radius: float) -> Mask:
     grown = _core.distance_image(wide, (SPACING,) * 3) <= radius
     kept = _core.distance_image(~grown, (SPACING,) * 3) > radius
     inner = tuple(slice(rim, -rim) for _ in range(3))
-    return np.asarray(kept[inner] | solid)
+    return kept[inner] | solid
 
 
 def _filled(grid: _Grid, solid: Mask) -> Mask:

@@ -1,8 +1,8 @@
-"""Patches of a segment that lie off the post-operative bone once the segment is laid on it.
+"""Patches of a segment that lie off the post-operative bone after registration.
 
-The search leaves out what does not fit, so that one piece that moved otherwise, or that was
-removed, does not bend the motion of the rest. The rest's motion is then given to the whole segment:
-whoever follows it must know of such a piece.
+The registration ignores what does not fit, so that a piece that moved differently, or was removed,
+does not distort the motion of the rest. The whole segment then gets the motion of the rest, and the
+user must know of such a piece.
 """
 
 from collections.abc import Sequence
@@ -19,19 +19,19 @@ from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["LEAST_STRAY", "REACH", "StrayPatch", "stray_patches"]
 
-# A vertex is off if it lies further from the bone than this, mm, three times what a segmented bone
-# is known to, and than so many times the rms of the fit: noise does that to one vertex in 10 000.
+# A vertex is off if it lies further from the bone than this, mm, three times the accuracy of a
+# segmented bone, and than this many times the rms of the fit: noise does so to 1 vertex in 10 000.
 OFF, OFF_RMS = 1.5, 4.0
 # The least area of a patch, mm²: 1 cm², a tenth of what a chin segment shows. Windows that a scan
 # leaves in thin walls, plates and screws are smaller.
 LEAST_STRAY = 100.0
 # What lies within this of another segment before the operation, mm, is a cut face or a joint: no
-# scan shows the former, and one or two voxels of a CT part the surfaces of two segments.
+# scan shows the former, and the surfaces of two segments lie one or two voxels of a CT apart.
 CUT_FACE = 1.5
-# Bone further off than this, mm, is not taken for where a patch went: few segments move as far.
+# Bone further away than this, mm, is not taken for a displaced patch: few segments move as far.
 REACH = 10.0
-# Bone that faces elsewhere by more than 60° (cosine) is another side: a resected chin lies near the
-# stump, not on it. A patch is there if this share of its vertices has bone that faces alike.
+# Bone whose normal differs by more than 60° (cosine) is another side: a resected chin lies near the
+# stump, not on it. A patch is present if this share of its vertices has bone with a like normal.
 FACING, SHOWN_SHARE = 0.5, 0.5
 
 
@@ -44,8 +44,7 @@ class StrayPatch:
     area : float, mm²
         Of the surface before.
     distance : float, mm
-        From the bone after the operation, where the segment's motion takes the patch; median of
-        its vertices.
+        From the post-operative bone, after the segment's motion; median of the patch's vertices.
     place : (3,) float64, mm
         The vertex nearest to the middle of the patch, before.
     has_bone : bool
@@ -89,9 +88,9 @@ def stray_patches(
     matrix : (4, 4) float64, mm
         The motion of the segment.
     rms : float, mm
-        What the fit leaves of the vertices that it keeps.
+        Residual of the fit over the vertices that it keeps.
     beside : sequence of SurfaceData
-        The other segments before: what touches them was cut, and is not looked for.
+        The other segments before: what touches them was cut, and is not searched for.
 
     Returns
     -------
@@ -100,8 +99,8 @@ def stray_patches(
     off : (n,) float64, mm
         Distance of each vertex from the bone.
     """
-    here = np.asarray(segment.vertices)
-    triangles = np.asarray(segment.triangles).astype(np.int64)
+    here = segment.vertices
+    triangles = segment.triangles.astype(np.int64)
     turn, shift = np.asarray(matrix)[:3, :3], np.asarray(matrix)[:3, 3]
     moved = here @ turn.T + shift
     closest, facing, _ = bone.closest(moved)
@@ -115,7 +114,7 @@ def stray_patches(
         stray[asked[np.linalg.norm(nearest - here[asked], axis=1) <= CUT_FACE]] = False
     if not stray.any():
         return (), off
-    normals = np.asarray(Surface(segment.vertices, segment.triangles).vertex_normals)
+    normals = Surface(segment.vertices, segment.triangles).vertex_normals
     alike = ((normals @ turn.T) * facing).sum(axis=1) >= FACING
     ends = edges_of(triangles).ends
     label = connected_labels(ends[stray[ends].all(axis=1)], len(here))

@@ -65,53 +65,9 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     named = argparse.ArgumentParser(add_help=False, parents=[common])
     named.add_argument("case", metavar="CASE", type=Path, help="case.toml, or its folder")
 
-    demo = commands.add_parser(
-        "demo", parents=[common], help="predict the face of a built-in case, and open the report"
-    )
-    demo.add_argument(
-        "folder",
-        metavar="FOLDER",
-        type=Path,
-        nargs="?",
-        default=demo_command.DEMO_FOLDER,
-        help=f"new, empty or from an earlier demo (default {demo_command.DEMO_FOLDER})",
-    )
-    demo.add_argument(
-        "--edge-length", metavar="H", type=float, default=6.0, help="tet edges, mm (default 6)"
-    )
-    demo.add_argument("--no-open", action="store_true", help="do not open the report")
-    demo.set_defaults(run=demo_command.demo, models=demo_command.DEMO_MODELS)
-
-    init = commands.add_parser(
-        "init",
-        parents=[common],
-        help="write a commented case.toml for the files in a folder, or for a 3D Slicer scene",
-        epilog="Anything unclear is written as a line with a question mark, which doctor rejects.",
-    )
-    init.add_argument(
-        "folder", metavar="FOLDER", type=Path, help="folder, or 3D Slicer scene (.mrml, .mrb)"
-    )
-    init.add_argument("--force", action="store_true", help="replace an existing case.toml")
-    init.set_defaults(run=init_command.init)
-
-    view = commands.add_parser(
-        "view", parents=[common], help="display a prediction, model, scene, result or surface"
-    )
-    view.add_argument(
-        "path",
-        metavar="FOLDER_OR_FILE",
-        type=Path,
-        help="folder written by predict, build or demo; case.toml, scene, result or surface",
-    )
-    view.add_argument(
-        "--model",
-        choices=MODELS,
-        help="which of several predictions (default: the last of H, M, H+S, M+S)",
-    )
-    view.add_argument(
-        "--screenshot", metavar="PNG", type=Path, help="write a picture, open no window"
-    )
-    view.set_defaults(run=view_command.view)
+    _add_demo(commands, common)
+    _add_init(commands, common)
+    _add_view(commands, common)
 
     doctor = commands.add_parser(
         "doctor",
@@ -139,6 +95,64 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
 
     _add_study_commands(commands, common, changed)
 
+    _add_phantom(commands, common)
+
+
+def _add_demo(commands: Any, common: argparse.ArgumentParser) -> None:
+    demo = commands.add_parser(
+        "demo", parents=[common], help="predict the face of a built-in case, and open the report"
+    )
+    demo.add_argument(
+        "folder",
+        metavar="FOLDER",
+        type=Path,
+        nargs="?",
+        default=demo_command.DEMO_FOLDER,
+        help=f"new, empty or from an earlier demo (default {demo_command.DEMO_FOLDER})",
+    )
+    demo.add_argument(
+        "--edge-length", metavar="H", type=float, default=6.0, help="tet edges, mm (default 6)"
+    )
+    demo.add_argument("--no-open", action="store_true", help="do not open the report")
+    demo.set_defaults(run=demo_command.demo, models=demo_command.DEMO_MODELS)
+
+
+def _add_init(commands: Any, common: argparse.ArgumentParser) -> None:
+    init = commands.add_parser(
+        "init",
+        parents=[common],
+        help="write a commented case.toml for the files in a folder, or for a 3D Slicer scene",
+        epilog="Anything unclear is written as a line with a question mark, which doctor rejects.",
+    )
+    init.add_argument(
+        "folder", metavar="FOLDER", type=Path, help="folder, or 3D Slicer scene (.mrml, .mrb)"
+    )
+    init.add_argument("--force", action="store_true", help="replace an existing case.toml")
+    init.set_defaults(run=init_command.init)
+
+
+def _add_view(commands: Any, common: argparse.ArgumentParser) -> None:
+    view = commands.add_parser(
+        "view", parents=[common], help="display a prediction, model, scene, result or surface"
+    )
+    view.add_argument(
+        "path",
+        metavar="FOLDER_OR_FILE",
+        type=Path,
+        help="folder written by predict, build or demo; case.toml, scene, result or surface",
+    )
+    view.add_argument(
+        "--model",
+        choices=MODELS,
+        help="which of several predictions (default: the last of H, M, H+S, M+S)",
+    )
+    view.add_argument(
+        "--screenshot", metavar="PNG", type=Path, help="write a picture, open no window"
+    )
+    view.set_defaults(run=view_command.view)
+
+
+def _add_phantom(commands: Any, common: argparse.ArgumentParser) -> None:
     phantom = commands.add_parser(
         "phantom", parents=[common], help="write the case of a synthetic head"
     )

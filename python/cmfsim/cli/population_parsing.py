@@ -14,6 +14,11 @@ __all__ = ["add_population_commands"]
 
 def add_population_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     """Adds both commands."""
+    _add_virtual_patients(commands, common)
+    _add_benchmark(commands, common)
+
+
+def _add_virtual_patients(commands: Any, common: argparse.ArgumentParser) -> None:
     virtual = commands.add_parser(
         "virtual-patients",
         parents=[common],
@@ -57,6 +62,8 @@ def add_population_commands(commands: Any, common: argparse.ArgumentParser) -> N
     )
     virtual.set_defaults(run=virtual_patients_command.virtual_patients)
 
+
+def _add_benchmark(commands: Any, common: argparse.ArgumentParser) -> None:
     benchmark = commands.add_parser(
         "benchmark",
         parents=[common],

@@ -89,7 +89,7 @@ def _read(path: Path) -> Scene:
 def info(options: argparse.Namespace) -> int:
     """Lists the contents of a scene."""
     scene = _read(options.scene)
-    nodes = np.asarray(scene.nodes)
+    nodes = scene.nodes
     if options.json:
         counts = {
             name: {"joined": int(np.size(s.joined)), "sliding": int(np.size(s.sliding))}

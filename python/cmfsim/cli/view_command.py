@@ -92,7 +92,7 @@ def _of_folder(folder: Path, model: str | None) -> list[ViewPart]:
 def _of_prediction(folder: Path) -> list[ViewPart]:
     found = read_parts(folder)
     before, after = found["skin"]["skin"]
-    moved = np.linalg.norm(after - np.asarray(before.vertices), axis=1)
+    moved = np.linalg.norm(after - before.vertices, axis=1)
     parts = [
         ViewPart("skin after", SurfaceData(after, before.triangles), SKIN_COLOUR, OVER_BONES),
         ViewPart("skin before", before, SKIN_COLOUR, OVER_BONES, shown=False),
@@ -132,8 +132,8 @@ def _of_archive(path: Path) -> list[ViewPart]:
     if "result" not in names:
         raise CaseInputError(f"{path.name}: is neither a scene nor a result of cmfsim")
     result = read_result(path)
-    nodes, triangles = np.asarray(result.nodes), np.asarray(result.skin_triangles)
-    moved = np.asarray(result.displacements)
+    nodes, triangles = result.nodes, result.skin_triangles
+    moved = result.displacements
     size = np.linalg.norm(moved, axis=1)
     return [
         ViewPart("after", SurfaceData(nodes + moved, triangles), "#21918c", values=size),
@@ -143,12 +143,12 @@ def _of_archive(path: Path) -> list[ViewPart]:
 
 def _of_scene(path: Path) -> list[ViewPart]:
     scene = read_scene(path)
-    boundary = np.asarray(TetMesh(scene.nodes, scene.tets).boundary_triangles())
+    boundary = TetMesh(scene.nodes, scene.tets).boundary_triangles()
     parts = [ViewPart("tissue", SurfaceData(scene.nodes, boundary), SKIN_COLOUR, OVER_BONES)]
-    held = {"fixed": np.asarray(scene.fixed)}
+    held = {"fixed": scene.fixed}
     for name, segment in scene.segments.items():
-        held[f"{name} joined"] = np.asarray(segment.joined)
-        held[f"{name} sliding"] = np.asarray(segment.sliding)
+        held[f"{name} joined"] = segment.joined
+        held[f"{name} sliding"] = segment.sliding
         if segment.contact is not None:
             parts.append(ViewPart(f"{name} contact", segment.contact, "#e6dcc3", shown=False))
     for name, nodes in held.items():

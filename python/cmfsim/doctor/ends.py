@@ -2,8 +2,6 @@
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.values.finding import Finding
 
@@ -60,6 +58,6 @@ def _chin(evidence: Evidence) -> tuple[float, float, str] | None:
         heights = [float(points[n][2]) for n in (LOWEST, HIGHEST) if n in points]
         return heights[0], max(heights), f"the landmark {LOWEST}"
     if "mandible" in evidence.bones:
-        heights = np.asarray(evidence.bones["mandible"].surface.vertices)[:, 2].tolist()
+        heights = evidence.bones["mandible"].surface.vertices[:, 2].tolist()
         return min(heights), max(heights), "the mandible"
     return None

@@ -64,7 +64,7 @@ class Body:
     @cached_property
     def samples(self) -> Floats:
         """Vertices, evenly taken from the list where there are many."""
-        vertices = np.asarray(self.repaired.vertices)
+        vertices = self.repaired.vertices
         step = -(-len(vertices) // MAX_SAMPLES)
         return vertices[::step]
 
@@ -122,7 +122,7 @@ class Evidence:
         """
         if self.skin is None:
             return np.ones(len(points), dtype=bool)
-        depths = np.asarray(self.skin.repaired.vertices)[:, 1]
+        depths = self.skin.repaired.vertices[:, 1]
         region = self.case.region
         try:
             plane = region.plane(self.skull_landmarks, float(depths.min()), float(depths.max()))
@@ -134,7 +134,7 @@ class Evidence:
             inside &= points[:, 2] > region.lower
         if region.upper is not None:
             inside &= points[:, 2] < region.upper
-        return np.asarray(inside, dtype=np.bool_)
+        return inside
 
     @property
     def has_all_bones(self) -> bool:

@@ -98,8 +98,8 @@ def nearest_of_level(
         spatial = import_module("scipy.spatial")
     except ModuleNotFoundError:
         return None
-    spacing = np.asarray(image.spacing)
-    values = np.asarray(image.values)
+    spacing = image.spacing
+    values = image.values
     if not float(values.min()) <= level < float(values.max()):
         return None
     found = []

@@ -74,7 +74,7 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
                 fix="export the bone before, and the same mesh after the motion",
             )
             continue
-        here, there = np.asarray(moved.surface.vertices), np.asarray(moved.moved_vertices)
+        here, there = moved.surface.vertices, moved.moved_vertices
         wrong = list(check_pairs(name, where, moved))
         # A bone of another size goes on, and must not go far.
         if all(finding.code == "moved-scaled" and finding.severity != "error" for finding in wrong):
@@ -101,7 +101,7 @@ def check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]
 
     An achieved plan is asked the same where it follows a bone vertex by vertex.
     """
-    here, there = np.asarray(moved.surface.vertices), np.asarray(moved.moved_vertices)
+    here, there = moved.surface.vertices, moved.moved_vertices
     if _is_mirrored(here, there):
         yield Finding.error(
             "moved-mirrored",
@@ -159,10 +159,10 @@ def _scaled(name: str, where: str, scale: float) -> Finding:
 
 def _edges(moved: MovedSurface) -> tuple[float, float]:
     """How much longer edges are after, and the cosine between before and after, less the turn."""
-    here, there = np.asarray(moved.surface.vertices), np.asarray(moved.moved_vertices)
-    ends = edges_of(np.asarray(moved.surface.triangles).astype(np.int64)).ends
+    here, there = moved.surface.vertices, moved.moved_vertices
+    ends = edges_of(moved.surface.triangles.astype(np.int64)).ends
     try:
-        turn = np.asarray(rigid_fit(here, there).matrix)[:3, :3]
+        turn = rigid_fit(here, there).matrix[:3, :3]
     except RegistrationError:
         # All in one place after: as small as can be.
         return 0.0, 1.0
@@ -189,8 +189,8 @@ def _is_mirrored(here: Floats, there: Floats) -> bool:
 
 def _check_distance(name: str, where: str, motion: MovedSurface) -> Iterator[Finding]:
     """Whether the bone moves as far, and turns as far, as bone is moved."""
-    surface, there = motion.surface, np.asarray(motion.moved_vertices)
-    here = np.asarray(surface.vertices)
+    surface, there = motion.surface, motion.moved_vertices
+    here = surface.vertices
     moved = np.linalg.norm(there - here, axis=1)
     worst = int(np.argmax(moved))
     if moved[worst] < STILL:

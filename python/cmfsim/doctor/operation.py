@@ -256,4 +256,4 @@ def _check_tissue(evidence: Evidence, name: str, piece: Floats) -> Iterator[Find
 
 
 def _moved(matrix: Floats, points: Floats) -> Floats:
-    return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3], dtype=np.float64)
+    return points @ matrix[:3, :3].T + matrix[:3, 3]

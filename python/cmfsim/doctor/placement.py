@@ -104,7 +104,7 @@ def _extent(points: Floats) -> float:
 def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
     if evidence.skin is None:
         return
-    extent = _extent(np.asarray(evidence.skin.repaired.vertices))
+    extent = _extent(evidence.skin.repaired.vertices)
     low, high = SKIN_EXTENT
     if low <= extent <= high:
         return
@@ -149,12 +149,12 @@ def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
 def _check_bone_sizes(evidence: Evidence) -> Iterator[Finding]:
     if evidence.skin is None:
         return
-    skin = _extent(np.asarray(evidence.skin.repaired.vertices))
+    skin = _extent(evidence.skin.repaired.vertices)
     low, high = SKIN_EXTENT
     if not low <= skin <= high:
         return
     for name, body in evidence.bones.items():
-        extent = _extent(np.asarray(body.repaired.vertices))
+        extent = _extent(body.repaired.vertices)
         if BONE_SHARE[0] * skin <= extent <= BONE_SHARE[1] * skin:
             continue
         yield Finding.error(
@@ -380,7 +380,7 @@ def _nearest_point(evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
     from cmfsim.imaging.intensity import calibration  # noqa: PLC0415
 
     try:
-        to_hu = calibration(np.asarray(image.values), given.rescale)
+        to_hu = calibration(image.values, given.rescale)
     except ImageError:
         # No CT: reported where the image is segmented.
         return None
@@ -405,7 +405,7 @@ def _check_bone_directions(evidence: Evidence) -> Iterator[Finding]:
         return
     lowest, highest = (np.asarray(getattr(cranium.report, n)) for n in ("lowest", "highest"))
     middle = 0.5 * (lowest + highest)
-    jaw = 0.5 * (np.asarray(mandible.report.lowest) + np.asarray(mandible.report.highest))
+    jaw = 0.5 * (mandible.report.lowest + mandible.report.highest)
     away = jaw - middle
     margin = 0.05 * (highest - lowest)
     if away[1] > margin[1] or away[2] > margin[2]:

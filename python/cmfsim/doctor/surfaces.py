@@ -29,9 +29,9 @@ def check_image(evidence: Evidence) -> Iterator[Finding]:
     image = evidence.image
     if image is None:
         return
-    largest = float(np.max(np.asarray(image.spacing)))
+    largest = float(np.max(image.spacing))
     if largest > COARSE_SPACING:
-        size = " × ".join(f"{s:.2f}" for s in np.asarray(image.spacing))
+        size = " × ".join(f"{s:.2f}" for s in image.spacing)
         yield Finding.warning(
             "ct-spacing-coarse",
             f"voxels are {size} mm",
@@ -85,7 +85,7 @@ def _check_body(body: Body) -> Iterator[Finding]:
             fix="flip normals in the program that made it",
         )
     if len(report.non_manifold):
-        vertex = np.asarray(body.surface.vertices)[report.non_manifold[0, 0]]
+        vertex = body.surface.vertices[report.non_manifold[0, 0]]
         yield Finding.warning(
             "surface-non-manifold",
             f"{len(report.non_manifold)} edges have more than two triangles, first at "

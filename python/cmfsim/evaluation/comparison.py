@@ -271,17 +271,7 @@ def compare_skins(
     if max_distance is not None:
         as_positive("max_distance", max_distance)
     skin, other = Skin(simulated), Skin(postoperative)
-    findings: list[Finding] = []
-    forth = back = None
-    if method == "landmarks":
-        if landmarks is None:
-            raise LandmarkInputError(
-                "method is 'landmarks', but there are none: give landmarks=(of the simulated skin, "
-                "of the post-operative skin), or use method='closest'"
-            )
-        ours, theirs, known = _paired(*landmarks)
-        findings += known
-        forth, back = ThinPlateSpline(ours, theirs), ThinPlateSpline(theirs, ours)
+    warps = _warps(landmarks) if method == "landmarks" else _Warps()
     names = landmarks[0] if landmarks is not None else None
     has_names = isinstance(names, Mapping) and all(n in names for n in SKIN_LANDMARKS)
     parts = _chosen_regions(regions, skin, names if has_names else None)
@@ -290,50 +280,86 @@ def compare_skins(
         skin,
         chosen,
         other,
-        warp=forth,
+        warp=warps.forth,
         max_distance=max_distance,
         exclude_borders=exclude_borders,
     )
-    if not len(matches.vertices):
-        raise RegistrationInputError(
-            f"none of {int(chosen.sum())} vertices has a partner: {matches.n_border} are matched "
-            f"to the border of the post-operative skin and {matches.n_far} are further away than "
-            "the limit; do both lie in one frame, and does the mask lie on the scanned face?"
-        )
+    _check_matched(matches, int(chosen.sum()))
     backward = _backward(
-        skin, chosen, other, warp=back, limit=max_distance, exclude_borders=exclude_borders
+        skin, chosen, other, warp=warps.back, limit=max_distance, exclude_borders=exclude_borders
     )
-    findings += _findings(matches, int(chosen.sum()), forth, skin.vertices[chosen])
+    found = _findings(matches, int(chosen.sum()), warps.forth, skin.vertices[chosen])
     areas = skin.vertex_areas()
-    statistics = distance_statistics(matches.signed)
-    inside = {name: part[matches.vertices] for name, part in parts.items()}
-    # Seen from the post-operative side, behind is in front.
-    back_signed = -backward.signed
-    both = _half_each(matches.signed, back_signed) if len(back_signed) else None
     return SkinComparison(
         method=method,
         vertices=frozen(matches.vertices.astype(np.uint32)),
         signed=frozen(matches.signed),
         partners=frozen(matches.partners),
-        statistics=statistics,
-        back_signed=frozen(back_signed),
-        back_vertices=frozen(backward.vertices.astype(np.uint32)),
-        backward=distance_statistics(back_signed) if len(back_signed) else None,
-        symmetric=both,
-        regions=MappingProxyType(
-            {n: distance_statistics(matches.signed[i]) for n, i in inside.items() if i.any()}
-        ),
-        region_vertices=MappingProxyType(
-            {n: frozen(matches.vertices[i].astype(np.uint32)) for n, i in inside.items() if i.any()}
-        ),
+        statistics=distance_statistics(matches.signed),
+        **_from_behind(matches, backward),
+        **_by_region(matches, parts),
         share=float(areas[matches.vertices].sum() / areas.sum()),
         n_masked=int(len(chosen) - chosen.sum()),
         n_border=matches.n_border,
         n_far=matches.n_far,
-        back_border=backward.n_border,
-        back_far=backward.n_far,
-        findings=tuple(findings),
+        findings=(*warps.findings, *found),
     )
+
+
+@dataclass(frozen=True)
+class _Warps:
+    """Splines between two skins, in both directions; None where vertices are not carried."""
+
+    forth: ThinPlateSpline | None = None
+    back: ThinPlateSpline | None = None
+    findings: tuple[Finding, ...] = ()
+
+
+def _warps(landmarks: tuple[Landmarks, Landmarks] | None) -> _Warps:
+    if landmarks is None:
+        raise LandmarkInputError(
+            "method is 'landmarks', but there are none: give landmarks=(of the simulated skin, "
+            "of the post-operative skin), or use method='closest'"
+        )
+    ours, theirs, findings = _paired(*landmarks)
+    return _Warps(ThinPlateSpline(ours, theirs), ThinPlateSpline(theirs, ours), findings)
+
+
+def _check_matched(matches: Matches, n_chosen: int) -> None:
+    if not len(matches.vertices):
+        raise RegistrationInputError(
+            f"none of {n_chosen} vertices has a partner: {matches.n_border} are matched "
+            f"to the border of the post-operative skin and {matches.n_far} are further away than "
+            "the limit; do both lie in one frame, and does the mask lie on the scanned face?"
+        )
+
+
+def _from_behind(matches: Matches, backward: Matches) -> dict[str, Any]:
+    """What a `SkinComparison` has from the post-operative skin, and from both directions."""
+    # Seen from the post-operative side, behind is in front.
+    signed = -backward.signed
+    return {
+        "back_signed": frozen(signed),
+        "back_vertices": frozen(backward.vertices.astype(np.uint32)),
+        "backward": distance_statistics(signed) if len(signed) else None,
+        "symmetric": _half_each(matches.signed, signed) if len(signed) else None,
+        "back_border": backward.n_border,
+        "back_far": backward.n_far,
+    }
+
+
+def _by_region(matches: Matches, parts: Mapping[str, NDArray[np.bool_]]) -> dict[str, Any]:
+    """Statistics and vertices of the regions that have any."""
+    inside = {name: part[matches.vertices] for name, part in parts.items()}
+    inside = {name: part for name, part in inside.items() if part.any()}
+    return {
+        "regions": MappingProxyType(
+            {name: distance_statistics(matches.signed[part]) for name, part in inside.items()}
+        ),
+        "region_vertices": MappingProxyType(
+            {n: frozen(matches.vertices[i].astype(np.uint32)) for n, i in inside.items()}
+        ),
+    }
 
 
 def _paired(ours: Landmarks, theirs: Landmarks) -> tuple[Floats, Floats, tuple[Finding, ...]]:

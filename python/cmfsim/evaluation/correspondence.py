@@ -27,8 +27,8 @@ class Skin:
             if isinstance(surface, Surface)
             else Surface(surface.vertices, surface.triangles, crease_angle=surface.crease_angle)
         )
-        self.vertices: Floats = np.asarray(self.core.vertices, dtype=np.float64)
-        self.triangles: NDArray[np.int64] = np.asarray(self.core.triangles).astype(np.int64)
+        self.vertices: Floats = self.core.vertices
+        self.triangles: NDArray[np.int64] = self.core.triangles.astype(np.int64)
         border = np.sort(edges_of(self.triangles).border, axis=1)
         self._border_edges = np.sort(border @ np.array([len(self.vertices), 1]))
         self._on_border = np.zeros(len(self.vertices), dtype=bool)

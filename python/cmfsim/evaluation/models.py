@@ -183,7 +183,7 @@ def compare_models(  # noqa: PLR0913 (options by name)
     if not predictions:
         raise CaseInputError("there is no prediction to compare")
     skin = preoperative if isinstance(preoperative, Surface) else _core(preoperative)
-    moved = {NO_CHANGE: np.asarray(skin.vertices, dtype=np.float64)}
+    moved = {NO_CHANGE: skin.vertices}
     for name, vertices in predictions.items():
         if as_text("model", name) == NO_CHANGE:
             raise CaseInputError(f"{NO_CHANGE!r} is the pre-operative skin: rename the model")

@@ -158,6 +158,6 @@ def thickened(skin: Surface, vertices: Floats, outward: Floats) -> Floats:
     vertices : (v, 3) float64, mm
     outward : (v,) float64, mm
     """
-    normals = np.asarray(skin.moved(vertices).vertex_normals)
+    normals = skin.moved(vertices).vertex_normals
     shifted: Floats = vertices + np.asarray(outward)[:, None] * normals
     return shifted

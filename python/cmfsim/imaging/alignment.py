@@ -175,7 +175,7 @@ def _checked_mask(mask: ImageData | None, fixed: ImageData) -> Mask:
         return np.ones(fixed.values.shape, dtype=bool, order="F")
     check_instance("mask", mask, ImageData)
     same = mask.values.shape == fixed.values.shape and np.allclose(mask.lowest, fixed.lowest)
-    if not (same and np.allclose(np.asarray(mask.spacing), np.asarray(fixed.spacing))):
+    if not (same and np.allclose(mask.spacing, fixed.spacing)):
         raise RegistrationInputError(
             f"the mask lies on another grid ({mask.values.shape} at {mask.lowest.tolist()} mm) "
             f"than the fixed volume ({fixed.values.shape} at {fixed.lowest.tolist()} mm)"

@@ -86,4 +86,4 @@ def _fitted(around: NDArray[Any], hu: NDArray[Any]) -> NDArray[np.float64]:
         if np.count_nonzero(near) < LEAST_VOXELS:
             break
         fitted = np.polyfit(around[near].astype(np.float64), hu[near], 2)
-    return np.asarray(fitted)
+    return fitted

@@ -36,7 +36,7 @@ class Places:
     """The mask in mm: where it lies, how far it reaches, how it turns."""
 
     def __init__(self, chosen: Mask, fixed: ImageData) -> None:
-        spacing = np.asarray(fixed.spacing)
+        spacing = fixed.spacing
         self.box = box_of(chosen, 2)
         index = np.argwhere(chosen)
         self.points = fixed.lowest + index * spacing
@@ -70,7 +70,7 @@ class Clipped:
 
     def at(self, size: float, box: tuple[slice, ...] | None) -> Any:
         """An ITK image of cubic voxels of a size, mm, of the whole volume or a block of it."""
-        spacing = np.asarray(self.image.spacing)
+        spacing = self.image.spacing
         part = self.image.values if box is None else self.image.values[box]
         first = np.zeros(3) if box is None else np.array([b.start for b in box])
         values = np.asfortranarray(np.clip(part, self.low, self.high), dtype=np.float32)
@@ -98,7 +98,7 @@ def align(
 ) -> tuple[int, float]:
     """Betters a transform at one resolution; the steps taken and the information reached."""
     itk = simpleitk()
-    mask = as_itk(np.asfortranarray(chosen), np.asarray(grid.spacing))
+    mask = as_itk(np.asfortranarray(chosen), grid.spacing)
     mask.SetOrigin(grid.lowest.tolist())
     mask = itk.Resample(mask, fixed, itk.Transform(), itk.sitkNearestNeighbor)
     count = int(itk.GetArrayViewFromImage(mask).sum())

@@ -89,7 +89,7 @@ def _root_mean(squares: Volume, soft: Mask) -> NDArray[np.float64]:
 def _squares(hu: Volume, soft: Mask) -> Volume:
     """Squared deviations from soft tissue, HU²; 0 elsewhere."""
     off = np.clip(hu - np.float32(SOFT), -FARTHEST, FARTHEST)
-    return np.asarray(np.where(soft, off * off, np.float32(0.0)))
+    return np.where(soft, off * off, np.float32(0.0))
 
 
 def _reconstructed(

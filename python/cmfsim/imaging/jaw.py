@@ -156,7 +156,7 @@ def _touching(mask: Mask, other: Mask) -> Mask:
     touches = np.zeros(count + 1, dtype=bool)
     touches[np.unique(labels[near & mask])] = True
     touches[0] = False
-    return np.asarray(touches[labels])
+    return touches[labels]
 
 
 def _side(mandible: Mask, bone: Mask) -> Volume:

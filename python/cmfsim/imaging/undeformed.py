@@ -84,5 +84,5 @@ def undeformed_mask(
             f"the image has no voxel above {threshold:g} HU on the upper side of the plane through "
             f"{', '.join(CRANIAL_LANDMARKS)}: is it in HU, and are both in one frame?"
         )
-    near = distance(np.asfortranarray(bone), np.asarray(image.spacing), margin) <= margin
+    near = distance(np.asfortranarray(bone), image.spacing, margin) <= margin
     return image.with_values((near & (height > 0.0)).astype(np.uint8))

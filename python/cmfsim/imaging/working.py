@@ -102,7 +102,7 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     ImageError
         (also `ValueError`) Too small, not finite, no CT, or no head in it.
     """
-    spacing = np.asarray(image.spacing, dtype=np.float64)
+    spacing = image.spacing
     _check_size(image, spacing)
     scale = calibration(image.values, options.rescale)
     findings = [*scale.findings, *_spacing_findings(spacing)]
@@ -124,7 +124,7 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     hu += np.float32(scale.offset)
     if options.rescale is None:
         check_is_ct(*coarse_of(hu, bins, MODALITY_STEP)[:2])
-    origin = np.asarray(image.origin) + shift + low * bins
+    origin = image.origin + shift + low * bins
     target = _target(bins, hu.shape, options)
     if not np.array_equal(target, bins):
         if (target > 1.01 * bins).any():
@@ -135,7 +135,7 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     np.clip(hu, LOWEST, HIGHEST, out=hu)
     saturation = saturation_of(image.values, float(np.prod(spacing)), scale)
     if field is not None:
-        field = field.scaled(spacing[:2], np.asarray(image.origin)[:2])
+        field = field.scaled(spacing[:2], image.origin[:2])
     return Working(hu, target, origin, border, spacing, saturation, field), tuple(findings)
 
 

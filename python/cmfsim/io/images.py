@@ -151,7 +151,7 @@ def write_image(image: ImageData, path: str | os.PathLike[str]) -> None:
     elif values.dtype == np.float16:
         values = values.astype(np.float32)
     written = itk.GetImageFromArray(np.ascontiguousarray(values.T))
-    written.SetSpacing([float(s) for s in np.asarray(image.spacing)])
+    written.SetSpacing([float(s) for s in image.spacing])
     written.SetOrigin([float(o) for o in image.lowest])
     # ITK tells the format by the ending of a name, and opens the file itself: so it gets a folder.
     prefix = f".{path.name}.writing-"

@@ -216,7 +216,6 @@ def read_tets(mesh: PlainMesh, path: Path) -> tuple[NDArray[np.int64], dict[str,
         raise CaseInputError(f"{path.name}: linear tets are needed, found {mesh.found}")
     tets = np.concatenate([mesh.cells[i].data for i in blocks])
     data = {
-        name: np.concatenate([np.asarray(values[i]) for i in blocks])
-        for name, values in mesh.cell_data.items()
+        name: np.concatenate([values[i] for i in blocks]) for name, values in mesh.cell_data.items()
     }
     return tets, data

@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.io.files import replacing
@@ -53,7 +52,7 @@ def write_plan(
     if made_for:
         lines.append(f"# made for: {made_for}")
     for name, motion in plan.items():
-        matrix = np.asarray(rigid_matrix(motion, f"motion of {name!r}"))
+        matrix = rigid_matrix(motion, f"motion of {name!r}")
         key = name if BARE.fullmatch(name) else json.dumps(name)
         rows = [f"  [{', '.join(repr(float(v)) for v in row)}]," for row in matrix]
         lines += ["", f"[plan.{key}]", "matrix = [", *rows, "]"]

@@ -400,7 +400,7 @@ def fill_prediction(
     write_surface(fresh / names[1], prediction.skin)
     face, before = prediction.face, prediction.face_before
     with replacing(fresh / names[4]) as file:
-        carried = np.asarray(face.vertices) - np.asarray(before.vertices)
+        carried = face.vertices - before.vertices
         write_triangles(file, before.vertices, before.triangles, {"displacement": carried})
     write_surface(fresh / names[5], face)
     with replacing(fresh / names[2]) as file:
@@ -423,10 +423,10 @@ def _write_parts(folder: Path, prediction: Prediction) -> dict[str, list[str]]:
     """The names of the parts in the file of each kind: bones, and muscles where there are any."""
     parts = {"bones": prediction.bones}
     if prediction.muscles is not None:
-        still = {m.name: (m.surface, np.asarray(m.surface.vertices)) for m in prediction.muscles}
+        still = {m.name: (m.surface, m.surface.vertices) for m in prediction.muscles}
         parts["muscles"] = still
     for kind, surfaces in parts.items():
-        before = [np.asarray(surface.vertices) for surface, _ in surfaces.values()]
+        before = [surface.vertices for surface, _ in surfaces.values()]
         counts = [len(vertices) for vertices in before]
         starts = np.concatenate([[0], np.cumsum(counts)])
         triangles = [
@@ -482,9 +482,9 @@ def _read_part_file(
     path: Path, names: Sequence[str]
 ) -> dict[str, tuple[SurfaceData, NDArray[np.float64]]]:
     mesh = read_mesh(path)
-    points = np.asarray(mesh.points, dtype=np.float64)
-    triangles = np.asarray(mesh.cells_dict["triangle"], dtype=np.int64)
-    number = np.asarray(mesh.point_data.get("part", np.zeros(len(points), dtype=np.int64)))
+    points = mesh.points
+    triangles = mesh.cells_dict["triangle"]
+    number = mesh.point_data.get("part", np.zeros(len(points), dtype=np.int64))
     moved = points + np.asarray(mesh.point_data.get("displacement", 0.0))
     found = {}
     for part, name in enumerate(names):

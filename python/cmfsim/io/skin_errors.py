@@ -42,7 +42,7 @@ class SkinErrors:
     evaluated: NDArray[np.bool_]
 
     def __post_init__(self) -> None:
-        count = len(np.asarray(self.skin.vertices))
+        count = len(self.skin.vertices)
         if self.signed.shape != (count,) or self.evaluated.shape != (count,):
             raise CaseInputError(
                 f"the skin has {count} vertices, but {len(self.signed)} distances and "
@@ -82,7 +82,7 @@ def write_skin_errors(
     signed : (k,) float64, mm
         Their distances.
     """
-    count = len(np.asarray(skin.vertices))
+    count = len(skin.vertices)
     values, evaluated = np.zeros(count), np.zeros(count, dtype=np.uint8)
     values[vertices], evaluated[vertices] = signed, 1
     with replacing(Path(path)) as file:
@@ -116,14 +116,12 @@ def read_skin_errors(
     if missing or "triangle" not in mesh.cells_dict:
         what = missing[0] if missing else "triangles"
         raise CaseInputError(f"{path}: has no {what}; {AGAIN}")
-    skin = SurfaceData(
-        as_rows("vertices", mesh.points, 3), np.asarray(mesh.cells_dict["triangle"], dtype=np.int64)
-    )
+    skin = SurfaceData(as_rows("vertices", mesh.points, 3), mesh.cells_dict["triangle"])
     try:
         return SkinErrors(
             skin,
             frozen(as_floats(DISTANCE, mesh.point_data[DISTANCE])),
-            np.asarray(mesh.point_data[EVALUATED]) != 0,
+            mesh.point_data[EVALUATED] != 0,
         )
     except CaseInputError as error:
         raise CaseInputError(f"{path}: {error}; {AGAIN}") from error

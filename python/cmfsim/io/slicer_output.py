@@ -176,7 +176,7 @@ def write_slicer_bundle(path: str | os.PathLike[str], prediction: Prediction) ->
 
 def _add_faces(scene: _Scene, prediction: Prediction) -> None:
     face, before = prediction.face, prediction.face_before
-    carried = np.asarray(face.vertices) - np.asarray(before.vertices)
+    carried = face.vertices - before.vertices
     data = {
         DISPLACEMENT: carried,
         LENGTH: np.linalg.norm(carried, axis=1),

@@ -74,7 +74,7 @@ def read_surface(
     scale = _scale(Path(path), units, frame, stated)
     if (scale == 1.0).all():
         return surface
-    return SurfaceData(np.asarray(surface.vertices) * scale, surface.triangles, crease_angle)
+    return SurfaceData(surface.vertices * scale, surface.triangles, crease_angle)
 
 
 def _scale(path: Path, units: str, frame: str | None, stated: str | None) -> NDArray[np.float64]:
@@ -172,7 +172,7 @@ def surface_as_stored(path: Path, crease_angle: float = 60.0) -> tuple[SurfaceDa
     """
     mesh = read_mesh(path)
     triangles = _triangles(mesh, path)
-    points = np.asarray(mesh.points)
+    points = mesh.points
     kept, number = _welded(points)
     return SurfaceData(points[kept], number[triangles], crease_angle), mesh.frame
 
@@ -252,8 +252,8 @@ def write_surface(path: str | os.PathLike[str], surface: SurfaceData) -> None:
         known = ", ".join(WRITERS)
         raise CaseInputError(f"{path.name}: a surface is written as {known}, not {path.suffix!r}")
     with replacing(path) as file:
-        vertices = np.asarray(surface.vertices, dtype=np.float64)
-        WRITERS[path.suffix](file, vertices, np.asarray(surface.triangles))
+        vertices = surface.vertices
+        WRITERS[path.suffix](file, vertices, surface.triangles)
 
 
 def surface_suffixes() -> tuple[str, ...]:

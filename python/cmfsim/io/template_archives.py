@@ -39,11 +39,11 @@ def write_template_archive(path: Path, template: TemplateData) -> None:
         else:
             entry.update(_counts(muscle.surface))
             entry["course"] = [len(line) for line in muscle.course]
-            vertices.append(np.asarray(muscle.surface.vertices))
+            vertices.append(muscle.surface.vertices)
             triangles.append(np.asarray(muscle.surface.triangles, dtype=np.int64))
             course += muscle.course
         entries.append(entry)
-    vertices.append(np.asarray(template.skull.vertices))
+    vertices.append(template.skull.vertices)
     triangles.append(np.asarray(template.skull.triangles, dtype=np.int64))
     header = {
         **{key: getattr(template, key) for key in ("name", "licence", "attribution", "source")},
@@ -71,8 +71,8 @@ def _packed(points: Floats) -> NDArray[Any]:
 
 def _counts(surface: SurfaceData) -> dict[str, int]:
     return {
-        "vertices": len(np.asarray(surface.vertices)),
-        "triangles": len(np.asarray(surface.triangles)),
+        "vertices": len(surface.vertices),
+        "triangles": len(surface.triangles),
     }
 
 
@@ -93,8 +93,8 @@ def _are_mirrored(one: MuscleSurface, other: MuscleSurface) -> bool:
 def mirrored_muscle(muscle: MuscleSurface, name: str, side: str) -> MuscleSurface:
     """A muscle's mirror image on the other side of the plane x = 0, triangles turned round."""
     surface = SurfaceData(
-        np.asarray(muscle.surface.vertices) * MIRROR,
-        np.asarray(muscle.surface.triangles)[:, ::-1],
+        muscle.surface.vertices * MIRROR,
+        muscle.surface.triangles[:, ::-1],
         muscle.surface.crease_angle,
     )
     course = tuple(line * MIRROR for line in muscle.course)

@@ -38,11 +38,11 @@ class MouthFrame:
 
     def into(self, points: Floats) -> Floats:
         """Coordinates to the left, ahead and up of points in space, (n, 3) mm."""
-        return np.asarray((points - self.origin) @ self.axes.T)
+        return (points - self.origin) @ self.axes.T
 
     def out_of(self, places: Floats) -> Floats:
         """The points in space of coordinates to the left, ahead and up, (n, 3) mm."""
-        return np.asarray(self.origin + places @ self.axes)
+        return self.origin + places @ self.axes
 
 
 def mouth_frame(arches: Mapping[str, DentalArch]) -> MouthFrame:
@@ -54,13 +54,13 @@ def mouth_frame(arches: Mapping[str, DentalArch]) -> MouthFrame:
         "upper" and "lower".
     """
     upper, lower = arches["upper"], arches["lower"]
-    up = np.asarray(upper.out) - np.asarray(lower.out)
+    up = upper.out - lower.out
     up = up / np.linalg.norm(up)
-    left = np.asarray(upper.left) - np.asarray(upper.right)
-    left = left + np.asarray(lower.left) - np.asarray(lower.right)
+    left = upper.left - upper.right
+    left = left + lower.left - lower.right
     left = left - (left @ up) * up
     left = left / np.linalg.norm(left)
-    tips = [np.asarray(upper.tip), np.asarray(lower.tip)]
+    tips = [upper.tip, lower.tip]
     molars = 0.5 * (upper.middle + lower.middle)
     origin = 0.5 * (tips[0] + tips[1])
     ahead = np.cross(left, up)

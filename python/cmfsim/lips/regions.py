@@ -94,7 +94,7 @@ def _sides(
     # On the faces that the lips turn to each other the seam itself tells nothing.
     places = centroids - INSIDE * np.sqrt(area)[:, None] * inwards
     side = np.zeros(len(triangles), dtype=np.int8)
-    vertices = np.asarray(seam.vertices)
+    vertices = seam.vertices
     low, high = vertices.min(axis=0) - height, vertices.max(axis=0) + height
     near = np.flatnonzero(((places >= low) & (places <= high)).all(axis=1))
     if not len(near):
@@ -143,4 +143,4 @@ def seam_faces(nodes: ArrayLike, triangles: ArrayLike) -> NDArray[np.bool_]:
     _, place = np.unique(points, axis=0, return_inverse=True)
     places = np.sort(place.reshape(-1)[corners], axis=1)
     _, which, count = np.unique(places, axis=0, return_inverse=True, return_counts=True)
-    return np.asarray(count[which.reshape(-1)] > 1)
+    return count[which.reshape(-1)] > 1

@@ -55,7 +55,7 @@ def signed_level(surface: SurfaceData, grid: ImageData) -> ImageData:
     >>> float(level.values[4, 4, 4])
     1.0
     """
-    spacing = np.asarray(grid.spacing)
+    spacing = grid.spacing
     band = BAND_IN_VOXELS * float(spacing.max())
     nx, ny, nz = grid.values.shape
     sx, sy, sz = (float(s) for s in spacing)
@@ -98,7 +98,7 @@ def anatomy_from_surfaces(
     as_positive("spacing", spacing)
     if not bones:
         raise MeshInputError("no bone is given: the tissue would not be attached to anything")
-    vertices = np.asarray(skin.vertices, dtype=np.float64)
+    vertices = skin.vertices
     lowest = vertices.min(axis=0) - MARGIN * spacing
     shape = np.ceil((vertices.max(axis=0) - lowest) / spacing) + 1 + MARGIN
     if shape.prod() > MAX_VOXELS:
@@ -138,8 +138,8 @@ def _outside(name: str, bone: ImageData, skin: ImageData) -> Finding | None:
     count = int(np.count_nonzero(beyond))
     if count == 0:
         return None
-    volume = count * float(np.prod(np.asarray(bone.spacing)))
-    place = np.asarray(bone.lowest) + np.argwhere(beyond).mean(axis=0) * np.asarray(bone.spacing)
+    volume = count * float(np.prod(bone.spacing))
+    place = bone.lowest + np.argwhere(beyond).mean(axis=0) * bone.spacing
     return Finding.warning(
         "bone-outside-skin",
         f"{volume:.0f} mm³ of bone {name!r} lie outside the skin",

@@ -123,10 +123,10 @@ def mesh_report(mesh: TetMesh, making: Mapping[str, Any] | None = None) -> MeshR
     """
     making = making or {}
     quality = mesh.quality()
-    least = np.asarray(quality.min_dihedral)
+    least = quality.min_dihedral
     order = np.argsort(least, kind="stable")[:N_WORST]
-    tets = np.asarray(mesh.tets)
-    nodes = np.asarray(mesh.nodes)
+    tets = mesh.tets
+    nodes = mesh.nodes
     counts, _ = np.histogram(np.minimum(least, BINS[-1]), bins=(*BINS, BINS[-1] + 5.0))
     volume = float(np.sum(mesh.volumes))
     wanted = making.get("level_volume")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim import _core
-from cmfsim.checks import as_number, as_point, as_positive
+from cmfsim.checks import Floats, as_number, as_point, as_positive
 from cmfsim.errors import MeshInputError
 from cmfsim.extras import third_party
 from cmfsim.values.anatomy import Anatomy
@@ -48,24 +48,33 @@ class TissueRegion:
     [0.0, 1.0, 0.0]
     """
 
-    point: ArrayLike
-    normal: ArrayLike = (0.0, 1.0, 0.0)
-    lower: float | None = None
-    upper: float | None = None
-    foramen_radius: float = FORAMEN_RADIUS
+    point: Floats
+    normal: Floats
+    lower: float | None
+    upper: float | None
+    foramen_radius: float
 
-    def __post_init__(self) -> None:
-        for name in ("point", "normal"):
-            row = as_point(name, getattr(self, name))
-            object.__setattr__(self, name, row)
-        length = float(np.linalg.norm(np.asarray(self.normal)))
+    def __init__(
+        self,
+        point: ArrayLike,
+        normal: ArrayLike = (0.0, 1.0, 0.0),
+        lower: float | None = None,
+        upper: float | None = None,
+        foramen_radius: float = FORAMEN_RADIUS,
+    ) -> None:
+        place, direction = as_point("point", point), as_point("normal", normal)
+        length = float(np.linalg.norm(direction))
         if length == 0.0:
             raise MeshInputError("normal of the posterior plane is (0, 0, 0): give its direction")
-        object.__setattr__(self, "normal", np.asarray(self.normal) / length)
-        for name in ("lower", "upper"):
-            if getattr(self, name) is not None:
-                as_number(name, getattr(self, name))
-        as_positive("foramen_radius", self.foramen_radius)
+        for name, height in (("lower", lower), ("upper", upper)):
+            if height is not None:
+                as_number(name, height)
+        as_positive("foramen_radius", foramen_radius)
+        object.__setattr__(self, "point", place)
+        object.__setattr__(self, "normal", direction / length)
+        object.__setattr__(self, "lower", lower)
+        object.__setattr__(self, "upper", upper)
+        object.__setattr__(self, "foramen_radius", foramen_radius)
 
 
 def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tuple[Finding, ...]]:
@@ -115,14 +124,14 @@ def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tup
 
 def near_skin(anatomy: Anatomy, depth: float) -> Mask:
     """Where the skin is nearer than `depth` mm: (nx, ny, nz) bool on the anatomy's grid."""
-    sx, sy, sz = (float(s) for s in np.asarray(anatomy.skin.spacing))
-    outside = np.asarray(anatomy.skin.values) <= 0.0
-    return np.asarray(_core.distance_image(outside, (sx, sy, sz), within=depth) < depth)
+    sx, sy, sz = (float(s) for s in anatomy.skin.spacing)
+    outside = anatomy.skin.values <= 0.0
+    return _core.distance_image(outside, (sx, sy, sz), within=depth) < depth
 
 
 def _inward_distances(grid: ImageData, region: TissueRegion) -> Iterator[Levels]:
     """Distance into the region from each of its planes, in the scale of a level."""
-    band = BAND_IN_VOXELS * float(np.asarray(grid.spacing).max())
+    band = BAND_IN_VOXELS * float(grid.spacing.max())
     x, y, z = grid.axes()
     point, normal = np.asarray(region.point), np.asarray(region.normal)
     behind = (x - point[0]) * normal[0] + (y - point[1]) * normal[1] + (z - point[2]) * normal[2]
@@ -138,7 +147,7 @@ def _without_hollows(
 ) -> Iterator[Finding]:
     """Takes from `level` what only openings narrower than a foramen join to the outer tissue."""
     ndimage = third_party("scipy.ndimage", "tissue is told from hollows", "imaging", MeshInputError)
-    sx, sy, sz = (float(s) for s in np.asarray(grid.spacing))
+    sx, sy, sz = (float(s) for s in grid.spacing)
     spacing = (sx, sy, sz)
     tissue: Mask = level > 0.0
     # Where a ball of the foramen's radius fits between bones, and what such balls reach.
@@ -147,7 +156,7 @@ def _without_hollows(
     closed: Mask = _core.distance_image(roomy, spacing, within=radius) > radius
     # Outer tissue touches the skin where no bone stands between; thin tissue over bone is not
     # roomy, so that the way along the skin stays open whatever its thickness.
-    shallow = np.asarray(grid.values) < 1.0
+    shallow = grid.values < 1.0
     open_tissue = tissue & (~closed | shallow)
     labels, count = ndimage.label(open_tissue)
     if count == 0:
@@ -166,7 +175,7 @@ def _without_hollows(
     volume = float(np.count_nonzero(hollow)) * sx * sy * sz
     if volume < NOTEWORTHY_HOLLOW:
         return
-    place = np.asarray(grid.lowest) + np.argwhere(hollow).mean(axis=0) * np.asarray(grid.spacing)
+    place = grid.lowest + np.argwhere(hollow).mean(axis=0) * grid.spacing
     yield Finding.note(
         "hollow-left-out",
         f"{volume / 1000.0:.1f} cm³ behind bone were removed from the tissue",

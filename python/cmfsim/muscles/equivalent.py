@@ -5,7 +5,7 @@ Kim et al. (2010), section 2.3; Uesu et al. (2005).
 
 import logging
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -233,11 +233,7 @@ def equivalent_material(
     else:
         tissue, mixed = mixed_tissue(shares, list(named), given.resolved(preset), mixing)
     end = time.perf_counter()
-    columns = shares.volumes
-    volumes = {
-        name: MuscleVolume(*(columns[key][i] for key in ("inside", "shared", "error", "enclosed")))
-        for i, name in enumerate(named)
-    }
+    volumes = _volumes(shares, named)
     mixture = Mixture(
         fraction=frozen(shares.fraction),
         fibre=frozen(shares.fibre),
@@ -247,7 +243,7 @@ def equivalent_material(
         volumes=MappingProxyType(volumes),
         samples=shares.counts["points"],
         findings=(
-            *_findings(volumes, columns["was_turned"], ready),
+            *_findings(volumes, shares.volumes["was_turned"], ready),
             *moduli_findings(given, preset),
         ),
         summary=MappingProxyType(
@@ -259,10 +255,7 @@ def equivalent_material(
                 "samples_per_crossed_tet": int(samples),
                 "seed": int(seed),
                 "muscles": len(volumes),
-                # Not by BLAS: the last bit of its sums depends on the number of threads.
-                "muscle_volume": float(np.sum(shares.fraction * mesh.volumes)),
-                "muscle_tets": int(np.count_nonzero(shares.fraction)),
-                **shares.counts,
+                **_counts(shares, mesh),
             }
         ),
         timings=MappingProxyType(
@@ -276,11 +269,33 @@ def equivalent_material(
         shares=shares,
         mixed=mixed,
     )
+    _report(mixture, mesh)
+    return mixture
+
+
+def _volumes(shares: _core.MuscleShares, names: Iterable[str]) -> dict[str, MuscleVolume]:
+    columns = shares.volumes
+    return {
+        name: MuscleVolume(*(columns[key][i] for key in ("inside", "shared", "error", "enclosed")))
+        for i, name in enumerate(names)
+    }
+
+
+def _counts(shares: _core.MuscleShares, mesh: TetMesh) -> dict[str, float | int]:
+    """Volume and tets of muscle, and the counts of work."""
+    return {
+        # Not by BLAS: the last bit of its sums depends on the number of threads.
+        "muscle_volume": float(np.sum(shares.fraction * mesh.volumes)),
+        "muscle_tets": int(np.count_nonzero(shares.fraction)),
+        **shares.counts,
+    }
+
+
+def _report(mixture: Mixture, mesh: TetMesh) -> None:
     for finding in mixture.findings:
         _log.debug("%s: %s", finding.severity, finding.what)
     held, points = mixture.summary["muscle_tets"], mixture.samples
     _log.info("muscle in %d of %d tets, %d points", held, mesh.n_tets, points)
-    return mixture
 
 
 def _named(

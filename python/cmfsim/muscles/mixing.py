@@ -49,7 +49,7 @@ def mixed_tissue(
     if mixing == "stiffness":
         return _by_stiffness(shares, table, Tissue.isotropic(young, poisson)), None
     tets, muscles, _, share, _ = shares.shares
-    p = np.asarray(shares.fraction)
+    p = shares.fraction
 
     def mixed(of_fat: float, column: int) -> Floats:
         of_muscle = np.bincount(tets, weights=share * table[muscles, column], minlength=len(p))

@@ -172,9 +172,9 @@ def _bearers(
 
 def _bone_of(anatomy: Anatomy, segment: BoneSegment) -> str | None:
     """The bone of the anatomy that a segment is a piece of."""
-    inside = np.asarray(segment.level.values) > 0.0
+    inside = segment.level.values > 0.0
     shared = {
-        name: int(np.count_nonzero(inside & (np.asarray(bone.values) > 0.0)))
+        name: int(np.count_nonzero(inside & (bone.values > 0.0)))
         for name, bone in anatomy.bones.items()
         if bone.values.shape == inside.shape
     }
@@ -227,14 +227,14 @@ def _rows_of_teeth(anatomy: Anatomy) -> tuple[Floats, Floats] | None:
     """The voxels of the upper and the lower teeth, (n, 3) mm each."""
     if anatomy.teeth is None:
         return None
-    teeth = np.asarray(anatomy.teeth.values) > 0.0
-    spacing = np.asarray(anatomy.teeth.spacing)
+    teeth = anatomy.teeth.values > 0.0
+    spacing = anatomy.teeth.spacing
     least = LEAST_ENAMEL / float(np.prod(spacing))
 
     def places(mask: NDArray[np.bool_]) -> Floats:
-        return np.asarray(anatomy.skin.lowest + np.argwhere(mask) * spacing)
+        return anatomy.skin.lowest + np.argwhere(mask) * spacing
 
-    of_bones = [places(teeth & (np.asarray(b.values) > 0.0)) for b in anatomy.bones.values()]
+    of_bones = [places(teeth & (b.values > 0.0)) for b in anatomy.bones.values()]
     rows = sorted((r for r in of_bones if len(r) >= least), key=lambda row: row[:, 2].mean())
     if len(rows) == 1:
         # One bone bears both: they meet where enamel is scarcest.

@@ -122,28 +122,18 @@ def classify_nodes(  # noqa: PLR0913 (options by name)
     if not len(triangles):
         raise CaseInputError("the mesh has no boundary triangles")
     border = _Boundary(points, triangles)
-    findings: list[Finding] = []
     surfaces = [Surface(s.surface.vertices, s.surface.triangles) for s in segments]
     nearest, near = _on_bones(border, surfaces, options)
     on_bone = nearest >= 0
     on_plane = _on_planes(border, anatomy, fixed_planes or {}, options)
     slides = np.zeros(len(border.points), dtype=bool)
+    findings: tuple[Finding, ...] = ()
     if options.sliding:
         if arches is None:
             arches = dental_arches(anatomy, segments, landmarks)
-        # Where every segment has regions of its own, no arch is asked for.
-        if {segment.name for segment in segments} - {r.segment for r in options.regions}:
-            findings += arches.findings
-        slides, noticed = sliding_nodes(
-            border.points,
-            nearest,
-            anatomy,
-            segments,
-            arches=arches,
-            contacts=contacts or {},
-            options=options,
+        slides, findings = _sliding(
+            border, nearest, anatomy, segments, arches=arches, contacts=contacts, options=options
         )
-        findings += noticed
     moves = np.array([name in moved for name in names])
     carried = on_bone & moves[nearest]
     kind = np.zeros(len(points), dtype=np.uint8)
@@ -155,15 +145,46 @@ def classify_nodes(  # noqa: PLR0913 (options by name)
     lies = on_bone & ~on_plane
     owner[border.ids[lies]] = nearest[lies]
     kinds = NodeKinds(kind, owner, names)
-    counts = {n: len(kinds.nodes(n)) for n in NODE_KINDS}
-    for name in names:
-        counts |= {f"{k} on {name}": len(kinds.nodes(k, name)) for k in ("joined", "sliding")}
-    counts["fixed on planes"] = int(on_plane.sum())
-    counts["fixed on bone"] = counts["fixed"] - counts["fixed on planes"]
+    counts = _counts(kinds, fixed_on_planes=int(on_plane.sum()))
     counts["contested"] = int((near > 1).sum())
     counts["overruled"] = int((on_plane & (carried | slides)).sum())
-    findings += _noticed(points, kinds, counts, moved)
-    return ClassifiedNodes(kinds, counts, tuple(findings))
+    return ClassifiedNodes(kinds, counts, (*findings, *_noticed(points, kinds, counts, moved)))
+
+
+def _sliding(
+    border: "_Boundary",
+    nearest: NDArray[np.int64],
+    anatomy: Anatomy,
+    segments: Sequence[BoneSegment],
+    *,
+    arches: DentalArches,
+    contacts: Mapping[str, SurfaceData] | None,
+    options: KindOptions,
+) -> tuple[NDArray[np.bool_], tuple[Finding, ...]]:
+    """Which nodes of the boundary slide, and what to know of it."""
+    slides, findings = sliding_nodes(
+        border.points,
+        nearest,
+        anatomy,
+        segments,
+        arches=arches,
+        contacts=contacts or {},
+        options=options,
+    )
+    # Where every segment has regions of its own, no arch is asked for.
+    if {segment.name for segment in segments} - {r.segment for r in options.regions}:
+        return slides, (*arches.findings, *findings)
+    return slides, tuple(findings)
+
+
+def _counts(kinds: NodeKinds, *, fixed_on_planes: int) -> dict[str, int]:
+    """Nodes of each kind, by segment where a bone holds them."""
+    counts = {n: len(kinds.nodes(n)) for n in NODE_KINDS}
+    for name in kinds.segments:
+        counts |= {f"{k} on {name}": len(kinds.nodes(k, name)) for k in ("joined", "sliding")}
+    counts["fixed on planes"] = fixed_on_planes
+    counts["fixed on bone"] = counts["fixed"] - fixed_on_planes
+    return counts
 
 
 def segment_data(
@@ -326,7 +347,7 @@ def _on_planes(
         at_end = name in {"left", "posterior", "superior"}
         end = high[axis] if at_end else low[axis]
         # A level that is cut by the border ends half a voxel to one voxel inside it.
-        slack = float(np.asarray(anatomy.skin.spacing)[axis])
+        slack = float(anatomy.skin.spacing[axis])
         found |= np.abs(border.points[:, axis] - end) <= reach + slack
     return found
 

@@ -60,7 +60,7 @@ def lifted_tissue(
     if reach == 0.0 or MAXILLA not in moved or not {CRANIUM, MAXILLA} <= set(surfaces):
         return None
     fixed = kinds.nodes("fixed")
-    on_cranium = fixed[np.asarray(kinds.segment)[fixed] == kinds.segments.index(CRANIUM)]
+    on_cranium = fixed[kinds.segment[fixed] == kinds.segments.index(CRANIUM)]
     places = as_rows("nodes", nodes, 3)[on_cranium]
     found = {
         name: Surface(surfaces[name].vertices, surfaces[name].triangles).closest(places)

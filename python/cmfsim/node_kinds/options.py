@@ -28,21 +28,22 @@ class SlidingBox:
     """
 
     segment: str
-    low: ArrayLike
-    high: ArrayLike
+    low: Floats
+    high: Floats
 
-    def __post_init__(self) -> None:
-        as_text("segment of a sliding box", self.segment)
-        where = f"sliding box on {self.segment!r}"
-        corners = as_rows(where, [np.asarray(self.low), np.asarray(self.high)], 3)
+    def __init__(self, segment: str, low: ArrayLike, high: ArrayLike) -> None:
+        as_text("segment of a sliding box", segment)
+        where = f"sliding box on {segment!r}"
+        corners = as_rows(where, [np.asarray(low), np.asarray(high)], 3)
         if (corners[0] >= corners[1]).any():
             raise CaseInputError(f"{where}: low {corners[0]} must lie below high {corners[1]}")
+        object.__setattr__(self, "segment", segment)
         object.__setattr__(self, "low", corners[0])
         object.__setattr__(self, "high", corners[1])
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Which of the points (n, 3) lie in the box."""
-        inside = (points >= np.asarray(self.low)) & (points <= np.asarray(self.high))
+        inside = (points >= self.low) & (points <= self.high)
         return cast("NDArray[np.bool_]", inside.all(axis=1))
 
 
@@ -59,19 +60,19 @@ class SlidingSphere:
     """
 
     segment: str
-    centre: ArrayLike
+    centre: Floats
     radius: float
 
-    def __post_init__(self) -> None:
-        as_text("segment of a sliding sphere", self.segment)
-        where = f"sliding sphere on {self.segment!r}"
-        centre = as_point(f"{where} centre", self.centre)
-        object.__setattr__(self, "centre", centre)
-        object.__setattr__(self, "radius", as_positive(f"{where} radius", self.radius))
+    def __init__(self, segment: str, centre: ArrayLike, radius: float) -> None:
+        as_text("segment of a sliding sphere", segment)
+        where = f"sliding sphere on {segment!r}"
+        object.__setattr__(self, "segment", segment)
+        object.__setattr__(self, "centre", as_point(f"{where} centre", centre))
+        object.__setattr__(self, "radius", as_positive(f"{where} radius", radius))
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Which of the points (n, 3) lie in the ball."""
-        distance = np.linalg.norm(points - np.asarray(self.centre), axis=1)
+        distance = np.linalg.norm(points - self.centre, axis=1)
         return cast("NDArray[np.bool_]", distance <= self.radius)
 
 

@@ -91,7 +91,7 @@ def _in_arch(
     front_depth = options.upper_front if upper else options.lower_front
     molar_depth = options.upper_molars if upper else options.lower_molars
     across, forwards, out = arch.axes()
-    tip, left, right = (np.asarray(place) for place in (arch.tip, arch.left, arch.right))
+    tip, left, right = arch.tip, arch.left, arch.right
     a = tip + front_depth * out
     b, c = left + molar_depth * out, right + molar_depth * out
     normal = np.cross(b - a, c - a)
@@ -120,6 +120,6 @@ def _near_teeth(points: Floats, anatomy: Anatomy, options: KindOptions) -> NDArr
         return np.ones(len(points), dtype=bool)
     ndimage = third_party("scipy.ndimage", "distances from the teeth are found", "imaging")
     distance = ndimage.distance_transform_edt(
-        ~(anatomy.teeth.values > 0.0), sampling=np.asarray(anatomy.teeth.spacing).tolist()
+        ~(anatomy.teeth.values > 0.0), sampling=anatomy.teeth.spacing.tolist()
     )
     return anatomy.teeth.with_values(distance).sample(points) <= options.teeth_distance

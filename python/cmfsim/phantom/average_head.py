@@ -53,8 +53,8 @@ def write_average_head(path: Path) -> None:
         surface = surfaces[name]
         if surface is None:
             raise AssertionError(name)
-        packed[f"{name}_vertices"] = np.round(np.asarray(surface.vertices) / GRAIN).astype(np.int16)
-        packed[f"{name}_triangles"] = np.asarray(surface.triangles).astype(np.uint16)
+        packed[f"{name}_vertices"] = np.round(surface.vertices / GRAIN).astype(np.int16)
+        packed[f"{name}_triangles"] = surface.triangles.astype(np.uint16)
     np.savez_compressed(path, allow_pickle=False, **packed)
 
 

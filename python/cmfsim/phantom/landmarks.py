@@ -196,6 +196,4 @@ def _in_person(
                 found[key.removesuffix("_L") + "_R"] = place * np.array([-1.0, 1.0, 1.0])
     order = sorted(found)
     rows = head.warp.forward(np.array([found[key] for key in order]))
-    return MappingProxyType(
-        {key: np.asarray(frozen(row)) for key, row in zip(order, rows, strict=True)}
-    )
+    return MappingProxyType({key: frozen(row) for key, row in zip(order, rows, strict=True)})

@@ -221,7 +221,7 @@ def _line(tissue: Tissue, tube: FlatTube, side: str, course: Course) -> Floats:
     elif side == "both" and course.kind == "ring":
         # The left half runs from the upper to the lower midline, the right half back again.
         points = np.vstack([points, mirror[-2::-1]])
-    return np.asarray(frozen(tissue.warp.forward(points)))
+    return frozen(tissue.warp.forward(points))
 
 
 def _strap(tissue: Tissue, rows: Floats, course: Course) -> FlatTube:

@@ -76,7 +76,7 @@ def picture_segments(
     if not segments:
         raise CaseInputError("there is no segment to draw")
     colours = segment_colours([s.name for s in segments])
-    corners = bounds([np.asarray(s.surface.vertices) for s in segments])
+    corners = bounds([s.surface.vertices for s in segments])
 
     def paint(plotter: Any, view: View) -> None:
         del view
@@ -115,7 +115,7 @@ def picture_anatomy(
     >>> cmfsim.pictures.picture_anatomy("anatomy.png", skin, segments)  # doctest: +SKIP
     """
     colours = segment_colours([s.name for s in segments])
-    corners = bounds([np.asarray(skin.vertices), *(s.surface.vertices for s in segments)])
+    corners = bounds([skin.vertices, *(s.surface.vertices for s in segments)])
 
     def paint(plotter: Any, view: View) -> None:
         del view

@@ -48,7 +48,7 @@ def picture_band(
     if band is None:
         raise CaseInputError("the prediction has no band: use predict_with_band")
     skin, half = prediction.skin, band.half_width
-    vertices = np.asarray(skin.vertices)
+    vertices = skin.vertices
     known = ~np.ma.getmaskarray(half)
     # What lies beyond the face, as at the cut of the neck, would have the scale to itself.
     face = band.regions.get("face", known) & known

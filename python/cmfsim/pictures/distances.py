@@ -72,7 +72,7 @@ def picture_distances(
     ... )  # doctest: +SKIP
     """
     as_positive("limit", limit)
-    vertices = np.asarray(skin.vertices)
+    vertices = skin.vertices
     values, shown = _values(distances, len(vertices))
     low, high = bounds([vertices[shown]])
     ends = skin_ends(skin)
@@ -174,7 +174,7 @@ def picture_distance_grid(
 
 def _centred(skin: SurfaceData, distances: ArrayLike) -> tuple[Any, SkinEnds, Floats, float]:
     """A skin about the middle of its evaluated part, its ends, half that extent, its mean."""
-    vertices = np.asarray(skin.vertices)
+    vertices = skin.vertices
     values, shown = _values(distances, len(vertices))
     low, high = bounds([vertices[shown]])
     moved = SurfaceData(vertices - 0.5 * (low + high), skin.triangles)

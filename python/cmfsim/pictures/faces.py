@@ -53,7 +53,7 @@ def picture_prediction(
     >>> cmfsim.pictures.picture_prediction("prediction.png", prediction)  # doctest: +SKIP
     """
     before, after = prediction.face_before, prediction.face
-    moved = np.linalg.norm(np.asarray(after.vertices) - np.asarray(before.vertices), axis=1)
+    moved = np.linalg.norm(after.vertices - before.vertices, axis=1)
     largest = max(float(moved.max()), LEAST_SCALE)
     ends = skin_ends(prediction.skin_before)
 
@@ -120,12 +120,12 @@ def picture_plan(
         for s in segments
     ]
     shifts = {
-        name: np.linalg.norm(vertices - np.asarray(surface.vertices), axis=1)
+        name: np.linalg.norm(vertices - surface.vertices, axis=1)
         for name, (surface, vertices) in after.items()
     }
     still = {name for name, shift in shifts.items() if np.quantile(shift, 0.99) < STAYS}
     colours = segment_colours([s.name for s in segments])
-    corners = bounds([np.asarray(s.surface.vertices) for s in (*segments, *moved)])
+    corners = bounds([s.surface.vertices for s in (*segments, *moved)])
 
     def paint(plotter: Any, view: View) -> None:
         del view

@@ -70,8 +70,8 @@ def picture_muscles(
     """
     if not len(musculature):
         raise CaseInputError("there is no muscle to draw")
-    clouds = [np.asarray(muscle.surface.vertices) for muscle in musculature]
-    corners = bounds(clouds if skull is None else [*clouds, np.asarray(skull.vertices)])
+    clouds = [muscle.surface.vertices for muscle in musculature]
+    corners = bounds(clouds if skull is None else [*clouds, skull.vertices])
 
     def paint_skull(plotter: Any) -> None:
         if skull is not None:
@@ -124,7 +124,7 @@ def add_muscle(plotter: Any, muscle: MuscleSurface, colour: str) -> None:
 
 def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:
     """Fibre strokes and box edges as pairs of points, and the colour of the boxes."""
-    vertices = np.asarray(muscle.surface.vertices, dtype=np.float64)
+    vertices = muscle.surface.vertices
     triangles = np.asarray(muscle.surface.triangles, dtype=np.int64)
     surface = Surface(vertices, triangles)
     fibres = MuscleFibres(surface, muscle.kind, muscle.boxes, muscle.course)

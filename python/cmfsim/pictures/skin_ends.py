@@ -39,7 +39,7 @@ def skin_ends(skin: SurfaceData) -> SkinEnds:
     ----------
     skin : SurfaceData
     """
-    vertices, triangles = np.asarray(skin.vertices), np.asarray(skin.triangles)
+    vertices, triangles = skin.vertices, skin.triangles
     edge = float(np.median(np.linalg.norm(np.diff(vertices[triangles[:, :2]], axis=1), axis=2)))
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     if (high - low).max() < 20.0 * RIM * edge:

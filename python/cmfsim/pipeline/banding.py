@@ -201,7 +201,7 @@ def _band(prediction: Prediction, rates: SkinRates, options: BandOptions) -> Ski
 def _normals(prediction: Prediction) -> Floats:
     """The outward unit normals of the predicted skin, (k, 3)."""
     skin = prediction.skin
-    return np.asarray(Surface(skin.vertices, skin.triangles).vertex_normals, dtype=np.float64)
+    return Surface(skin.vertices, skin.triangles).vertex_normals
 
 
 def _calibration_values(options: BandOptions) -> dict[str, Any] | None:

@@ -268,7 +268,7 @@ class _Compared:
         regions = {name: part for name, part in regions.items() if part.any()}
         return compare_models(
             before,
-            {p.model: np.asarray(p.skin.vertices) for p in self.predictions},
+            {p.model: p.skin.vertices for p in self.predictions},
             self.after,
             landmarks=(ours, theirs) if both else None,
             mask="face" if "face" in regions else None,

@@ -41,7 +41,7 @@ def least_volume_ratios(tensors: MassTensors, displacements: ArrayLike) -> Float
     if len(tensors.mid_edges) == 0:
         return ratios
     tets = np.asarray(tensors.mesh.tets, dtype=np.int64)
-    rest = 6.0 * np.asarray(tensors.mesh.volumes)
+    rest = 6.0 * tensors.mesh.volumes
     # Of each corner the other three, in the order that keeps the tet's orientation: (m, 4, 3).
     all_others = tets[:, [(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)]]
     all_middles = _middles(tensors, tets[:, :, None], all_others)
@@ -105,7 +105,7 @@ def inversion_finding(tensors: MassTensors, displacements: ArrayLike) -> tuple[i
     if count == 0:
         return 0, None
     worst = int(np.argmin(ratios))
-    x, y, z = np.asarray(tensors.mesh.nodes)[np.asarray(tensors.mesh.tets)[worst]].mean(axis=0)
+    x, y, z = tensors.mesh.nodes[tensors.mesh.tets[worst]].mean(axis=0)
     return count, Finding.warning(
         "inverted-tets",
         f"{count} of {len(ratios)} tets are inverted at equilibrium; the worst is tet {worst}, at "

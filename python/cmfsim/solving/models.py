@@ -65,7 +65,7 @@ def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
     joined = {}
     for name, segment in scene.segments.items():
         lifted = [lip.released[name] for lip in patient.lips.values() if name in lip.released]
-        nodes = np.concatenate([np.asarray(segment.joined), np.asarray(segment.sliding), *lifted])
+        nodes = np.concatenate([segment.joined, segment.sliding, *lifted])
         joined[name] = SegmentData(joined=np.unique(nodes))
     return replace(scene, segments=joined, touching=(), obstacles=())
 
@@ -137,7 +137,7 @@ def solved_patient(
     solver = solver or scene_solver(scene)
     result, solution = solved_scene(scene, solver)
     timings = {**patient.summary.get("timings", {}), "solving": time.perf_counter() - begun}
-    moved = np.linalg.norm(np.asarray(result.displacements)[patient.skin_nodes], axis=1)
+    moved = np.linalg.norm(result.displacements[patient.skin_nodes], axis=1)
     summary = {
         **patient.summary,
         "model": model,
@@ -177,14 +177,14 @@ def _case_key(patient: PatientModel, scene: Scene) -> str:
 
 def _arrays(scene: Scene) -> Iterator[tuple[str, NDArray[Any]]]:
     """Mesh and motions of a scene, each with its name."""
-    yield "nodes", np.asarray(scene.nodes)
-    yield "tets", np.asarray(scene.tets)
+    yield "nodes", scene.nodes
+    yield "tets", scene.tets
     for name, motion in scene.plan.items():
         if isinstance(motion, MovedSurface):
-            yield f"surface of {name}", np.asarray(motion.surface.vertices)
-            yield f"moved {name}", np.asarray(motion.moved_vertices)
+            yield f"surface of {name}", motion.surface.vertices
+            yield f"moved {name}", motion.moved_vertices
         else:
-            yield f"motion of {name}", np.asarray(motion)
+            yield f"motion of {name}", motion
 
 
 def _motion(patient: PatientModel, scene: Scene, name: str) -> dict[str, Any]:
@@ -195,9 +195,9 @@ def _motion(patient: PatientModel, scene: Scene, name: str) -> dict[str, Any]:
     motion = scene.plan[name]
     surfaces = {segment.name: segment.surface for segment in patient.segments}
     if isinstance(motion, MovedSurface) or np.shape(motion) == (4, 4):
-        vertices = np.asarray(surfaces[name].vertices)
+        vertices = surfaces[name].vertices
     else:
-        vertices = np.asarray(scene.nodes)[np.asarray(scene.segments[name].joined)]
+        vertices = scene.nodes[scene.segments[name].joined]
     clinical = clinical_motion(
         name,
         motion,
@@ -206,22 +206,21 @@ def _motion(patient: PatientModel, scene: Scene, name: str) -> dict[str, Any]:
         source=patient.summary.get("plan_sources", {}).get(name, ""),
     ).as_dict()
     if isinstance(motion, MovedSurface):
-        here, there = np.asarray(motion.surface.vertices), np.asarray(motion.moved_vertices)
+        here, there = motion.surface.vertices, motion.moved_vertices
         size = np.linalg.norm(there - here, axis=1)
         fit = rigid_fit(here, there)
         return {
             "mean": float(size.mean()),
             "largest": float(size.max()),
             # The nearest rigid motion, and what it leaves of the vertices' own.
-            **_rigid_numbers(np.asarray(fit.matrix), here.mean(axis=0)),
+            **_rigid_numbers(fit.matrix, here.mean(axis=0)),
             "bending": float(fit.rms),
             "clinical": clinical,
         }
-    matrix = np.asarray(motion, dtype=np.float64)
-    if matrix.shape != (4, 4):
-        size = np.linalg.norm(matrix, axis=1)
+    if motion.shape != (4, 4):
+        size = np.linalg.norm(motion, axis=1)
         return {"mean": float(size.mean()), "largest": float(size.max()), "clinical": clinical}
-    return {**_rigid_numbers(matrix, vertices.mean(axis=0)), "clinical": clinical}
+    return {**_rigid_numbers(motion, vertices.mean(axis=0)), "clinical": clinical}
 
 
 def _rigid_numbers(matrix: NDArray[np.float64], centre: NDArray[np.float64]) -> dict[str, Any]:

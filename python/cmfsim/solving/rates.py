@@ -142,7 +142,7 @@ def tissue_load(
     """
     tissue = parts.changed(source.name, STEP * source.sd).tissue()
     changed = MassTensors(tensors.mesh, tissue, element=tensors.element)
-    return np.asarray(-(changed.force(u) - forces) / STEP, dtype=np.float64)
+    return -(changed.force(u) - forces) / STEP
 
 
 def _plan_changes(
@@ -154,15 +154,14 @@ def _plan_changes(
         return {}
     found = {}
     for name, motion in scene.plan.items():
-        if isinstance(motion, MovedSurface) or np.shape(motion) != (4, 4):
+        if isinstance(motion, MovedSurface) or motion.shape != (4, 4):
             left_out.append(f"execution of the plan: {name} moves vertex by vertex")
             continue
-        matrix = np.asarray(motion, dtype=np.float64)
-        nodes = np.asarray(scene.segments[name].joined)
-        if np.array_equal(matrix, np.eye(4)) or not len(nodes):
+        nodes = scene.segments[name].joined
+        if np.array_equal(motion, np.eye(4)) or not len(nodes):
             continue
-        middle = np.asarray(scene.nodes)[nodes].mean(axis=0)
-        found[name] = _rates(matrix, matrix[:3, :3] @ middle + matrix[:3, 3])
+        middle = scene.nodes[nodes].mean(axis=0)
+        found[name] = _rates(motion, motion[:3, :3] @ middle + motion[:3, 3])
     return found
 
 

@@ -115,7 +115,7 @@ def scene_plan(scene: Scene) -> dict[str, NDArray[np.float64] | SurfaceMotion]:
         if isinstance(motion, MovedSurface):
             plan[name] = SurfaceMotion(_surface(motion.surface), motion.moved_vertices)
         else:
-            plan[name] = np.asarray(motion, dtype=np.float64)
+            plan[name] = motion
     return plan
 
 
@@ -239,7 +239,7 @@ def _touching(scene: Scene, solution: Solution) -> dict[str, dict[str, Any]]:
         return {}
     return {
         "touching": {
-            "pressed": int(np.count_nonzero(np.asarray(solution.touching_forces) > 0.0)),
+            "pressed": int(np.count_nonzero(solution.touching_forces > 0.0)),
             "penetration": _finite(solution.penetration),
             "rounds": solution.touching_rounds,
             "converged": solution.touching_converged,

@@ -137,7 +137,7 @@ def tissue_parts(
     if data.kind == "preset":
         moduli = PRESET_MODULI[data.preset]
         young, poisson = moduli.fat.constants()
-        p = np.asarray(arrays["fraction"], dtype=np.float64)
+        p = arrays["fraction"]
         along, across, ratio = (p * value for value in moduli.muscle.constants())
         law = "spencer"
     else:

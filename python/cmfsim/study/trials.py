@@ -244,8 +244,7 @@ def _apart(before: Musculature, after: Musculature) -> dict[str, float]:
     return {
         muscle.name: float(
             np.linalg.norm(
-                np.asarray(after[muscle.name].surface.vertices)
-                - np.asarray(muscle.surface.vertices),
+                after[muscle.name].surface.vertices - muscle.surface.vertices,
                 axis=1,
             ).mean()
         )

@@ -37,7 +37,7 @@ def at_closest(surface: Surface, values: ArrayLike, points: ArrayLike) -> Floats
     points : (k, 3) float64, mm
     """
     closest, _, triangles = surface.closest(points)
-    vertices, corners = np.asarray(surface.vertices), np.asarray(surface.triangles)[triangles]
+    vertices, corners = surface.vertices, surface.triangles[triangles]
     # Rounding puts points of an edge a little beyond it.
     weights = np.clip(barycentric(vertices[corners], closest), 0.0, 1.0)
     field = np.asarray(values, dtype=np.float64)[corners]

@@ -92,4 +92,4 @@ def _is_ear(points: Floats, i: int) -> bool:
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], dtype=np.float64)
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

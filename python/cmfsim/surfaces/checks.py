@@ -174,8 +174,8 @@ def check_surface(surface: SurfaceData, *, crossings: bool = True) -> SurfaceRep
     >>> report.area, report.borders[0].length, report.is_closed
     (6.0, 12.0, False)
     """
-    vertices = np.asarray(surface.vertices, dtype=np.float64)
-    triangles = np.asarray(surface.triangles).astype(np.int64)
+    vertices = surface.vertices
+    triangles = surface.triangles.astype(np.int64)
     check_extent(vertices)
     degenerate, slivers = thin_triangles(vertices, triangles)
     duplicate = duplicate_triangles(triangles)

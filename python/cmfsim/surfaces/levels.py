@@ -122,7 +122,7 @@ def surface_of_level(
     block = values[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
     outside = -max(float(values.max()), -float(values.min()))
     block = np.pad(block, 1, constant_values=outside)
-    spacing = np.asarray(level.spacing)
+    spacing = level.spacing
     vertices, triangles, _, _ = measure.marching_cubes(block, 0.0, gradient_direction="descent")
     points = np.asarray(vertices, dtype=np.float64) + (low - 1)
     corners, points = _without_slits(np.asarray(triangles, dtype=np.int64), points)
@@ -170,9 +170,9 @@ def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> 
     >>> import cmfsim
     >>> cmfsim.contact_surface(segments["maxilla"], relief=2.0)  # doctest: +SKIP
     """
-    sigma = as_positive("relief", relief) / np.asarray(segment.level.spacing)
+    sigma = as_positive("relief", relief) / segment.level.spacing
     ndimage = third_party("scipy.ndimage", "contact surfaces are smoothed", "imaging")
-    inside = np.asarray(segment.level.values) > 0.0
+    inside = segment.level.values > 0.0
     first, past = block_of(inside)
     if not (past > first).all():
         raise CaseInputError(f"{segment.name!r} has no voxel inside: its surface would be empty")
@@ -183,7 +183,7 @@ def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> 
     within = tuple(slice(r, -r) for r in rim)
     bounds = tuple(slice(a, b) for a, b in zip(first, past, strict=True))
     block[within] = inside[bounds]
-    spacing = np.asarray(segment.level.spacing).tolist()
+    spacing = segment.level.spacing.tolist()
     x, y, z = spacing
     # Distances between voxel centres: the surface lies half a voxel from either.
     half = np.float32(0.5 * min(spacing))
@@ -271,10 +271,10 @@ def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> S
     CaseError
         (also `ValueError`) fast-simplification is missing; nothing is left of the surface.
     """
-    triangles = np.asarray(surface.triangles).astype(np.int64)
+    triangles = surface.triangles.astype(np.int64)
     if len(triangles) <= max_triangles:
         return surface
-    points, corners = _simplified(name, np.asarray(surface.vertices), triangles, max_triangles)
+    points, corners = _simplified(name, surface.vertices, triangles, max_triangles)
     used, numbers = np.unique(corners, return_inverse=True)
     if not len(used):
         raise CaseInputError(f"nothing is left of {name!r} at {max_triangles} triangles")

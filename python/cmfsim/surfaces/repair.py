@@ -62,8 +62,8 @@ def clean_surface(surface: SurfaceData) -> SurfaceData:
 
     What remains is fit for `cmfsim.Surface`; it may be empty of triangles.
     """
-    vertices = np.asarray(surface.vertices)
-    triangles = np.asarray(surface.triangles).astype(np.int64)
+    vertices = surface.vertices
+    triangles = surface.triangles.astype(np.int64)
     keep = np.ones(len(triangles), dtype=bool)
     keep[thin_triangles(vertices, triangles)[0]] = False
     keep[duplicate_triangles(triangles)] = False
@@ -115,8 +115,8 @@ def repair_surface(
             Finding.note(code, what, where=name, why=why, fix="look at the result; nothing to do")
         )
 
-    vertices = np.asarray(surface.vertices)
-    triangles = np.asarray(surface.triangles).astype(np.int64)
+    vertices = surface.vertices
+    triangles = surface.triangles.astype(np.int64)
     check_extent(vertices)
     vertices, triangles, n_welded = _welded(vertices, triangles, options.weld_distance)
     if n_welded:

@@ -64,7 +64,7 @@ class Anatomy(Frozen):
             same = (
                 level.values.shape == self.skin.values.shape
                 and np.array_equal(level.lowest, self.skin.lowest)
-                and np.array_equal(np.asarray(level.spacing), np.asarray(self.skin.spacing))
+                and np.array_equal(level.spacing, self.skin.spacing)
             )
             if not same:
                 raise CaseInputError(f"{name} lies on another grid than the skin")

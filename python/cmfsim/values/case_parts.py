@@ -100,23 +100,23 @@ class Plane(Frozen):
         (also `ValueError`) Not three finite numbers, a normal of length zero.
     """
 
-    point: ArrayLike
-    normal: ArrayLike
+    point: Floats
+    normal: Floats
 
-    def __post_init__(self) -> None:
-        point = as_point("plane point", self.point)
-        normal = as_point("plane normal", self.normal)
-        largest = float(np.abs(normal).max())
+    def __init__(self, point: ArrayLike, normal: ArrayLike) -> None:
+        place = as_point("plane point", point)
+        direction = as_point("plane normal", normal)
+        largest = float(np.abs(direction).max())
         if largest == 0.0:
             raise CaseInputError("plane normal is (0, 0, 0): give its direction, any length")
-        scaled = normal / largest
-        object.__setattr__(self, "point", point)
+        scaled = direction / largest
+        object.__setattr__(self, "point", place)
         object.__setattr__(self, "normal", scaled / np.linalg.norm(scaled))
 
     def distance(self, points: ArrayLike) -> Floats:
         """The signed distances of (n, 3) points from the plane, mm: positive along its normal."""
-        offsets = as_rows("points", points, 3) - np.asarray(self.point)
-        return np.asarray(offsets @ np.asarray(self.normal), dtype=np.float64)
+        offsets = as_rows("points", points, 3) - self.point
+        return offsets @ self.normal
 
 
 @dataclass(frozen=True)

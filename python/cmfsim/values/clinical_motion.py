@@ -141,7 +141,7 @@ class ClinicalMotion:
             "yaw_deg": self.yaw,
             "roll_deg": self.roll,
             "place": self.place,
-            "point": None if self.point is None else np.asarray(self.point).tolist(),
+            "point": None if self.point is None else self.point.tolist(),
             "residual_mm": self.residual,
             "source": self.source,
         }
@@ -318,8 +318,8 @@ def _pairs(motion: ArrayLike | MovedSurface, points: Floats | None) -> tuple[Flo
     """Places before and after, where a motion is given vertex by vertex."""
     if isinstance(motion, MovedSurface):
         return (
-            np.asarray(motion.surface.vertices, dtype=np.float64),
-            np.asarray(motion.moved_vertices, dtype=np.float64),
+            motion.surface.vertices,
+            motion.moved_vertices,
         )
     shifts = np.asarray(motion, dtype=np.float64)
     return (
@@ -337,7 +337,7 @@ def _nearest_rigid(here: Floats, there: Floats) -> tuple[Floats, float]:
         matrix[:3, 3] = (there - here).mean(axis=0)
         rest = there - here - matrix[:3, 3]
         return matrix, float(np.sqrt((rest**2).sum(axis=1).mean()))
-    return np.asarray(fit.matrix, dtype=np.float64), float(fit.rms)
+    return fit.matrix, float(fit.rms)
 
 
 def _reference(

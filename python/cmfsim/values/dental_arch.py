@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from cmfsim.checks import (
     Floats,
@@ -48,10 +47,10 @@ class DentalArch(Frozen):
     """
 
     jaw: str
-    tip: ArrayLike
-    left: ArrayLike
-    right: ArrayLike
-    out: ArrayLike
+    tip: Floats
+    left: Floats
+    right: Floats
+    out: Floats
     depth_front: float
     depth_molars: float
 
@@ -63,7 +62,7 @@ class DentalArch(Frozen):
         for name in ("depth_front", "depth_molars"):
             as_number(f"{self.jaw} arch: {name}", getattr(self, name))
         axes = self.axes()
-        tip, left, right = (np.asarray(place) for place in (self.tip, self.left, self.right))
+        tip, left, right = self.tip, self.left, self.right
         if self.half_width < LEAST_ARCH or float(axes[1] @ (tip - self.middle)) < LEAST_ARCH:
             raise CaseInputError(
                 f"{self.jaw} arch: its front {tip.round(1).tolist()} and its molars "
@@ -75,22 +74,22 @@ class DentalArch(Frozen):
     @property
     def middle(self) -> Floats:
         """Half-way between the molars, (3,) mm."""
-        return np.asarray(0.5 * (np.asarray(self.left) + np.asarray(self.right)))
+        return 0.5 * (self.left + self.right)
 
     @property
     def half_width(self) -> float:
         """Half the distance between the molars, mm."""
-        return 0.5 * float(np.linalg.norm(np.asarray(self.left) - np.asarray(self.right)))
+        return 0.5 * float(np.linalg.norm(self.left - self.right))
 
     def axes(self) -> Floats:
         """Unit vectors to the left, ahead, and along `out`, as rows (3, 3).
 
         The last two are at right angles to the first, but not quite to each other: `ahead` is.
         """
-        out = np.asarray(self.out)
-        across = np.asarray(self.left) - np.asarray(self.right)
+        out = self.out
+        across = self.left - self.right
         across = across / max(float(np.linalg.norm(across)), np.finfo(float).tiny)
-        ahead = np.asarray(self.tip) - self.middle
+        ahead = self.tip - self.middle
         ahead = ahead - (ahead @ across) * across - (ahead @ out) * out
         ahead = ahead / max(float(np.linalg.norm(ahead)), np.finfo(float).tiny)
         return np.stack([across, ahead, out])

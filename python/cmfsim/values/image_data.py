@@ -2,7 +2,7 @@
 
 import itertools
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,32 +45,34 @@ class ImageData(Frozen):
     """
 
     values: NDArray[Any]
-    spacing: ArrayLike
-    origin: ArrayLike = (0.0, 0.0, 0.0)
+    spacing: Floats
+    origin: Floats
 
-    def __post_init__(self) -> None:
-        values = np.asarray(self.values)
+    def __init__(
+        self, values: NDArray[Any], spacing: ArrayLike, origin: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> None:
+        values = np.asarray(values)
         if values.ndim != 3 or 0 in values.shape:
             raise CaseInputError(f"image has shape {values.shape}: three axes, none empty, needed")
         if values.dtype.kind not in "fiub":
             raise CaseInputError(f"image has dtype {values.dtype}: real numbers are needed")
-        spacing = as_point("image spacing", self.spacing)
-        if (spacing <= 0.0).any():
-            raise CaseInputError(f"image spacing is {spacing.tolist()} mm: must be above 0")
+        steps = as_point("image spacing", spacing)
+        if (steps <= 0.0).any():
+            raise CaseInputError(f"image spacing is {steps.tolist()} mm: must be above 0")
         object.__setattr__(self, "values", values)
-        object.__setattr__(self, "spacing", spacing)
-        object.__setattr__(self, "origin", as_point("image origin", self.origin))
+        object.__setattr__(self, "spacing", steps)
+        object.__setattr__(self, "origin", as_point("image origin", origin))
 
     @property
     def lowest(self) -> Floats:
         """Centre of the first voxel, (3,) mm."""
-        return cast("Floats", self.origin)
+        return self.origin
 
     @property
     def highest(self) -> Floats:
         """Centre of the last voxel, (3,) mm."""
         steps = np.array(self.values.shape) - 1
-        return cast("Floats", self.lowest + steps * np.asarray(self.spacing))
+        return self.lowest + steps * self.spacing
 
     def with_values(self, values: NDArray[Any]) -> "ImageData":
         """Other values on the same grid."""
@@ -82,9 +84,7 @@ class ImageData(Frozen):
         """The coordinates of the voxel centres along each axis, mm, shaped to broadcast."""
         x, y, z = (
             o + s * np.arange(n)
-            for o, s, n in zip(
-                self.lowest, np.asarray(self.spacing), self.values.shape, strict=True
-            )
+            for o, s, n in zip(self.lowest, self.spacing, self.values.shape, strict=True)
         )
         return x[:, None, None], y[None, :, None], z[None, None, :]
 
@@ -100,7 +100,7 @@ class ImageData(Frozen):
         (n,) float64
         """
         shape = np.array(self.values.shape)
-        place = (as_rows("points", points, 3) - self.lowest) / np.asarray(self.spacing)
+        place = (as_rows("points", points, 3) - self.lowest) / self.spacing
         place = np.clip(place, 0.0, shape - 1.0)
         low = np.minimum(place.astype(np.intp), np.maximum(shape - 2, 0))
         part = place - low

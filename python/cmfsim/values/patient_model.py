@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -101,7 +101,7 @@ class PatientModel(Frozen):
         """The patient's skin as the mesh has it, outward."""
         nodes = self.skin_nodes
         triangles = np.searchsorted(nodes, self.skin_triangles)
-        return SurfaceData(np.asarray(self.scene.nodes)[nodes], triangles)
+        return SurfaceData(self.scene.nodes[nodes], triangles)
 
     def with_plan(self, plan: Mapping[str, ArrayLike | MovedSurface]) -> PatientModel:
         """The patient under another plan; segments that are not named stay.
@@ -134,7 +134,9 @@ class PatientModel(Frozen):
         fixed = self.scene.fixed
         if self.lifted is not None:
             fixed = self.lifted.fixed(fixed, motions[self.lifted.segment])
-        scene = replace(self.scene, plan=motions, fixed=fixed)
+        # `replace` is typed by the fields; the scene converts what it is given.
+        plan_given = cast("Mapping[str, Floats | MovedSurface]", motions)
+        scene = replace(self.scene, plan=plan_given, fixed=fixed)
         return replace(self, scene=scene, findings=findings, summary=summary)
 
     @cached_property

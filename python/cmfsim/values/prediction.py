@@ -45,7 +45,7 @@ def carried_points(before: SurfaceData, displacements: Floats, points: ArrayLike
         Of its vertices.
     points : (k, 3) float64, mm
     """
-    moved = np.asarray(before.vertices) + displacements
+    moved = before.vertices + displacements
     skin = Surface(before.vertices, before.triangles)
     places = as_rows("points", points, 3)
     closest, _, _ = skin.closest(places)
@@ -121,12 +121,12 @@ class Prediction(Frozen):
     def skin(self) -> SurfaceData:
         """The predicted skin: the vertices and triangles of `skin_before`, moved."""
         before = self.skin_before
-        return SurfaceData(np.asarray(before.vertices) + self.skin_displacements, before.triangles)
+        return SurfaceData(before.vertices + self.skin_displacements, before.triangles)
 
     @property
     def skin_displacements(self) -> Floats:
         """How each vertex of the skin moves, (k, 3) mm."""
-        return np.asarray(self.result.displacements)[self.skin_nodes]
+        return self.result.displacements[self.skin_nodes]
 
     def carried(self, points: ArrayLike) -> Floats:
         """How points on or near the skin move, (k, 3) mm: as `carried_points` has it.
@@ -182,7 +182,7 @@ class Prediction(Frozen):
     def face(self) -> SurfaceData:
         """The predicted face: the vertices and triangles of `face_before`, carried by the skin."""
         before = self.face_before
-        vertices = np.asarray(before.vertices)
+        vertices = before.vertices
         return SurfaceData(vertices + self.carried(vertices), before.triangles)
 
     @property
@@ -195,14 +195,12 @@ class Prediction(Frozen):
         found = {}
         for segment in self.patient.segments:
             surface, motion = segment.surface, self.scene.plan.get(segment.name)
-            vertices = np.asarray(surface.vertices, dtype=np.float64)
+            vertices = surface.vertices
             if isinstance(motion, MovedSurface):
                 surface = motion.surface
-                vertices = np.asarray(motion.moved_vertices, dtype=np.float64)
-            elif motion is not None and np.shape(motion) == (4, 4):
-                matrix = np.asarray(motion, dtype=np.float64)
-                if not np.array_equal(matrix, np.eye(4)):
-                    vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+                vertices = motion.moved_vertices
+            elif motion is not None and motion.shape == (4, 4) and (motion != np.eye(4)).any():
+                vertices = vertices @ motion[:3, :3].T + motion[:3, 3]
             found[segment.name] = (surface, vertices)
         return found
 

@@ -7,8 +7,9 @@ bodies that are not held) the core finds when the scene is solved.
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -43,6 +44,8 @@ __all__ = [
 
 CONFLICTS = ("error", "resolve")
 
+DEFAULT_OPTIONS = SolverOptions()
+
 
 @dataclass(frozen=True, eq=False)
 class SegmentData(Frozen):
@@ -67,27 +70,36 @@ class SegmentData(Frozen):
     [0, 4, 7]
     """
 
-    joined: ArrayLike = ()
-    sliding: ArrayLike = ()
-    contact: SurfaceData | None = None
-    gap: ArrayLike | str = 0.0
+    joined: Indices
+    sliding: Indices
+    contact: SurfaceData | None
+    gap: Floats | str
 
-    def __post_init__(self) -> None:
-        joined = as_indices("joined", self.joined)
-        sliding = as_indices("sliding", self.sliding)
-        if self.contact is not None:
-            check_instance("contact", self.contact, SurfaceData)
-        object.__setattr__(self, "joined", joined)
-        object.__setattr__(self, "sliding", sliding)
-        if isinstance(self.gap, str):
-            check_one_of("gap", self.gap, ("rest",))
-            return
-        gap = as_floats("gap", self.gap)
-        if gap.shape not in {(), (len(sliding),)}:
+    def __init__(
+        self,
+        joined: ArrayLike = (),
+        sliding: ArrayLike = (),
+        contact: SurfaceData | None = None,
+        gap: ArrayLike | str = 0.0,
+    ) -> None:
+        object.__setattr__(self, "joined", as_indices("joined", joined))
+        object.__setattr__(self, "sliding", as_indices("sliding", sliding))
+        if contact is not None:
+            check_instance("contact", contact, SurfaceData)
+        object.__setattr__(self, "contact", contact)
+        object.__setattr__(self, "gap", self._checked_gap(gap))
+
+    def _checked_gap(self, gap: ArrayLike | str) -> Floats | str:
+        if isinstance(gap, str):
+            check_one_of("gap", gap, ("rest",))
+            return gap
+        distances = as_floats("gap", gap)
+        if distances.shape not in {(), (len(self.sliding),)}:
             raise CaseInputError(
-                f"gap has shape {gap.shape}: one number or {len(sliding)} (one per sliding node)"
+                f"gap has shape {distances.shape}: one number or {len(self.sliding)} "
+                "(one per sliding node)"
             )
-        object.__setattr__(self, "gap", frozen(gap))
+        return frozen(distances)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,52 +152,78 @@ class Scene(Frozen):
     (4, 1)
     """
 
-    nodes: ArrayLike
-    tets: ArrayLike
+    nodes: Floats
+    tets: Indices
     tissue: TissueData
-    segments: Mapping[str, SegmentData] = field(default_factory=dict)
-    plan: Mapping[str, ArrayLike | MovedSurface] = field(default_factory=dict)
-    fixed: ArrayLike = ()
-    loads: ArrayLike | None = None
-    options: SolverOptions = field(default_factory=SolverOptions)
-    conflicts: str = "error"
-    touching: tuple[TouchingData, ...] = ()
-    obstacles: tuple[ObstacleData, ...] = ()
+    segments: Mapping[str, SegmentData]
+    plan: Mapping[str, Floats | MovedSurface]
+    fixed: Indices
+    loads: Floats | None
+    options: SolverOptions
+    conflicts: str
+    touching: tuple[TouchingData, ...]
+    obstacles: tuple[ObstacleData, ...]
 
-    def __post_init__(self) -> None:
-        nodes = as_rows("nodes", self.nodes, 3)
-        tets = as_index_rows("tets", self.tets, 4, len(nodes), "nodes")
-        fixed = as_indices("fixed", self.fixed, len(nodes))
-        check_instance("tissue", self.tissue, TissueData)
-        check_instance("segments", self.segments, Mapping)
-        check_instance("plan", self.plan, Mapping)
-        check_instance("options", self.options, SolverOptions)
+    def __init__(  # noqa: PLR0913, PLR0917 (one for each field)
+        self,
+        nodes: ArrayLike,
+        tets: ArrayLike,
+        tissue: TissueData,
+        segments: Mapping[str, SegmentData] = MappingProxyType({}),
+        plan: Mapping[str, ArrayLike | MovedSurface] = MappingProxyType({}),
+        fixed: ArrayLike = (),
+        loads: ArrayLike | None = None,
+        options: SolverOptions = DEFAULT_OPTIONS,
+        conflicts: str = "error",
+        touching: Iterable[TouchingData] = (),
+        obstacles: Iterable[ObstacleData] = (),
+    ) -> None:
+        keep = partial(object.__setattr__, self)
+        keep("nodes", as_rows("nodes", nodes, 3))
+        keep("tets", as_index_rows("tets", tets, 4, self.n_nodes, "nodes"))
+        keep("fixed", as_indices("fixed", fixed, self.n_nodes))
+        for name, value, kind in (
+            ("tissue", tissue, TissueData),
+            ("segments", segments, Mapping),
+            ("plan", plan, Mapping),
+            ("options", options, SolverOptions),
+        ):
+            check_instance(name, value, kind)
+        keep("tissue", tissue)
+        keep("segments", MappingProxyType(dict(segments)))
+        keep("options", options)
+        self._check_parts()
+        keep("loads", self._checked_loads(loads))
+        check_one_of("conflicts", conflicts, CONFLICTS)
+        keep("conflicts", conflicts)
+        keep("plan", MappingProxyType(self._checked_plan(plan)))
+        keep("touching", tuple(touching))
+        keep("obstacles", tuple(obstacles))
+        self._check_contact(self.n_nodes)
+
+    def _check_parts(self) -> None:
+        """Tissue with a row for each tet, segments of nodes that there are."""
         for name, array in self.tissue.arrays().items():
-            if len(array) not in {1, len(tets)}:
+            if len(array) not in {1, self.n_tets}:
                 raise CaseInputError(
-                    f"tissue {name} has {len(array)} rows: 1 or {len(tets)} (one per tet) needed"
+                    f"tissue {name} has {len(array)} rows: 1 or {self.n_tets} (one per tet) needed"
                 )
         for name, segment in self.segments.items():
             as_text("segment name", name)
             check_instance(f"segment {name!r}", segment, SegmentData)
             for kind in ("joined", "sliding"):
-                as_indices(f"segment {name!r} {kind}", getattr(segment, kind), len(nodes))
-        loads = None if self.loads is None else as_rows("loads", self.loads, 3)
-        if loads is not None and len(loads) != len(nodes):
-            raise CaseInputError(f"loads has {len(loads)} rows for {len(nodes)} nodes")
-        check_one_of("conflicts", self.conflicts, CONFLICTS)
-        object.__setattr__(self, "nodes", nodes)
-        object.__setattr__(self, "tets", tets)
-        object.__setattr__(self, "fixed", fixed)
-        object.__setattr__(self, "loads", loads)
-        object.__setattr__(self, "segments", MappingProxyType(dict(self.segments)))
-        object.__setattr__(self, "plan", MappingProxyType(self._checked_plan()))
-        self._check_contact(len(nodes))
+                as_indices(f"segment {name!r} {kind}", getattr(segment, kind), self.n_nodes)
+
+    def _checked_loads(self, loads: ArrayLike | None) -> Floats | None:
+        if loads is None:
+            return None
+        forces = as_rows("loads", loads, 3)
+        if len(forces) != self.n_nodes:
+            raise CaseInputError(f"loads has {len(forces)} rows for {self.n_nodes} nodes")
+        return forces
 
     def _check_contact(self, n_nodes: int) -> None:
         """One-sided contact: nodes of the mesh, and segments that there are."""
-        object.__setattr__(self, "touching", tuple(self.touching))
-        object.__setattr__(self, "obstacles", tuple(self.obstacles))
         for number, touch in enumerate(self.touching):
             check_instance(f"touching[{number}]", touch, TouchingData)
             as_indices(f"touching[{number}] nodes", touch.nodes, n_nodes)
@@ -199,23 +237,25 @@ class Scene(Frozen):
                     f"obstacles[{number}] is of segment {obstacle.segment!r}; segments are: {known}"
                 )
 
-    def _checked_plan(self) -> dict[str, Floats | MovedSurface]:
-        for name in self.plan:
+    def _checked_plan(
+        self, plan: Mapping[str, ArrayLike | MovedSurface]
+    ) -> dict[str, Floats | MovedSurface]:
+        for name in plan:
             if name not in self.segments:
                 known = ", ".join(repr(s) for s in self.segments) or "none"
                 raise CaseInputError(f"plan names segment {name!r}; segments are: {known}")
         checked: dict[str, Floats | MovedSurface] = {}
         for name, segment in self.segments.items():
-            if name not in self.plan:
+            if name not in plan:
                 raise CaseInputError(
                     f"plan lacks segment {name!r}: give the identity matrix if it stays"
                 )
-            motion = self.plan[name]
+            motion = plan[name]
             if isinstance(motion, MovedSurface):
                 checked[name] = motion
                 continue
             array = as_floats(f"plan of segment {name!r}", motion)
-            joined = len(np.asarray(segment.joined))
+            joined = len(segment.joined)
             if array.shape not in {(4, 4), (joined, 3)}:
                 raise CaseInputError(
                     f"plan of segment {name!r} has shape {array.shape}: a (4, 4) matrix or "
@@ -229,12 +269,12 @@ class Scene(Frozen):
     @property
     def n_nodes(self) -> int:
         """Number of nodes."""
-        return len(np.asarray(self.nodes))
+        return len(self.nodes)
 
     @property
     def n_tets(self) -> int:
         """Number of tets."""
-        return len(np.asarray(self.tets))
+        return len(self.tets)
 
     def header(self) -> dict[str, Any]:
         """Names, kinds and options of the scene: what of it is not an array, ready for JSON."""
@@ -279,37 +319,37 @@ class Scene(Frozen):
         return dict(self._arrays())
 
     def _arrays(self) -> Iterator[tuple[str, NDArray[Any]]]:
-        yield "nodes", np.asarray(self.nodes)
-        yield "tets", np.asarray(self.tets)
+        yield "nodes", self.nodes
+        yield "tets", self.tets
         for name, array in self.tissue.arrays().items():
             yield f"tissue.{name}", array
-        yield "fixed", np.asarray(self.fixed)
+        yield "fixed", self.fixed
         if self.loads is not None:
-            yield "loads", np.asarray(self.loads)
+            yield "loads", self.loads
         # Segments are numbered: their names are free text and stay out of the archive's directory.
         for number, (name, segment) in enumerate(self.segments.items()):
             key = f"segment.{number}"
-            yield f"{key}.joined", np.asarray(segment.joined)
-            yield f"{key}.sliding", np.asarray(segment.sliding)
+            yield f"{key}.joined", segment.joined
+            yield f"{key}.sliding", segment.sliding
             if segment.contact is not None:
-                yield f"{key}.contact.vertices", np.asarray(segment.contact.vertices)
-                yield f"{key}.contact.triangles", np.asarray(segment.contact.triangles)
+                yield f"{key}.contact.vertices", segment.contact.vertices
+                yield f"{key}.contact.triangles", segment.contact.triangles
             if not isinstance(segment.gap, str):
-                yield f"{key}.gap", np.asarray(segment.gap)
+                yield f"{key}.gap", segment.gap
             motion = self.plan[name]
             if isinstance(motion, MovedSurface):
-                yield f"{key}.motion.vertices", np.asarray(motion.surface.vertices)
-                yield f"{key}.motion.triangles", np.asarray(motion.surface.triangles)
-                yield f"{key}.motion.moved_vertices", np.asarray(motion.moved_vertices)
+                yield f"{key}.motion.vertices", motion.surface.vertices
+                yield f"{key}.motion.triangles", motion.surface.triangles
+                yield f"{key}.motion.moved_vertices", motion.moved_vertices
             else:
-                yield f"{key}.motion", np.asarray(motion)
+                yield f"{key}.motion", motion
         for number, touch in enumerate(self.touching):
-            yield f"touching.{number}.nodes", np.asarray(touch.nodes)
-            yield f"touching.{number}.triangles", np.asarray(touch.triangles)
+            yield f"touching.{number}.nodes", touch.nodes
+            yield f"touching.{number}.triangles", touch.triangles
         for number, obstacle in enumerate(self.obstacles):
-            yield f"obstacle.{number}.nodes", np.asarray(obstacle.nodes)
-            yield f"obstacle.{number}.vertices", np.asarray(obstacle.surface.vertices)
-            yield f"obstacle.{number}.triangles", np.asarray(obstacle.surface.triangles)
+            yield f"obstacle.{number}.nodes", obstacle.nodes
+            yield f"obstacle.{number}.vertices", obstacle.surface.vertices
+            yield f"obstacle.{number}.triangles", obstacle.surface.triangles
 
     def sha256(self) -> str:
         """The SHA-256 of the scene's content, the same from whichever file it was read."""

@@ -91,7 +91,7 @@ class SkinBand(Frozen):
     def arrays(self) -> dict[str, Floats]:
         """The standard deviation and the half width by their names; NaN outside of the face."""
         sd, half = self.array_names
-        return {sd: np.asarray(self.sd), half: np.ma.filled(self.half_width, np.nan)}
+        return {sd: self.sd, half: np.ma.filled(self.half_width, np.nan)}
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values with units in their names, as JSON holds them; no arrays."""
@@ -113,12 +113,12 @@ class SkinBand(Frozen):
     def _of(self, part: NDArray[np.bool_], factor: BandFactor | None) -> dict[str, Any]:
         # A region has its own factor everywhere, also where a smaller one has another.
         times = self.plain_factor if factor is None else factor.factor
-        half = times * np.asarray(self.sd)[part]
+        half = times * self.sd[part]
         return {
             "half_width_mean_mm": float(half.mean()),
             "half_width_p95_mm": float(np.percentile(half, 95)),
             "half_width_largest_mm": float(half.max()),
-            "sd_mean_mm": float(np.asarray(self.sd)[part].mean()),
+            "sd_mean_mm": float(self.sd[part].mean()),
             "calibration": None if factor is None else factor.as_dict(),
             "sources_rms_mm": {
                 name: float(np.sqrt(np.mean(np.square(values[part]))))

@@ -2,14 +2,9 @@
 
 from dataclasses import dataclass
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import (
-    as_index_rows,
-    as_number,
-    as_rows,
-)
+from cmfsim.checks import Floats, Indices, as_index_rows, as_number, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.values.frozen import Frozen
 
@@ -35,16 +30,18 @@ class SurfaceData(Frozen):
     (3, 3)
     """
 
-    vertices: ArrayLike
-    triangles: ArrayLike
-    crease_angle: float = 60.0
+    vertices: Floats
+    triangles: Indices
+    crease_angle: float
 
-    def __post_init__(self) -> None:
-        vertices = as_rows("surface vertices", self.vertices, 3)
-        triangles = as_index_rows("surface triangles", self.triangles, 3, len(vertices), "vertices")
-        object.__setattr__(self, "vertices", vertices)
-        object.__setattr__(self, "triangles", triangles)
-        object.__setattr__(self, "crease_angle", as_number("crease_angle", self.crease_angle))
+    def __init__(
+        self, vertices: ArrayLike, triangles: ArrayLike, crease_angle: float = 60.0
+    ) -> None:
+        places = as_rows("surface vertices", vertices, 3)
+        corners = as_index_rows("surface triangles", triangles, 3, len(places), "vertices")
+        object.__setattr__(self, "vertices", places)
+        object.__setattr__(self, "triangles", corners)
+        object.__setattr__(self, "crease_angle", as_number("crease_angle", crease_angle))
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +63,14 @@ class MovedSurface(Frozen):
     """
 
     surface: SurfaceData
-    moved_vertices: ArrayLike
+    moved_vertices: Floats
 
-    def __post_init__(self) -> None:
-        moved = as_rows("moved_vertices", self.moved_vertices, 3)
-        count = len(np.asarray(self.surface.vertices))
+    def __init__(self, surface: SurfaceData, moved_vertices: ArrayLike) -> None:
+        moved = as_rows("moved_vertices", moved_vertices, 3)
+        count = len(surface.vertices)
         if len(moved) != count:
             raise CaseInputError(
                 f"moved_vertices has {len(moved)} rows, but the surface has {count} vertices"
             )
+        object.__setattr__(self, "surface", surface)
         object.__setattr__(self, "moved_vertices", moved)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import as_index_rows, as_indices, as_text, check_instance
+from cmfsim.checks import Indices, as_index_rows, as_indices, as_text, check_instance
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.surface_data import SurfaceData
 
@@ -32,16 +32,16 @@ class TouchingData(Frozen):
     [7, 9]
     """
 
-    nodes: ArrayLike
-    triangles: ArrayLike
+    nodes: Indices
+    triangles: Indices
 
-    def __post_init__(self) -> None:
-        nodes = as_indices("nodes that touch", self.nodes)
-        corners = np.asarray(self.triangles)
-        count = 1 + int(corners.max(initial=0)) if corners.dtype.kind in "iu" else 0
-        triangles = as_index_rows("triangles that are touched", corners, 3, count, "nodes")
-        object.__setattr__(self, "nodes", nodes)
-        object.__setattr__(self, "triangles", triangles)
+    def __init__(self, nodes: ArrayLike, triangles: ArrayLike) -> None:
+        touching = as_indices("nodes that touch", nodes)
+        given = np.asarray(triangles)
+        count = 1 + int(given.max(initial=0)) if given.dtype.kind in "iu" else 0
+        corners = as_index_rows("triangles that are touched", given, 3, count, "nodes")
+        object.__setattr__(self, "nodes", touching)
+        object.__setattr__(self, "triangles", corners)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +67,13 @@ class ObstacleData(Frozen):
     'maxilla'
     """
 
-    nodes: ArrayLike
+    nodes: Indices
     segment: str
     surface: SurfaceData
 
-    def __post_init__(self) -> None:
-        as_text("segment of an obstacle", self.segment)
-        check_instance("surface of an obstacle", self.surface, SurfaceData)
-        object.__setattr__(self, "nodes", as_indices("nodes before an obstacle", self.nodes))
+    def __init__(self, nodes: ArrayLike, segment: str, surface: SurfaceData) -> None:
+        as_text("segment of an obstacle", segment)
+        check_instance("surface of an obstacle", surface, SurfaceData)
+        object.__setattr__(self, "nodes", as_indices("nodes before an obstacle", nodes))
+        object.__setattr__(self, "segment", segment)
+        object.__setattr__(self, "surface", surface)

@@ -42,7 +42,7 @@ class SmoothDistance:
 
     def __init__(self, level: ImageData, relief: float = RELIEF) -> None:
         ndimage = third_party("scipy.ndimage", "contact of virtual patients is found", "study")
-        spacing = np.asarray(level.spacing)
+        spacing = level.spacing
         blurred = ndimage.gaussian_filter(
             np.asarray(level.values, dtype=np.float64), as_positive("relief", relief) / spacing
         )
@@ -73,7 +73,7 @@ class SmoothDistance:
             step[axis] = DIFFERENCE
             columns.append((self.slope(points + step) - self.slope(points - step)) / 2.0)
         found = np.stack(columns, axis=2) / DIFFERENCE
-        return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
+        return 0.5 * (found + found.transpose(0, 2, 1))
 
 
 @dataclass(frozen=True, eq=False)

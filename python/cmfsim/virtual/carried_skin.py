@@ -89,7 +89,7 @@ def scanned(
     for name, value in (("white", white), ("smooth", smooth)):
         if as_number(f"{name} noise", value) < 0.0:
             raise CaseInputError(f"{name} noise is {value:g} mm: 0 or more is needed")
-    vertices, triangles = np.asarray(surface.vertices), np.asarray(surface.triangles)
+    vertices, triangles = surface.vertices, surface.triangles
     generator = np.random.default_rng(seed)
     offset = white * generator.standard_normal(len(vertices))
     wave = generator.standard_normal(len(vertices))

@@ -200,7 +200,7 @@ class HyperelasticTissue:
         stress = self.mu * gradient + self._pressure(det, i4) * cof
         stress += (along * m + self.difference * fc)[:, None] * self.fibre[None]
         stress += self.difference * m[:, None] * c[None]
-        return np.asarray(stress)
+        return stress
 
     def tangent(self, gradient: Floats, *, convex: bool = False) -> Floats:
         """∂P/∂F, (m, 9, 9) MPa, symmetric, over the entries of F row by row.
@@ -254,11 +254,11 @@ class HyperelasticTissue:
         """∂ψ/∂J, (m,) MPa."""
         change = (self.lambda_ + self.mu) * (det - 1.0) - self.mu + 0.5 * self.alpha * i4
         change -= self._crushing() * np.maximum(CRUSHED - det, 0.0) ** 2
-        return np.asarray(change)
+        return change
 
     def _crushing(self) -> Floats:
         """The factor of the term against collapse, p λ̂ / J₀², (m,) MPa."""
-        return np.asarray(CRUSHED_PRESSURE / CRUSHED**2 * (self.lambda_ + self.mu))
+        return CRUSHED_PRESSURE / CRUSHED**2 * (self.lambda_ + self.mu)
 
     def _fibre_strain(self, gradient: Floats) -> tuple[Floats, Floats, Floats]:
         """Of the fibre: m = F a and c = (C − I) a, (3, m), and i₄ = a·c, (m,)."""

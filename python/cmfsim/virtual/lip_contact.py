@@ -82,7 +82,7 @@ class Lip:
         """The nodes of edges that belong to one triangle alone."""
         bare = self.neighbours < 0
         ends = [self.triangles[np.roll(bare, shift, axis=1)] for shift in (1, 2)]
-        return np.asarray(np.unique(np.concatenate(ends)))
+        return np.unique(np.concatenate(ends))
 
 
 def lips_of(
@@ -212,7 +212,7 @@ class LipContact:
         """The force of each node, half from either lip, (c,) N."""
         d, onset = touch.depth, self.onset
         pressure = np.where(d < onset, 0.5 * d**2 / onset, d - 0.5 * onset)
-        return np.asarray(0.5 * self.stiffness * touch.area * pressure)
+        return 0.5 * self.stiffness * touch.area * pressure
 
     def coupling(self, displacements: Floats, part: float) -> Any:
         """∂ forces / ∂ displacements, (3n, 3n) N/mm, with the closest feature of each node frozen.
@@ -279,7 +279,7 @@ def _swing(normal: Floats, corners: Floats, weights: Floats) -> Floats:
     way = corners[edge, (opposite + 2) % 3] - corners[edge, (opposite + 1) % 3]
     way /= np.maximum(np.linalg.norm(way, axis=1), np.finfo(np.float64).tiny)[:, None]
     found[edge] -= way[:, :, None] * way[:, None, :]
-    return np.asarray(found)
+    return found
 
 
 def _closest(

@@ -121,9 +121,9 @@ def with_open_mouth(head: PhantomHead, anatomy: Anatomy, bite: float) -> Anatomy
     """
     slit = MouthSlit(head)
     skin = anatomy.skin
-    spacing, lowest = np.asarray(skin.spacing), np.asarray(skin.lowest)
+    spacing, lowest = skin.spacing, skin.lowest
     rows = [head.surface(name, TEETH_SPACING) for name in ("upper_teeth", "lower_teeth")]
-    places = np.vstack([np.asarray(row.vertices) for row in rows])
+    places = np.vstack([row.vertices for row in rows])
     low, high = places.min(axis=0) - TEETH_REACH, places.max(axis=0) + TEETH_REACH
     # The slit begins in front of the lips.
     low[1] -= 2.0 * TEETH_REACH

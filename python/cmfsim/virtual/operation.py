@@ -93,7 +93,7 @@ def screw(matrix: Floats, centre: Floats) -> Callable[[float], Floats]:
 
     def after(part: float) -> Floats:
         if part == 1.0:
-            return np.asarray(matrix, dtype=np.float64)
+            return matrix
         return rigid_motion(part * whole.translation, part * whole.angle, whole.axis, centre)
 
     return after
@@ -138,7 +138,7 @@ def without_bite(
         A tet whose middle has both within this, taken together, lies between them.
     """
     middles = nodes[tets].mean(axis=1)
-    return np.asarray(-upper.sample(middles) - lower.sample(middles) >= gap)
+    return -upper.sample(middles) - lower.sample(middles) >= gap
 
 
 def without_gaps(
@@ -181,7 +181,7 @@ def without_gaps(
 
 def _towards(depth: ImageData, points: Floats) -> Floats:
     """Unit vectors to a bone, (k, 3)."""
-    steps = np.diag(np.asarray(depth.spacing))
+    steps = np.diag(depth.spacing)
     slope = np.column_stack([depth.sample(points + s) - depth.sample(points - s) for s in steps])
     length = np.linalg.norm(slope, axis=1, keepdims=True)
     return np.asarray(slope / np.maximum(length, np.finfo(np.float64).tiny))
@@ -232,11 +232,11 @@ def operate(
     motion = {
         name: screw(matrix, centres[name]) for name, matrix in zip(names, matrices, strict=True)
     }
-    kind = np.asarray(kinds.kind)
+    kind = kinds.kind
     owner = np.full(len(nodes), -1, dtype=np.int64)
     joined = kinds.nodes("joined")
     of_kinds = np.array([names.index(name) for name in kinds.segments])
-    owner[joined] = of_kinds[np.asarray(kinds.segment)[joined]]
+    owner[joined] = of_kinds[kinds.segment[joined]]
     held = np.isin(kind, (1, 2))
     targets = np.zeros_like(nodes)
     for number, matrix in enumerate(matrices):

@@ -19,7 +19,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.cohorts import COHORT_FORMAT
 from cmfsim.io.files import replacing
-from cmfsim.phantom import make_head
+from cmfsim.phantom import PhantomHead, make_head
 from cmfsim.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.carried_skin import scanned
@@ -226,15 +226,7 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
     begun = time.perf_counter()
     head = make_head(patient.parameters)
     stage("imaging the head")
-    ct = head.ct((spacing, spacing, spacing), seed=_draw(seed, patient, CT_DRAW))
-    write_image(ct, folder / "ct.nrrd")
-    skull = _placed(head.skull_landmarks, SKULL_NOISE, [seed, patient.number, SKULL_DRAW])
-    write_landmarks(folder / "skull.mrk.json", skull)
-    skin = _placed(head.skin_landmarks, SKIN_NOISE, [seed, patient.number, SKIN_DRAW])
-    write_landmarks(folder / "skin.mrk.json", skin)
-    with replacing(folder / "case.toml") as file:
-        file.write(case_text(patient, skull, COARSER * edge_length).encode())
-    case = Case.load(folder / "case.toml")
+    case = _write_case(folder, patient, head, seed, spacing=spacing, edge_length=edge_length)
     truth = postoperative_truth(
         patient,
         head,
@@ -247,20 +239,60 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
         progress=progress,
     )
     stage("writing the truth")
-    after = _placed(truth.skin_landmarks, SKIN_NOISE, [seed, patient.number, AFTER_DRAW])
-    scan = scanned(
-        truth.skin,
-        white=SCAN_WHITE,
-        smooth=SCAN_SMOOTH,
-        seed=[seed, patient.number, SCAN_DRAW],
-    )
     write_surface(folder / SKIN, truth.skin_before)
     fresh = folder / f".{TRUTH}.new"
     shutil.rmtree(fresh, ignore_errors=True)
-    _write_truth(fresh, truth, scan, after)
-    record = {
+    _write_truth(fresh, truth, _scan(truth, patient, seed), _landmarks_after(truth, patient, seed))
+    settings = patient_settings(patient, seed, edge_length, spacing)
+    _write_json(fresh / RECORD, _record(patient, truth, settings))
+    # Apart from the record, which the same seed reproduces to the last byte.
+    times = {"seconds": time.perf_counter() - begun, "solve_seconds": truth.equilibrium.seconds}
+    _write_json(fresh / TIMES, times)
+    shutil.rmtree(folder / TRUTH, ignore_errors=True)
+    fresh.rename(folder / TRUTH)
+    return folder / "case.toml"
+
+
+def _write_case(
+    folder: Path,
+    patient: VirtualPatient,
+    head: PhantomHead,
+    seed: int,
+    *,
+    spacing: float,
+    edge_length: float,
+) -> Case:
+    """The case before the operation, read back from the files written: CT, landmarks, case file."""
+    ct = head.ct((spacing, spacing, spacing), seed=_draw(seed, patient, CT_DRAW))
+    write_image(ct, folder / "ct.nrrd")
+    skull = _placed(head.skull_landmarks, SKULL_NOISE, [seed, patient.number, SKULL_DRAW])
+    write_landmarks(folder / "skull.mrk.json", skull)
+    skin = _placed(head.skin_landmarks, SKIN_NOISE, [seed, patient.number, SKIN_DRAW])
+    write_landmarks(folder / "skin.mrk.json", skin)
+    with replacing(folder / "case.toml") as file:
+        file.write(case_text(patient, skull, COARSER * edge_length).encode())
+    return Case.load(folder / "case.toml")
+
+
+def _scan(truth: PostoperativeTruth, patient: VirtualPatient, seed: int) -> SurfaceData:
+    """The true skin after the operation as a surface scanner measures it."""
+    draw = [seed, patient.number, SCAN_DRAW]
+    return scanned(truth.skin, white=SCAN_WHITE, smooth=SCAN_SMOOTH, seed=draw)
+
+
+def _landmarks_after(
+    truth: PostoperativeTruth, patient: VirtualPatient, seed: int
+) -> dict[str, Floats]:
+    return _placed(truth.skin_landmarks, SKIN_NOISE, [seed, patient.number, AFTER_DRAW])
+
+
+def _record(
+    patient: VirtualPatient, truth: PostoperativeTruth, settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What `truth.json` states: how the patient was made, and what the truth is."""
+    return {
         "what": "in silico: a synthetic head and a computed operation; no patient",
-        "settings": patient_settings(patient, seed, edge_length, spacing),
+        "settings": settings,
         "patient": _described(patient),
         "motions": {name: matrix.tolist() for name, matrix in truth.motions.items()},
         "noise_mm": {
@@ -272,18 +304,11 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
         "truth": _measured(truth),
         "versions": {"cmfsim": __version__, "python": platform.python_version()},
     }
-    times = {
-        "seconds": time.perf_counter() - begun,
-        "solve_seconds": truth.equilibrium.seconds,
-    }
-    # Apart from the rest, which the same seed gives again to the last byte.
-    with replacing(fresh / TIMES) as file:
-        file.write(json.dumps(times, indent=1, allow_nan=False).encode())
-    with replacing(fresh / RECORD) as file:
-        file.write(json.dumps(record, indent=1, allow_nan=False).encode())
-    shutil.rmtree(folder / TRUTH, ignore_errors=True)
-    fresh.rename(folder / TRUTH)
-    return folder / "case.toml"
+
+
+def _write_json(path: Path, values: Mapping[str, Any]) -> None:
+    with replacing(path) as file:
+        file.write(json.dumps(values, indent=1, allow_nan=False).encode())
 
 
 def _draw(seed: int, patient: VirtualPatient, draw: int) -> int:
@@ -295,8 +320,7 @@ def _placed(landmarks: Mapping[str, Floats], noise: float, seed: list[int]) -> d
     """Landmarks as they are placed, off by noise along each axis."""
     generator = np.random.default_rng(seed)
     return {
-        label: np.asarray(point) + noise * generator.standard_normal(3)
-        for label, point in landmarks.items()
+        label: point + noise * generator.standard_normal(3) for label, point in landmarks.items()
     }
 
 
@@ -385,7 +409,7 @@ def _described(patient: VirtualPatient) -> dict[str, Any]:
 def _measured(truth: PostoperativeTruth) -> dict[str, Any]:
     """What the solution says of itself."""
     found = truth.equilibrium
-    moved = np.asarray(truth.skin.vertices) - np.asarray(truth.skin_before.vertices)
+    moved = truth.skin.vertices - truth.skin_before.vertices
     lips = truth.lips
     contact: dict[str, Any] = {}
     if lips is not None:
@@ -424,7 +448,7 @@ def _write_truth(
     for name in ("bones", "bones_before"):
         (folder / name).mkdir()
     for name, segment in truth.segments.items():
-        before, matrix = np.asarray(segment.surface.vertices), truth.motions[name]
+        before, matrix = segment.surface.vertices, truth.motions[name]
         after = before @ matrix[:3, :3].T + matrix[:3, 3]
         write_surface(folder / "bones_before" / f"{name}.ply", segment.surface)
         write_surface(

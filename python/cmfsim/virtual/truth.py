@@ -169,17 +169,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     separate = patient.separate_lips
     if options is None and separate:
         options = EquilibriumOptions(steps=STEPS_WITH_LIPS)
-    region = replace(case.region, upper=float(head.skull_landmarks["nasion"][2]) + ABOVE_NASION)
-    mesh = replace(case.mesh, edge_length=length, refine=refine or separate)
-    fine = replace(
-        case,
-        region=region,
-        mesh=mesh,
-        # The operation itself strips tissue off the bone, by how far the sides of a cut move apart.
-        node_kinds=dict(case.node_kinds, lifted=0.0),
-        muscles=None,
-        postoperative=None,
-    )
+    fine = _true_case(case, head, length, refine=refine or separate)
     stage("drawing the true anatomy")
     anatomy = head.anatomy(as_positive("grid", grid))
     bite = head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE
@@ -192,10 +182,10 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     motions = {name: _departure(patient, head, name) @ _motion(case, name) for name in segments}
 
     stage("opening bite and cuts")
-    distances = bone_distances(np.asarray(model.scene.nodes), segments)
+    distances = bone_distances(model.scene.nodes, segments)
     opened = _opened(
-        np.asarray(model.scene.nodes),
-        np.asarray(model.scene.tets),
+        model.scene.nodes,
+        model.scene.tets,
         model.kinds,
         distances,
         motions,
@@ -206,8 +196,8 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
 
     stage("placing the true muscles")
     muscles = thickened(head.muscles, patient.muscle_thickness)
-    depth = np.maximum(anatomy.skin.sample(nodes), 0.0)
-    fraction, fibre = muscle_field(head, muscles, nodes, tets, depth)
+    depth = anatomy.skin.sample(nodes)
+    fraction, fibre = muscle_field(head, muscles, nodes, tets, np.maximum(depth, 0.0))
     tissue = HyperelasticTissue.mixed(fraction, fibre, stiffness=patient.muscle_stiffness)
 
     stage("moving the bones")
@@ -223,7 +213,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
         boundary,
         opened.kinds,
         distances=distances,
-        centres={name: np.asarray(s.surface.vertices).mean(axis=0) for name, s in segments.items()},
+        centres={name: s.surface.vertices.mean(axis=0) for name, s in segments.items()},
         plan=motions,
         bared=bared,
     )
@@ -234,14 +224,10 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
 
     stage("moving the skin")
     before = head.surface("skin", skin_spacing)
-    places, names = np.asarray(before.vertices), list(head.skin_landmarks)
-    points = np.array([head.skin_landmarks[name] for name in names])
-    after = places + carried(places, nodes, tets, found.displacements)
-    moved = points + carried(points, nodes, tets, found.displacements)
-    if patient.thickness_change:
-        outward = _outward(patient, before, after, segments)
-        after, moved = after + outward, moved + outward[_nearest(points, places)]
-    on_skin = np.abs(anatomy.skin.sample(nodes)) < NEAR_SKIN
+    after, landmarks = _moved_skin(
+        patient, head, opened, found.displacements, before=before, segments=segments
+    )
+    on_skin = np.abs(depth) < NEAR_SKIN
     return PostoperativeTruth(
         nodes=nodes,
         tets=tets,
@@ -250,7 +236,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
         fibre=fibre,
         skin_before=before,
         skin=SurfaceData(after, before.triangles),
-        skin_landmarks=dict(zip(names, moved, strict=True)),
+        skin_landmarks=landmarks,
         skull_landmarks=_moved_sites(head.skull_landmarks, segments, motions),
         segments=segments,
         motions=motions,
@@ -260,6 +246,39 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
         last_step=float(np.linalg.norm(found.last_step[on_skin], axis=1).max()),
         lips=lips,
     )
+
+
+def _true_case(case: Case, head: PhantomHead, edge_length: float, *, refine: bool) -> Case:
+    """The case as the true model is built from it: its own mesh, no muscles, nothing afterwards."""
+    return replace(
+        case,
+        region=replace(case.region, upper=float(head.skull_landmarks["nasion"][2]) + ABOVE_NASION),
+        mesh=replace(case.mesh, edge_length=edge_length, refine=refine),
+        # The operation itself strips tissue off the bone, by how far the sides of a cut move apart.
+        node_kinds=dict(case.node_kinds, lifted=0.0),
+        muscles=None,
+        postoperative=None,
+    )
+
+
+def _moved_skin(
+    patient: VirtualPatient,
+    head: PhantomHead,
+    tissue: "_Opened",
+    displacements: Floats,
+    *,
+    before: SurfaceData,
+    segments: Mapping[str, BoneSegment],
+) -> tuple[Floats, dict[str, Floats]]:
+    """Vertices and landmarks of the skin after the operation, carried by the tissue and swollen."""
+    places, names = before.vertices, list(head.skin_landmarks)
+    points = np.array([head.skin_landmarks[name] for name in names])
+    after = places + carried(places, tissue.nodes, tissue.tets, displacements)
+    moved = points + carried(points, tissue.nodes, tissue.tets, displacements)
+    if patient.thickness_change:
+        outward = _outward(patient, before, after, segments)
+        after, moved = after + outward, moved + outward[_nearest(points, places)]
+    return after, dict(zip(names, moved, strict=True))
 
 
 def _motion(case: Case, segment: str) -> Floats:

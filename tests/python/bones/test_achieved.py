@@ -142,7 +142,7 @@ def test_the_real_mandible_is_found_where_it_was_taken():
 @pytest.mark.parametrize(
     ("arguments", "pattern"),
     [
-        ({"segments": {}}, "no segment"),
+        ({"segments": {}}, "segments is empty"),
         ({"postoperative": {"cranium": None}}, "no post-operative surface of jaw"),
         ({"reference": "skull"}, "use one of cranium, jaw"),
         ({"centres": {"chin": (0, 0, 0)}}, "use one of cranium, jaw"),
@@ -172,7 +172,9 @@ def test_bad_options_are_named(options, pattern):
 
 
 def test_other_triangles_are_refused():
-    with pytest.raises(cmfsim.RegistrationError, match="other triangles: 80 on 42 vertices before"):
+    with pytest.raises(
+        cmfsim.RegistrationError, match="different triangles: 80 on 42 vertices before"
+    ):
         cmfsim.measure_motion(pebble(1), pebble(2))
 
 

@@ -183,7 +183,7 @@ def test_targets_that_cannot_be_met_are_refused(planning):
     point = np.asarray(planning.skin_before.vertices)[:1]
     with pytest.raises(cmfsim.CaseError, match="no target"):
         cmfsim.plan_for_face(planning, [])
-    with pytest.raises(cmfsim.CaseError, match="lies away from the tissue"):
+    with pytest.raises(cmfsim.CaseError, match="lies outside the tissue"):
         cmfsim.plan_for_face(planning, [cmfsim.PointTarget(point + 500.0, point)])
     with pytest.raises(cmfsim.CaseError, match="one goal for each"):
         cmfsim.PointTarget(point, np.zeros((2, 3)))
@@ -200,7 +200,7 @@ def test_targets_that_cannot_be_met_are_refused(planning):
     wish = [cmfsim.PointTarget(point, point)]
     for search, said in (
         (cmfsim.FaceSearch(segments=["chin"]), "no segment 'chin'"),
-        (cmfsim.FaceSearch(follows={"maxilla": "maxilla"}), "does not move by itself"),
+        (cmfsim.FaceSearch(follows={"maxilla": "maxilla"}), "does not move independently"),
         (cmfsim.FaceSearch(["mandible"], follows={"mandible": "maxilla"}), "nothing is free"),
     ):
         with pytest.raises(cmfsim.CaseError, match=said):

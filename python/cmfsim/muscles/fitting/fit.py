@@ -161,7 +161,7 @@ def fit_muscles(morphed: MorphedMusculature, anatomy: Anatomy) -> MuscleFit:
     >>> fit = cmfsim.fit_muscles(muscles, head.anatomy(3.0))  # doctest: +SKIP
     """
     begun = time.perf_counter()
-    vertices = np.concatenate([np.asarray(m.surface.vertices) for m in morphed.muscles])
+    vertices = np.concatenate([m.surface.vertices for m in morphed.muscles])
     volumes = Volumes.of([m.surface for m in morphed.muscles])
     samples = [_samples(i, muscle) for i, muscle in enumerate(morphed.muscles)]
     courses = [line for muscle in morphed.muscles for line in muscle.course]
@@ -181,7 +181,7 @@ def fit_muscles(morphed: MorphedMusculature, anatomy: Anatomy) -> MuscleFit:
         replace(
             muscle,
             surface=replace(muscle.surface, vertices=volumes.part(after, i)),
-            course=tuple(moved(np.asarray(line)) for line in muscle.course),
+            course=tuple(moved(line) for line in muscle.course),
         )
         for i, muscle in enumerate(morphed.muscles)
     )
@@ -244,7 +244,7 @@ def _samples(index: int, muscle: MuscleSurface) -> Floats:
         surface = Surface(muscle.surface.vertices, muscle.surface.triangles)
     except MeshError as error:
         raise MeshInputError(f"muscle {muscle.name!r}: {error}") from error
-    vertices = np.asarray(muscle.surface.vertices)
+    vertices = muscle.surface.vertices
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     volume = surface.volume or 0.5 * surface.area
     edge = (abs(volume) / SAMPLES) ** (1.0 / 3.0)
@@ -253,7 +253,7 @@ def _samples(index: int, muscle: MuscleSurface) -> Floats:
     corners = np.indices(cells.tolist()).reshape(3, -1).T
     places = corners + np.random.default_rng(index).random(corners.shape)
     points = low + places * (high - low) / cells
-    inside = np.abs(np.asarray(surface.winding_number(points))) > 0.5
+    inside = np.abs(surface.winding_number(points)) > 0.5
     return np.asarray(points[inside])
 
 
@@ -263,9 +263,7 @@ def _targets(morphed: MorphedMusculature, begins: Sequence[int]) -> Targets:
     carried = Surface(morphed.skull.vertices, morphed.skull.triangles)
     spread = [_spread(muscle.surface) for muscle in morphed.muscles]
     first, last = (
-        np.concatenate(
-            [np.asarray(m.surface.vertices)[c] for m, (c, _) in zip(muscles, spread, strict=True)]
-        )
+        np.concatenate([m.surface.vertices[c] for m, (c, _) in zip(muscles, spread, strict=True)])
         for muscles in (morphed.template.muscles, morphed.muscles)
     )
     closest, normals, _ = bone.closest(first)
@@ -274,7 +272,7 @@ def _targets(morphed: MorphedMusculature, begins: Sequence[int]) -> Targets:
     return Targets(
         np.concatenate([begin + c for begin, (c, _) in zip(begins, spread, strict=False)]),
         np.concatenate([area for _, area in spread]),
-        np.asarray(carried.closest(last)[1]),
+        carried.closest(last)[1],
         (apart < ATTACHED) | (height < 0.0),
         np.clip(-height, 0.0, MOST_DEPTH),
     )
@@ -282,7 +280,7 @@ def _targets(morphed: MorphedMusculature, begins: Sequence[int]) -> Targets:
 
 def _spread(surface: SurfaceData) -> tuple[NDArray[np.intp], Floats]:
     """Vertices of a surface that are spread over it evenly, and the area for which each stands."""
-    vertices = np.asarray(surface.vertices)
+    vertices = surface.vertices
     triangles = np.asarray(surface.triangles, dtype=np.intp)
     cross = np.cross(
         vertices[triangles[:, 1]] - vertices[triangles[:, 0]],

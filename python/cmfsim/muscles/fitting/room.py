@@ -85,7 +85,7 @@ def known_part(skin: ImageData) -> tuple[Floats, Floats]:
     low, high : (3,) float64, mm
         Infinite where the head was not cut off along an axis.
     """
-    inside = np.asarray(skin.values) > 0.0
+    inside = skin.values > 0.0
     low, high = np.full(3, -np.inf), np.full(3, np.inf)
     for axis in range(3):
         others = tuple(a for a in range(3) if a != axis)
@@ -93,7 +93,7 @@ def known_part(skin: ImageData) -> tuple[Floats, Floats]:
         held = np.flatnonzero(count)
         if len(held) < 3:
             continue
-        spacing = float(np.asarray(skin.spacing)[axis])
+        spacing = float(skin.spacing[axis])
         # The slice after the outermost: the cut itself may lie between two.
         if count[held[0] + 1] > CUT_SHARE * count.max():
             low[axis] = skin.lowest[axis] + spacing * (held[0] + 1)
@@ -104,9 +104,9 @@ def known_part(skin: ImageData) -> tuple[Floats, Floats]:
 
 def _resampled(level: ImageData, axes: list[Floats]) -> NDArray[np.float32]:
     """A level at the crossings of three axes, trilinear, beyond the border as at the border."""
-    values = np.asarray(level.values)
+    values = level.values
     for axis, places in enumerate(axes):
-        spacing = float(np.asarray(level.spacing)[axis])
+        spacing = float(level.spacing[axis])
         at = np.clip((places - level.lowest[axis]) / spacing, 0.0, values.shape[axis] - 1.0)
         before = np.minimum(at.astype(np.intp), max(values.shape[axis] - 2, 0))
         after = np.minimum(before + 1, values.shape[axis] - 1)

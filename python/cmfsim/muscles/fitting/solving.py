@@ -168,7 +168,7 @@ def _way_out(
     """How far it is along a direction until a distance is positive, mm; 0 where not asked."""
     way = np.zeros(len(points))
     inside = np.flatnonzero(asked)
-    step = 0.5 * float(np.asarray(level.spacing)[0])
+    step = 0.5 * float(level.spacing[0])
     while len(inside) and way[inside].max() <= FURTHEST + step:
         way[inside] += step
         places = points[inside] + way[inside, None] * direction[inside]
@@ -178,7 +178,7 @@ def _way_out(
 
 def sampled(level: ImageData, points: Floats) -> tuple[Floats, Floats]:
     """A distance at points and its unit gradient."""
-    step = 0.5 * float(np.asarray(level.spacing)[0])
+    step = 0.5 * float(level.spacing[0])
     offsets = step * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
     around = level.sample((points[None] + offsets[:, None]).reshape(-1, 3)).reshape(7, -1)
     gradient = (around[1:4] - around[4:]).T

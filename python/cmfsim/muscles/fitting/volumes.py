@@ -33,7 +33,7 @@ class Volumes:
     @classmethod
     def of(cls, surfaces: Sequence[SurfaceData]) -> Self:
         """Those of surfaces whose vertices are joined in their order."""
-        begins = np.cumsum([0, *(len(np.asarray(s.vertices)) for s in surfaces)])
+        begins = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
         triangles = [np.asarray(s.triangles, dtype=np.intp) for s in surfaces]
         return cls(tuple(triangles), tuple(map(_is_closed, triangles)), tuple(begins.tolist()))
 

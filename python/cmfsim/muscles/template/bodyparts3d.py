@@ -255,9 +255,9 @@ def _mirrored(surface: SurfaceData, landmarks: Mapping[str, Floats]) -> SurfaceD
     normal = across / np.linalg.norm(across)
     pairs = [0.5 * (landmarks[f"{name}_L"] + landmarks[f"{name}_R"]) for name in vectors]
     middle = np.mean(pairs, axis=0)
-    vertices = np.asarray(surface.vertices)
+    vertices = surface.vertices
     height = (vertices - middle) @ normal
-    triangles = np.asarray(surface.triangles)[:, ::-1]
+    triangles = surface.triangles[:, ::-1]
     return SurfaceData(vertices - 2.0 * height[:, None] * normal, triangles)
 
 

@@ -38,7 +38,7 @@ def atlas_course(name: str, side: str, surface: SurfaceData) -> tuple[Floats, ..
     -------
     tuple of (n, 3) float64, mm
     """
-    vertices = np.asarray(surface.vertices)
+    vertices = surface.vertices
     mirror = np.array([-1.0 if side == "R" else 1.0, 1.0, 1.0])
     if name == "temporalis":
         tip = vertices[np.argsort(vertices[:, 2])[:TIP_VERTICES]].mean(axis=0)

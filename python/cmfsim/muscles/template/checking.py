@@ -88,7 +88,7 @@ def check_contents(template: TemplateData) -> tuple[Finding, ...]:
 def _searchable(surface: object) -> Surface | None:
     """A surface to measure distances from; None if no triangle of it has an area."""
     cleaned = clean_surface(surface)  # type: ignore[arg-type]
-    if not len(np.asarray(cleaned.triangles)):
+    if not len(cleaned.triangles):
         return None
     return Surface(cleaned.vertices, cleaned.triangles)
 
@@ -203,7 +203,7 @@ def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Ite
 
 
 def _check_skull(template: TemplateData) -> Iterator[Finding]:
-    vertices = np.asarray(template.skull.vertices)
+    vertices = template.skull.vertices
     extent = float(np.ptp(vertices, axis=0).max()) if len(vertices) else 0.0
     low, high = SKULL_EXTENT
     if not low <= extent <= high:
@@ -286,9 +286,9 @@ def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Find
             "affected",
             fix="nothing, if the muscle looks right",
         )
-    if skull is None or not len(np.asarray(muscle.surface.vertices)):
+    if skull is None or not len(muscle.surface.vertices):
         return
-    nearest = float(_distances(skull, np.asarray(muscle.surface.vertices)).min())
+    nearest = float(_distances(skull, muscle.surface.vertices).min())
     if nearest > MUSCLE_DISTANCE:
         yield Finding.warning(
             "template-far-from-skull",
@@ -316,7 +316,7 @@ def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Find
 
 def _check_sides(template: TemplateData) -> Iterator[Finding]:
     """Left muscles on the left of right ones: x grows to the patient's left."""
-    middles = {m.name: np.asarray(m.surface.vertices).mean(axis=0)[0] for m in template.muscles}
+    middles = {m.name: m.surface.vertices.mean(axis=0)[0] for m in template.muscles}
     for muscle in template.muscles:
         partner = f"{muscle.name[:-1]}R"
         if muscle.side != "L" or partner not in middles:

@@ -115,10 +115,10 @@ class _View:
         first /= np.linalg.norm(first)
         self.axes = np.array([first, np.cross(axis, first)])
         self._axis = axis
-        vertices = np.asarray(surface.vertices)
+        vertices = surface.vertices
         self.places = self.flat(vertices)
         self._depths = vertices @ axis
-        self._triangles = np.asarray(surface.triangles)
+        self._triangles = surface.triangles
 
     def flat(self, points: Floats) -> Floats:
         """Where points lie in the plane, (n, 2)."""

@@ -93,7 +93,7 @@ def phantom_muscle(head: PhantomHead, muscle: Muscle) -> MuscleSurface:
 def _surface(head: PhantomHead, part: str, spacing: float) -> SurfaceData:
     """The closed surface of a part in rounded coordinates, without what the grid broke off."""
     drawn = head.surface(part, spacing)
-    rounded = SurfaceData(_rounded(np.asarray(drawn.vertices)), drawn.triangles)
+    rounded = SurfaceData(_rounded(drawn.vertices), drawn.triangles)
     return repair_surface(rounded, part, RepairOptions())[0]
 
 

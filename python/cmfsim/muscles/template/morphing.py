@@ -181,9 +181,7 @@ def morph_template(
         warp=warp,
         skull=_warped(template.skull, warp),
         landmarks=MappingProxyType(dict(zip(matched.names, matched.target, strict=True))),
-        residuals=MappingProxyType(
-            dict(zip(matched.names, np.asarray(warp.residuals).tolist(), strict=True))
-        ),
+        residuals=MappingProxyType(dict(zip(matched.names, warp.residuals.tolist(), strict=True))),
         leave_one_out=left_out,
         missing=tuple(name for name in template.landmarks if name not in matched.names),
         folds=MappingProxyType(folds),
@@ -265,7 +263,7 @@ def _folds(
     found: dict[str, int] = {}
     worst: tuple[float, str, Floats] = (np.inf, "", np.zeros(3))
     for muscle in template.muscles:
-        points = np.asarray(muscle.surface.vertices)
+        points = muscle.surface.vertices
         folds = warp.folds(points)
         if not folds.count or folds.worst is None or folds.smallest is None:
             continue

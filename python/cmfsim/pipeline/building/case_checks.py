@@ -65,7 +65,7 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
             name,
             motion,
             case.where("plan" if case.achieved else f"plan.{name}"),
-            points=np.asarray(surfaces[name].vertices),
+            points=surfaces[name].vertices,
             typed=given is not None and given.typed,
             has_centre=given is not None and given.centre is not None,
         )
@@ -94,14 +94,14 @@ def untouched(
     """
     findings = []
     segments = {segment.name: segment for segment in bones.segments}
-    nodes = np.asarray(mesh.nodes)
+    nodes = mesh.nodes
     low, high = nodes.min(axis=0), nodes.max(axis=0)
     for name, motion in bones.motions.items():
         if len(kinds.nodes("joined", name)) or len(kinds.nodes("sliding", name)):
             continue
         if not isinstance(motion, MovedSurface) and np.array_equal(motion, np.eye(4)):
             continue
-        vertices = np.asarray(segments[name].surface.vertices)
+        vertices = segments[name].surface.vertices
         beside = ((vertices > low) & (vertices < high)).all(axis=1).any()
         what = (
             f"segment {name!r} moves, but no node of the tissue is joined to it or slides on it "

@@ -357,8 +357,8 @@ def _nodes(
     if mesh.n_tets < whole or lips.regions:
         report = report_of_part(mesh, report)
     found = end_findings(
-        np.asarray(mesh.nodes),
-        np.asarray(mesh.boundary_triangles()),
+        mesh.nodes,
+        mesh.boundary_triangles(),
         kinds,
         anatomy,
         tissue.region,
@@ -382,7 +382,7 @@ def _assembled(
     """The patient without muscles."""
     case, anatomy, kinds = head.case, head.anatomy, nodes.kinds
     stages.begin("assembling the scene")
-    places, boundary = np.asarray(nodes.mesh.nodes), np.asarray(nodes.mesh.boundary_triangles())
+    places, boundary = nodes.mesh.nodes, nodes.mesh.boundary_triangles()
     slid = nodes.contacts.of_scene(bones.segments, kinds)
     scene = _scene(case, nodes, bones, slid)
     departures = nodes.contacts.summary(bones.segments, kinds, places, slid)
@@ -498,7 +498,7 @@ def _summary(
         "mesh": nodes.report.as_dict(),
         "grid": {
             "shape": list(grid.values.shape),
-            "spacing": np.asarray(grid.spacing).tolist(),
+            "spacing": grid.spacing.tolist(),
             "origin": grid.lowest.tolist(),
         },
         "bones": list(head.anatomy.bones),

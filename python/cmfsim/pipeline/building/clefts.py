@@ -34,7 +34,7 @@ def without_clefts(
     width : float, mm
         As for `cleft_tets`.
     """
-    nodes, tets = np.asarray(mesh.nodes), np.asarray(mesh.tets)
+    nodes, tets = mesh.nodes, mesh.tets
     inside = cleft_tets(nodes, tets, kinds, segments, moved=moved, width=width)
     if not inside.any():
         return mesh, kinds, ()
@@ -43,7 +43,7 @@ def without_clefts(
     used[kept] = True
     number = np.cumsum(used) - 1
     left = TetMesh(nodes[used], number[kept])
-    volume = float(np.asarray(mesh.volumes)[inside].sum())
+    volume = float(mesh.volumes[inside].sum())
     finding = Finding.note(
         "clefts-left-out",
         f"{int(inside.sum())} tets of {volume:.0f} mm³ in all lie in the clefts between segments "
@@ -84,7 +84,7 @@ def cleft_tets(
     if width <= 0.0 or not moved:
         return inside
     moves = np.array([name in moved for name in kinds.segments])
-    owner = np.asarray(kinds.segment)[tets]
+    owner = kinds.segment[tets]
     most = owner.max(axis=1)
     least = np.where(owner < 0, most[:, None], owner).min(axis=1)
     inside |= (most != least) & (moves[most] | moves[least])
@@ -113,7 +113,7 @@ def _least_at_corners(
     nodes: Floats, tets: NDArray[np.uint32], surface: Surface, reach: float
 ) -> Floats:
     """The distance of each tet's nearest corner from a surface; infinity beyond its box."""
-    vertices = np.asarray(surface.vertices)
+    vertices = surface.vertices
     low, high = vertices.min(axis=0) - reach, vertices.max(axis=0) + reach
     near = np.flatnonzero(((nodes >= low) & (nodes <= high)).all(axis=1))
     distance = np.full(len(nodes), np.inf)

@@ -159,11 +159,11 @@ def _whole_bone(
 
     But for a bone that the other arch, too, was cut from.
     """
-    level = np.maximum.reduce([np.asarray(segment.level.values) for segment in mine])
+    level = np.maximum.reduce([segment.level.values for segment in mine])
     inside = level > 0.0
-    theirs = [np.asarray(segments[number].level.values) > 0.0 for number in sorted(others)]
+    theirs = [segments[number].level.values > 0.0 for number in sorted(others)]
     for bone in anatomy.bones.values():
-        values = np.asarray(bone.values)
+        values = bone.values
         if values.shape != level.shape or not (inside & (values > 0.0)).any():
             continue
         if not any(_mostly(other, values) for other in theirs):
@@ -201,5 +201,5 @@ def _sharp(jaw: str, name: str, sheet: ContactSheet, edge_length: float) -> Find
 
 def mean_edge(mesh: TetMesh) -> float:
     """The mean length of the edges on the boundary of a mesh, mm."""
-    corners = np.asarray(mesh.nodes)[np.asarray(mesh.boundary_triangles())]
+    corners = mesh.nodes[mesh.boundary_triangles()]
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())

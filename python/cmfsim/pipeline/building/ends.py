@@ -59,7 +59,7 @@ def _near_ends(
 ) -> Iterator[Finding]:
     image_low, image_high = (float(h[2]) for h in (anatomy.skin.lowest, anatomy.skin.highest))
     for segment in moving:
-        heights = np.asarray(segment.surface.vertices)[:, 2]
+        heights = segment.surface.vertices[:, 2]
         ends = (
             ("below", region.lower, float(heights.min()), -1.0, image_low, "lower"),
             ("above", region.upper, float(heights.max()), 1.0, image_high, "upper"),
@@ -96,7 +96,7 @@ def _loose_ends(
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     twice = np.linalg.norm(normal, axis=1)
     free = (kinds.kind[triangles] == 0).all(axis=1)
-    spacing = np.asarray(anatomy.skin.spacing)
+    spacing = anatomy.skin.spacing
     for axis, names in enumerate(BORDERS):
         for name, sign, end in zip(
             names, (-1.0, 1.0), (anatomy.skin.lowest, anatomy.skin.highest), strict=True

@@ -27,7 +27,7 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
     MeshError
         (also `ValueError`) Nothing of it is held.
     """
-    tets = np.asarray(mesh.tets)
+    tets = mesh.tets
     body = tet_bodies(tets)
     n_bodies = int(body.max(initial=-1)) + 1
     holds = np.isin(kinds.kind, (1, 2))
@@ -46,9 +46,9 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
     keep_node = np.zeros(mesh.n_nodes, dtype=bool)
     keep_node[tets[~dropped]] = True
     number = np.cumsum(keep_node) - 1
-    kept = TetMesh(np.asarray(mesh.nodes)[keep_node], number[tets[~dropped]])
-    volume = float(np.asarray(mesh.volumes)[dropped].sum())
-    place = np.asarray(mesh.nodes)[tets[dropped]].reshape(-1, 3).mean(axis=0)
+    kept = TetMesh(mesh.nodes[keep_node], number[tets[~dropped]])
+    volume = float(mesh.volumes[dropped].sum())
+    place = mesh.nodes[tets[dropped]].reshape(-1, 3).mean(axis=0)
     speck = volume < SPECKS
     finding = Finding(
         severity="note" if speck else "warning",

@@ -74,7 +74,7 @@ def find_seam(
 
 def _upwards(surface: SurfaceData) -> SurfaceData:
     """The surface, turned if its normals look down."""
-    vertices, triangles = np.asarray(surface.vertices), np.asarray(surface.triangles)
+    vertices, triangles = surface.vertices, surface.triangles
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     if float(np.cross(b - a, c - a)[:, 2].sum()) >= 0.0:
         return surface
@@ -109,7 +109,7 @@ def separated_at_seam(
             fix="none is needed",
         )
         return mesh, kinds, (finding,)
-    _, place = np.unique(np.asarray(separated.nodes), axis=0, return_inverse=True)
+    _, place = np.unique(separated.nodes, axis=0, return_inverse=True)
     place = place.reshape(-1)
     first = np.full(place.max() + 1, -1)
     first[place[: mesh.n_nodes]] = np.arange(mesh.n_nodes)
@@ -145,11 +145,11 @@ def lip_contact(
     """
     if seam.surface is None:
         return CaseLipContact({}, kinds)
-    nodes = np.asarray(mesh.nodes)
+    nodes = mesh.nodes
     by_jaw = {} if arches is None else arches.by_jaw
     regions = lip_regions(
         nodes,
-        np.asarray(mesh.boundary_triangles()),
+        mesh.boundary_triangles(),
         kinds,
         seam.surface,
         height=height,
@@ -168,7 +168,7 @@ def lip_contact(
 
 def _touching(nodes: Floats, lip: LipRegion, other: LipRegion) -> TouchingData:
     """The nodes of a lip that may come to the other one, and that one."""
-    ids = np.asarray(lip.nodes)
+    ids = lip.nodes
     away = _distances(nodes[ids], Surface(nodes, other.triangles))
     return TouchingData(ids[away <= REACH], other.triangles)
 
@@ -199,7 +199,7 @@ def _obstacles(
     bones = [Surface(s.surface.vertices, s.surface.triangles) for s in bearers]
     found = []
     for lip, region in regions.items():
-        ids = np.asarray(region.nodes)
+        ids = region.nodes
         if not len(ids):
             continue
         away = np.array([_distances(nodes[ids], bone) for bone in bones])
@@ -224,7 +224,7 @@ def _sheet(segment: BoneSegment, contacts: CaseContacts) -> SurfaceData:
 
 def _on_teeth(sheet: SurfaceData, bones: Sequence[Surface]) -> SurfaceData | None:
     """The part of a sheet that lies on bones and teeth, its largest piece; None if none does."""
-    vertices, triangles = np.asarray(sheet.vertices), np.asarray(sheet.triangles)
+    vertices, triangles = sheet.vertices, sheet.triangles
     away = np.min([_distances(vertices, bone) for bone in bones], axis=0)
     kept = triangles[(away[triangles] <= ON_TEETH).all(axis=1)]
     if not len(kept):

@@ -232,8 +232,8 @@ def _same_bone(case: Case, name: str, there: SurfaceData) -> MovedSurface | None
     if before is None or given is None or case.surfaces is None:
         return None
     here = read_surface(before, units=case.surfaces.units, frame=case.surfaces.frame)
-    same = len(np.asarray(here.vertices)) == len(np.asarray(there.vertices)) and np.array_equal(
-        np.asarray(here.triangles), np.asarray(there.triangles)
+    same = len(here.vertices) == len(there.vertices) and np.array_equal(
+        here.triangles, there.triangles
     )
     return MovedSurface(here, there.vertices) if same else None
 
@@ -255,12 +255,12 @@ def _paired(case: Case, name: str, moved: MovedSurface) -> list[Finding]:
 
 def _joined(surfaces: list[SurfaceData]) -> SurfaceData:
     """Several surfaces as one."""
-    starts = np.cumsum([0, *(len(np.asarray(s.vertices)) for s in surfaces)])
+    starts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
     return SurfaceData(
-        np.concatenate([np.asarray(s.vertices) for s in surfaces]),
+        np.concatenate([s.vertices for s in surfaces]),
         np.concatenate(
             [
-                np.asarray(s.triangles).astype(np.int64) + start
+                s.triangles.astype(np.int64) + start
                 for s, start in zip(surfaces, starts[:-1], strict=True)
             ]
         ),

@@ -116,9 +116,9 @@ def _laid_on(case: Case, bones: Mapping[str, SurfaceData]) -> Floats:
         )
     still = read_surface(before[name], units=case.surfaces.units, frame=case.surfaces.frame)
     after = bones[name]
-    here, there = np.asarray(still.vertices), np.asarray(after.vertices)
+    here, there = still.vertices, after.vertices
     if here.shape == there.shape and np.array_equal(still.triangles, after.triangles):
-        return np.asarray(_trimmed_fit(there, here))
+        return _trimmed_fit(there, here)
     start = np.eye(4)
     start[:3, 3] = here.mean(axis=0) - there.mean(axis=0)
     from cmfsim.registration import icp  # noqa: PLC0415
@@ -131,7 +131,7 @@ def _laid_on(case: Case, bones: Mapping[str, SurfaceData]) -> Floats:
             "above the jaws, and write aligned = true"
         )
     _log.info("%s after the operation aligned with the one before: %.2f mm rms", name, fit.rms)
-    return np.asarray(fit.matrix, dtype=np.float64)
+    return fit.matrix
 
 
 def _trimmed_fit(moving: Floats, fixed: Floats) -> Floats:
@@ -139,7 +139,7 @@ def _trimmed_fit(moving: Floats, fixed: Floats) -> Floats:
     kept = np.ones(len(moving), dtype=bool)
     for _ in range(MOST_STEPS):
         fit = rigid_fit(moving[kept], fixed[kept])
-        matrix = np.asarray(fit.matrix, dtype=np.float64)
+        matrix = fit.matrix
         left = np.linalg.norm(moving @ matrix[:3, :3].T + matrix[:3, 3] - fixed, axis=1)
         nearest = left <= np.quantile(left, 1.0 - TRIM)
         if np.array_equal(nearest, kept):
@@ -160,7 +160,7 @@ def _scanned(case: Case, given: CasePostoperative) -> Postoperative:
 
     head = segment_head(read.image, segment_options(case), landmarks=there or None)
     levels = list(head.bones.values())
-    bone = levels[0].with_values(np.maximum.reduce([np.asarray(b.values) for b in levels]))
+    bone = levels[0].with_values(np.maximum.reduce([b.values for b in levels]))
     return Postoperative(
         _carried(surface_of_level("skin", head.skin), matrix),
         {},
@@ -185,5 +185,5 @@ def _registered(case: Case, after: ImageData, skull: Mapping[str, Floats]) -> Fl
 
 
 def _carried(surface: SurfaceData, matrix: Floats) -> SurfaceData:
-    vertices = np.asarray(surface.vertices) @ matrix[:3, :3].T + matrix[:3, 3]
+    vertices = surface.vertices @ matrix[:3, :3].T + matrix[:3, 3]
     return replace(surface, vertices=vertices)

@@ -34,7 +34,7 @@ SEAM_REACH = 4.0
 def allowed_halvings(anatomy: Anatomy) -> Counts:
     """How often the edge may be halved for what is thin: (nx, ny, nz) on the anatomy's grid."""
     allowed: Counts = near_skin(anatomy, THIN_DEPTH).astype(np.uint8)
-    allowed[np.asarray(anatomy.skin.values) <= 0.0] = GAP_REFINEMENTS
+    allowed[anatomy.skin.values <= 0.0] = GAP_REFINEMENTS
     return allowed
 
 
@@ -55,13 +55,13 @@ def needed_halvings(level: ImageData, anatomy: Anatomy) -> Counts:
     -------
     (nx, ny, nz) uint8
     """
-    tissue = np.asarray(level.values) > 0.0
+    tissue = level.values > 0.0
     upper = np.zeros(tissue.shape, dtype=bool)
     lower = np.zeros(tissue.shape, dtype=bool)
     for name, bone in anatomy.bones.items():
         jaw = lower if name == "mandible" else upper
-        jaw |= np.asarray(bone.values) > 0.0
-    sx, sy, sz = (float(s) for s in np.asarray(level.spacing))
+        jaw |= bone.values > 0.0
+    sx, sy, sz = (float(s) for s in level.spacing)
     width = np.zeros(tissue.shape, dtype=np.float32)
     for jaw in (upper, lower):
         width += distance_image(jaw, (sx, sy, sz), within=MOUTH_WIDTH)
@@ -88,13 +88,13 @@ def lip_halvings(level: ImageData, seam: LipSeam, edge_length: float) -> Counts:
     -------
     (nx, ny, nz) uint8
     """
-    values = np.asarray(level.values)
+    values = level.values
     needed = np.zeros(values.shape, dtype=np.uint8)
     if seam.surface is None:
         return needed
     thickness = float(seam.summary.get("thickness", np.inf))
     wanted = int(np.ceil(np.log2(max(TETS_IN_LIP * edge_length / max(thickness, 1e-3), 1.0))))
-    vertices, spacing = np.asarray(seam.surface.vertices), np.asarray(level.spacing)
+    vertices, spacing = seam.surface.vertices, level.spacing
     low = np.floor((vertices.min(axis=0) - SEAM_REACH - level.lowest) / spacing).astype(int)
     high = np.ceil((vertices.max(axis=0) + SEAM_REACH - level.lowest) / spacing).astype(int) + 1
     low, high = np.maximum(low, 0), np.clip(high, 0, values.shape)

@@ -48,8 +48,8 @@ CUT_MARGIN = 1.5
 
 def region_of(case: Case, anatomy: Anatomy, landmarks: Mapping[str, Floats]) -> TissueRegion:
     """The region of the case; where the head was cut off below or above, tissue ends on a plane."""
-    inside = np.asarray(anatomy.skin.values) > 0.0
-    lowest, spacing = anatomy.skin.lowest, np.asarray(anatomy.skin.spacing)
+    inside = anatomy.skin.values > 0.0
+    lowest, spacing = anatomy.skin.lowest, anatomy.skin.spacing
     rows = np.flatnonzero(inside.any(axis=(0, 2)))
     foremost, hindmost = (lowest[1] + spacing[1] * rows[[0, -1]]).tolist()
     plane = case.region.plane(landmarks, foremost, hindmost)

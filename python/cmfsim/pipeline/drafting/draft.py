@@ -391,7 +391,7 @@ def _write_motion(text: Text, name: str, motion: DraftMotion) -> None:
         text.ask(key, motion.question, motion.choices, value)
     lead = "# " if motion.question else ""
     if motion.matrix is not None:
-        text.matrix(np.asarray(motion.matrix).tolist(), lead)
+        text.matrix(motion.matrix.tolist(), lead)
     elif motion.transform and not motion.question:
         text.value("transform", motion.transform)
 

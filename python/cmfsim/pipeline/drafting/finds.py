@@ -268,10 +268,10 @@ def image_find(path: Path, label: str) -> ImageFind:
     except (CmfsimError, OSError) as error:
         return ImageFind(label, role, path, error=str(error))
     image = read.image
-    spacing = np.abs(np.asarray(image.spacing, dtype=np.float64))
+    spacing = np.abs(image.spacing)
     size = " × ".join(str(n) for n in image.values.shape)
     steps = " × ".join(f"{s:.3g}" for s in spacing)
-    low = np.asarray(image.lowest, dtype=np.float64)
+    low = image.lowest
     box = np.stack([low, low + spacing * (np.array(image.values.shape) - 1)])
     return ImageFind(
         label,

@@ -41,8 +41,8 @@ def _surface(name: str, mask: NDArray[np.bool_], read: Segmentation) -> SurfaceD
     level = ImageData(mask.astype(np.float32) - 0.5, lengths)
     surface = surface_of_level(name, level)
     turn = read.affine[:, :3] / lengths
-    vertices = np.asarray(surface.vertices) @ turn.T + read.affine[:, 3]
-    triangles = np.asarray(surface.triangles)
+    vertices = surface.vertices @ turn.T + read.affine[:, 3]
+    triangles = surface.triangles
     # A grid of left-handed axes turns surfaces inside out.
     mirrored = bool(np.linalg.det(turn) < 0.0)
     return SurfaceData(vertices, triangles[:, ::-1] if mirrored else triangles)

@@ -104,7 +104,7 @@ class Anatomy:
         """The vertices of a surface in LPS mm, as far as unit and frame are known, (v, 3)."""
         frame = find.stated or self.frame or "LPS"
         scale = UNITS.get(self.units, 1.0) * (FLIP if frame == "RAS" else np.ones(3))
-        return np.asarray(find.surface.vertices) * scale
+        return find.surface.vertices * scale
 
 
 def choose_surfaces(
@@ -163,10 +163,10 @@ def _choose_skin(anatomy: Anatomy, parts: dict[str, list[SurfaceFind]]) -> None:
 
 def _encloses(outer: SurfaceFind, others: Sequence[SurfaceFind]) -> bool:
     """Whether the box of a surface holds the boxes of all others."""
-    points = np.asarray(outer.surface.vertices)
+    points = outer.surface.vertices
     low, high = points.min(axis=0), points.max(axis=0)
     for find in others:
-        inner = np.asarray(find.surface.vertices)
+        inner = find.surface.vertices
         if find is not outer and ((inner.min(axis=0) < low) | (inner.max(axis=0) > high)).any():
             return False
     return True
@@ -257,7 +257,7 @@ def _share(piece: SurfaceFind, whole: SurfaceFind) -> float:
     """The share of a piece's vertices that lie in or on a bone."""
     if (piece.stated or "LPS") != (whole.stated or "LPS"):
         return 0.0
-    points = np.asarray(piece.surface.vertices)
+    points = piece.surface.vertices
     points = np.ascontiguousarray(points[:: max(1, len(points) // SAMPLES)], dtype=np.float64)
     index = Surface(
         np.ascontiguousarray(whole.surface.vertices, dtype=np.float64),
@@ -328,10 +328,10 @@ def _shown_frame(
 ) -> tuple[str | None, str]:
     """The frame that the places of things show, and how; None where they show none."""
     unit = UNITS[anatomy.units]
-    points = np.concatenate([np.asarray(find.surface.vertices) for find in silent]) * unit
+    points = np.concatenate([find.surface.vertices for find in silent]) * unit
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     others = [
-        (find.label, np.asarray(find.surface.vertices) * unit * (FLIP if f == "RAS" else 1.0))
+        (find.label, find.surface.vertices * unit * (FLIP if f == "RAS" else 1.0))
         for find in anatomy.chosen
         if (f := find.stated) is not None
     ]
@@ -406,7 +406,7 @@ def _report(anatomy: Anatomy) -> None:
 def _shape(find: SurfaceFind, unit: str = "") -> str:
     size = " × ".join(f"{length:.3g}" for length in find.extent)
     closed = "closed" if find.is_closed else "open"
-    count = len(np.asarray(find.surface.triangles))
+    count = len(find.surface.triangles)
     return f"{size} {unit or 'in its own unit'}, {count} triangles, {closed}"
 
 

@@ -76,11 +76,11 @@ def midline_profile(surface: SurfaceData, landmarks: Mapping[str, ArrayLike]) ->
     places = np.array(known)
     rows = np.stack([np.ones(len(places)), places[:, 2] - places[:, 2].mean()], axis=1)
     (across, tilt), *_ = np.linalg.lstsq(rows, places[:, 0], rcond=None)
-    vertices = np.asarray(surface.vertices)
+    vertices = surface.vertices
     side = vertices[:, 0] - across - tilt * (vertices[:, 2] - places[:, 2].mean())
     # A vertex on the plane would be cut by no edge, or by all of its own.
     side = np.where(np.abs(side) < 1e-9, 1e-9, side)
-    chain = _chain(vertices, np.asarray(surface.triangles).astype(np.int64), side, places)
+    chain = _chain(vertices, surface.triangles.astype(np.int64), side, places)
     ends = np.array(chain, dtype=np.uint32)
     a, b = side[ends[:, 0]], side[ends[:, 1]]
     share = a / (a - b)

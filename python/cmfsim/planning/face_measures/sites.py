@@ -111,7 +111,7 @@ def face_sites(patient: PatientModel) -> FaceSites:
     needed = dict.fromkeys(name for measure in MEASURES for name in measure.sites)
     keys = {label_key(name): name for name in needed}
     given = {
-        keys.get(label_key(name), name): np.asarray(place, dtype=np.float64)
+        keys.get(label_key(name), name): place
         for name, place in patient.landmarks.get("skin", {}).items()
     }
     skin = {name: given[name] for name in needed if name in given}
@@ -176,7 +176,7 @@ def measure_face(prediction: Prediction, sites: FaceSites | None = None) -> dict
 def _at(profile: Floats, known: Mapping[str, Floats], name: str) -> int:
     """The point of the profile nearest to a landmark."""
     if name not in known:
-        raise LandmarkInputError(f"it is found from {name}, which the case does not give")
+        raise LandmarkInputError(f"it is located from {name}, which the case does not have")
     return int(np.argmin(np.linalg.norm(profile - known[name], axis=1)))
 
 
@@ -192,7 +192,7 @@ def _glabella(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     above = profile[:, 2] - profile[_at(profile, known, "nasion"), 2]
     part = profile[(above >= GLABELLA[0]) & (above <= GLABELLA[1])]
     if not len(part):
-        raise LandmarkInputError("the skin ends too near above nasion")
+        raise LandmarkInputError("the skin ends too close above nasion")
     return np.asarray(part[np.argmin(part[:, 1])])
 
 
@@ -233,7 +233,7 @@ def _open(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]
     """The edges of lips that are apart."""
     upper, lower = _stomion_superius(profile, known), _stomion_inferius(profile, known)
     if np.linalg.norm(upper - lower) < LEAST_GAP:
-        raise LandmarkInputError("the lips are closed, and their tissue is one in this model")
+        raise LandmarkInputError("the lips are closed, and joined in this model")
     return upper, lower
 
 
@@ -304,9 +304,9 @@ def _upper_incisor(patient: PatientModel) -> BoneSite:
     skull = patient.landmarks.get("skull", {})
     if "supradentale" not in skull:
         raise LandmarkInputError("the case gives no skull landmark supradentale")
-    root = np.asarray(skull["supradentale"], dtype=np.float64)
+    root = skull["supradentale"]
     bearer = _upper_bearer(patient.segments)
-    vertices = np.asarray(bearer.surface.vertices)
+    vertices = bearer.surface.vertices
     away = vertices - root
     near = vertices[
         (np.abs(away[:, 0]) <= INCISOR_SIDE)
@@ -326,4 +326,4 @@ def _upper_bearer(segments: tuple[BoneSegment, ...]) -> BoneSegment:
     for name in UPPER_BEARERS:
         if name in by_name:
             return by_name[name]
-    raise LandmarkInputError("no segment is known to bear the upper teeth")
+    raise LandmarkInputError("no segment bears the upper teeth")

@@ -25,8 +25,8 @@ __all__ = ["NUMBERS", "FacePlan", "FaceSearch", "plan_for_face"]
 NUMBERS = ("forwards", "up", "left", "pitch", "yaw", "roll")
 # A number within this of a bound is held by it, mm or degrees.
 AT_BOUND = 1e-6
-# Standard deviation of what nothing determines, mm or degrees; and the share of what the prior
-# alone allows, from which on a number counts as open.
+# Standard deviation of an undetermined number, mm or degrees; and the share of the prior's standard
+# deviation above which a number counts as open.
 OPEN, OPEN_SHARE = 1e3, 0.5
 
 
@@ -37,16 +37,16 @@ class FaceSearch:
     Attributes
     ----------
     segments : sequence of str or None
-        Those that may move; those that the reference moves if left out.
+        Those that may move; by default, those that the reference moves.
     follows : mapping of str to str
-        Segments that keep their place to another one: {"mandible_body": "maxilla"} keeps the final
-        bite of the reference plan.
+        Segments that keep their place relative to another one: {"mandible_body": "maxilla"} keeps
+        the final bite of the reference plan.
     shift, turn : float, mm and degrees
-        Bounds of every number, to either side of no movement.
+        Bounds of every number, on either side of no movement.
     prior_shift, prior_turn : float or None, mm and degrees
         Standard deviations of a prior about no movement; None for no prior.
     steps : int
-        At most so many steps.
+        Largest number of steps.
 
     Raises
     ------
@@ -79,30 +79,30 @@ class FaceSearch:
 
 @dataclass(frozen=True, eq=False)
 class FacePlan:
-    """A plan that was found for a face.
+    """A plan found for a desired face.
 
     Attributes
     ----------
     plan : mapping of str to (4, 4) float64, mm
         Of every segment.
     motions : mapping of str to ClinicalMotion
-        Of those that were free, in words and numbers.
+        Of the free segments, in words and numbers.
     std : mapping of str to (6,) float64
-        What targets and prior leave open of each number of `NUMBERS`, as standard deviations, mm
-        and degrees; 0 where a bound holds it.
+        Standard deviation of each number of `NUMBERS`, given targets and prior, mm and degrees; 0
+        where the number is at a bound.
     covariance : (6 s, 6 s) float64
-        Of the numbers of the free segments, one after the other; 0 where a bound holds one.
+        Of the numbers of the free segments, one after the other; 0 where a number is at a bound.
     undetermined : tuple of str
-        Numbers that the targets leave open: with them the standard deviation is more than half of
-        what the prior alone allows, or there is no prior and nothing else fixes the number.
+        Numbers that the targets leave open: their standard deviation is more than half that of the
+        prior, or there is no prior and nothing else determines the number.
     at_bounds : tuple of str
-        Numbers that a bound holds.
+        Numbers that are at a bound.
     residuals : tuple of (m,) float64
         Of each target, in its standard deviations, by the plan operator.
     exact : Prediction or None
         The exact solution of the plan.
     exact_residuals : tuple of (m,) float64
-        As `residuals`, of the exact solution; empty where it was not asked for.
+        As `residuals`, of the exact solution; empty if it was not requested.
     steps : int
     converged : bool
     """
@@ -135,7 +135,7 @@ def plan_for_face(
     targets : sequence of PointTarget, MeasureTarget and SurfaceTarget
     search : FaceSearch, optional
     exact : bool
-        Whether the plan is solved exactly in the end, contact included.
+        Whether the plan is finally solved exactly, with contact.
 
     Returns
     -------
@@ -144,8 +144,8 @@ def plan_for_face(
     Raises
     ------
     CaseError
-        (also `ValueError`) No target; a segment that the patient does not have, or that follows one
-        which itself follows; a target that no plan moves.
+        (also `ValueError`) No target; a segment that the patient does not have, or that follows a
+        follower; a target that no plan moves.
     ContactError, SolverError
         The plan that was found cannot be solved.
 
@@ -215,10 +215,10 @@ def _rows(wishes: Sequence[Wish], places: Floats, plan: Mapping[str, Floats]) ->
 def _covariance(
     jacobian: Floats, prior: Floats, held: NDArray[np.bool_]
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """The covariance of the numbers that no bound holds, and which of them targets leave open.
+    """The covariance of the numbers that are not at a bound, and which of them targets leave open.
 
-    (JᵀJ)⁻¹ with the rows of the prior in J. Directions of which neither targets nor prior say
-    anything get the variance OPEN².
+    (JᵀJ)⁻¹ with the rows of the prior in J. Directions that neither targets nor prior determine
+    get the variance OPEN².
     """
     free = ~held
     normal = (jacobian.T @ jacobian)[np.ix_(free, free)]
@@ -231,7 +231,7 @@ def _covariance(
 
 
 class _Space:
-    """The numbers of the segments that are free, and the plans that they stand for."""
+    """The numbers of the free segments, and the plans that they represent."""
 
     def __init__(self, planning: PlanningModel, search: FaceSearch) -> None:
         reference = planning.reference
@@ -244,17 +244,17 @@ class _Space:
         for follower, leader in search.follows.items():
             if leader in search.follows or leader == follower:
                 raise CaseInputError(
-                    f"{follower!r} follows {leader!r}, which does not move by itself"
+                    f"{follower!r} follows {leader!r}, which does not move independently"
                 )
         self.reference = reference
         self.free = [name for name in dict.fromkeys(named) if name not in search.follows]
         if not self.free:
             raise CaseInputError("every segment follows another: nothing is free to move")
         skull = planning.patient.landmarks.get("skull", {})
-        surfaces = {s.name: np.asarray(s.surface.vertices) for s in planning.patient.segments}
+        surfaces = {s.name: s.surface.vertices for s in planning.patient.segments}
         self.skull, self.surfaces = skull, surfaces
         self.points = {name: self.stated(name, np.eye(4)).point for name in self.free}
-        # What takes a follower from its leader's place to its own: the final bite.
+        # The motion from a leader's place to its follower's: the final bite.
         self.bites = {
             follower: (leader, np.linalg.inv(reference[leader]) @ reference[follower])
             for follower, leader in search.follows.items()
@@ -264,11 +264,11 @@ class _Space:
         return clinical_motion(name, motion, landmarks=self.skull, vertices=self.surfaces.get(name))
 
     def numbers_of_reference(self) -> Floats:
-        rows = [self.stated(name, np.asarray(self.reference[name])) for name in self.free]
+        rows = [self.stated(name, self.reference[name]) for name in self.free]
         return np.array([getattr(row, number) for row in rows for number in NUMBERS])
 
     def plan(self, numbers: Floats) -> dict[str, Floats]:
-        plan = {name: np.asarray(motion) for name, motion in self.reference.items()}
+        plan = dict(self.reference)
         for index, name in enumerate(self.free):
             shift, turn = numbers[6 * index : 6 * index + 3], numbers[6 * index + 3 : 6 * index + 6]
             point = self.points[name]
@@ -284,7 +284,7 @@ class _Space:
 
 
 def _prior(search: FaceSearch, segments: int) -> Floats:
-    """What the numbers are multiplied by in the residuals of the prior; 0 for none."""
+    """The weights of the numbers in the residuals of the prior; 0 for none."""
     shift = 0.0 if search.prior_shift is None else 1.0 / search.prior_shift
     turn = 0.0 if search.prior_turn is None else 1.0 / search.prior_turn
     return np.tile([shift] * 3 + [turn] * 3, segments)

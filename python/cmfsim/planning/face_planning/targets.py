@@ -62,27 +62,36 @@ class PointTarget:
     [[0.0, -96.0, -80.0]]
     """
 
-    points: ArrayLike
-    goals: ArrayLike
-    std: float = 0.5
-    directions: ArrayLike | None = None
+    points: Floats
+    goals: Floats
+    std: float
+    directions: Floats | None
 
-    def __post_init__(self) -> None:
-        points = as_rows("target points", self.points, 3)
-        goals = as_rows("target goals", self.goals, 3)
-        if len(points) != len(goals) or not len(points):
+    def __init__(
+        self,
+        points: ArrayLike,
+        goals: ArrayLike,
+        std: float = 0.5,
+        directions: ArrayLike | None = None,
+    ) -> None:
+        places = as_rows("target points", points, 3)
+        wished = as_rows("target goals", goals, 3)
+        if len(places) != len(wished) or not len(places):
             raise CaseInputError(
-                f"{len(points)} target points and {len(goals)} goals: one goal for each point"
+                f"{len(places)} target points and {len(wished)} goals: one goal for each point"
             )
-        as_positive("target std", self.std)
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "goals", goals)
-        if self.directions is not None:
-            directions = as_rows("target directions", self.directions, 3)
-            sizes = np.linalg.norm(directions, axis=1, keepdims=True)
-            if len(directions) != len(points) or not (sizes > 0.0).all():
+        as_positive("target std", std)
+        ways: Floats | None = None
+        if directions is not None:
+            ways = as_rows("target directions", directions, 3)
+            sizes = np.linalg.norm(ways, axis=1, keepdims=True)
+            if len(ways) != len(places) or not (sizes > 0.0).all():
                 raise CaseInputError("target directions: one that is not zero for each point")
-            object.__setattr__(self, "directions", directions / sizes)
+            ways = ways / sizes
+        object.__setattr__(self, "points", places)
+        object.__setattr__(self, "goals", wished)
+        object.__setattr__(self, "std", std)
+        object.__setattr__(self, "directions", ways)
 
 
 @dataclass(frozen=True)
@@ -198,10 +207,10 @@ class CarriedPoints:
         skin = Surface(before.vertices, before.triangles)
         closest, _, triangles = skin.closest(points)
         self.share = carried_share(skin, np.linalg.norm(closest - points, axis=1))
-        corners = np.asarray(before.triangles)[np.unique(triangles)]
+        corners = before.triangles[np.unique(triangles)]
         nodes, numbers = np.unique(corners, return_inverse=True)
         self.points = points
-        self._places = np.asarray(before.vertices)[nodes]
+        self._places = before.vertices[nodes]
         self._surface = Surface(self._places, numbers.reshape(corners.shape))
         columns = planning.columns
         self._columns = columns
@@ -215,23 +224,23 @@ class CarriedPoints:
         if self._correction is not None:
             moved = moved + self._correction.displacements(plan).ravel()
         motion = SurfaceMotion(self._surface, self._places + moved.reshape(-1, 3))
-        return np.asarray(self.share[:, None] * motion.displacement(self.points))
+        return self.share[:, None] * motion.displacement(self.points)
 
 
 def _points_wish(planning: PlanningModel, target: PointTarget) -> Wish:
-    points, goals = np.asarray(target.points), np.asarray(target.goals)
+    points, goals = target.points, target.goals
     share = CarriedPoints(planning, points).share
     if not (share > 0.0).all():
         place = points[int(np.argmin(share))].round(1).tolist()
         raise CaseInputError(
-            f"target point {place} mm lies away from the tissue of the model: no plan moves it"
+            f"target point {place} mm lies outside the tissue of the model: no plan moves it"
         )
 
     def rows(places: Floats, _: Motions) -> Floats:
         off = places - goals
         if target.directions is not None:
-            off = (off * np.asarray(target.directions)).sum(axis=1)
-        return np.asarray(off.ravel() / target.std)
+            off = (off * target.directions).sum(axis=1)
+        return off.ravel() / target.std
 
     return Wish(points, rows)
 
@@ -262,7 +271,7 @@ def _bone_places(sites: FaceSites, plan: Motions) -> dict[str, Floats]:
 
 
 def _surface_wish(planning: PlanningModel, target: SurfaceTarget) -> Wish:
-    before = np.asarray(planning.skin_before.vertices)
+    before = planning.skin_before.vertices
     chosen = np.flatnonzero(np.abs(planning.columns.matrix).max(axis=(1, 2)) > MOVES)
     points = before[chosen[:: max(1, len(chosen) // int(target.points))]]
     surface = Surface(target.surface.vertices, target.surface.triangles)
@@ -291,8 +300,8 @@ def _has_partner(surface: Surface, rim: Floats, points: Floats) -> NDArray[np.bo
 
 def _border_points(surface: SurfaceData) -> Floats:
     """The vertices on the border of a surface, where a face was cut off."""
-    triangles = np.asarray(surface.triangles).astype(np.int64)
+    triangles = surface.triangles.astype(np.int64)
     edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     unique, count = np.unique(edges, axis=0, return_counts=True)
-    rim: Floats = np.asarray(surface.vertices)[np.unique(unique[count == 1])]
+    rim: Floats = surface.vertices[np.unique(unique[count == 1])]
     return rim

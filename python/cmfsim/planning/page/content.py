@@ -1,4 +1,4 @@
-"""What a planning page holds of a patient: surfaces, operator, sites, errors, as plain values."""
+"""The content of a planning page: surfaces, operator, sites and errors, as plain values."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -32,9 +32,9 @@ __all__ = ["PageContent", "page_content"]
 
 # Triangles that the page draws of the face, and of all bones together.
 FACE_TRIANGLES, BONE_TRIANGLES, LEAST_BONE = 40_000, 60_000, 500
-# Most nodes of the skin that a page holds: a larger file is slow to open and to send.
+# Largest number of skin nodes on a page: a larger file is slow to open and to send.
 MOST_NODES = 60_000
-# A node moves if a plan of the range moves it by this, mm: a tenth of what rounding does.
+# A node moves if a plan in the range moves it by this, mm: a tenth of the rounding error.
 STILL = 4e-4
 # The product of the page takes columns in steps of so many.
 PRODUCT_STEP = 4
@@ -48,7 +48,7 @@ SPAN_SHARE, LEAST_SPAN = 1.15, 60.0
 
 @dataclass(frozen=True, eq=False)
 class PageContent:
-    """What a page is written from.
+    """The data from which a page is written.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ def page_content(
     variants: Mapping[str, Motions] | None = None,
     band: PlanBand | None = None,
 ) -> PageContent:
-    """What the page of a planning model holds.
+    """The content of the page of a planning model.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def page_content(
         The exact solution of its reference plan.
     errors : ExpectedError
     variants : mapping of str to plan, optional
-        Plans by name that the page begins with, besides the reference.
+        Plans by name that the page shows at first, in addition to the reference.
     band : PlanBand, optional
         How far to trust the face, which follows the plan.
 
@@ -106,10 +106,10 @@ def page_content(
     patient = planning.patient
     findings: list[Finding] = []
     skin = planning.skin_before
-    count = len(np.asarray(skin.vertices))
+    count = len(skin.vertices)
     if count > MOST_NODES:
         raise CaseInputError(
-            f"the skin has {count} nodes, a page holds {MOST_NODES}: give a larger "
+            f"the skin has {count} nodes, a page holds at most {MOST_NODES}: give a larger "
             "edge_length in [mesh], or --edge-length"
         )
     face = _fewer("face", patient.face or skin, FACE_TRIANGLES, findings)
@@ -120,7 +120,7 @@ def page_content(
         "face": _singles(face.vertices),
         "face_triangles": _indices(face.triangles),
         **_operator(planning, reference),
-        **_carried("face", skin, np.asarray(face.vertices)),
+        **_carried("face", skin, face.vertices),
         **_carried("site", skin, _rows(sites.skin.values())),
         "sites": _singles(_rows(sites.skin.values())),
     }
@@ -168,21 +168,21 @@ def _rows(places: Any) -> Floats:
 
 def _fewer(name: str, surface: SurfaceData, most: int, findings: list[Finding]) -> SurfaceData:
     """The surface, simplified with a finding where it has more triangles than are drawn."""
-    count = len(np.asarray(surface.triangles))
+    count = len(surface.triangles)
     if count <= most:
         return surface
     fewer = simplified_surface(name, surface, most)
     there = Surface(surface.vertices, surface.triangles)
     closest, _, _ = there.closest(fewer.vertices)
-    away = float(np.linalg.norm(closest - np.asarray(fewer.vertices), axis=1).max())
+    away = float(np.linalg.norm(closest - fewer.vertices, axis=1).max())
     findings.append(
         Finding.note(
             "page-simplified",
-            f"{name} has {count} triangles: the page draws "
-            f"{len(np.asarray(fewer.triangles))}, at most {away:.2f} mm away",
+            f"{name} has {count} triangles; the page draws it with "
+            f"{len(fewer.triangles)}, at most {away:.2f} mm away",
             where=name,
             why="a page with all of them is slow to open and to send",
-            fix="nothing: predictions are made with all of them",
+            fix="none needed: predictions use all of them",
         )
     )
     return fewer
@@ -221,14 +221,14 @@ def _operator(planning: PlanningModel, reference: Prediction) -> dict[str, NDArr
 
 
 def _solved_plans(correction: PlanCorrection | None) -> Floats:
-    """The numbers of the plans that a correction goes through, (n, 6 s) mm."""
+    """The numbers of the plans that a correction interpolates, (n, 6 s) mm."""
     if correction is None:
         return np.zeros((0, 0))
     return correction.plans.reshape(len(correction.plans), -1)
 
 
 def _correction(planning: PlanningModel) -> dict[str, Any] | None:
-    """What the amounts of the correction's shapes depend on; none where there is no correction."""
+    """The parameters of the correction; empty if there is none."""
     if planning.correction is None:
         return None
     numbers = planning.correction.numbers
@@ -242,10 +242,10 @@ def _correction(planning: PlanningModel) -> dict[str, Any] | None:
 
 
 def _carried(part: str, skin: SurfaceData, points: Floats) -> dict[str, NDArray[Any]]:
-    """How points hang on the skin: as `carried_points` of a prediction does it."""
+    """How points are attached to the skin, as in `carried_points` of a prediction."""
     there = Surface(skin.vertices, skin.triangles)
     closest, _, triangles = there.closest(points)
-    corners = np.asarray(skin.vertices)[np.asarray(skin.triangles)[triangles]]
+    corners = skin.vertices[skin.triangles[triangles]]
     offset = points - closest
     share = carried_share(there, np.linalg.norm(offset, axis=1))
     return {
@@ -262,7 +262,7 @@ def _segments(planning: PlanningModel) -> list[dict[str, Any]]:
     boxes = segment_boxes(planning)
     found = []
     for name, centre in zip(planning.segments, planning.columns.centres, strict=True):
-        points = segment_points(name, skull, np.asarray(surfaces[name].vertices))
+        points = segment_points(name, skull, surfaces[name].vertices)
         found.append(
             {
                 "name": name,
@@ -270,7 +270,7 @@ def _segments(planning: PlanningModel) -> list[dict[str, Any]]:
                 "centre": centre.tolist(),
                 "box": [boxes[name].min(axis=0).tolist(), boxes[name].max(axis=0).tolist()],
                 "points": [{"label": p.label, "place": p.place.tolist()} for p in points],
-                "reference": np.asarray(planning.reference[name]).ravel().tolist(),
+                "reference": planning.reference[name].ravel().tolist(),
             }
         )
     return found
@@ -279,9 +279,9 @@ def _segments(planning: PlanningModel) -> list[dict[str, Any]]:
 def _bones(
     planning: PlanningModel, arrays: dict[str, NDArray[Any]], findings: list[Finding]
 ) -> list[dict[str, Any]]:
-    """The bones, those that stay included; each gets triangles in proportion to what it has."""
+    """All bones, including those that stay; each is simplified by the same ratio."""
     segments = planning.patient.segments
-    counts = [len(np.asarray(segment.surface.triangles)) for segment in segments]
+    counts = [len(segment.surface.triangles) for segment in segments]
     found: list[dict[str, Any]] = []
     for number, segment in enumerate(segments):
         most = max(LEAST_BONE, BONE_TRIANGLES * counts[number] // sum(counts))
@@ -365,7 +365,7 @@ def _teeth(planning: PlanningModel, arrays: dict[str, NDArray[Any]]) -> dict[str
             "upper": number.get(rows.upper),
             "lower": number.get(rows.lower),
             "origin": rows.depth.lowest.tolist(),
-            "spacing": float(np.asarray(rows.depth.spacing)[0]),
+            "spacing": float(rows.depth.spacing[0]),
             "shape": list(rows.depth.values.shape),
         },
         "occlusion_absent": "",
@@ -374,7 +374,7 @@ def _teeth(planning: PlanningModel, arrays: dict[str, NDArray[Any]]) -> dict[str
 
 def _framing(skin: SurfaceData, active: NDArray[Any]) -> dict[str, Any]:
     """Where the picture looks, and how much it shows, mm: what moves, and some of the head."""
-    vertices = np.asarray(skin.vertices)
+    vertices = skin.vertices
     moving = vertices[active] if len(active) else vertices
     low, high = moving.min(axis=0), moving.max(axis=0)
     return {

@@ -84,7 +84,7 @@ def segment_points(
     stated = clinical_motion(segment, np.eye(4), landmarks=landmarks, vertices=vertices)
     points = []
     if stated.point is not None:
-        points.append(SegmentPoint(stated.place, np.asarray(stated.point)))
+        points.append(SegmentPoint(stated.place, stated.point))
     for name, label in SITES.get(NUMBERED.sub("", segment), ()):
         place = known.get(name)
         if place is None or np.linalg.norm(vertices - place, axis=1).min() > ON_SEGMENT:
@@ -92,7 +92,7 @@ def segment_points(
         if any(np.array_equal(place, point.place) for point in points):
             continue
         estimated = "" if name in landmarks else " (estimated)"
-        points.append(SegmentPoint(f"{label}{estimated}", np.asarray(place)))
+        points.append(SegmentPoint(f"{label}{estimated}", place))
     middle = vertices.mean(axis=0)
     if not any(np.allclose(middle, point.place) for point in points):
         points.append(SegmentPoint("middle of its surface", middle))

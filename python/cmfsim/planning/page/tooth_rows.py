@@ -1,7 +1,7 @@
 """Whether tooth rows pass through each other: depth of the lower teeth inside the upper ones.
 
-Points of the lower row are looked up in a grid of the depth inside the upper row's bone, in the
-place that it has before the operation: both move rigidly, so one grid serves every plan.
+Points of the lower row are looked up in a grid of the depth inside the upper row's bone, at its
+place before the operation: both move rigidly, so one grid serves every plan.
 """
 
 from collections.abc import Mapping
@@ -38,7 +38,7 @@ class ToothRows:
     Attributes
     ----------
     upper, lower : str
-        The segments that bear them; one that no plan moves stays.
+        The segments that bear them; a segment that the plan does not move stays.
     points : (n, 3) float64, mm
         Of the lower row, before the operation.
     depth : ImageData
@@ -82,7 +82,7 @@ def tooth_rows(patient: PatientModel) -> ToothRows:
     Raises
     ------
     CaseError
-        (also `ValueError`) No arches are known, or no segments that bear them.
+        (also `ValueError`) The arches, or the segments that bear them, are unknown.
     """
     arches = dental_arches(patient.anatomy, patient.segments, patient.landmarks.get("skull"))
     if "lower" not in arches.by_jaw:
@@ -110,11 +110,11 @@ def _bearer(segments: tuple[BoneSegment, ...], names: tuple[str, ...], jaw: str)
 
 
 def _row(bearer: BoneSegment, arch: DentalArch) -> Floats:
-    """Vertices and middles of triangles of a bone where its teeth stand."""
-    vertices = np.asarray(bearer.surface.vertices)
-    points = np.concatenate([vertices, vertices[np.asarray(bearer.surface.triangles)].mean(axis=1)])
+    """Vertices and triangle centres of a bone at its teeth."""
+    vertices = bearer.surface.vertices
+    points = np.concatenate([vertices, vertices[bearer.surface.triangles].mean(axis=1)])
     places = (points - arch.middle) @ arch.axes().T
-    front = float((np.asarray(arch.tip) - arch.middle) @ arch.axes()[1])
+    front = float((arch.tip - arch.middle) @ arch.axes()[1])
     chosen = points[
         (np.abs(places[:, 0]) <= arch.half_width + SIDE)
         & (places[:, 1] >= -BEHIND)
@@ -124,13 +124,13 @@ def _row(bearer: BoneSegment, arch: DentalArch) -> Floats:
     if not len(chosen):
         raise CaseInputError(f"the surface of {bearer.name} has no teeth at its arch")
     step = -(-len(chosen) // MOST_POINTS)
-    return np.asarray(chosen[::step])
+    return chosen[::step]
 
 
 def _depth(bearer: BoneSegment, places: Floats) -> Floats:
     """Depth of places inside a bone, mm; 0 outside."""
     surface = Surface(bearer.surface.vertices, bearer.surface.triangles)
-    inside = np.asarray(surface.winding_number(places)) > 0.5
+    inside = surface.winding_number(places) > 0.5
     depth = np.zeros(len(places))
     if inside.any():
         closest, _, _ = surface.closest(places[inside])

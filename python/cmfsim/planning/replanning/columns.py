@@ -57,7 +57,7 @@ class PlanColumns:
 
     def displacements(self, plan: Mapping[str, ArrayLike]) -> Floats:
         """The displacements under a plan, (k, 3) mm."""
-        return np.asarray(self.offset + self.matrix @ self.numbers(plan), dtype=np.float64)
+        return self.offset + self.matrix @ self.numbers(plan)
 
 
 def plan_columns(operator: PlanOperator) -> PlanColumns:
@@ -79,9 +79,9 @@ def plan_columns(operator: PlanOperator) -> PlanColumns:
     names = tuple(operator.segments)
     rest = {name: np.eye(4) for name in names}
     offset = operator(rest)
-    matrix = np.asarray(operator.matrix).reshape(len(offset), 3, -1)
-    centres = np.asarray(operator.centres)
-    columns = PlanColumns(names, frozen(centres), frozen(matrix), frozen(np.asarray(offset)))
+    matrix = operator.matrix.reshape(len(offset), 3, -1)
+    centres = operator.centres
+    columns = PlanColumns(names, frozen(centres), frozen(matrix), frozen(offset))
     _check(columns, operator)
     return columns
 

@@ -1,4 +1,4 @@
-"""What exact solutions add to the plan operator away from its reference: a smooth interpolation.
+"""A correction of the plan operator away from its reference, interpolated from exact solutions.
 
 The operator continues contact to first order. What it misses, e(x), vanishes at the reference
 together with its gradient. It is interpolated between plans that were solved exactly as a Gaussian
@@ -8,9 +8,9 @@ vanishes with its gradient at 0 has
     k(x, y) = g(x, y) − g(x, 0) g(0, y) (1 + x·y/ℓ²)
 
 (Rasmussen and Williams 2006, section 9.4), here summed over the segments, each by itself, and all
-of them together. x holds six numbers of each segment: the shift of its middle, mm, and the turn
-times an arm, mm. Far away k goes to 0, and the operator is what it was. Length ℓ and noise are
-those with the least error at plans that were left out.
+of them together. x has six numbers for each segment: the shift of its centre, mm, and the rotation
+times an arm, mm. Far away k tends to 0, and so does the correction. Length ℓ and noise are those
+with the least error in cross-validation.
 """
 
 import math
@@ -27,13 +27,13 @@ __all__ = ["PlanCorrection", "PlanNumbers", "fitted_correction"]
 # Lengths ℓ, mm, and noise as a share of the variance, among which plans that are left out choose.
 LENGTHS = (7.0, 10.0, 14.0, 20.0)
 NOISES = (1e-3, 1e-2, 1e-1)
-# A turn counts by the way of a point at this share of the distance of the furthest corner.
+# A rotation counts by the path of a point at this share of the distance of the furthest corner.
 ARM_SHARE = 0.6
-# Shapes of the correction: as few as keep this share of what is corrected, and at most so many.
+# Shapes of the correction: as few as retain this share of the corrections, and at most this many.
 KEPT_ENERGY, MOST_SHAPES = 0.99, 16
 # A correction is used if, at plans that were left out, the largest error falls to this share.
 PAYS = 0.9
-# Twice the sine of a turn below this is twice the turn itself.
+# Below this, twice the sine of an angle equals twice the angle.
 SMALL_SINE = 1e-9
 
 
@@ -44,13 +44,13 @@ class PlanNumbers:
     Attributes
     ----------
     segments : tuple of str
-        Those that count; others may move, and change nothing.
+        Those that count; the motion of others changes nothing.
     backwards : (s, 4, 4) float64, mm
         The inverse of each segment's motion under the reference plan.
     middles : (s, 3) float64, mm
         The middle of each segment, before.
     arms : (s,) float64, mm
-        What turns are multiplied by, in radians.
+        By which rotations, in radians, are multiplied.
     """
 
     segments: tuple[str, ...]
@@ -83,13 +83,13 @@ class PlanNumbers:
 
 @dataclass(frozen=True, eq=False)
 class PlanCorrection:
-    """A sum of shapes whose amounts depend smoothly on the plan; nothing at the reference.
+    """A sum of shapes whose amounts depend smoothly on the plan; zero at the reference.
 
     Attributes
     ----------
     numbers : PlanNumbers
     length : float, mm
-        ℓ: over this the correction changes.
+        ℓ, over which the correction varies.
     plans : (n, s, 6) float64, mm
         The numbers of the plans that were solved exactly.
     weights : (n, m) float64
@@ -97,8 +97,8 @@ class PlanCorrection:
     shapes : (k, 3, m) float64, mm
         Displacements of the operator's nodes, their largest component 1.
     before, left_out : (n,) float64, mm
-        The largest error at each plan without the correction, and with the one that is fitted to
-        all other plans.
+        The largest error at each plan, without the correction and with the one fitted to all other
+        plans.
     """
 
     numbers: PlanNumbers
@@ -116,7 +116,7 @@ class PlanCorrection:
 
     def displacements(self, plan: Mapping[str, ArrayLike]) -> Floats:
         """What is added to the operator's displacements under a plan, (k, 3) mm."""
-        return np.asarray(self.shapes @ self.amounts(plan))
+        return self.shapes @ self.amounts(plan)
 
     def at(self, nodes: NDArray[np.integer]) -> "PlanCorrection":
         """The correction of some of the nodes, by their places in the operator."""
@@ -132,9 +132,9 @@ def fitted_correction(
     ----------
     numbers : PlanNumbers
     plans : (n, s, 6) float64, mm
-        Their values at plans that were solved exactly; two at least.
+        Their values at plans that were solved exactly; at least two.
     errors : (n, k, 3) float64, mm
-        Exact displacements less the operator's.
+        Exact displacements minus the operator's.
 
     Returns
     -------
@@ -180,8 +180,8 @@ def _turn(motion: Floats) -> Floats:
     twice = np.array([zy - yz, xz - zx, yx - xy])
     sine = math.hypot(*twice)
     angle = math.atan2(sine, float(np.trace(motion[:3, :3])) - 1.0)
-    # A half turn has no such axis; it is far beyond the plans that correct anything.
-    return np.asarray(twice * (angle / sine if sine > SMALL_SINE else 0.5))
+    # A half turn has no such axis; it is far beyond the plans near which the correction acts.
+    return twice * (angle / sine if sine > SMALL_SINE else 0.5)
 
 
 def _covariance(a: Floats, b: Floats, length: float) -> Floats:

@@ -55,7 +55,7 @@ class PlanTrial:
 
 @dataclass(frozen=True, eq=False)
 class ExpectedError:
-    """What exact solutions around the reference say about the product; an estimate, no bound.
+    """The error of the product near the reference, from exact solutions; an estimate, not a bound.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class ExpectedError:
     shift, turn : float, mm and degrees
         The range: along each axis, and about any axis.
     slides : bool
-        Whether tissue slides; without, the product is exact.
+        Whether tissue slides; if not, the product is exact.
     """
 
     trials: tuple[PlanTrial, ...]
@@ -79,9 +79,9 @@ class ExpectedError:
     def at(self, distance: float) -> tuple[float, float] | None:
         """Mean and largest error to expect at a distance from the reference, mm.
 
-        The largest ratio of error to distance that was seen, times the distance: error grows
-        faster than the distance, so that this is too large near the reference. None beyond
-        `reach`, where nothing was tried.
+        The largest measured ratio of error to distance, times the distance. The error grows faster
+        than the distance, so this overestimates near the reference. None beyond `reach`, where no
+        plan was tried.
         """
         if not self.slides:
             return 0.0, 0.0
@@ -116,7 +116,7 @@ class ExpectedError:
 def plan_distance(planning: PlanningModel, plan: Motions) -> float:
     """How far a plan is from the reference, mm.
 
-    The largest distance between where the two take a corner of the box around a segment's surface.
+    The largest distance between the two positions of a corner of the box around a segment.
     """
     whole = planning.whole(plan)
     return max(
@@ -136,7 +136,7 @@ def segment_boxes(planning: PlanningModel) -> dict[str, Floats]:
     found = {}
     for segment in planning.patient.segments:
         if segment.name in planning.segments:
-            vertices = np.asarray(segment.surface.vertices)
+            vertices = segment.surface.vertices
             low, high = vertices.min(axis=0), vertices.max(axis=0)
             ends = np.array([[(n >> axis) & 1 for axis in range(3)] for n in range(8)])
             found[segment.name] = np.where(ends, high, low)
@@ -156,8 +156,8 @@ def expected_error(
 
     Every segment that the reference moves (all, if it moves none) is shifted by up to `shift` along
     each axis and turned by up to `turn` about a random axis through the middle of its surface, each
-    segment by itself; every second plan by half of that. Without sliding tissue one plan is solved,
-    as a check.
+    segment independently; every second plan by half of that. Without sliding tissue, one plan is
+    solved as a check.
 
     Parameters
     ----------
@@ -188,12 +188,12 @@ def expected_error(
     """
     shift, turn = as_positive("shift", shift), as_positive("turn", turn)
     if isinstance(trials, bool) or not isinstance(trials, int) or trials < 1:
-        raise CaseInputError(f"trials is {trials!r}: a whole number from 1 on is needed")
+        raise CaseInputError(f"trials is {trials!r}: a whole number of 1 or more is needed")
     rng = np.random.default_rng(seed)
     found = []
     for number in range(trials if planning.slides else 1):
         if progress is not None:
-            progress(f"solving a plan nearby exactly ({number + 1})")
+            progress(f"solving a nearby plan exactly ({number + 1})")
         share = SHARES[number % len(SHARES)]
         plan = plan_near(planning, rng, share * shift, share * turn)
         found.append(_trial(planning, plan))
@@ -211,7 +211,7 @@ def plan_near(
 ) -> dict[str, Floats]:
     """A random plan around the reference: up to `shift` mm along each axis, and `turn` degrees."""
     boxes = segment_boxes(planning)
-    plan = {name: np.asarray(motion) for name, motion in planning.reference.items()}
+    plan = dict(planning.reference)
     for name in moving_segments(planning):
         centre = boxes[name].mean(axis=0)
         more = rigid_motion(

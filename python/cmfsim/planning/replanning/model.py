@@ -91,9 +91,7 @@ class PlanningModel:
             known = ", ".join(self.segments) or "none"
             raise CaseInputError(f"the plan moves {unknown[0]!r}; segments are: {known}")
         return {
-            name: np.asarray(rigid_matrix(plan[name], f"motion of {name!r}"))
-            if name in plan
-            else np.eye(4)
+            name: rigid_matrix(plan[name], f"motion of {name!r}") if name in plan else np.eye(4)
             for name in self.segments
         }
 
@@ -106,7 +104,7 @@ class PlanningModel:
     def skin(self, plan: Motions) -> SurfaceData:
         """The skin of the mesh under a plan, by one product."""
         before = self.skin_before
-        vertices = np.asarray(before.vertices) + self.displacements(plan)
+        vertices = before.vertices + self.displacements(plan)
         return SurfaceData(vertices, before.triangles)
 
     def carried(self, plan: Motions, points: ArrayLike) -> Floats:
@@ -116,7 +114,7 @@ class PlanningModel:
     def face(self, plan: Motions) -> SurfaceData:
         """The face in full detail under a plan, as `Prediction.face`."""
         before = self.patient.face or self.skin_before
-        vertices = np.asarray(before.vertices)
+        vertices = before.vertices
         return SurfaceData(vertices + self.carried(plan, vertices), before.triangles)
 
     def solve(self, plan: Motions) -> Prediction:

@@ -1,11 +1,11 @@
 """The band of a planning model: how far to trust the skin under any rigid plan, by one product.
 
-The variance along the normal at a vertex is v + Σ_p (r_p + R_p q)². The constant v has what no plan
-changes, the errors of its execution and what lies along the normal, and, as at the reference plan,
-sources of tissue beyond the moduli. Of each modulus p, one standard deviation moves the skin by r_p
-at the reference; R_p are the rates of that with six numbers q of each segment, zero at the
-reference: the further shift of its centre and its further turn, to first order, with contact
-continued about the reference.
+The variance along the normal at a vertex is v + Σ_p (r_p + R_p q)². The constant v has the parts
+that do not depend on the plan (errors of its execution and errors along the normal) and, at their
+values for the reference plan, the tissue sources other than the moduli. One standard deviation of
+modulus p moves the skin by r_p at the reference; R_p are the rates of r_p with six numbers q of
+each segment, zero at the reference: the further shift of its centre and its further rotation, to
+first order, with contact linearised about the reference.
 """
 
 from collections.abc import Mapping
@@ -96,7 +96,7 @@ class PlanBand:
     def factor(self) -> Floats:
         """How many standard deviations the band has at each vertex, (k,); NaN where it has none."""
         band = self.at_reference
-        return np.asarray(np.ma.filled(band.half_width, np.nan) / np.asarray(band.sd))
+        return np.ma.filled(band.half_width, np.nan) / band.sd
 
 
 def _factor(band: SkinBand, factor: BandFactor | None) -> float:
@@ -145,7 +145,7 @@ def plan_band(planning: PlanningModel, reference: Prediction) -> PlanBand:
     moduli = [name for name in MODULI if name in band.parts]
     columns = planning.columns
     skin = reference.skin
-    normals = np.asarray(Surface(skin.vertices, skin.triangles).vertex_normals)
+    normals = Surface(skin.vertices, skin.triangles).vertex_normals
     rates = np.zeros((len(moduli), len(normals), NUMBERS * len(columns.segments)))
     if moduli:
         rates = _rates(planning, solution, moduli, normals)

@@ -34,12 +34,12 @@ class Detected:
 
 def joined(surfaces: list[SurfaceData]) -> SurfaceData:
     """Several surfaces as one."""
-    starts = np.cumsum([0, *(len(np.asarray(s.vertices)) for s in surfaces)])[:-1]
+    starts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])[:-1]
     return SurfaceData(
-        np.concatenate([np.asarray(s.vertices) for s in surfaces]),
+        np.concatenate([s.vertices for s in surfaces]),
         np.concatenate(
             [
-                np.asarray(s.triangles).astype(np.int64) + start
+                s.triangles.astype(np.int64) + start
                 for s, start in zip(surfaces, starts, strict=True)
             ]
         ),
@@ -65,7 +65,7 @@ def is_lower(name: str) -> bool:
 
 
 def _points(surface: SurfaceData, pose: Pose) -> Floats:
-    area = Surface(np.asarray(surface.vertices), np.asarray(surface.triangles)).area
+    area = Surface(surface.vertices, surface.triangles).area
     count = min(MOST_POINTS, int(DENSITY * float(area)))
     points, _ = surface_samples(surface, max(count, 1000))
     return pose.into(points) / pose.size
@@ -82,7 +82,7 @@ def biases(
     pairs = ((found.skull, template.skull), (found.skin, template.skin_landmarks))
     skull, skin = (
         {
-            name: pose.into(np.asarray(true[name])[None])[0] / pose.size - place
+            name: pose.into(true[name][None])[0] / pose.size - place
             for name, place in sites.items()
             if name in true
         }

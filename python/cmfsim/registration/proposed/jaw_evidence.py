@@ -151,8 +151,8 @@ def _rise(sites: Mapping[str, Floats]) -> float | None:
 
 def _volume(surface: SurfaceData) -> float:
     """The volume that a surface encloses, cm³."""
-    points = np.asarray(surface.vertices)
-    corners = (points - points.mean(axis=0))[np.asarray(surface.triangles).astype(np.int64)]
+    points = surface.vertices
+    corners = (points - points.mean(axis=0))[surface.triangles.astype(np.int64)]
     sixfold = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     return abs(float(sixfold)) / 6000.0
 

@@ -57,7 +57,7 @@ def cut_planes(surfaces: Sequence[SurfaceData]) -> tuple[CutPlane, ...]:
 
 def _cap(surface: SurfaceData, axis: int, sign: float) -> tuple[float, float]:
     """Place of the end of a surface along an axis, and the area that lies flat there."""
-    corners = np.asarray(surface.vertices)[np.asarray(surface.triangles).astype(np.int64)]
+    corners = surface.vertices[surface.triangles.astype(np.int64)]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = 0.5 * np.linalg.norm(doubled, axis=1)
     end = float(sign * (sign * corners[:, :, axis]).max())

@@ -60,11 +60,11 @@ class Pose:
 
     def into(self, points: Floats) -> Floats:
         """Points of the patient, (n, 3) mm, in the head's own frame."""
-        return np.asarray((points - self.origin) @ self.axes.T)
+        return (points - self.origin) @ self.axes.T
 
     def out(self, points: Floats) -> Floats:
         """Points of the head's own frame, (n, 3) mm, in the patient's."""
-        return np.asarray(points @ self.axes + self.origin)
+        return points @ self.axes + self.origin
 
 
 def surface_samples(surface: SurfaceData, count: int, seed: int = 0) -> tuple[Floats, Floats]:
@@ -72,8 +72,8 @@ def surface_samples(surface: SurfaceData, count: int, seed: int = 0) -> tuple[Fl
 
     The same for the same seed; triangles count by their area.
     """
-    vertices = np.asarray(surface.vertices)
-    corners = vertices[np.asarray(surface.triangles).astype(np.int64)]
+    vertices = surface.vertices
+    corners = vertices[surface.triangles.astype(np.int64)]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled = np.linalg.norm(normals, axis=1)
     total = np.cumsum(doubled)
@@ -119,7 +119,7 @@ def find_pose(bones: SurfaceData, average: SurfaceData, average_size: float = 1.
 
 def _symmetry(whole: SurfaceData, points: Floats, normals: Floats) -> tuple[Floats, Floats]:
     """The unit normal of the plane of symmetry, towards the left, and a point of it."""
-    surface = Surface(np.asarray(whole.vertices), np.asarray(whole.triangles))
+    surface = Surface(whole.vertices, whole.triangles)
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     flip = np.array([-1.0, 1.0, 1.0])
     mirrored = (points - centre) * flip + centre
@@ -137,7 +137,7 @@ def _symmetry(whole: SurfaceData, points: Floats, normals: Floats) -> tuple[Floa
             max_angle=np.radians(45.0),
             normals=normals * flip,
         )
-        matrix = np.asarray(fit.matrix)
+        matrix = fit.matrix
     except RegistrationError as error:
         raise LandmarkInputError(
             f"the bones have no plane of symmetry that can be found ({error}): place the landmarks "
@@ -161,12 +161,12 @@ def _fitted(
 ) -> Pose:
     """The pose of points whose plane of symmetry is known by its normal and a point."""
     (points, normals), (left, centre) = samples, plane
-    surface = Surface(np.asarray(average.vertices), np.asarray(average.triangles))
+    surface = Surface(average.vertices, average.triangles)
     up = np.array([0.0, 0.0, 1.0]) - left * left[2]
     up /= np.linalg.norm(up)
     upright = np.stack([left, np.cross(up, left), up])
     begin, turned = (points - centre) @ upright.T, normals @ upright.T
-    starts = _starts(begin, np.asarray(average.vertices), average_size)
+    starts = _starts(begin, average.vertices, average_size)
     few = slice(None, None, 6)
     tried = [
         _similarity((begin[few], turned[few]), surface, start, FIRST_ROUNDS) for start in starts
@@ -263,7 +263,7 @@ def _planar_fit(source: Floats, target: Floats, weight: Floats) -> tuple[Floats,
 
 def distance_from(points: Floats, normals: Floats, template: SurfaceData) -> float:
     """How far points of a head lie from a template's bone after the best small similarity, mm."""
-    surface = Surface(np.asarray(template.vertices), np.asarray(template.triangles))
+    surface = Surface(template.vertices, template.triangles)
     return _similarity((points, normals), surface, (np.eye(3), np.zeros(3)), FINE_ROUNDS)[0]
 
 
@@ -314,7 +314,7 @@ def _similarity(
 
 
 def _face_normals(surface: Surface) -> Floats:
-    corners = np.asarray(surface.vertices)[np.asarray(surface.triangles).astype(np.int64)]
+    corners = surface.vertices[surface.triangles.astype(np.int64)]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None])
 

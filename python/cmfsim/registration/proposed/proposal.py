@@ -152,7 +152,7 @@ def _likeness(
         other = _template_pose(template, templates[0])
         points, normals = surface_samples(upper, 2000)
         shape = _parts(template.bones).upper
-        moved = SurfaceData(other.into(np.asarray(shape.vertices)) / other.size, shape.triangles)
+        moved = SurfaceData(other.into(shape.vertices) / other.size, shape.triangles)
         distance = distance_from(pose.into(points) / pose.size, normals @ pose.axes.T, moved)
     return 1.0 / (1.0 + (distance / LIKENESS) ** 2)
 
@@ -215,7 +215,7 @@ def _on_surface(
         if not names:
             continue
         points = pose.out(np.array([sites[name] for name in names]) * pose.size)
-        whole = Surface(np.asarray(surface.vertices), np.asarray(surface.triangles))
+        whole = Surface(surface.vertices, surface.triangles)
         near, _, _ = whole.closest(points)
         placed.update(zip(names, near, strict=True))
     return placed
