@@ -13,7 +13,7 @@ use nalgebra::{Cholesky, Matrix3, Matrix6, SymmetricEigen, Vector3};
 use crate::mechanics::hyperelastic::{HyperelasticLaw, PointResponse, Tangent, cofactor};
 use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::material::{Lame, Voigt};
-use crate::mechanics::polar::Polar;
+use crate::mechanics::polar::{Polar, small_tangent};
 use crate::mechanics::tissue::TetMaterial;
 
 /// Sum of two principal stretches below which the rotation about the third axis is undefined: the tet is almost
@@ -126,6 +126,27 @@ impl Density {
         }
         out
     }
+
+    /// The tangent at `f` without negative curvature: steps computed with it go downhill.
+    ///
+    /// Most points have none: a Cholesky factorisation with a small shift shows that, and the shifted tangent is
+    /// the answer.
+    pub fn definite(&self, f: &Matrix3<f64>, kinematics: Kinematics, pressure: f64) -> Tangent {
+        let tangent = self.tangent(f, kinematics, pressure);
+        // The eigenvalue iteration would not terminate.
+        if tangent.iter().any(|x| !x.is_finite()) {
+            return tangent;
+        }
+        let symmetric = 0.5 * (tangent + tangent.transpose());
+        let lifted = symmetric + Tangent::identity() * (DEFINITE_LIFT * symmetric.amax());
+        if Cholesky::new(lifted).is_some() {
+            lifted
+        } else if matches!(self.stretch, Some(Stiffness::General(_))) {
+            without_negative(&symmetric, kinematics)
+        } else {
+            without_negative_isotropic(&symmetric, f, kinematics)
+        }
+    }
 }
 
 /// θ and ∂θ/∂F of `kinematics` at `f`.
@@ -141,36 +162,66 @@ pub(crate) fn volumetric(f: &Matrix3<f64>, kinematics: Kinematics) -> Volumetric
     }
 }
 
-/// `tangent` without negative curvature: steps computed with it go downhill.
+/// Curvature kept in place of `value`, which may be negative.
 ///
 /// For hyperelastic points negative curvature is replaced by its absolute value, so that steps stay as short
 /// along it as along positive curvature (Chen et al. 2024); without it they would overshoot. For corotational
 /// points it is removed (Teran et al. 2005): it comes from rotations far from rest, which short steps would not
 /// complete.
-///
-/// Most points have none: a Cholesky factorisation with a small shift shows that, and the shifted tangent is
-/// the answer.
-pub(crate) fn definite(tangent: Tangent, kinematics: Kinematics) -> Tangent {
-    // The eigenvalue iteration would not terminate.
-    if tangent.iter().any(|x| !x.is_finite()) {
-        return tangent;
+fn kept_curvature(value: f64, kinematics: Kinematics) -> f64 {
+    match kinematics {
+        Kinematics::Hyperelastic(_) => value.abs(),
+        Kinematics::Linear | Kinematics::Corotational => value.max(0.0),
     }
-    let symmetric = 0.5 * (tangent + tangent.transpose());
-    let lifted = symmetric + Tangent::identity() * (DEFINITE_LIFT * symmetric.amax());
-    if Cholesky::new(lifted).is_some() {
-        return lifted;
-    }
-    let eigen = SymmetricEigen::new(symmetric);
+}
+
+/// The symmetric `tangent` with the curvature that is kept along each of its eigenvectors.
+fn without_negative(tangent: &Tangent, kinematics: Kinematics) -> Tangent {
+    let eigen = SymmetricEigen::new(*tangent);
     let mut out = Tangent::zeros();
     for i in 0..9 {
-        let (mode, value) = (eigen.eigenvectors.column(i), eigen.eigenvalues[i]);
-        let kept = match kinematics {
-            Kinematics::Hyperelastic(_) => value.abs(),
-            Kinematics::Linear | Kinematics::Corotational => value.max(0.0),
-        };
-        out += mode * mode.transpose() * kept;
+        let mode = eigen.eigenvectors.column(i);
+        out += mode * mode.transpose() * kept_curvature(eigen.eigenvalues[i], kinematics);
     }
     out
+}
+
+/// [`without_negative`] for isotropic tissue at `f`: in the principal axes its tangent consists of one block for
+/// the three stretches and one for each pair of axes (Smith, de Goes & Kim 2019).
+fn without_negative_isotropic(
+    tangent: &Tangent,
+    f: &Matrix3<f64>,
+    kinematics: Kinematics,
+) -> Tangent {
+    let polar = Polar::new(f);
+    let inner = carried(tangent, &polar.q.transpose(), &polar.v.transpose());
+    let mut kept = Tangent::zeros();
+    let mut block = Matrix3::from_fn(|i, j| inner[(4 * i, 4 * j)]);
+    // Negative curvature usually comes from turns, not from stretches.
+    if Cholesky::new(block).is_none() {
+        let eigen = SymmetricEigen::new(block);
+        let values = eigen.eigenvalues.map(|value| kept_curvature(value, kinematics));
+        block =
+            eigen.eigenvectors * Matrix3::from_diagonal(&values) * eigen.eigenvectors.transpose();
+    }
+    for i in 0..3 {
+        for j in 0..3 {
+            kept[(4 * i, 4 * j)] = block[(i, j)];
+        }
+    }
+    for (a, b) in [(1, 3), (2, 6), (5, 7)] {
+        let (own, other, mixed) = (inner[(a, a)], inner[(b, b)], inner[(a, b)]);
+        let t = if mixed == 0.0 { 0.0 } else { small_tangent(0.5 * (other - own) / mixed) };
+        // Eigenvalues and eigenvectors (1, −t) and (t, 1).
+        let (low, high) = (own - t * mixed, other + t * mixed);
+        let (low, high) = (kept_curvature(low, kinematics), kept_curvature(high, kinematics));
+        let size = 1.0 / (1.0 + t * t);
+        kept[(a, a)] = (low + t * t * high) * size;
+        kept[(b, b)] = (t * t * low + high) * size;
+        kept[(a, b)] = t * (high - low) * size;
+        kept[(b, a)] = kept[(a, b)];
+    }
+    carried(&kept, &polar.q, &polar.v)
 }
 
 /// The isotropic stiffness nearest to `c` (Fedorov 1968): 9K = C_iijj, 30 μ = 3 C_ijij − C_iijj.
@@ -441,6 +492,30 @@ mod tests {
                         assert!(off.abs() < 1e-14, "{kinematics:?} {row} {col}: {off}");
                     }
                 }
+            }
+        }
+    }
+
+    #[test]
+    fn the_definite_tangent_keeps_the_curvature_along_each_eigenvector() {
+        for kinematics in Kinematics::all().skip(1) {
+            for material in materials() {
+                let density = Density::new(&material, kinematics);
+                let mut altered = 0;
+                for f in gradients() {
+                    for pressure in [0.0, -0.7] {
+                        let exact = density.tangent(&f, kinematics, pressure);
+                        let kept = density.definite(&f, kinematics, pressure);
+                        // No outside solver of eigenvalues here: those of nalgebra, on the whole tangent.
+                        let reference = without_negative(&exact, kinematics);
+                        let off = (kept - reference).amax();
+                        assert!(off < 1e-9 * exact.amax(), "{kinematics:?} {f} {off}");
+                        let least = kept.symmetric_eigenvalues().min();
+                        assert!(least > -1e-13 * kept.amax(), "{kinematics:?} {f} {least}");
+                        altered += usize::from((kept - exact).amax() > 1e-3 * exact.amax());
+                    }
+                }
+                assert!(altered >= 4, "{kinematics:?}: only {altered} tangents were indefinite");
             }
         }
     }

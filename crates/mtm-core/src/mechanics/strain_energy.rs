@@ -1,19 +1,21 @@
 //! Strain energy of a body under large rotation: its value, its first derivative (the internal forces) and its
 //! second derivative (the tangent stiffness), on the pattern of the tensors.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
-use crate::algebra::blocks::{BlockMatrix, RowTask};
+use crate::algebra::blocks::{Block, BlockMatrix, RowTask};
+use crate::algebra::simd::{Kernel, widest};
 use crate::error::Result;
-use crate::mechanics::density::{Density, definite, volumetric};
-use crate::mechanics::element::ElementNodes;
+use crate::mechanics::density::{Density, volumetric};
+use crate::mechanics::element::{ElementNodes, MOST_NODES};
 use crate::mechanics::hyperelastic::Tangent;
 use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::nodal_pressure::split;
 use crate::mechanics::tensors::MassTensors;
+use crate::vector::add;
 
 /// Nodes per parallel task.
 const NODES_PER_TASK: usize = 256;
@@ -34,6 +36,17 @@ pub struct StrainEnergy {
     kinematics: Kinematics,
     /// Energy density of each tet, or of all of them.
     densities: Vec<Density>,
+    /// Memory of the last state and tangent: clearing new pages takes longer than computing forces.
+    scratch: Mutex<Scratch>,
+}
+
+/// Values of every tet, kept for their memory only.
+#[derive(Debug, Default)]
+struct Scratch {
+    /// Internal force on each node of each tet, N.
+    forces: Vec<[f64; 3]>,
+    /// Tangent of each quadrature point times its volume, N mm.
+    tangents: Vec<Tangent>,
 }
 
 /// Energy and internal forces of a state.
@@ -67,7 +80,7 @@ impl StrainEnergy {
                 }
             })
             .collect();
-        Self { tensors, kinematics, densities }
+        Self { tensors, kinematics, densities, scratch: Mutex::default() }
     }
 
     /// The kinematics.
@@ -87,16 +100,28 @@ impl StrainEnergy {
     fn gradients(&self, t: usize, u: &[[f64; 3]]) -> impl Iterator<Item = Matrix3<f64>> {
         let nodes = self.nodes();
         let geometry = nodes.mesh().geometry(t);
-        let own: Vec<Vector3<f64>> =
-            nodes.of_tet(t).iter().map(|&j| u[j as usize].into()).collect();
+        let mut own = [[0.0; 3]; MOST_NODES];
+        for (own, &j) in own.iter_mut().zip(nodes.of_tet(t)) {
+            *own = u[j as usize];
+        }
         (0..nodes.n_points()).map(move |point| {
-            let (gradients, _) = nodes.gradients(&geometry, point);
+            let (gradients, count) = nodes.gradients(&geometry, point);
             let mut f = Matrix3::identity();
-            for (u, g) in own.iter().zip(gradients) {
-                f += u * Vector3::from(g).transpose();
+            for (u, g) in own.iter().zip(&gradients[..count]) {
+                f += Vector3::from(*u) * Vector3::from(*g).transpose();
             }
             f
         })
+    }
+
+    /// Takes the memory of the last state and tangent; another thread's call meanwhile starts with none.
+    fn take_scratch(&self) -> Scratch {
+        std::mem::take(&mut *self.scratch.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Keeps `scratch` for the next state and tangent.
+    fn keep_scratch(&self, scratch: Scratch) {
+        *self.scratch.lock().unwrap_or_else(PoisonError::into_inner) = scratch;
     }
 
     /// Energy and forces under displacements of all nodes, mm.
@@ -109,39 +134,46 @@ impl StrainEnergy {
         let mesh = nodes.mesh();
         let averaged = self.averaged(u);
         let share = 1.0 / nodes.n_points() as f64;
-        let points: Vec<(f64, Vec<Matrix3<f64>>)> = (0..mesh.n_tets())
-            .into_par_iter()
-            .map(|t| {
+        let n_own = nodes.of_tet(0).len();
+        let mut scratch = self.take_scratch();
+        scratch.forces.resize(mesh.n_tets() * n_own, [0.0; 3]);
+        let energies: Vec<f64> = scratch
+            .forces
+            .par_chunks_mut(n_own)
+            .enumerate()
+            .map(|(t, own)| {
                 let pressure = averaged.as_ref().map_or(0.0, |a| a.pressures[t]);
-                let (mut energy, mut stresses) = (0.0, Vec::with_capacity(nodes.n_points()));
-                for f in self.gradients(t, u) {
-                    let found = self.density(t).response(&f, self.kinematics, pressure);
+                let (density, geometry) = (self.density(t), mesh.geometry(t));
+                let weight = share * geometry.volume;
+                let mut energy = 0.0;
+                own.fill([0.0; 3]);
+                for (point, f) in self.gradients(t, u).enumerate() {
+                    let found = density.response(&f, self.kinematics, pressure);
                     energy += found.energy;
-                    stresses.push(found.stress);
+                    let stress = found.stress * weight;
+                    for (force, g) in own.iter_mut().zip(nodes.gradients(&geometry, point).0) {
+                        *force = (Vector3::from(*force) + stress * Vector3::from(g)).into();
+                    }
                 }
-                (energy * share * mesh.volumes()[t], stresses)
+                energy * weight
             })
             .collect();
         let forces = (0..nodes.n_nodes())
             .into_par_iter()
             .with_min_len(NODES_PER_TASK)
             .map(|j| {
-                let mut sum = Vector3::zeros();
+                let mut sum = [0.0; 3];
                 for &t in nodes.tets_of_node(j) {
                     let t = t as usize;
-                    let geometry = mesh.geometry(t);
-                    let Some(a) = nodes.of_tet(t).iter().position(|&v| v as usize == j) else {
-                        continue;
-                    };
-                    for (point, stress) in points[t].1.iter().enumerate() {
-                        let g = nodes.gradients(&geometry, point).0[a];
-                        sum += stress * Vector3::from(g) * (share * geometry.volume);
+                    if let Some(a) = nodes.of_tet(t).iter().position(|&v| v as usize == j) {
+                        sum = add(sum, scratch.forces[t * n_own + a]);
                     }
                 }
-                sum.into()
+                sum
             })
             .collect();
-        let energy: f64 = points.iter().map(|p| p.0).sum();
+        self.keep_scratch(scratch);
+        let energy: f64 = energies.iter().sum();
         Ok(EnergyState { energy: energy + averaged.map_or(0.0, |a| a.energy), forces })
     }
 
@@ -154,63 +186,33 @@ impl StrainEnergy {
         let nodes = self.nodes();
         let mesh = nodes.mesh();
         let averaged = self.averaged(u);
-        let tangents: Vec<Vec<Tangent>> = (0..mesh.n_tets())
-            .into_par_iter()
-            .map(|t| {
-                let pressure = averaged.as_ref().map_or(0.0, |a| a.pressures[t]);
-                let weight = mesh.volumes()[t] / nodes.n_points() as f64;
-                let density = self.density(t);
-                self.gradients(t, u)
-                    .map(|f| {
-                        let tangent = density.tangent(&f, self.kinematics, pressure);
-                        let kept = match kind {
-                            TangentKind::Definite => definite(tangent, self.kinematics),
-                            TangentKind::Exact => tangent,
-                        };
-                        kept * weight
-                    })
-                    .collect()
-            })
-            .collect();
+        let n_points = nodes.n_points();
+        let mut scratch = self.take_scratch();
+        scratch.tangents.resize(mesh.n_tets() * n_points, Tangent::zeros());
+        scratch.tangents.par_chunks_mut(n_points).enumerate().for_each(|(t, own)| {
+            let pressure = averaged.as_ref().map_or(0.0, |a| a.pressures[t]);
+            let weight = mesh.volumes()[t] / n_points as f64;
+            let density = self.density(t);
+            for (out, f) in own.iter_mut().zip(self.gradients(t, u)) {
+                *out = weight
+                    * match kind {
+                        TangentKind::Definite => density.definite(&f, self.kinematics, pressure),
+                        TangentKind::Exact => density.tangent(&f, self.kinematics, pressure),
+                    };
+            }
+        });
         let pattern = self.tensors.matrix();
         let mut matrix =
             BlockMatrix::from_pattern(pattern.row_start.clone(), pattern.columns.clone());
-        matrix.row_tasks().into_par_iter().for_each(|task| self.fill(&tangents, task));
+        matrix.row_tasks().into_par_iter().for_each(|task| {
+            widest(Fill { nodes, tangents: &scratch.tangents, task });
+        });
+        self.keep_scratch(scratch);
         if let (Some(patches), Some(averaged)) = (self.tensors.patches(), &averaged) {
             let gradients = patches.gradients(mesh, |t| averaged.slopes[t]);
             patches.add_to(mesh, &gradients, &mut matrix);
         }
         Ok(matrix)
-    }
-
-    /// Adds g_aᵀ H g_b of every tet around the rows of `task`.
-    fn fill(&self, tangents: &[Vec<Tangent>], task: RowTask<'_>) {
-        let nodes = self.nodes();
-        let origin = task.start[0];
-        for (offset, window) in task.start.windows(2).enumerate() {
-            let row = window[0] - origin..window[1] - origin;
-            let (columns, blocks) = (&task.columns[row.clone()], &mut task.blocks[row]);
-            let j = task.first + offset;
-            for &t in nodes.tets_of_node(j) {
-                let t = t as usize;
-                let geometry = nodes.mesh().geometry(t);
-                let own = nodes.of_tet(t);
-                let Some(a) = own.iter().position(|&v| v as usize == j) else { continue };
-                for (point, tangent) in tangents[t].iter().enumerate() {
-                    let (gradients, _) = nodes.gradients(&geometry, point);
-                    let left = left_contracted(tangent, gradients[a]);
-                    for (&k, g) in own.iter().zip(&gradients) {
-                        let Ok(at) = columns.binary_search(&k) else { continue };
-                        for r in 0..3 {
-                            for c in 0..3 {
-                                let h = &left[r][c];
-                                blocks[at][3 * r + c] += h[0] * g[0] + h[1] * g[1] + h[2] * g[2];
-                            }
-                        }
-                    }
-                }
-            }
-        }
     }
 
     fn averaged(&self, u: &[[f64; 3]]) -> Option<Averaged> {
@@ -233,15 +235,74 @@ impl StrainEnergy {
     }
 }
 
-/// Σ_m H_(rm)(cn) g_m: for each pair of components (r, c) the vector over n.
-fn left_contracted(tangent: &Tangent, g: [f64; 3]) -> [[[f64; 3]; 3]; 3] {
-    let mut out = [[[0.0; 3]; 3]; 3];
+/// The rows of `task`: g_aᵀ H g_b of every tet around them.
+struct Fill<'a> {
+    nodes: &'a ElementNodes,
+    /// Tangents of all quadrature points, tet by tet.
+    tangents: &'a [Tangent],
+    task: RowTask<'a>,
+}
+
+impl Kernel for Fill<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run(self) {
+        let Self { nodes, tangents, task } = self;
+        let n_points = nodes.n_points();
+        let origin = task.start[0];
+        for (offset, window) in task.start.windows(2).enumerate() {
+            let row = window[0] - origin..window[1] - origin;
+            let (columns, blocks) = (&task.columns[row.clone()], &mut task.blocks[row]);
+            let j = task.first + offset;
+            for &t in nodes.tets_of_node(j) {
+                let t = t as usize;
+                let geometry = nodes.mesh().geometry(t);
+                let own = nodes.of_tet(t);
+                let Some(a) = own.iter().position(|&v| v as usize == j) else { continue };
+                let mut at = [None; MOST_NODES];
+                for (at, k) in at.iter_mut().zip(own) {
+                    *at = columns.binary_search(k).ok();
+                }
+                for (point, tangent) in tangents[t * n_points..][..n_points].iter().enumerate() {
+                    let (gradients, _) = nodes.gradients(&geometry, point);
+                    let left = left_contracted(tangent, gradients[a]);
+                    for (at, g) in at.iter().zip(&gradients) {
+                        let Some(at) = *at else { continue };
+                        add_contracted(&mut blocks[at], &left, *g);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Σ_m H_(rm)(cn) g_m: for each component n the entries (r, c), row by row.
+#[inline(always)]
+fn left_contracted(tangent: &Tangent, g: [f64; 3]) -> [Block; 3] {
+    // H is symmetric: its columns are its rows, and contiguous.
+    let columns = tangent.as_slice();
+    let mut out = [[0.0; 9]; 3];
     for r in 0..3 {
+        let mut sum = [0.0; 9];
+        for m in 0..3 {
+            let column = &columns[9 * (3 * r + m)..][..9];
+            for (sum, value) in sum.iter_mut().zip(column) {
+                *sum += value * g[m];
+            }
+        }
         for c in 0..3 {
             for n in 0..3 {
-                out[r][c][n] = (0..3).map(|m| tangent[(3 * r + m, 3 * c + n)] * g[m]).sum();
+                out[n][3 * r + c] = sum[3 * c + n];
             }
         }
     }
     out
+}
+
+/// Adds Σ_n `left`_n g_n to `block`.
+#[inline(always)]
+fn add_contracted(block: &mut Block, left: &[Block; 3], g: [f64; 3]) {
+    for (i, entry) in block.iter_mut().enumerate() {
+        *entry += left[0][i] * g[0] + left[1][i] * g[1] + left[2][i] * g[2];
+    }
 }
