@@ -47,6 +47,7 @@ struct Scratch {
     forces: Vec<[f64; 3]>,
     /// Tangent of each quadrature point times its volume, N mm.
     tangents: Vec<Tangent>,
+    matrix: Option<BlockMatrix>,
 }
 
 /// Energy and internal forces of a state.
@@ -182,6 +183,16 @@ impl StrainEnergy {
     /// # Errors
     /// Displacements of the wrong number, or not finite.
     pub fn stiffness(&self, u: &[[f64; 3]], kind: TangentKind) -> Result<BlockMatrix> {
+        self.with_stiffness(u, kind, BlockMatrix::clone)
+    }
+
+    /// The result of `read` for the tangent stiffness under displacements of all nodes.
+    pub(crate) fn with_stiffness<T>(
+        &self,
+        u: &[[f64; 3]],
+        kind: TangentKind,
+        read: impl FnOnce(&BlockMatrix) -> T,
+    ) -> Result<T> {
         self.tensors.check_displacements(u)?;
         let nodes = self.nodes();
         let mesh = nodes.mesh();
@@ -202,17 +213,20 @@ impl StrainEnergy {
             }
         });
         let pattern = self.tensors.matrix();
-        let mut matrix =
-            BlockMatrix::from_pattern(pattern.row_start.clone(), pattern.columns.clone());
+        let mut matrix = scratch.matrix.take().unwrap_or_else(|| {
+            BlockMatrix::from_pattern(pattern.row_start.clone(), pattern.columns.clone())
+        });
         matrix.row_tasks().into_par_iter().for_each(|task| {
             widest(Fill { nodes, tangents: &scratch.tangents, task });
         });
-        self.keep_scratch(scratch);
         if let (Some(patches), Some(averaged)) = (self.tensors.patches(), &averaged) {
             let gradients = patches.gradients(mesh, |t| averaged.slopes[t]);
             patches.add_to(mesh, &gradients, &mut matrix);
         }
-        Ok(matrix)
+        let result = read(&matrix);
+        scratch.matrix = Some(matrix);
+        self.keep_scratch(scratch);
+        Ok(result)
     }
 
     fn averaged(&self, u: &[[f64; 3]]) -> Option<Averaged> {
@@ -253,6 +267,7 @@ impl Kernel for Fill<'_> {
         for (offset, window) in task.start.windows(2).enumerate() {
             let row = window[0] - origin..window[1] - origin;
             let (columns, blocks) = (&task.columns[row.clone()], &mut task.blocks[row]);
+            blocks.fill([0.0; 9]);
             let j = task.first + offset;
             for &t in nodes.tets_of_node(j) {
                 let t = t as usize;

@@ -4,11 +4,12 @@
 //! the estimate may miss a slow motion. In these cases a trial with a known solution is solved first, and its
 //! true errors calibrate the estimates (`benches/error_estimate.rs` measures how often they fail).
 
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::krylov::{
-    Enough, Operator, PcgOptions, PcgOutcome, Preconditioner, Reached, Spectrum, Trial,
+    Enough, Operator, PcgOptions, PcgOutcome, Preconditioner, Problem, Reached, Spectrum, Trial,
+    pcg_near,
 };
 use crate::algebra::multigrid::{Multigrid, MultigridOptions};
 use crate::algebra::relaxation::{RelaxationOptions, relax};
@@ -81,7 +82,7 @@ pub(crate) struct Advance {
 /// A system without a factorisation: the matrix and a multigrid hierarchy for it.
 pub(crate) struct Iterative {
     matrix: BlockMatrix,
-    multigrid: Multigrid,
+    multigrid: Arc<Multigrid>,
     /// Whether sweeps solve the system, and the hierarchy only measures their error.
     sweeps: bool,
     /// Estimated error over the length of the motion.
@@ -94,12 +95,12 @@ pub(crate) struct Iterative {
 }
 
 impl Iterative {
-    /// The system of `matrix`, to be solved by `method`, with a multigrid hierarchy.
+    /// The system of `matrix`, to be solved by `method`, with a multigrid hierarchy for it or for a similar matrix.
     ///
     /// `tissue`: contrast and compressibility of the tissue.
     pub fn new(
         matrix: BlockMatrix,
-        multigrid: Multigrid,
+        multigrid: Arc<Multigrid>,
         tissue: Extremes,
         method: Method,
         options: &StaticOptions,
@@ -137,6 +138,11 @@ impl Iterative {
         &self.matrix
     }
 
+    /// The hierarchy, for a system with a similar matrix.
+    pub fn multigrid(&self) -> &Arc<Multigrid> {
+        &self.multigrid
+    }
+
     /// Bytes of the hierarchy.
     pub fn bytes(&self) -> usize {
         self.multigrid.memory_bytes()
@@ -160,24 +166,25 @@ impl Iterative {
     }
 
     /// A⁻¹ b with an error of `allowed`, mm, or of the tolerance times the distance that one cycle moves the
-    /// rows, if that is more: a step of Newton's method.
+    /// rows, if that is more, and the number of iterations: a step of Newton's method.
     pub fn step(
         &self,
         b: &[[f64; 3]],
         allowed: f64,
         interrupted: Interrupt<'_>,
-    ) -> Result<Vec<[f64; 3]>> {
+    ) -> Result<(Vec<[f64; 3]>, usize)> {
         let begun = Begun::new(&self.multigrid, b);
         let far = begun.reach(0.0);
         if far == 0.0 {
-            return Ok(vec![[0.0; 3]; b.len()]);
+            return Ok((vec![[0.0; 3]; b.len()], 0));
         }
-        let tolerance = allowed.max(self.tolerance * far);
-        let confirmed = Confirmed {
-            relative: tolerance / far,
-            ..self.confirmed((&self.matrix, &begun), &self.trial, interrupted)
-        };
-        Ok(self.solution(&confirmed, b, tolerance)?.solution)
+        // Without a trial: what a step leaves, the next one finds.
+        let options = self.options(allowed.max(self.tolerance * far));
+        let start = vec![[0.0; 3]; b.len()];
+        let problem = Problem { a: &self.matrix, b, preconditioner: &begun, interrupted };
+        let seen = &mut Spectrum::default();
+        let found = pcg_near(&problem, &start, &options, None, seen)?.into_outcome()?;
+        Ok((found.solution, found.iterations))
     }
 
     /// The solution for `b` by `confirmed`, starting from rest.
@@ -235,7 +242,7 @@ impl Iterative {
             let product =
                 ProjectedProduct::new(&self.matrix, &constraints, &springs).with_links(links);
             let confirmed =
-                self.confirmed((&product, &self.multigrid), &trail.trial, solve.interrupted);
+                self.confirmed((&product, &*self.multigrid), &trail.trial, solve.interrupted);
             match confirmed.solve(&b, &start, &options, leave.enough, &mut trail.seen)? {
                 Reached::Solution(found) => break (found, true),
                 Reached::Step(found) => break (found, false),
@@ -310,7 +317,7 @@ impl Iterative {
             };
             let start = vec![[0.0; 3]; b.len()];
             let trial = OnceLock::new();
-            let confirmed = self.confirmed((matrix, &self.multigrid), &trial, solve.interrupted);
+            let confirmed = self.confirmed((matrix, &*self.multigrid), &trial, solve.interrupted);
             let left = Confirmed { relative: MEASURED_SHARE, ..confirmed }
                 .solve(&rest, &start, &options, None, &mut Spectrum::default())
                 .and_then(Reached::into_outcome)

@@ -2,9 +2,12 @@
 
 use rayon::prelude::*;
 
-use crate::algebra::blocks::{Block, BlockMatrix};
+use crate::algebra::blocks::BlockMatrix;
 use crate::boundary::NodeKind;
 pub(crate) use crate::contact::pairs::NO_ROW;
+
+/// Blocks per parallel task of a copy.
+const BLOCKS_PER_TASK: usize = 4096;
 
 /// Free and sliding nodes as rows of the system.
 pub(crate) struct Reduction {
@@ -44,13 +47,16 @@ impl Reduction {
 
     /// Rows and columns of `matrix` that belong to unknown nodes.
     pub fn matrix(&self, matrix: &BlockMatrix) -> BlockMatrix {
+        self.pattern(matrix).taken_from(matrix)
+    }
+
+    /// Where the rows and columns of unknown nodes are in matrices with the pattern of `matrix`.
+    pub fn pattern(&self, matrix: &BlockMatrix) -> ReducedPattern {
         let Self { unknowns, row_of } = self;
         let kept = |j: u32| {
-            let (columns, blocks) = matrix.row(j as usize);
-            columns
-                .iter()
-                .map(|&k| row_of[k as usize])
-                .zip(blocks)
+            let range = matrix.row_start[j as usize]..matrix.row_start[j as usize + 1];
+            range
+                .map(|at| (row_of[matrix.columns[at] as usize], at))
                 .filter(|(row, _)| *row != NO_ROW)
         };
         let lengths: Vec<usize> = unknowns.par_iter().map(|&j| kept(j).count()).collect();
@@ -59,19 +65,25 @@ impl Reduction {
         for length in lengths {
             row_start.push(row_start[row_start.len() - 1] + length);
         }
-        let columns = unknowns.par_iter().flat_map_iter(|&j| kept(j).map(|(row, _)| row)).collect();
-        let mut out = BlockMatrix::from_pattern(row_start, columns);
-        out.row_tasks().into_par_iter().for_each(|task| {
-            let (first, mut blocks) = (task.first, task.blocks);
-            for &j in &unknowns[first..first + task.start.len() - 1] {
-                let row: Vec<&Block> = kept(j).map(|(_, block)| block).collect();
-                let (head, tail) = blocks.split_at_mut(row.len());
-                for (out, block) in head.iter_mut().zip(row) {
-                    *out = *block;
-                }
-                blocks = tail;
-            }
-        });
+        let (columns, sources) = unknowns.par_iter().flat_map_iter(|&j| kept(j)).unzip();
+        ReducedPattern { row_start, columns, sources }
+    }
+}
+
+/// The pattern of a matrix of unknown nodes, within that of all nodes.
+pub(crate) struct ReducedPattern {
+    row_start: Vec<usize>,
+    columns: Vec<u32>,
+    /// Position of each block in the matrix of all nodes.
+    sources: Vec<usize>,
+}
+
+impl ReducedPattern {
+    /// The rows and columns of unknown nodes of `matrix`.
+    pub fn taken_from(&self, matrix: &BlockMatrix) -> BlockMatrix {
+        let mut out = BlockMatrix::from_pattern(self.row_start.clone(), self.columns.clone());
+        let blocks = out.blocks.par_iter_mut().zip(&self.sources);
+        blocks.with_min_len(BLOCKS_PER_TASK).for_each(|(block, &at)| *block = matrix.blocks[at]);
         out
     }
 }

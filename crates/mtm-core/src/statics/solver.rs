@@ -125,6 +125,7 @@ impl StaticSolver {
                     lame_ratio: tensors.tissue().largest_lame_ratio(),
                     contrast: tensors.tissue().contrast(),
                 },
+                multigrid: None,
             };
             System::new(matrix, &body, &options, &mut clock, interrupted)
                 .map(|(system, method)| (Mechanics::Linear(Box::new(system)), method))

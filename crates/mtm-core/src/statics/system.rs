@@ -62,6 +62,8 @@ pub(crate) struct BodyRows<'a> {
     pub held: Held,
     /// Contrast and compressibility of the tissue.
     pub tissue: Extremes,
+    /// The hierarchy of a similar matrix under the same conditions, if there is one.
+    pub multigrid: Option<Arc<Multigrid>>,
 }
 
 /// Displacements of the rows after a solve, with contact if nodes slide.
@@ -166,10 +168,23 @@ impl System {
             }
             method = Method::Pcg;
         }
-        let multigrid = multigrid(&matrix, body)?;
+        let multigrid = match &body.multigrid {
+            Some(kept) => kept.clone(),
+            None => Arc::new(multigrid(&matrix, body)?),
+        };
         let iterative = Iterative::new(matrix, multigrid, body.tissue, method, options);
         clock.lap("preconditioner", true);
         Ok((with(Kept::Matrix(Unfactored::Iterative(Box::new(iterative)))), method))
+    }
+
+    /// The hierarchy, if the system is solved by iteration.
+    pub fn multigrid(&self) -> Option<&Arc<Multigrid>> {
+        match &self.kept {
+            Kept::Matrix(Unfactored::Iterative(iterative)) => Some(iterative.multigrid()),
+            Kept::Matrix(Unfactored::Refactored { .. })
+            | Kept::Factor(_)
+            | Kept::Flexible { .. } => None,
+        }
     }
 
     /// Bytes of the factor or preconditioner.

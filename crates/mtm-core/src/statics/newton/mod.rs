@@ -4,13 +4,15 @@
 //! negative curvature at each integration point has been removed, so that every step goes downhill. Sliding
 //! constraints n·u = g are enforced by projection, as in the linear system.
 
+mod hierarchy;
 mod sliding;
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::Symbolic;
 use crate::algebra::constraints::{Constraint, add_offsets, projected, projected_rhs};
+use crate::algebra::multigrid::Multigrid;
 use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, Shortfall};
 use crate::mechanics::strain_energy::StrainEnergy;
@@ -18,8 +20,9 @@ use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::mechanics::tensors::MassTensors;
 use crate::statics::effort::Solve;
 use crate::statics::iterative::{Extremes, Iterative, hierarchy};
+use crate::statics::newton::hierarchy::{Found, SharedHierarchy};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
-use crate::statics::reduction::Reduction;
+use crate::statics::reduction::{ReducedPattern, Reduction};
 use crate::statics::row_conditions::RowConditions;
 use crate::statics::solution::Clock;
 use crate::statics::system::Solved;
@@ -48,9 +51,12 @@ const LONGEST: f64 = 16.0;
 /// Length of a step, relative to the length at which the exact tangent was not positive definite, below which
 /// it is tried again.
 const RETRY_EXACT: f64 = 0.5;
+/// Length of a step with the exact tangent, relative to the step before, above which the tangent counts as
+/// indefinite: near the solution steps become shorter.
+const LONGER: f64 = 8.0;
 /// Length of a step over all displacements, below which conjugate gradients use the exact tangent: at rest it
 /// is positive definite, and further away they would detect indefiniteness only by chance.
-const NEAR_REST: f64 = 0.1;
+const NEAR_REST: f64 = 0.05;
 
 /// How tangent systems are solved.
 enum TangentSolver {
@@ -63,9 +69,13 @@ pub(crate) struct Equilibrium {
     energy: StrainEnergy,
     tensors: Arc<MassTensors>,
     reduction: Arc<Reduction>,
+    /// Where the rows are in the tangent, once there was one.
+    pattern: OnceLock<ReducedPattern>,
     solver: TangentSolver,
     options: StaticOptions,
     tissue: Extremes,
+    /// The hierarchy of the tangent at rest, once a plan has needed it: every plan starts there.
+    at_rest: OnceLock<Arc<Multigrid>>,
 }
 
 /// A body under large deformation that follows contact conditions, reaching equilibrium under each set.
@@ -112,6 +122,8 @@ struct Target<'a> {
     conditions: RowConditions,
     /// Reference length of the tolerance, mm.
     scale: f64,
+    /// The hierarchy that the steps towards it share.
+    hierarchy: &'a SharedHierarchy,
 }
 
 /// A state, with the data from which the next step starts.
@@ -195,14 +207,24 @@ impl Equilibrium {
             lame_ratio: tensors.tissue().largest_lame_ratio(),
             contrast: tensors.tissue().contrast(),
         };
-        Ok((Self { energy, tensors, reduction, solver, options: *options, tissue }, method))
+        let made = Self {
+            energy,
+            tensors,
+            reduction,
+            pattern: OnceLock::new(),
+            solver,
+            options: *options,
+            tissue,
+            at_rest: OnceLock::new(),
+        };
+        Ok((made, method))
     }
 
-    /// Bytes of a factorisation; 0 for conjugate gradients, which keep nothing from one tangent to the next.
+    /// Bytes of a factorisation, or of the hierarchy at rest once there is one.
     pub fn bytes(&self) -> usize {
         match &self.solver {
             TangentSolver::Cholesky(symbolic) => symbolic.factor_bytes(),
-            TangentSolver::Pcg => 0,
+            TangentSolver::Pcg => self.at_rest.get().map_or(0, |m| m.memory_bytes()),
         }
     }
 
@@ -221,7 +243,10 @@ impl Equilibrium {
     ) -> Result<Solved> {
         let clock = Clock::new();
         let scale = solve.scale;
-        let target = || Target { prescribed, loads, conditions: RowConditions::default(), scale };
+        let shared = SharedHierarchy::starting(self.at_rest.get());
+        let hierarchy = &shared;
+        let conditions = RowConditions::default;
+        let target = || Target { prescribed, loads, conditions: conditions(), scale, hierarchy };
         let mut u = vec![[0.0; 3]; prescribed.len()];
         let settled = |u: &[[f64; 3]], contact: ContactState| Solved {
             rows: self.reduction.rows(u),
@@ -243,7 +268,10 @@ impl Equilibrium {
             Err(error) => return Err(error),
         }
         let Slide { sliding, motions, .. } = slide;
-        let (target, before, interrupted) = (target(), u.clone(), solve.interrupted);
+        // Other constraints than those at rest.
+        let own = SharedHierarchy::default();
+        let target = Target { hierarchy: &own, ..target() };
+        let (before, interrupted) = (u.clone(), solve.interrupted);
         let mut body = Followed { equilibrium: self, target, sliding, before, u, solve };
         let state = sliding.solve(motions, None, &self.options.contact, interrupted, &mut body)?;
         Ok(settled(&body.u, state))
@@ -306,6 +334,9 @@ impl Equilibrium {
             let moves = Moves { constraints: &constraints, change: Some(&change) };
             self.step(&start, target, &moves, (kind, allowed), interrupted)
         })?;
+        if constraints.is_empty() {
+            self.leave_rest(target);
+        }
         let mut ahead = start.u;
         for (value, d) in ahead.iter_mut().zip(&change) {
             *value = add(*value, *d);
@@ -352,7 +383,11 @@ impl Equilibrium {
                 allowed = allowed.min(finest);
             }
             let first = if length <= near { Exact } else { Definite };
-            let (step, kind) = by_tangent(first, |kind| next(&pose, (kind, allowed)))?;
+            let (mut step, mut kind) = by_tangent(first, |kind| next(&pose, (kind, allowed)))?;
+            // Conjugate gradients do not always notice that a tangent is indefinite.
+            if !by_factor && kind == Exact && step.length() > LONGER * length {
+                (step, kind) = (next(&pose, (Definite, allowed))?, Definite);
+            }
             if kind != first {
                 near = RETRY_EXACT * length;
             }
@@ -465,14 +500,16 @@ impl Equilibrium {
         kind: TangentKind,
         change: Option<&[[f64; 3]]>,
     ) -> Result<(BlockMatrix, Vec<[f64; 3]>)> {
-        let full = self.energy.stiffness(&pose.u, kind)?;
         let mut b: Vec<[f64; 3]> = pose.slope.iter().map(|&s| scaled(s, -1.0)).collect();
-        if let Some(change) = change {
-            for (b, f) in b.iter_mut().zip(self.reduction.rows(&full.multiply(change))) {
-                *b = sub(*b, f);
+        let matrix = self.energy.with_stiffness(&pose.u, kind, |full| {
+            if let Some(change) = change {
+                for (b, f) in b.iter_mut().zip(self.reduction.rows(&full.multiply(change))) {
+                    *b = sub(*b, f);
+                }
             }
-        }
-        Ok((self.reduction.matrix(&full), b))
+            self.pattern.get_or_init(|| self.reduction.pattern(full)).taken_from(full)
+        })?;
+        Ok((matrix, b))
     }
 
     /// Newton step from `pose` on the rows.
@@ -487,33 +524,57 @@ impl Equilibrium {
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         let &Moves { constraints, change } = moves;
-        let (mut matrix, b) = self.tangent(pose, kind, change)?;
-        for (row, spring) in &target.conditions.springs {
-            matrix.add_to_diagonal(*row, spring.axis, spring.stiffness);
-        }
-        let rhs = projected_rhs(&matrix, &b, constraints);
-        if !constraints.is_empty() {
-            matrix = projected(&matrix, constraints);
-        }
-        let mut x = match &self.solver {
-            TangentSolver::Cholesky(symbolic) => symbolic.factor(&matrix)?.solve(&rhs),
-            TangentSolver::Pcg => {
-                self.by_iteration(matrix, constraints)?.step(&rhs, allowed, interrupted)?
+        target.hierarchy.serve(kind == Definite, |kept| {
+            let (mut matrix, b) = self.tangent(pose, kind, change)?;
+            for (row, spring) in &target.conditions.springs {
+                matrix.add_to_diagonal(*row, spring.axis, spring.stiffness);
             }
-        };
-        add_offsets(&mut x, constraints);
-        Ok(x)
+            let rhs = projected_rhs(&matrix, &b, constraints);
+            if !constraints.is_empty() {
+                matrix = projected(&matrix, constraints);
+            }
+            let (mut value, multigrid, iterations) = match &self.solver {
+                TangentSolver::Cholesky(symbolic) => {
+                    (symbolic.factor(&matrix)?.solve(&rhs), None, 0)
+                }
+                TangentSolver::Pcg => {
+                    let system = self.by_iteration(matrix, constraints, kept)?;
+                    let (rows, iterations) = system.step(&rhs, allowed, interrupted)?;
+                    (rows, Some(system.multigrid().clone()), iterations)
+                }
+            };
+            add_offsets(&mut value, constraints);
+            Ok(Found { value, multigrid, iterations })
+        })
     }
 
-    /// The tangent system of the projected `matrix`, to be solved by conjugate gradients.
-    fn by_iteration(&self, matrix: BlockMatrix, constraints: &[Constraint]) -> Result<Iterative> {
-        let positions = self.reduction.rows(self.tensors.element_nodes().positions());
-        let normals: Vec<(usize, [f64; 3])> =
-            constraints.iter().map(|c| (c.row, c.normal)).collect();
-        let multigrid = hierarchy(&matrix, &positions, &normals, self.tissue)?;
+    /// The tangent system of the projected `matrix`, to be solved by conjugate gradients with the hierarchy
+    /// `kept`, or with its own.
+    fn by_iteration(
+        &self,
+        matrix: BlockMatrix,
+        constraints: &[Constraint],
+        kept: Option<Arc<Multigrid>>,
+    ) -> Result<Iterative> {
+        let multigrid = match kept {
+            Some(kept) => kept,
+            None => {
+                let positions = self.reduction.rows(self.tensors.element_nodes().positions());
+                let normals: Vec<(usize, [f64; 3])> =
+                    constraints.iter().map(|c| (c.row, c.normal)).collect();
+                Arc::new(hierarchy(&matrix, &positions, &normals, self.tissue)?)
+            }
+        };
         let options =
             StaticOptions { tolerance: STEP_TOLERANCE * self.options.tolerance, ..self.options };
         Ok(Iterative::new(matrix, multigrid, self.tissue, Method::Pcg, &options))
+    }
+
+    /// Keeps the hierarchy of the first tangent for other plans; later tangents of this one get their own.
+    fn leave_rest(&self, target: &Target<'_>) {
+        if let Some(multigrid) = target.hierarchy.take() {
+            self.at_rest.get_or_init(|| multigrid);
+        }
     }
 }
 

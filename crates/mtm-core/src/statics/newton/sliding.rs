@@ -5,8 +5,9 @@
 use crate::boundary::Motion;
 use crate::contact::{ContactState, Sliding};
 use crate::error::Result;
-use crate::mechanics::strain_energy::TangentKind::{self, Exact};
+use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::statics::effort::Solve;
+use crate::statics::newton::hierarchy::Found;
 use crate::statics::newton::{
     Equilibrium, Pose, STEP_SHARE, STEP_TOLERANCE, Step, TangentSolver, Target, along_slope,
     by_tangent, moved_by, reach,
@@ -67,6 +68,7 @@ impl Equilibrium {
             let start = Start { change: Some(&change), ..Start::default() };
             self.settled(&rest, &wanted, &start, (kind, first), interrupted)
         })?;
+        self.leave_rest(target);
         solve.effort.iterations += 1;
         let ahead: Vec<[f64; 3]> = rest.u.iter().zip(&change).map(|(a, b)| add(*a, *b)).collect();
         let pose = self.pose(moved_by(&self.reduction, &ahead, &rows, 1.0), target)?;
@@ -103,35 +105,43 @@ impl Equilibrium {
     ) -> Result<(Vec<[f64; 3]>, ContactState)> {
         let &Wanted { target, slide } = wanted;
         let here = self.reduction.rows(&pose.u);
-        let (matrix, mut b) = self.tangent(pose, kind, start.change)?;
-        // K (x − u) = −slope: the contact conditions apply to x, the whole displacement.
-        for (b, f) in b.iter_mut().zip(matrix.multiply(&here)) {
-            *b = add(*b, f);
-        }
         // Closest points cannot converge further than the solves do.
         let far = reach(pose, target);
         let share = if far > 0.0 { allowed / far } else { STEP_SHARE };
         let mut options = self.step_options(share);
         options.contact.allowed = allowed;
-        let body = BodyRows {
-            positions: &self.reduction.rows(self.tensors.element_nodes().positions()),
-            sliding: Some(slide.sliding),
-            held: slide.held,
-            tissue: self.tissue,
-        };
-        let (system, _) = System::new(matrix, &body, &options, &mut Clock::new(), interrupted)?;
-        let contact = start.contact.map(|state| slide.sliding.start_of(state));
-        let settle = Settle {
-            sliding: slide.sliding,
-            motions: slide.motions,
-            begin: contact.map(|contact| Begin { rows: &here, contact }),
-            options: &options,
-            linked: Linked::default(),
-        };
-        let mut solve = Solve::new(target.scale, interrupted);
-        let Settled { rows, contact, .. } = system.solve_with_contact(&b, &settle, &mut solve)?;
-        let step = rows.iter().zip(&here).map(|(x, u)| sub(*x, *u)).collect();
-        Ok((step, contact))
+        let positions = self.reduction.rows(self.tensors.element_nodes().positions());
+        target.hierarchy.serve(kind == Definite, |multigrid| {
+            let (matrix, mut b) = self.tangent(pose, kind, start.change)?;
+            // K (x − u) = −slope: the contact conditions apply to x, the whole displacement.
+            for (b, f) in b.iter_mut().zip(matrix.multiply(&here)) {
+                *b = add(*b, f);
+            }
+            let body = BodyRows {
+                positions: &positions,
+                sliding: Some(slide.sliding),
+                held: slide.held,
+                tissue: self.tissue,
+                multigrid,
+            };
+            let (system, _) = System::new(matrix, &body, &options, &mut Clock::new(), interrupted)?;
+            let contact = start.contact.map(|state| slide.sliding.start_of(state));
+            let settle = Settle {
+                sliding: slide.sliding,
+                motions: slide.motions,
+                begin: contact.map(|contact| Begin { rows: &here, contact }),
+                options: &options,
+                linked: Linked::default(),
+            };
+            let mut solve = Solve::new(target.scale, interrupted);
+            let Settled { rows, contact, .. } =
+                system.solve_with_contact(&b, &settle, &mut solve)?;
+            let step = rows.iter().zip(&here).map(|(x, u)| sub(*x, *u)).collect();
+            let iterations = solve.effort.iterations / contact.iterations.max(1);
+            // Under contact, iterations with an earlier hierarchy cost more than a new one.
+            let multigrid = start.change.and_then(|_| system.multigrid().cloned());
+            Ok(Found { value: (step, contact), multigrid, iterations })
+        })
     }
 
     /// Options of the system of one step, with an error of at most `share` of the reach.

@@ -1,0 +1,71 @@
+//! The multigrid hierarchy that the tangents of one plan share: setting one up takes as long as some fifteen
+//! iterations of conjugate gradients, and tissue that stretches keeps its order of stiffness.
+
+use std::cell::RefCell;
+use std::sync::Arc;
+
+use crate::algebra::multigrid::Multigrid;
+use crate::error::{MtmError, Result};
+
+/// Iterations, relative to those of the first solve with a hierarchy, above which the next tangent gets a new one.
+const WORN: usize = 2;
+
+/// A hierarchy and its use so far.
+#[derive(Default)]
+pub(super) struct SharedHierarchy(RefCell<Option<Used>>);
+
+struct Used {
+    multigrid: Arc<Multigrid>,
+    /// Iterations of the first solve with it; none before.
+    first: Option<usize>,
+}
+
+/// What a solve with a hierarchy found.
+pub(super) struct Found<T> {
+    pub value: T,
+    /// The hierarchy; none if the system was factorised.
+    pub multigrid: Option<Arc<Multigrid>>,
+    pub iterations: usize,
+}
+
+impl SharedHierarchy {
+    /// Begins with the hierarchy of the body at rest, if there is one yet.
+    pub fn starting(rest: Option<&Arc<Multigrid>>) -> Self {
+        Self(RefCell::new(rest.map(|m| Used { multigrid: m.clone(), first: None })))
+    }
+
+    /// The result of `solve` with the hierarchy of an earlier tangent, or with its own if it is given none.
+    ///
+    /// `again`: whether a solve that does not converge with an earlier hierarchy is repeated with its own.
+    ///
+    /// # Errors
+    /// Those of `solve`.
+    pub fn serve<T>(
+        &self,
+        again: bool,
+        solve: impl Fn(Option<Arc<Multigrid>>) -> Result<Found<T>>,
+    ) -> Result<T> {
+        let kept = self.0.borrow().as_ref().map(|used| used.multigrid.clone());
+        let is_old = kept.is_some();
+        let found = match solve(kept) {
+            Err(MtmError::NotConverged { .. }) if is_old && again => solve(None)?,
+            other => other?,
+        };
+        let Found { value, multigrid, iterations } = found;
+        let mut shared = self.0.borrow_mut();
+        let before = shared.take();
+        *shared = multigrid.and_then(|multigrid| {
+            let first = before
+                .filter(|used| Arc::ptr_eq(&used.multigrid, &multigrid))
+                .and_then(|used| used.first)
+                .unwrap_or(iterations);
+            (iterations <= WORN * first).then_some(Used { multigrid, first: Some(first) })
+        });
+        Ok(value)
+    }
+
+    /// The hierarchy shared so far; the next tangent gets its own.
+    pub fn take(&self) -> Option<Arc<Multigrid>> {
+        self.0.take().map(|used| used.multigrid)
+    }
+}
