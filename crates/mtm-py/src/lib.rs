@@ -2,14 +2,16 @@
 //! decisions.
 
 mod arrays;
+mod boundary;
 mod equivalent;
 mod errors;
 mod fibres;
 mod geometry;
 mod materials;
-mod model;
+mod plans;
 mod registration;
 mod running;
+mod statics;
 mod stuffing;
 
 #[global_allocator]
@@ -23,6 +25,8 @@ mod _core {
     use pyo3::types::PyTuple;
 
     #[pymodule_export]
+    use crate::boundary::PyBoundary;
+    #[pymodule_export]
     use crate::equivalent::{PyMuscleShares, sample};
     #[pymodule_export]
     use crate::fibres::PyMuscleFibres;
@@ -31,9 +35,9 @@ mod _core {
     #[pymodule_export]
     use crate::materials::{PyMassTensors, PyTissue};
     #[pymodule_export]
-    use crate::model::{PyBoundary, PyPlanOperator, PySolution, PyStaticSolver};
-    #[pymodule_export]
     use crate::registration::{PyFolds, PyIcpFit, PyRigidFit, PyThinPlateSpline, icp, rigid_fit};
+    #[pymodule_export]
+    use crate::statics::{PyPlanOperator, PySolution, PyStaticSolver};
 
     #[pymodule_export]
     use crate::stuffing::{distance_image, part_mesh, signed_distance_image, stuff_image};

@@ -1,6 +1,11 @@
 //! The only error type of the crate: each variant states a fact, with the offending index and value.
 
+mod ranges;
+
 use thiserror::Error;
+
+pub use ranges::LARGEST_COORDINATE;
+pub(crate) use ranges::{check_coordinates, check_displacements, check_finite_rows, check_forces};
 
 /// What went wrong, where, how much, and what to do about it.
 ///
@@ -75,7 +80,7 @@ pub enum MtmError {
     },
     /// A tet names the same node twice.
     #[error(
-        "tet {tet} names node {node} twice: nodes {nodes:?}; remove the tet or mend its connectivity"
+        "tet {tet} names node {node} twice: nodes {nodes:?}; remove the tet or fix its connectivity"
     )]
     DuplicateNode {
         /// The tet.
@@ -501,56 +506,3 @@ impl MtmError {
 
 /// Result of a fallible operation of this crate.
 pub type Result<T> = std::result::Result<T, MtmError>;
-
-/// Rejects NaN and infinity in rows of three, stating the row.
-pub(crate) fn check_finite_rows(what: &str, rows: &[[f64; 3]], kind: ErrorKind) -> Result<()> {
-    for (index, row) in rows.iter().enumerate() {
-        if let Some(&value) = row.iter().find(|v| !v.is_finite()) {
-            return Err(MtmError::NotFinite { what: what.to_owned(), index, value, kind });
-        }
-    }
-    Ok(())
-}
-
-/// Largest coordinate and displacement, mm (1 km): squares and sums of them stay far from overflow.
-pub const LARGEST_COORDINATE: f64 = 1e6;
-/// Largest force on a node, N.
-pub const LARGEST_FORCE: f64 = 1e12;
-
-/// Rejects NaN, infinity and coordinates or displacements beyond [`LARGEST_COORDINATE`], stating the row.
-pub(crate) fn check_coordinates(what: &str, rows: &[[f64; 3]], kind: ErrorKind) -> Result<()> {
-    check_rows_within(what, rows, LARGEST_COORDINATE, "-1e6 to 1e6 mm; check the units", kind)
-}
-
-/// Rejects NaN, infinity and displacements that no body can have, stating the row: those of a solution under
-/// absurd loads may be beyond [`LARGEST_COORDINATE`].
-pub(crate) fn check_displacements(what: &str, rows: &[[f64; 3]], kind: ErrorKind) -> Result<()> {
-    check_rows_within(what, rows, 1e30, "-1e30 to 1e30 mm", kind)
-}
-
-/// Rejects NaN, infinity and forces beyond [`LARGEST_FORCE`], stating the row.
-pub(crate) fn check_forces(what: &str, rows: &[[f64; 3]], kind: ErrorKind) -> Result<()> {
-    check_rows_within(what, rows, LARGEST_FORCE, "-1e12 to 1e12 N; check the units", kind)
-}
-
-fn check_rows_within(
-    what: &str,
-    rows: &[[f64; 3]],
-    largest: f64,
-    allowed: &'static str,
-    kind: ErrorKind,
-) -> Result<()> {
-    check_finite_rows(what, rows, kind)?;
-    for (index, row) in rows.iter().enumerate() {
-        if let Some(&value) = row.iter().find(|v| v.abs() > largest) {
-            return Err(MtmError::OutOfRange {
-                what: what.to_owned(),
-                index,
-                value,
-                allowed,
-                kind,
-            });
-        }
-    }
-    Ok(())
-}
