@@ -36,6 +36,7 @@ __all__ = [
     "RegistrationError",
     "RegistrationInputError",
     "SolverError",
+    "UnpairedError",
 ]
 
 
@@ -45,6 +46,10 @@ class BoundaryInputError(BoundaryError, ValueError):
 
 class CaseInputError(CaseError, ValueError):
     """A scene or case, in memory or on disk, that cannot be meant."""
+
+
+class UnpairedError(CaseInputError):
+    """Two surfaces with different triangles, where vertices are to be followed one by one."""
 
 
 class CalibrationError(CaseInputError):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cmfsim._core import PRESETS, Surface
 from cmfsim.checks import Floats
 from cmfsim.errors import CaseError, CmfsimError
-from cmfsim.io import Case, read_landmark_file, read_moved_surface, read_surface
+from cmfsim.io import Case, read_bone_pair, read_landmark_file, read_surface
 from cmfsim.io.images import read_image_file
 from cmfsim.io.transforms import TransformFile, read_transform_file
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
@@ -99,9 +99,12 @@ class Evidence:
     transforms: Mapping[str, TransformFile] = field(default_factory=dict)
 
     @cached_property
-    def moved(self) -> Mapping[str, MovedSurface | CmfsimError]:
-        """The motions that are given by surfaces before and after, or why they are not read."""
-        found: dict[str, MovedSurface | CmfsimError] = {}
+    def moved(self) -> Mapping[str, MovedSurface | tuple[SurfaceData, SurfaceData] | CmfsimError]:
+        """The motions that are given by surfaces before and after, or why they are not read.
+
+        Surfaces with different triangles are both there.
+        """
+        found: dict[str, MovedSurface | tuple[SurfaceData, SurfaceData] | CmfsimError] = {}
         given = self.case.surfaces
         units, frame = ("mm", None) if given is None else (given.units, given.frame)
         for name, motion in self.case.plan.items():
@@ -110,7 +113,7 @@ class Evidence:
             if before is None or after is None or not (before.is_file() and after.is_file()):
                 continue
             try:
-                found[name] = read_moved_surface(before, after, units=units, frame=frame)
+                found[name] = read_bone_pair(before, after, units=units, frame=frame)
             except CmfsimError as error:
                 found[name] = error
         return found

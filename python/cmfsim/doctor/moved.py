@@ -14,7 +14,7 @@ from cmfsim.errors import CmfsimError, RegistrationError
 from cmfsim.surfaces.topology import edges_of
 from cmfsim.values.clinical_motion import clinical_motion
 from cmfsim.values.finding import Finding
-from cmfsim.values.surface_data import MovedSurface
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = ["check_moved", "check_pairs"]
 
@@ -48,12 +48,11 @@ STAYS = 3.0
 FEW = 0.05
 # What is left of a motion if the bone is mirrored first, as a share of what is left if it is not.
 MIRRORED = 0.1
-# What is left where vertices cannot be followed. Vertices out of order are refused in an achieved
-# plan too, so that naming such bones there is not enough.
+# What is left where vertices cannot be followed.
 BY_SHAPE = (
-    'or align the bone by shape: plan = "achieved", with the bone after in [postoperative.bones] '
-    "segmented or remeshed on its own (it then moves rigidly, and a change of size is reported "
-    "with its interval)"
+    "or give the bone after as it was segmented or remeshed on its own: with other triangles it is "
+    "registered by its shape (it then moves rigidly, and a change of size is reported with its "
+    "interval)"
 )
 # Vertices that a fit is made of.
 SAMPLES = 5000
@@ -73,6 +72,9 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
                 why=f"it is unknown where each vertex of {name} went",
                 fix="export the bone before, and the same mesh after the motion",
             )
+            continue
+        if not isinstance(moved, MovedSurface):
+            yield _remeshed(name, where, *moved)
             continue
         here, there = moved.surface.vertices, moved.moved_vertices
         wrong = list(check_pairs(name, where, moved))
@@ -94,6 +96,19 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
             fix="register the post-operative scan to the pre-operative one on the skull "
             "(register_volumes, icp)",
         )
+
+
+def _remeshed(name: str, where: str, before: SurfaceData, after: SurfaceData) -> Finding:
+    """A bone whose vertices cannot be followed: the build finds its motion by its shape."""
+    return Finding.note(
+        "moved-remeshed",
+        f"{name} has {len(after.triangles)} triangles after and {len(before.triangles)} before, or "
+        "numbers them differently: its rigid motion is found by its shape",
+        where=where,
+        why="vertices cannot be followed; a bone that was cut into pieces moves as its largest",
+        fix="nothing to do if it is one piece, segmented or remeshed twice; for several pieces, "
+        "name each of them",
+    )
 
 
 def check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]:
@@ -150,8 +165,8 @@ def _scaled(name: str, where: str, scale: float) -> Finding:
         f"{what}: not close to the ratio of any two units (2.54, 10, 25.4, 100, 1000)",
         where=where,
         why="bone does not grow during an operation, so the calibration or segmentation of the "
-        f"scans differs by {abs(scale - 1.0):.1%}; each vertex is still followed, and the "
-        "difference counts as motion",
+        f"scans differs by {abs(scale - 1.0):.1%}; where the shape differs as well, each vertex is "
+        "followed, and the difference counts as motion",
         fix="check the voxel sizes of both scans and the thresholds of both segmentations, and "
         f"measure again; {BY_SHAPE}",
     )

@@ -14,7 +14,7 @@ from cmfsim.io.predictions import read_parts, write_prediction
 from cmfsim.io.results import read_result, result_suffixes, write_result
 from cmfsim.io.scenes import read_plan, read_scene, write_scene
 from cmfsim.io.slicer_output import write_slicer_bundle
-from cmfsim.io.surfaces import read_moved_surface, read_surface, write_surface
+from cmfsim.io.surfaces import read_bone_pair, read_moved_surface, read_surface, write_surface
 from cmfsim.io.transforms import read_transform, write_transform
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "LandmarkFile",
     "as_case",
     "finish_writing",
+    "read_bone_pair",
     "read_image",
     "read_landmark_file",
     "read_landmarks",

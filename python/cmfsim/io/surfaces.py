@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.checks import check_one_of
-from cmfsim.errors import CaseInputError
+from cmfsim.errors import CaseInputError, UnpairedError
 from cmfsim.io.files import named, replacing
 from cmfsim.io.meshes import read_mesh
 from cmfsim.io.obj import write_obj
@@ -23,6 +23,7 @@ from cmfsim.values.case_parts import FRAMES, UNITS
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = [
+    "read_bone_pair",
     "read_moved_surface",
     "read_surface",
     "read_triangles",
@@ -137,11 +138,11 @@ def read_moved_surface(
         ("triangles", len(moved_triangles), len(triangles)),
     ):
         if a != b:
-            raise CaseInputError(f"{names.format(f'{a} {what}', b)}: {SAME_NEEDED}")
+            raise UnpairedError(f"{names.format(f'{a} {what}', b)}: {SAME_NEEDED}")
     other_corners = np.flatnonzero((triangles != moved_triangles).any(axis=1))
     if len(other_corners):
         first = int(other_corners[0])
-        raise CaseInputError(
+        raise UnpairedError(
             f"{names.format(f'triangle {first} at other vertices', 'at its own')}: {SAME_NEEDED}"
         )
     if not np.isfinite(there).all():
@@ -151,6 +152,24 @@ def read_moved_surface(
     kept, number = _welded(np.concatenate([here, there], axis=1))
     rest = SurfaceData(here[kept] * scale, number[triangles])
     return MovedSurface(rest, there[kept] * scale)
+
+
+def read_bone_pair(
+    before: str | os.PathLike[str],
+    after: str | os.PathLike[str],
+    *,
+    units: str = "mm",
+    frame: str | None = None,
+) -> MovedSurface | tuple[SurfaceData, SurfaceData]:
+    """A bone before and after: followed by its vertices if the triangles are the same, else both.
+
+    Parameters and errors as in `read_moved_surface`, except that the triangles may differ.
+    """
+    try:
+        return read_moved_surface(before, after, units=units, frame=frame)
+    except UnpairedError:
+        one, other = (read_surface(path, units=units, frame=frame) for path in (before, after))
+        return one, other
 
 
 SAME_NEEDED = (

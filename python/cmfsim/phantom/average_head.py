@@ -10,6 +10,7 @@ from cmfsim.checks import Floats
 from cmfsim.phantom.model import PhantomHead, make_head
 from cmfsim.registration.proposed import TemplateHead
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["average_head", "drawn_head", "write_average_head"]
@@ -19,20 +20,26 @@ FILE = "average_head.npz"
 GRAIN = 1.0 / 100.0
 # Voxels that the surfaces are taken from, mm, and how many triangles each has at most.
 SPACING, MOST_TRIANGLES = 1.5, 16_000
-PARTS = ("cranium", "mandible", "skin")
+BONES = ("cranium", "mandible")
+PARTS = (*BONES, "skin")
 
 
 @lru_cache(maxsize=1)
 def average_head() -> TemplateHead:
     """The ordinary synthetic head: cranium and mandible with their teeth, skin, all landmarks.
 
-    Its frame is that of `make_head`. The surfaces come with the package
-    (`scripts/make_average_head.py` makes them again), the landmarks from the head itself.
+    Its frame is that of `make_head`. Surfaces and landmarks come with the package
+    (`scripts/make_average_head.py` makes them again): finding the landmarks on the head takes a
+    second.
     """
-    head = make_head()
     with np.load(Path(__file__).with_name(FILE), allow_pickle=False) as stored:
         parts = {name: _unpacked(stored, name) for name in PARTS}
-    return _template("synthetic head", head, parts)
+        skull, skin = (
+            dict(zip(names, stored[f"{kind}_landmarks"], strict=True))
+            for kind, names in (("skull", SKULL_LANDMARKS), ("skin", SKIN_LANDMARKS))
+        )
+    bones = {bone: parts[bone] for bone in BONES}
+    return TemplateHead("synthetic head", bones, skull, parts["skin"], skin)
 
 
 def drawn_head(head: PhantomHead, name: str) -> TemplateHead:
@@ -41,11 +48,12 @@ def drawn_head(head: PhantomHead, name: str) -> TemplateHead:
     options = SurfaceOptions(max_triangles=MOST_TRIANGLES)
     levels = {**anatomy.bones, "skin": anatomy.skin}
     parts = {part: surface_of_level(part, levels[part], options) for part in PARTS}
-    return _template(name, head, parts)
+    bones = {bone: parts[bone] for bone in BONES}
+    return TemplateHead(name, bones, head.skull_landmarks, parts["skin"], head.skin_landmarks)
 
 
 def write_average_head(path: Path) -> None:
-    """Writes the surfaces of the ordinary synthetic head, packed."""
+    """Writes the ordinary synthetic head: its surfaces packed, its landmarks with every digit."""
     template = drawn_head(make_head(), "synthetic head")
     surfaces = {**template.bones, "skin": template.skin}
     packed: dict[str, NDArray[np.generic]] = {}
@@ -55,19 +63,11 @@ def write_average_head(path: Path) -> None:
             raise AssertionError(name)
         packed[f"{name}_vertices"] = np.round(surface.vertices / GRAIN).astype(np.int16)
         packed[f"{name}_triangles"] = surface.triangles.astype(np.uint16)
+    packed["skull_landmarks"] = np.array([template.skull[name] for name in SKULL_LANDMARKS])
+    packed["skin_landmarks"] = np.array([template.skin_landmarks[name] for name in SKIN_LANDMARKS])
     np.savez_compressed(path, allow_pickle=False, **packed)
 
 
 def _unpacked(stored: "np.lib.npyio.NpzFile", name: str) -> SurfaceData:
     vertices: Floats = stored[f"{name}_vertices"].astype(np.float64) * GRAIN
     return SurfaceData(vertices, stored[f"{name}_triangles"].astype(np.uint32))
-
-
-def _template(name: str, head: PhantomHead, parts: dict[str, SurfaceData]) -> TemplateHead:
-    return TemplateHead(
-        name,
-        {bone: parts[bone] for bone in ("cranium", "mandible")},
-        head.skull_landmarks,
-        parts["skin"],
-        head.skin_landmarks,
-    )

@@ -125,7 +125,8 @@ class PatientModel(Frozen):
         motions = {name: plan.get(name, np.eye(4)) for name in self.scene.segments}
         # What is known of the case's own motions says nothing of these.
         findings = tuple(f for f in self.findings if not f.code.startswith("plan-"))
-        summary = {k: v for k, v in self.summary.items() if k not in {"achieved", "plan_sources"}}
+        own = {"achieved", "plan_fits", "plan_sources"}
+        summary = {k: v for k, v in self.summary.items() if k not in own}
         summary["findings"] = [
             entry
             for entry in summary.get("findings", ())

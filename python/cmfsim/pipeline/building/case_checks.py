@@ -61,6 +61,7 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
         if isinstance(motion, MovedSurface):
             continue
         given = case.plan.get(name)
+        is_measured = case.achieved or name in bones.fits
         sized = SizedMotion(
             name,
             motion,
@@ -74,7 +75,7 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
             finding
             for finding in check_motion_size(sized)
             if (finding.code, finding.where) not in seen
-            and not (case.achieved and finding.code.startswith("plan-tiny"))
+            and not (is_measured and finding.code.startswith("plan-tiny"))
         ]
     if case.surfaces is None and (errors := [f for f in found if f.severity == "error"]):
         raise CaseInputError(f"{errors[0].where}: {errors[0].what}; {errors[0].fix}")

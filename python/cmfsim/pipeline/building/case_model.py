@@ -273,6 +273,10 @@ def _bones(
     if case.achieved:
         stages.begin("reading the achieved plan")
     bones = planned_bones(case, cut.segments, after)
+    for name, fit in bones.fits.items():
+        if fit.method == "shape":
+            # By shape the size is known with an interval, and is no part of the motion.
+            stages.drop({"moved-scaled"}, case.where(f"plan.{name}"))
     stages.add(bones.findings)
     stages.add(plan_sizes(case, bones, stages.findings))
     if case.image is not None:
@@ -410,6 +414,11 @@ def _assembled(
             "contact": departures,
             **({} if nodes.seam is None else {"lips": lip_summary(nodes.seam, nodes.lips)}),
             **({} if bones.achieved is None else {"achieved": bones.achieved.as_dict()}),
+            **(
+                {"plan_fits": {name: fit.as_dict() for name, fit in bones.fits.items()}}
+                if bones.fits
+                else {}
+            ),
             "plan_sources": dict(bones.sources),
         },
         detailed_skin=partial(detailed_surface, "skin", anatomy.skin),

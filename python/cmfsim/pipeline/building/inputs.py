@@ -16,8 +16,8 @@ from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.io import (
     Case,
+    read_bone_pair,
     read_landmark_file,
-    read_moved_surface,
     read_surface,
     read_transform,
 )
@@ -31,7 +31,7 @@ from cmfsim.surfaces.repair import repair_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMesh, CaseMotion
 from cmfsim.values.finding import Finding
-from cmfsim.values.surface_data import MovedSurface
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:
     from cmfsim.imaging import SegmentOptions
@@ -124,8 +124,13 @@ def segment_options(case: Case) -> SegmentOptions:
     return SegmentOptions(**given)
 
 
-def read_motion(case: Case, motion: CaseMotion) -> Floats | MovedSurface:
-    """How a segment moves, from its table and the files that this names."""
+def read_motion(
+    case: Case, motion: CaseMotion
+) -> Floats | MovedSurface | tuple[SurfaceData, SurfaceData]:
+    """How a segment moves, from its table and the files that this names.
+
+    Surfaces with different triangles come back as they are, before and after.
+    """
     if motion.matrix is not None:
         return motion.matrix
     if motion.transform is not None:
@@ -136,7 +141,7 @@ def read_motion(case: Case, motion: CaseMotion) -> Floats | MovedSurface:
     frame: str | None = None
     if case.surfaces is not None:
         units, frame = case.surfaces.units, case.surfaces.frame
-    return read_moved_surface(motion.surface, motion.moved_surface, units=units, frame=frame)
+    return read_bone_pair(motion.surface, motion.moved_surface, units=units, frame=frame)
 
 
 def motion_source(motion: CaseMotion) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -47,6 +47,8 @@ class PlannedBones:
     findings : tuple of Finding
     achieved : AchievedPlan or None
         How they were found, where the plan is the achieved one.
+    fits : mapping of str to AchievedMotion
+        How the motions that a plan gives by surfaces were found.
     sources : mapping of str to str
         Where each motion comes from and how it was understood, in words.
     """
@@ -55,6 +57,7 @@ class PlannedBones:
     motions: Motions
     findings: tuple[Finding, ...] = ()
     achieved: AchievedPlan | None = None
+    fits: Mapping[str, AchievedMotion] = field(default_factory=dict)
     sources: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -85,23 +88,61 @@ def planned_bones(
             )
     if case.achieved:
         return _achieved_bones(case, segments, after or read_postoperative(case))
-    motions = {name: read_motion(case, motion) for name, motion in case.plan.items()}
-    planned = _with_motions(case, segments, motions)
+    fits: dict[str, AchievedMotion] = {}
+    motions: dict[str, Floats | MovedSurface] = {}
+    for name, motion in case.plan.items():
+        given = read_motion(case, motion)
+        motions[name] = _laid(name, given, segments, fits) if isinstance(given, tuple) else given
+    planned = _with_motions(case, segments, motions, fits)
     return replace(
-        planned, sources={name: motion_source(motion) for name, motion in case.plan.items()}
+        planned,
+        findings=(*planned.findings, *_fit_findings(case, known, fits)),
+        fits=frozen_mapping(fits),
+        sources={name: motion_source(motion) for name, motion in case.plan.items()},
     )
+
+
+def _laid(
+    name: str,
+    pair: tuple[SurfaceData, SurfaceData],
+    segments: tuple[BoneSegment, ...],
+    fits: dict[str, AchievedMotion],
+) -> Floats | MovedSurface:
+    """The rigid motion of a bone that has different triangles before and after, entered in `fits`.
+
+    It is found on the surfaces as given: those of segments are as coarse as their voxels.
+    """
+    from cmfsim.bones.achieved import achieved_plan  # noqa: PLC0415
+
+    before, after = (clean_surface(surface) for surface in pair)
+    others = [segment.surface for segment in segments if segment.name != name]
+    found = achieved_plan({name: before}, {name: after}, beside=others)
+    fits[name] = found.motions[name]
+    return found.plan[name]
+
+
+def _fit_findings(
+    case: Case, names: list[str], fits: Mapping[str, AchievedMotion]
+) -> Iterator[Finding]:
+    """Findings about the motions that were found from surfaces before and after."""
+    skull = next((fits[name].fit for name in REFERENCES if name in fits), None)
+    for name, found in fits.items():
+        # A torn bone's pieces are numbered after it.
+        bone = name if name in names else name.rsplit("_", 1)[0]
+        where = case.where(plan_key(case, bone))
+        yield from motion_findings(found, name, where, skull, is_still=name in REFERENCES)
 
 
 def _with_motions(
     case: Case,
     segments: tuple[BoneSegment, ...],
     motions: Motions,
-    measured: dict[str, AchievedMotion] | None = None,
+    measured: dict[str, AchievedMotion],
 ) -> PlannedBones:
     """The segments with their motions, parted where these are torn.
 
-    With `measured`, motions by vertices come from surfaces after the operation: what vertices slid
-    along the bone is taken off, and what was found is entered there.
+    Motions by vertices come from surfaces before and after: what vertices slid along the bone is
+    taken off, and what was found is entered in `measured`.
     """
     findings: list[Finding] = []
     parted: list[BoneSegment] = []
@@ -134,13 +175,11 @@ def _with_motions(
 def _by_shape(
     name: str,
     motion: MovedSurface,
-    measured: dict[str, AchievedMotion] | None,
+    measured: dict[str, AchievedMotion],
     *,
     is_still: bool,
 ) -> Floats | MovedSurface | None:
     """The motion of a piece without slip, if the bone after is the bone before that moved."""
-    if measured is None:
-        return None
     from cmfsim.bones.achieved import measure_pair  # noqa: PLC0415
 
     after = SurfaceData(motion.moved_vertices, motion.surface.triangles)
@@ -206,13 +245,7 @@ def _achieved_bones(
         # By shape the size is known with an interval, and is no part of the motion.
         if not (finding.code == "moved-scaled" and measured[name].method == "shape")
     ]
-    skull = next((motions_found[n].fit for n in REFERENCES if n in motions_found), None)
-    for name, found in motions_found.items():
-        # A torn bone's pieces are numbered after it.
-        bone = name if name in names else name.rsplit("_", 1)[0]
-        noticed += motion_findings(
-            found, name, case.where(plan_key(case, bone)), skull, is_still=name in REFERENCES
-        )
+    noticed += _fit_findings(case, names, motions_found)
     return replace(
         made,
         findings=(*made.findings, *noticed),

@@ -73,9 +73,13 @@ class Stages:
         """Takes what a stage noticed."""
         self.findings += findings
 
-    def drop(self, codes: Collection[str]) -> None:
-        """Forgets the findings of some codes."""
-        self.findings = [finding for finding in self.findings if finding.code not in codes]
+    def drop(self, codes: Collection[str], where: str | None = None) -> None:
+        """Forgets the findings of some codes, at one place alone if it is given."""
+        self.findings = [
+            finding
+            for finding in self.findings
+            if finding.code not in codes or where not in {None, finding.where}
+        ]
 
     def drop_repeated(self) -> None:
         """Keeps each finding once."""
