@@ -11,7 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.imaging.bone import Bone
-from cmfsim.imaging.morphology import Mask, Volume, box_of, depth, label, opened, reached, simplex
+from cmfsim.imaging.morphology import (
+    Mask,
+    Volume,
+    box_of,
+    chosen,
+    depth,
+    label,
+    ndimage,
+    opened,
+    reached,
+    simplex,
+)
 from cmfsim.imaging.skin import Skin
 from cmfsim.imaging.working import Working, coarse_of
 from cmfsim.values.finding import Finding
@@ -35,6 +46,11 @@ OWN_BONE = 4.0
 # mm.
 FARTHEST = 15.0
 STANDING_OUT = 8.0
+# A throat has up to 400 mm² across, a windpipe 300 mm².
+AIRWAY_AREA = 900.0
+# It lies deep in the head for this length, mm, with thick tissue on so much of its sides, and under
+# the skin of the neck, which is thin, on so much at least. Hollow things are thin all around.
+AIRWAY_LENGTH, DEEP, SHALLOW = 20.0, 0.8, 0.3
 # Smaller and shorter things are folds, swellings and noise, mm³ and mm.
 LEAST_VOLUME = 600.0
 LEAST_LENGTH = 18.0
@@ -55,7 +71,7 @@ def attached_findings(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
     rows = box[1]
     behind = rows.start + int(FACE_PART * (rows.stop - rows.start))
     around = depth(mask, spacing)
-    core = opened(mask, WIDEST, spacing)
+    core = opened(mask | _airway(mask, spacing), WIDEST, spacing)
     out = mask & ~core
     out[:, behind:] = False
     away = -depth(core, spacing)
@@ -79,6 +95,45 @@ def attached_findings(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
         kind = next((text for which, text in kinds if which[here].mean() > 0.5), ONE_SIDED_TEXT)
         findings.append(_finding(middle, size, volume, kind))
     return findings
+
+
+def _airway(mask: Mask, spacing: NDArray[np.float64]) -> Mask:
+    """The air in throat and windpipe: closed in by tissue in each slice, narrow, deep somewhere.
+
+    The skin in front of a windpipe is thin and stands free of the rest of the neck, as a thing on
+    the face does. Air in or behind such a thing is nowhere deep in the head.
+    """
+    images = ndimage()
+    across = np.zeros((3, 3, 3), dtype=bool)
+    across[:, :, 1] = images.generate_binary_structure(2, 1)
+    # Filled in each slice alone: the airway is open at nose, mouth and the end of the image.
+    closed_in = images.binary_fill_holes(mask, structure=across) & ~mask
+    labels, count = images.label(closed_in, structure=across)
+    areas = np.bincount(labels.ravel(), minlength=count + 1) * spacing[0] * spacing[1]
+    around = images.grey_dilation(labels, footprint=across)
+    walls = mask & (around > 0)
+    walled = np.bincount(around[walls], minlength=count + 1)
+    thick = np.bincount(around[walls & _thick(mask, spacing)], minlength=count + 1)
+    is_airy = (areas <= AIRWAY_AREA) & (thick >= SHALLOW * walled)
+    is_airy[0] = False
+    pieces, pieces_count = label(np.asfortranarray(is_airy[labels]))
+    is_deep = (is_airy & (thick >= DEEP * walled))[labels]
+    is_airway = [False]
+    for piece, block in enumerate(images.find_objects(pieces, pieces_count), 1):
+        levels = (is_deep[block] & (pieces[block] == piece)).any(axis=(0, 1))
+        is_airway.append(bool(np.count_nonzero(levels) * spacing[2] >= AIRWAY_LENGTH))
+    return chosen(np.array(is_airway), pieces)
+
+
+def _thick(mask: Mask, spacing: NDArray[np.float64]) -> Mask:
+    """Where a ball fits into the head, as if its lowest slice went on below the image."""
+    low = box_of(mask)[2].start
+    below = int(np.ceil(WIDEST / spacing[2])) + 1
+    lowest = np.repeat(mask[:, :, low : low + 1], below, axis=2)
+    longer = np.asfortranarray(np.concatenate([lowest, mask[:, :, low:]], axis=2))
+    thick = np.zeros_like(mask)
+    thick[:, :, low:] = opened(longer, WIDEST, spacing)[:, :, below:]
+    return thick
 
 
 def _finding(
