@@ -278,7 +278,7 @@ def _surface_wish(planning: PlanningModel, target: SurfaceTarget) -> Wish:
     kept = points[_has_partner(surface, _border_points(target.surface), points)]
     if not len(kept):
         raise CaseInputError(
-            f"the wished surface lies more than {MOST_APART:g} mm from the face: both must be in "
+            f"the desired surface lies more than {MOST_APART:g} mm from the face: both must be in "
             "the frame of the case"
         )
 
