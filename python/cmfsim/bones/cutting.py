@@ -1,6 +1,6 @@
 """Bones cut into segments: the levels of the pieces, and where small fragments go."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import cast
@@ -232,17 +232,7 @@ def _make_cut(
     findings: list[Finding],
     options: CutOptions,
 ) -> None:
-    source = next((name for name in cut.sources if name in pieces), None)
-    if source is None or (source == "skull" and procedure.kind in PROCEDURES):
-        have = ", ".join(repr(n) for n in pieces)
-        raise CaseInputError(
-            f"{procedure.kind} cuts {' or '.join(repr(s) for s in cut.sources if s != 'skull')}, "
-            f"but the bones are {have}: separate the jaws (give landmarks to the segmentation), or "
-            "give the surfaces of the segments"
-        )
-    rest_name = cut.rest or source
-    if cut.segment in pieces or (rest_name != source and rest_name in pieces):
-        raise CaseInputError(f"{procedure.kind} makes {cut.segment!r}, which exists already")
+    source, rest_name = _names_of_cut(procedure, cut, pieces)
     bone = pieces[source]
     limit = max(float(bone.max()), -float(bone.min()))
     # Where the bone's level is clipped, so are those of both pieces.
@@ -264,28 +254,8 @@ def _make_cut(
             )
     for one, other, both in ((piece, rest, names), (rest, piece, names[::-1])):
         moved, kept = _join_crumbs(one, other, bone, limit, int(options.crumb_volume / voxel))
-        if moved:
-            findings.append(
-                Finding.note(
-                    "osteotomy-crumbs",
-                    f"fragments that the cut separated from {both[0]!r}: {len(moved)}, "
-                    f"{sum(moved) * voxel:.0f} mm³ in all; they stay with {both[1]!r}",
-                    where=procedure.kind,
-                    why="they would move with a bone to which they are not connected",
-                    fix="move the planes, or lower crumb_volume",
-                )
-            )
-        if kept:
-            findings.append(
-                Finding.warning(
-                    "osteotomy-parts",
-                    f"{both[0]!r} has {len(kept) + 1} disconnected parts; the volumes of the "
-                    f"smaller ones are {', '.join(f'{n * voxel:.0f}' for n in kept)} mm³",
-                    where=procedure.kind,
-                    why="disconnected parts move together as one segment",
-                    fix="check the picture of the segments; move the planes",
-                )
-            )
+        volumes = ([n * voxel for n in moved], [n * voxel for n in kept])
+        findings.extend(_fragment_findings(procedure.kind, both, *volumes))
     names_now = list(pieces.items())
     pieces.clear()
     for name, values in names_now:
@@ -293,6 +263,47 @@ def _make_cut(
             _within(whole, box, rest, limit) if name == source else values
         )
     pieces[cut.segment] = _within(whole, box, piece, limit)
+
+
+def _names_of_cut(procedure: Procedure, cut: Cut, pieces: Iterable[str]) -> tuple[str, str]:
+    """The piece that is cut, and the name of what remains of it."""
+    pieces = list(pieces)
+    source = next((name for name in cut.sources if name in pieces), None)
+    if source is None or (source == "skull" and procedure.kind in PROCEDURES):
+        have = ", ".join(repr(n) for n in pieces)
+        raise CaseInputError(
+            f"{procedure.kind} cuts {' or '.join(repr(s) for s in cut.sources if s != 'skull')}, "
+            f"but the bones are {have}: separate the jaws (give landmarks to the segmentation), or "
+            "give the surfaces of the segments"
+        )
+    rest_name = cut.rest or source
+    if cut.segment in pieces or (rest_name != source and rest_name in pieces):
+        raise CaseInputError(f"{procedure.kind} makes {cut.segment!r}, which exists already")
+    return source, rest_name
+
+
+def _fragment_findings(
+    kind: str, names: tuple[str, str], moved: Sequence[float], kept: Sequence[float]
+) -> Iterator[Finding]:
+    """Findings about the fragments of the first of two segments, by their volumes in mm³."""
+    if moved:
+        yield Finding.note(
+            "osteotomy-crumbs",
+            f"fragments that the cut separated from {names[0]!r}: {len(moved)}, "
+            f"{sum(moved):.0f} mm³ in all; they stay with {names[1]!r}",
+            where=kind,
+            why="they would move with a bone to which they are not connected",
+            fix="move the planes, or lower crumb_volume",
+        )
+    if kept:
+        yield Finding.warning(
+            "osteotomy-parts",
+            f"{names[0]!r} has {len(kept) + 1} disconnected parts; the volumes of the smaller "
+            f"ones are {', '.join(f'{volume:.0f}' for volume in kept)} mm³",
+            where=kind,
+            why="disconnected parts move together as one segment",
+            fix="check the picture of the segments; move the planes",
+        )
 
 
 def _within(whole: Levels, box: tuple[slice, ...], part: Levels, limit: float) -> Levels:

@@ -376,6 +376,12 @@ def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> No
     )
     check.set_defaults(run=template_commands.check)
 
+    _add_template_import(actions, common)
+    _add_template_morph(actions, named)
+    _add_template_show(actions, named)
+
+
+def _add_template_import(actions: Any, common: argparse.ArgumentParser) -> None:
     imports = actions.add_parser(
         "import",
         parents=[common],
@@ -395,6 +401,8 @@ def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> No
     )
     imports.set_defaults(run=template_commands.import_atlas)
 
+
+def _add_template_morph(actions: Any, named: argparse.ArgumentParser) -> None:
     morph = actions.add_parser(
         "morph", parents=[named], help="map the muscles of a template to a patient by landmarks"
     )
@@ -412,6 +420,8 @@ def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> No
     )
     morph.set_defaults(run=template_commands.morph)
 
+
+def _add_template_show(actions: Any, named: argparse.ArgumentParser) -> None:
     show = actions.add_parser("show", parents=[named], help="draw a template's muscles")
     show.add_argument(
         "-o", "--output", metavar="PNG", type=Path, required=True, help="picture to write"

@@ -39,7 +39,7 @@ from cmfsim.planning.server import check_serving, serve_planning
 
 __all__ = ["TRIALS", "plan"]
 
-# What the plan of a wished face is called, and the file that it is saved as.
+# Name of the plan for a desired face, and the file to which it is saved.
 TOWARDS, PLAN_FILE = "Towards", "towards.toml"
 # Plans that are solved exactly to measure the error of the page.
 TRIALS = 6
@@ -102,7 +102,7 @@ def plan(options: argparse.Namespace) -> int:
 
 def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
     """Everything that the page contains."""
-    # Before any work: a file that is none would be found a minute later.
+    # Before any work, so that an invalid file is not reported a minute later.
     targets = None if options.towards is None else read_targets(options.towards)
     models = (options.model,)
     wanted = band_options(options, case)

@@ -15,7 +15,7 @@ __all__ = ["TARGET_STD", "read_targets"]
 
 SURFACES = (".stl", ".ply", ".obj", ".vtp")
 LANDMARKS = (".json", ".fcsv")
-# How much a point of the face may be off what is wished, mm.
+# Tolerance of a point of the face, mm.
 TARGET_STD = 0.5
 
 

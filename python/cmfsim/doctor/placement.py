@@ -1,4 +1,4 @@
-"""Whether skin, bones and landmarks lie where a head has them: units, frames, sides, distances."""
+"""Whether skin, bones and landmarks are in plausible places: units, frames, sides, distances."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -32,20 +32,20 @@ OTHER_UNITS: Sequence[tuple[str, float, float, float]] = (
     ("um", 110_000.0, 420_000.0, 0.001),
 )
 # Longest extent of a bone as a share of the skin's: a chin is a tenth of a head, a skull less than
-# all of it. Beyond these bounds, the nearest unit tells which of them was meant.
+# all of it. Beyond these bounds, the nearest unit shows which one is wrong.
 BONE_SHARE = (0.04, 1.15)
-# Share of a bone's points outside the skin from which on it lies elsewhere, not merely too far out.
+# Share of a bone's points outside the skin above which it is misplaced, not merely too far out.
 ELSEWHERE_SHARE = 0.4
-# A different frame is the reason if no more than this share stays outside in it.
+# Another frame explains this if no more than this share is outside in it.
 FITTING_SHARE = 0.05
-# Depth by which a bone may pass the skin before it is said, mm: the accuracy of two surfaces.
+# Distance of bone outside the skin above which it is reported, mm: the accuracy of two surfaces.
 THROUGH_SKIN = 0.1
 # Distances of a set of landmarks from its surface, mm, at which it fits, and at which another frame
 # or unit is tried.
 LANDMARK_WARNING, LANDMARK_ERROR = 5.0, 15.0
-# So many landmarks on a bone that is given alone are no accident.
+# Number of landmarks on a single given bone above which they are not there by chance.
 OF_ONE_BONE = 4
-# Share of the landmarks that then lie far from it.
+# Smallest share of the landmarks that are then far from it.
 OF_OTHERS = 0.25
 # HU at which bone and skin begin where the case does not state it, as in `SegmentOptions`.
 THRESHOLDS = {"skull": 250.0, "skin": -300.0}
@@ -62,7 +62,7 @@ HALF_TURN = np.array([-1.0, -1.0, 1.0])
 
 
 def check_placement(evidence: Evidence) -> list[Finding]:
-    """Findings about where things lie; a fault that makes others is said alone."""
+    """Findings about positions; a fault that causes others is reported alone."""
     sizes = [*_check_skin_size(evidence), *_check_bone_sizes(evidence)]
     if sizes:
         return sizes
@@ -109,7 +109,7 @@ def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
     if low <= extent <= high:
         return
     stated = evidence.case.surfaces.units if evidence.case.surfaces else "mm"
-    # As the file has it: where other units are stated, its numbers may simply be mm.
+    # In the numbers of the file: if another unit is stated, they may simply be mm.
     numbers = extent / UNITS[stated]
     if low <= numbers <= high:
         yield Finding.error(
@@ -235,7 +235,7 @@ def _check_landmark_fit(
 def _check_within_image(
     evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
 ) -> Iterator[Finding]:
-    """Landmarks beyond the CT, or inside it only in another frame."""
+    """Landmarks outside the CT, or inside it only in another frame."""
     image = evidence.image
     if image is None:
         return
@@ -269,7 +269,7 @@ def _check_within_image(
 
 
 def _mean(landmarks: Mapping[str, Floats], names: Sequence[str]) -> Floats | None:
-    """The mean of those that are there; of a pair only where both sides are."""
+    """Mean of the available landmarks; pairs count only if both sides are available."""
     found: list[Floats] = []
     for name in names:
         if name in landmarks:
@@ -290,7 +290,7 @@ def _direction(
 
 
 def _unit(vector: Floats) -> Floats | None:
-    """The vector at length 1; None if it is too short to point anywhere."""
+    """The unit vector; None if the vector is too short to have a direction."""
     length = float(np.linalg.norm(vector))
     return vector / length if length > SHORTEST else None
 
@@ -389,7 +389,7 @@ def _nearest_point(evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
 
 
 def _is_part(bodies: Sequence[Body], points: Floats) -> bool:
-    """Whether the landmarks belong to a skull of which one bone alone is given."""
+    """Whether the landmarks belong to a whole skull, of which a single bone is given."""
     if len(bodies) != 1:
         return False
     nearest = _nearest(bodies, points)
@@ -459,10 +459,10 @@ def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Fi
     )
 
 
-# Points of a bone are taken this far under its surface to ask whether another bone has them, mm:
-# surfaces that touch, as in joints and at cuts, do not count.
+# Depth below its surface at which a bone is tested for being inside another, mm: surfaces that
+# merely touch, as in joints and at cuts, do not count.
 UNDER_SURFACE = 0.5
-# Share of a bone's points within another, from which on it lies in it.
+# Share of a bone's points inside another above which it is reported as being inside it.
 OVERLAP_SHARE = 0.05
 
 
@@ -470,7 +470,7 @@ def _check_bone_overlap(evidence: Evidence) -> Iterator[Finding]:
     for name, body in evidence.bones.items():
         inner = body.samples - UNDER_SURFACE * body.index.closest(body.samples)[1]
         for other_name, other in evidence.bones.items():
-            # Each pair once: the smaller bone is the one that lies in the other.
+            # Each pair once, with the smaller bone inside the other.
             size, other_size = body.report.area, other.report.area
             if (size, name) >= (other_size, other_name):
                 continue

@@ -13,14 +13,14 @@ __all__ = ["check_image", "check_mesh_size", "check_surfaces"]
 
 # Spacing above which thin structures of a face are lost, mm: half the thickness of lips and lids.
 COARSE_SPACING = 2.5
-# A border longer than this many extents of the skin runs round the face, not the neck: a cap over
-# it replaces the back of the head.
+# A border longer than this many extents of the skin surrounds the face, not the neck: a cap over it
+# replaces the back of the head.
 WIDE_BORDER = 2.0
-# Shares of slivers that are worth a word, and above which normals of a surface are doubtful.
+# Shares of slivers above which they are reported, and above which normals are doubtful.
 SOME_SLIVERS, SLIVER_SHARE = 0.01, 0.05
-# Share of crossing triangles above which a surface encloses nothing that could be meant.
+# Share of crossing triangles above which the enclosed volume is implausible.
 CROSSING_SHARE = 0.02
-# Share of the skin whose tissue is thinner than an edge, above which it is worth a word.
+# Share of the skin with tissue thinner than an edge, above which it is reported.
 THIN_SHARE = 0.02
 
 
@@ -42,37 +42,50 @@ def check_image(evidence: Evidence) -> Iterator[Finding]:
 
 
 def check_surfaces(evidence: Evidence) -> Iterator[Finding]:
-    """Findings about each surface for itself."""
+    """Findings about each surface by itself."""
     bodies = [evidence.skin] if evidence.skin else []
     for body in [*bodies, *evidence.bones.values()]:
         yield from _check_body(body)
 
 
 def _check_body(body: Body) -> Iterator[Finding]:
+    yield from _check_borders(body)
+    yield from _check_orientation(body)
+    yield from _check_edges(body)
+    yield from _check_crossings(body)
+    yield from _check_pieces(body)
+    yield from _check_triangles(body)
+
+
+def _check_borders(body: Body) -> Iterator[Finding]:
     report = body.report
-    where = body.where
-    if report.borders:
-        longest = report.borders[0]
-        lengths = ", ".join(f"{loop.length:.1f}" for loop in report.borders[:4])
-        more = ", …" if len(report.borders) > 4 else ""
-        extent = float((report.highest - report.lowest).max())
-        wide = longest.length > WIDE_BORDER * extent
-        yield Finding(
-            severity="warning" if wide or body.name != "skin" else "note",
-            code="surface-open",
-            what=f"{len(report.borders)} open borders of {lengths}{more} mm, the longest round "
-            f"{place_text(longest.centre)}",
-            where=where,
-            why="only a closed surface has an inside and an outside: gaps are capped"
-            + (", and a cap this wide invents part of the head" if wide else ""),
-            fix="look at the caps after build; if they are wrong, close the surface yourself",
-        )
+    if not report.borders:
+        return
+    longest = report.borders[0]
+    lengths = ", ".join(f"{loop.length:.1f}" for loop in report.borders[:4])
+    more = ", …" if len(report.borders) > 4 else ""
+    extent = float((report.highest - report.lowest).max())
+    wide = longest.length > WIDE_BORDER * extent
+    yield Finding(
+        severity="warning" if wide or body.name != "skin" else "note",
+        code="surface-open",
+        what=f"{len(report.borders)} open borders of {lengths}{more} mm, the longest around "
+        f"{place_text(longest.centre)}",
+        where=body.where,
+        why="only a closed surface has an inside and an outside: gaps are capped"
+        + (", and a cap this wide invents part of the head" if wide else ""),
+        fix="look at the caps after build; if they are wrong, close the surface yourself",
+    )
+
+
+def _check_orientation(body: Body) -> Iterator[Finding]:
+    report = body.report
     if report.inconsistent or not report.orientable:
         yield Finding.warning(
             "surface-inconsistent",
             f"{report.inconsistent} edges have triangles that face opposite ways"
             + ("" if report.orientable else "; a part has only one side (Möbius)"),
-            where=where,
+            where=body.where,
             why="inside and outside change from place to place; the smaller part is flipped",
             fix="recompute normals in the program that made it",
         )
@@ -80,25 +93,34 @@ def _check_body(body: Body) -> Iterator[Finding]:
         yield Finding.warning(
             "surface-inward",
             f"normals point inwards (volume {report.volume:.0f} mm³)",
-            where=where,
+            where=body.where,
             why="inside and outside are swapped; build flips it",
             fix="flip normals in the program that made it",
         )
+
+
+def _check_edges(body: Body) -> Iterator[Finding]:
+    """Edges at which a surface forks."""
+    report = body.report
     if len(report.non_manifold):
         vertex = body.surface.vertices[report.non_manifold[0, 0]]
         yield Finding.warning(
             "surface-non-manifold",
             f"{len(report.non_manifold)} edges have more than two triangles, first at "
             f"{place_text(vertex)}",
-            where=where,
+            where=body.where,
             why="the surface forks there, so inside and outside are undefined near it",
             fix="remove inner walls and repeated parts, or remesh it",
         )
+
+
+def _check_crossings(body: Body) -> Iterator[Finding]:
+    report = body.report
     if report.crossings is None:
         yield Finding.warning(
             "surface-crossings-unknown",
             "triangles are too crowded to check for intersections",
-            where=where,
+            where=body.where,
             why="intersecting triangles make inside and outside ambiguous",
             fix="remesh it with triangles of about equal size",
         )
@@ -109,13 +131,11 @@ def _check_body(body: Body) -> Iterator[Finding]:
             code="surface-crossing",
             what=f"{len(report.crossings)} pairs of triangles intersect, first at "
             f"{place_text(report.crossing_points[0])}",
-            where=where,
+            where=body.where,
             why="volume enclosed twice counts once, and volume between the folds may count as "
             "outside",
             fix="smooth or remesh it there",
         )
-    yield from _check_pieces(body)
-    yield from _check_triangles(body)
 
 
 def _check_pieces(body: Body) -> Iterator[Finding]:
@@ -130,8 +150,8 @@ def _check_pieces(body: Body) -> Iterator[Finding]:
     yield Finding(
         severity="warning" if body.name == "skin" else "note",
         code="surface-islands",
-        what=f"{len(solid)} pieces besides the largest, with {share:.1%} of its area; the next is "
-        f"of {solid[0].n_triangles} triangles at {place_text(solid[0].centre)}",
+        what=f"{len(solid)} pieces besides the largest, with {share:.1%} of its area; the next has "
+        f"{solid[0].n_triangles} triangles at {place_text(solid[0].centre)}",
         where=body.where,
         why="debris becomes islands of bone or skin; pieces below 1 % of the largest are dropped",
         fix="delete what does not belong, or give each bone a file of its own",
@@ -154,8 +174,7 @@ def _check_triangles(body: Body) -> Iterator[Finding]:
             severity="warning" if share > SLIVER_SHARE else "note",
             code="surface-slivers",
             what=f"{len(report.slivers)} of {report.n_triangles} triangles are slivers, over a "
-            "hundred "
-            "times longer than high",
+            "hundred times longer than high",
             where=body.where,
             why="their normals are unreliable, which disturbs contact",
             fix="remesh it if sliding on it matters" if share <= SLIVER_SHARE else "remesh it",

@@ -1,9 +1,9 @@
-"""Slices with metal as they would be without it: rays through the metal are replaced.
+"""Removal of metal artefacts from slices, by replacing the rays through the metal.
 
 Normalised metal artefact reduction (Meyer et al. 2010): each direction's line integrals are divided
 by those of a plain image of air, soft tissue and bone, so that they vary little; across the shadow
-of the metal they are interpolated (Kalender et al. 1987) and multiplied back. Only what changes is
-reconstructed, so that everything else keeps the sharpness of the image.
+of the metal they are interpolated (Kalender et al. 1987) and multiplied back. Only the change is
+reconstructed, so that the rest of the image stays sharp.
 """
 
 import numpy as np
@@ -14,27 +14,27 @@ from cmfsim.imaging.projections import Projector, projector
 
 __all__ = ["deviations", "without_metal"]
 
-# Rays that pass less than this much metal are kept, mm.
+# Rays through less metal than this are kept, mm.
 LEAST_PATH = 0.05
-# The plain image: below the first air, above the second bone, soft tissue between, HU. It is made
-# of an image smoothed by this, mm, and its bone is no denser than enamel.
+# The plain image: air below the first, bone above the second, soft tissue between, HU. It is made
+# from an image smoothed by this, mm, and its bone is at most as dense as enamel.
 PLAIN = (-500.0, 350.0)
 PLAIN_SIGMA = 1.0
 ENAMEL = 2000.0
 SOFT = 40.0
-# Rays that pass less than this of water have nothing to be divided by, mm.
+# Rays through less water than this are not normalised, mm.
 LEAST_WATER = 5.0
-# What is denser is metal, whose own value says nothing, HU.
+# Threshold of metal, HU; the value of metal itself carries no information.
 DENSEST = 2500.0
-# How far soft tissue is from one value is judged over this distance, mm; what is farther off than
-# the second counts no more, HU.
+# Window in which the deviation of soft tissue from a single value is measured, mm; largest
+# deviation that counts, HU.
 NEARBY = 8.0
 FARTHEST = 1000.0
 # What is denser than soft tissue is lowered, but not below this, HU, by this many standard
 # deviations.
 DENSE = 100.0
 EXCESS = 2.0
-# Slices that are corrected together; more would need more memory, and be no faster.
+# Number of slices corrected together; more would need more memory without being faster.
 TOGETHER = 16
 
 
@@ -72,7 +72,7 @@ def without_metal(
 
 
 def deviations(hu: Volume, spacing: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The deviation of each slice's soft tissue from one value, HU (root mean square)."""
+    """Root mean square deviation of each slice's soft tissue from a single value, HU."""
     soft = _is_soft(_plain(hu, spacing))
     return _root_mean(_squares(hu, soft), soft)
 
@@ -95,7 +95,7 @@ def _squares(hu: Volume, soft: Mask) -> Volume:
 def _reconstructed(
     hu: Volume, metal: Mask, rays: Projector, spacing: NDArray[np.float64]
 ) -> tuple[Volume, Volume]:
-    """HU with the rays through metal replaced, and the plain image in parts of water."""
+    """HU with the rays through metal replaced, and the plain image relative to water."""
     water = np.clip(hu, -1000.0, DENSEST) * np.float32(1e-3) + np.float32(1.0)
     lines = rays.lines(water)
     hidden = rays.lines(metal.astype(np.float32)) > LEAST_PATH
@@ -106,7 +106,7 @@ def _reconstructed(
 
 
 def _bridged(lines: Volume, hidden: Mask, prior: Volume | None) -> Volume:
-    """Line integrals with those through metal interpolated along the rays of a direction."""
+    """Line integrals, interpolated across the metal's shadow in each direction."""
     scale = np.ones_like(lines) if prior is None else np.maximum(prior, np.float32(LEAST_WATER))
     ratio = lines / scale
     place = np.arange(lines.shape[1])
@@ -118,7 +118,7 @@ def _bridged(lines: Volume, hidden: Mask, prior: Volume | None) -> Volume:
 
 
 def _plain(hu: Volume, spacing: NDArray[np.float64]) -> Volume:
-    """Air, soft tissue and bone, in parts of water."""
+    """Attenuation of air, soft tissue and bone, relative to water."""
     air, bone = PLAIN
     flat = (PLAIN_SIGMA / spacing[0], PLAIN_SIGMA / spacing[1], 0.0)
     smooth = ndimage().gaussian_filter(hu, flat)

@@ -7,7 +7,8 @@ import numpy as np
 
 from cmfsim.errors import ImageInputError
 from cmfsim.io.dicom_headers import DicomHeader, dicom_header
-from cmfsim.io.dicom_stack import counted, is_localizer, listed, slices_of, volume_of
+from cmfsim.io.dicom_slices import counted, is_localizer, listed, slices_of
+from cmfsim.io.dicom_stack import volume_of
 from cmfsim.io.image_headers import check_shape
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData

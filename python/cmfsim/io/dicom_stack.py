@@ -7,8 +7,7 @@ slice, never from file names, instance numbers or a reader's sorting.
 import itertools
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,14 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
-from cmfsim.io.dicom_headers import DicomHeader, numbers_of
+from cmfsim.io.dicom_headers import numbers_of
+from cmfsim.io.dicom_slices import Slice, Stack, counted, is_localizer, listed
 from cmfsim.io.image_grids import aligned, of_slices, turn_of, upright
 from cmfsim.io.image_headers import check_shape
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["Slice", "counted", "is_localizer", "listed", "slices_of", "volume_of"]
+__all__ = ["volume_of"]
 
 # Slices of another orientation than the rest, up to this many, are scouts.
 MOST_SCOUTS = 3
@@ -48,74 +48,6 @@ COARSE_SLICES = 2.5
 READERS_AGREE = 0.01
 # Kinds of value that say HU, or nothing.
 UNSTATED_SCALES = frozenset({"", "HU", "US"})
-
-
-@dataclass(frozen=True)
-class Slice:
-    """One slice: where it lies, and the file and frame of its pixels."""
-
-    header: DicomHeader
-    frame: int
-    tags: Mapping[str, str | int]
-
-    @property
-    def name(self) -> str:
-        """The file's name, and the frame's number where it has several."""
-        frames = len(self.header.frames)
-        return self.header.path.name + (f" frame {self.frame + 1}" if frames else "")
-
-    def text(self, key: str) -> str:
-        """A value of the frame, or of its file."""
-        return str(self.tags.get(key, self.header.text(key)))
-
-    def numbers(self, key: str, count: int) -> NDArray[np.float64]:
-        """The numbers of a value that a slice must have."""
-        found = numbers_of(self.text(key), count)
-        if found is None:
-            tag = {"position": "0020,0032", "orientation": "0020,0037"}.get(key, "0028,0030")
-            raise ImageInputError(
-                f"{self.name}: does not state its {key.replace('_', ' ')} (DICOM tag {tag} is "
-                f"{self.text(key)[:60]!r}): export the series again as it was scanned"
-            )
-        return found
-
-
-def is_localizer(header: DicomHeader) -> bool:
-    """Whether an image is a scout, by its own word."""
-    return "LOCALIZER" in header.text("image_type").upper()
-
-
-def slices_of(header: DicomHeader) -> list[Slice]:
-    """The slices of a file."""
-    stated = numbers_of(header.text("n_frames") or "1", 1)
-    count = 1 if stated is None else int(stated[0])
-    if count == 1 and not header.frames:
-        return [Slice(header, 0, {})]
-    if len(header.frames) != count:
-        raise ImageInputError(
-            f"{header.path.name}: has {count} frames and states the places of "
-            f"{len(header.frames)}: export the series as one file per slice"
-        )
-    return [Slice(header, n, frame.tags) for n, frame in enumerate(header.frames)]
-
-
-@dataclass(frozen=True, eq=False)
-class _Stack:
-    """Parallel slices in ascending order along their normal."""
-
-    slices: tuple[Slice, ...]
-    positions: NDArray[np.float64]
-    axes: NDArray[np.float64]
-    spacing: tuple[float, float]
-
-    @property
-    def heights(self) -> NDArray[np.float64]:
-        return np.asarray(self.positions @ np.cross(*self.axes))
-
-    def kept(self, which: Sequence[int]) -> "_Stack":
-        chosen = list(which)
-        slices = tuple(self.slices[i] for i in chosen)
-        return _Stack(slices, self.positions[chosen], self.axes, self.spacing)
 
 
 def volume_of(
@@ -182,7 +114,7 @@ def _without_scouts(name: str, slices: list[Slice]) -> tuple[list[Slice], list[F
     return groups[0], [finding]
 
 
-def _stack(name: str, slices: list[Slice]) -> _Stack:
+def _stack(name: str, slices: list[Slice]) -> Stack:
     """The slices in the order of their places, of one size and spacing."""
     sizes = Counter((s.text("columns"), s.text("rows")) for s in slices)
     spacings = [s.numbers("pixel_spacing", 2) for s in slices]
@@ -237,10 +169,10 @@ def _stack(name: str, slices: list[Slice]) -> _Stack:
     order = sorted(range(len(slices)), key=lambda i: (float(heights[i]), slices[i].name))
     sorted_slices = tuple(slices[i] for i in order)
     # Pixel spacing states rows first: the distance between rows, then between columns.
-    return _Stack(sorted_slices, positions[order], axes, (float(usual[1]), float(usual[0])))
+    return Stack(sorted_slices, positions[order], axes, (float(usual[1]), float(usual[0])))
 
 
-def _pixels(name: str, stack: _Stack) -> NDArray[Any]:
+def _pixels(name: str, stack: Stack) -> NDArray[Any]:
     """The pixels of all slices, axes slice, row, column, by the third-party reader."""
     files = list(dict.fromkeys(s.header.path for s in stack.slices))
     size = sum(path.stat().st_size for path in files)
@@ -257,7 +189,7 @@ def _pixels(name: str, stack: _Stack) -> NDArray[Any]:
     return np.stack([parts[s.header.path][s.frame] for s in stack.slices])
 
 
-def _of_files(stack: _Stack, limits: ReadLimits) -> NDArray[Any]:
+def _of_files(stack: Stack, limits: ReadLimits) -> NDArray[Any]:
     paths = [str(s.header.path.absolute()) for s in stack.slices]
     answer = read_in_child("cmfsim.io.image_reading:read_slices", limits, paths=paths)
     places = np.array(answer.values["places"])
@@ -279,7 +211,7 @@ def _of_frames(path: Path, limits: ReadLimits) -> NDArray[Any]:
     return values if values.ndim == 3 else values[None]
 
 
-def _check_scales(name: str, stack: _Stack) -> None:
+def _check_scales(name: str, stack: Stack) -> None:
     """Refuses frames with several slopes: the reader applies one of them to all."""
     scales = {(s.text("slope"), s.text("intercept")) for s in stack.slices}
     if len(scales) > 1:
@@ -290,7 +222,7 @@ def _check_scales(name: str, stack: _Stack) -> None:
 
 
 def _without_copies(
-    name: str, stack: _Stack, values: NDArray[Any]
+    name: str, stack: Stack, values: NDArray[Any]
 ) -> tuple[list[int], list[Finding]]:
     """The slices without those that are there twice; an error where two at one place differ."""
     kept, copies = [0], []
@@ -322,12 +254,12 @@ def _without_copies(
     return kept, [finding]
 
 
-def _place(stack: _Stack, i: int) -> str:
+def _place(stack: Stack, i: int) -> str:
     text = ", ".join(f"{x:.2f}" for x in stack.positions[i])
     return f"first pixel at {text} mm"
 
 
-def _check_acquisitions(name: str, stack: _Stack) -> None:
+def _check_acquisitions(name: str, stack: Stack) -> None:
     """Refuses slices of several scans that lie between one another."""
     ranges: dict[str, list[float]] = {}
     for one, height in zip(stack.slices, stack.heights, strict=True):
@@ -343,7 +275,7 @@ def _check_acquisitions(name: str, stack: _Stack) -> None:
             )
 
 
-def _check_steps(name: str, stack: _Stack) -> list[int]:
+def _check_steps(name: str, stack: Stack) -> list[int]:
     """The uneven steps of a stack; an error where slices are missing or too many."""
     heights = stack.heights
     steps = np.diff(heights)
@@ -376,7 +308,7 @@ def _check_steps(name: str, stack: _Stack) -> list[int]:
     return [int(i) for i in np.flatnonzero(np.abs(steps - usual) > 0.01 * usual)] or [0]
 
 
-def _steps(stack: _Stack, which: Sequence[int] | NDArray[np.intp]) -> str:
+def _steps(stack: Stack, which: Sequence[int] | NDArray[np.intp]) -> str:
     """Steps with the slices that they lie between."""
     heights = stack.heights
     texts = [
@@ -389,7 +321,7 @@ def _steps(stack: _Stack, which: Sequence[int] | NDArray[np.intp]) -> str:
 
 
 def _placed(
-    name: str, stack: _Stack, values: NDArray[Any], uneven: list[int]
+    name: str, stack: Stack, values: NDArray[Any], uneven: list[int]
 ) -> tuple[ImageData, list[Finding]]:
     """The image of a stack on axes of the patient, resampled where its slices ask for it."""
     heights, normal = stack.heights, np.cross(*stack.axes)
@@ -424,7 +356,7 @@ def _placed(
 
 def _tilt_findings(
     name: str,
-    stack: _Stack,
+    stack: Stack,
     along: NDArray[np.float64],
     *,
     straight: bool,
@@ -472,7 +404,7 @@ def _tilt_findings(
     return findings
 
 
-def _whole_heights(stack: _Stack) -> str:
+def _whole_heights(stack: Stack) -> str:
     """Between which heights every slice position was scanned, as the region of a case has them."""
     columns, rows = (int(stack.slices[0].text(k)) for k in ("columns", "rows"))
     across = np.array([0.0, (columns - 1) * stack.spacing[0] * stack.axes[0, 2]])
@@ -487,7 +419,7 @@ def _whole_heights(stack: _Stack) -> str:
     )
 
 
-def _uneven(name: str, stack: _Stack, uneven: list[int]) -> Finding:
+def _uneven(name: str, stack: Stack, uneven: list[int]) -> Finding:
     steps = np.diff(stack.heights)
     return Finding.warning(
         "dicom-uneven",
@@ -519,7 +451,7 @@ def _coarse(name: str, gap: float) -> Finding:
     )
 
 
-def _rescale_findings(name: str, stack: _Stack) -> list[Finding]:
+def _rescale_findings(name: str, stack: Stack) -> list[Finding]:
     kinds = {s.text("rescale_type").upper() for s in stack.slices} - UNSTATED_SCALES
     if not kinds:
         return []
@@ -532,14 +464,3 @@ def _rescale_findings(name: str, stack: _Stack) -> list[Finding]:
             fix="check skin and bone by eye, or set skin_threshold and bone_threshold",
         )
     ]
-
-
-def counted(number: int, what: str) -> str:
-    """A number of things in words: "1 slice", "3 slices"."""
-    many = f"{what[:-1]}ies" if what.endswith("y") else f"{what}s"
-    return f"{number} {what if number == 1 else many}"
-
-
-def listed(names: Sequence[str]) -> str:
-    """Up to four names, and how many more there are."""
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

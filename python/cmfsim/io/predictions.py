@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,32 +20,16 @@ from cmfsim.io.metrics import (
     read_evaluation,
     read_picture,
 )
+from cmfsim.io.prediction_schema import PREDICTION, is_prediction_file
 from cmfsim.io.results import write_result
-from cmfsim.io.summaries import (
-    checked_file,
-    finding,
-    flag,
-    listing,
-    mapping,
-    number,
-    one_of,
-    optional,
-    plain,
-    read_summary,
-    table,
-    text,
-    whole,
-    write_summary,
-)
+from cmfsim.io.summaries import checked_file, read_summary, write_summary
 from cmfsim.io.surfaces import write_surface
 from cmfsim.io.vtk import write_tets, write_triangles
-from cmfsim.values.moduli import MOST_POISSON, YOUNG_RANGE
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
     "fill_prediction",
-    "is_prediction_file",
     "is_result_file",
     "predictions_of",
     "read_parts",
@@ -58,142 +41,6 @@ __all__ = [
 
 PREDICTION_FILE = "prediction.json"
 AGAIN = "run cmfsim predict again"
-PREDICTION_FILES = re.compile(
-    r"prediction\.(vtp|stl|vtu|npz|png|json|mrb)|face\.(vtp|stl)|(bones|muscles)\.vtp"
-    r"|(plan|muscles|band)\.png|timings\.json"
-)
-
-
-_LENGTH, _COUNT, _SECONDS = number(-1e6, 1e6), whole(0, 10**12), number(0.0, 1e9)
-_VECTOR = listing(_LENGTH, length=3)
-_RIGID = table({"translation": _VECTOR, "angle": number(0.0, 360.0), "axis": _VECTOR})
-_MOVED = table({"mean": number(0.0, 1e6), "largest": number(0.0, 1e6)})
-
-
-def _motion(where: str, value: object) -> None:
-    table({}, {"mean": number(0.0, 1e6), "bending": number(0.0, 1e6)})(where, value)
-    rigid = isinstance(value, dict) and "translation" in value
-    (_RIGID if rigid else _MOVED)(where, value)
-
-
-def _file_name(where: str, value: object) -> None:
-    if not isinstance(value, str) or not is_prediction_file(value):
-        raise CaseInputError(f"{where} is {value!r:.60}: a prediction has no file of that name")
-
-
-_SOLUTION = table(
-    {
-        "method": text,
-        "n_tets": _COUNT,
-        "n_unknowns": _COUNT,
-        "residual": optional(number(0.0, 1e12)),
-        "contact_iterations": _COUNT,
-        "contact_gap": optional(_LENGTH),
-    },
-    dict.fromkeys(("error_bound", "error_estimate"), optional(number(0.0, 1e12))),
-)
-_SIZE = number(0.1, 10.0)
-_FIT = table(
-    {
-        **dict.fromkeys(("rms_mm", "worst_mm", "median_mm", "p95_mm"), number(0.0, 1e6)),
-        "share": number(0.0, 1.0),
-    },
-    {
-        "shape": table(
-            {
-                "scale": _SIZE,
-                "scale_interval": listing(_SIZE, length=2),
-                "eigenvalue_ratio": number(0.0, 1.0),
-                "open": listing(plain),
-            }
-        ),
-        "slip_mm": number(0.0, 1e6),
-    },
-)
-_YOUNG, _POISSON = number(*YOUNG_RANGE), number(-1.0, MOST_POISSON)
-_MUSCLE = table({"young_along": _YOUNG, "young_across": _YOUNG, "poisson": _POISSON})
-_WIDTH, _SHARE = number(0.0, 1e6), number(0.0, 1.0)
-_FACTOR = table(
-    {
-        "factor": number(0.0, 1e9),
-        "n": _COUNT,
-        "rank": _COUNT,
-        **dict.fromkeys(("coverage", "coverage_5_percent", "coverage_95_percent"), _SHARE),
-    }
-)
-_BAND_REGION = table(
-    {
-        **dict.fromkeys(
-            ("half_width_mean_mm", "half_width_p95_mm", "half_width_largest_mm", "sd_mean_mm"),
-            _WIDTH,
-        ),
-        "calibration": optional(_FACTOR),
-        "sources_rms_mm": mapping(_WIDTH, most=1000),
-    }
-)
-_BAND = table(
-    {
-        "state": one_of("calibrated", "uncalibrated"),
-        "coverage": _SHARE,
-        "factor_uncalibrated": optional(number(0.0, 1e3)),
-        "settings_digest": text,
-        "settings": mapping(plain),
-        "regions": mapping(_BAND_REGION, most=100),
-        "sources": mapping(
-            table({"sd": number(0.0, 1e6), "unit": text, "reference": text}), most=1000
-        ),
-        "not_covered": listing(text),
-        "notes": listing(text),
-        "calibration": optional(
-            table({"file": text, "note": text, "n": _COUNT}, {"group": optional(text)})
-        ),
-        "seconds": number(0.0, 1e9),
-    }
-)
-_PREDICTION = table(
-    {
-        "case": text,
-        "model": one_of(*MODELS),
-        "case_key": text,
-        "versions": mapping(text, most=100),
-        "inputs": mapping(text),
-        "timings": mapping(_SECONDS, most=1000),
-        "skin": table(dict.fromkeys(("mean", "p95", "largest"), number(0.0, 1e6))),
-        "plan": mapping(_motion, most=1000),
-        "segments": mapping(table({"joined": _COUNT, "sliding": _COUNT}), most=1000),
-        "mesh": mapping(plain),
-        "solution": _SOLUTION,
-        "findings": listing(finding),
-        "parts": mapping(listing(text), most=10, keys=one_of("bones", "muscles")),
-        "files": listing(_file_name),
-    },
-    {
-        "note": text,
-        "left_out": listing(text),
-        "achieved": table({"segments": mapping(_FIT, most=1000)}),
-        "muscles": table(
-            {},
-            {
-                "volumes": mapping(number(0.0, 1e12)),
-                "template": text,
-                "moduli": table(
-                    {
-                        "fat": table({"young": _YOUNG, "poisson": _POISSON}),
-                        "muscle": _MUSCLE,
-                        "muscles": mapping(_MUSCLE, most=1000),
-                    }
-                ),
-            },
-        ),
-        "refined": flag,
-        "band": _BAND,
-    },
-)
-
-
-def is_prediction_file(name: str) -> bool:
-    """Whether a prediction is written as files of this name, among others."""
-    return PREDICTION_FILES.fullmatch(name) is not None
 
 
 def is_result_file(name: str) -> bool:
@@ -228,7 +75,7 @@ def read_prediction(folder: str | os.PathLike[str]) -> dict[str, Any]:
     CaseError
         (also `ValueError`) It was changed, or holds what a prediction does not.
     """
-    return read_summary(Path(folder) / PREDICTION_FILE, _PREDICTION, AGAIN)
+    return read_summary(Path(folder) / PREDICTION_FILE, PREDICTION, AGAIN)
 
 
 def read_prediction_picture(

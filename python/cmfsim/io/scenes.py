@@ -185,26 +185,8 @@ def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray
         known_keys(f"segments[{number}]", entry, ENTRY_KEYS)
         if name in segments:
             raise CaseInputError(f"segments[{number}] is {name!r} again")
-        contact = None
-        if any(f"{key}.contact.{part}" in members for part in ("vertices", "triangles")):
-            contact = SurfaceData(
-                member_of(members, f"{key}.contact.vertices"),
-                member_of(members, f"{key}.contact.triangles"),
-                entry.get("crease_angle", 60.0),
-            )
-        gap = entry["gap"] if "gap" in entry else member_of(members, f"{key}.gap")
-        segments[name] = SegmentData(
-            member_of(members, f"{key}.joined"), member_of(members, f"{key}.sliding"), contact, gap
-        )
-        if entry.get("motion") == "surface":
-            surface = SurfaceData(
-                member_of(members, f"{key}.motion.vertices"),
-                member_of(members, f"{key}.motion.triangles"),
-                entry.get("motion_crease_angle", 60.0),
-            )
-            plan[name] = MovedSurface(surface, member_of(members, f"{key}.motion.moved_vertices"))
-        else:
-            plan[name] = member_of(members, f"{key}.motion")
+        segments[name] = _stored_segment(entry, key, members)
+        plan[name] = _stored_motion(entry, key, members)
     touching, obstacles = _one_sided(header, members)
     known = {
         "scene",
@@ -230,6 +212,35 @@ def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray
         touching=touching,
         obstacles=obstacles,
     )
+
+
+def _stored_segment(
+    entry: Mapping[str, Any], key: str, members: Mapping[str, NDArray[Any]]
+) -> SegmentData:
+    contact = None
+    if any(f"{key}.contact.{part}" in members for part in ("vertices", "triangles")):
+        contact = SurfaceData(
+            member_of(members, f"{key}.contact.vertices"),
+            member_of(members, f"{key}.contact.triangles"),
+            entry.get("crease_angle", 60.0),
+        )
+    gap = entry["gap"] if "gap" in entry else member_of(members, f"{key}.gap")
+    return SegmentData(
+        member_of(members, f"{key}.joined"), member_of(members, f"{key}.sliding"), contact, gap
+    )
+
+
+def _stored_motion(
+    entry: Mapping[str, Any], key: str, members: Mapping[str, NDArray[Any]]
+) -> NDArray[Any] | MovedSurface:
+    if entry.get("motion") != "surface":
+        return member_of(members, f"{key}.motion")
+    surface = SurfaceData(
+        member_of(members, f"{key}.motion.vertices"),
+        member_of(members, f"{key}.motion.triangles"),
+        entry.get("motion_crease_angle", 60.0),
+    )
+    return MovedSurface(surface, member_of(members, f"{key}.motion.moved_vertices"))
 
 
 def _one_sided(

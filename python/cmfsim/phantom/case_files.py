@@ -1,4 +1,4 @@
-"""A case made by code: the phantom's CT and landmarks with a case file, ready to be built."""
+"""A synthetic case: the phantom's CT and landmarks with a case file, ready to build."""
 
 import os
 from pathlib import Path
@@ -45,7 +45,7 @@ folder = "out"
 def write_phantom_case(
     folder: str | os.PathLike[str], head: PhantomHead, *, spacing: float = 1.0, seed: int = 0
 ) -> Path:
-    """The path of a `case.toml` beside the CT and the landmarks of a made head.
+    """The path of a new `case.toml` next to the CT and the landmarks of a synthetic head.
 
     Parameters
     ----------

@@ -54,46 +54,11 @@ def _head(p: HeadParameters) -> list[Step | Engraving]:
     """Vault, face without features, jaw, chin and neck."""
     fat = p.fat_thickness
     vault = Egg((0, 4, 50), (77, 101, 70), (77, 97, 84), power=2.25)
-    # The section widens to the cheekbones and dives under the vault above the brows.
-    z = (-95.0, -80.0, -65.0, -50.0, -35.0, -20.0, -5.0, 10.0, 25.0, 40.0, 55.0, 70.0)
-    front = (-86.0, -92.0, -93.0, -93.0, -93.0, -92.0, -90.0, -88.0, -90.0, -93.0, -87.0, -72.0)
-    width = (48.0, 53.0, 57.5, 61.0, 64.0, 68.5, 72.5, 73.5, 73.0, 70.0, 62.0, 50.0)
-    power = (1.9, 1.95, 2.0, 2.1, 2.15, 2.25, 2.35, 2.3, 2.2, 2.2, 2.2, 2.2)
-    back = (0.0, 4.0, 8.0, 14.0, 20.0, 28.0, 35.0, 40.0, 42.0, 40.0, 34.0, 24.0)
-    face = Loft(
-        middle=-16.0,
-        front=Table(z, [v - 0.5 * fat for v in front]),
-        back=Table(z, back),
-        width=Table(z, [v + fat for v in width]),
-        power=Table(z, power),
-        box=Box((0, -110, -110), (80, 60, 80)),
-    )
-    jaw_slope = 0.36
-    length = float(np.hypot(1.0, jaw_slope))
-    jaw = Plane((0, -92, -89 - 0.6 * fat), (0, jaw_slope / length, -1.0 / length))
-    lower_face = Blend(
-        (
-            Step("join", face),
-            Step("meet", jaw, 12.0),
-            Step("meet", Plane((0, 0, 62), (0, 0, 1)), 12.0),
-        ),
-        face.box,
-    )
-    neck = _tube(
-        [
-            [0, 21, -150, 53 + fat],
-            [0, 16, -95, 48 + fat],
-            [0, 14, -55, 47 + 0.5 * fat],
-            [0, 18, -20, 48],
-            [0, 22, 15, 48],
-        ],
-        12,
-    )
     chin = -p.chin_projection
     return [
         Step("join", vault),
-        Step("join", lower_face, 10.0),
-        Step("join", neck, 12.0),
+        Step("join", _lower_face(fat), 10.0),
+        Step("join", _neck(fat), 12.0),
         # Cheekbones, cheeks, the muzzle that the lips lie on, and the chin.
         Step("join", Egg((42, -58, -4), (22 + 0.4 * fat, 24, 17)), 12.0),
         Step("join", Egg((36, -62, -30), (16 + fat, 18 + 0.5 * fat, 20)), 12.0),
@@ -119,6 +84,48 @@ def _head(p: HeadParameters) -> list[Step | Engraving]:
             9.0,
         ),
     ]
+
+
+def _lower_face(fat: float) -> Blend:
+    """The face below the vault, cut off along the lower border of the jaw."""
+    # The section widens to the cheekbones and dives under the vault above the brows.
+    z = (-95.0, -80.0, -65.0, -50.0, -35.0, -20.0, -5.0, 10.0, 25.0, 40.0, 55.0, 70.0)
+    front = (-86.0, -92.0, -93.0, -93.0, -93.0, -92.0, -90.0, -88.0, -90.0, -93.0, -87.0, -72.0)
+    width = (48.0, 53.0, 57.5, 61.0, 64.0, 68.5, 72.5, 73.5, 73.0, 70.0, 62.0, 50.0)
+    power = (1.9, 1.95, 2.0, 2.1, 2.15, 2.25, 2.35, 2.3, 2.2, 2.2, 2.2, 2.2)
+    back = (0.0, 4.0, 8.0, 14.0, 20.0, 28.0, 35.0, 40.0, 42.0, 40.0, 34.0, 24.0)
+    face = Loft(
+        middle=-16.0,
+        front=Table(z, [v - 0.5 * fat for v in front]),
+        back=Table(z, back),
+        width=Table(z, [v + fat for v in width]),
+        power=Table(z, power),
+        box=Box((0, -110, -110), (80, 60, 80)),
+    )
+    jaw_slope = 0.36
+    length = float(np.hypot(1.0, jaw_slope))
+    jaw = Plane((0, -92, -89 - 0.6 * fat), (0, jaw_slope / length, -1.0 / length))
+    return Blend(
+        (
+            Step("join", face),
+            Step("meet", jaw, 12.0),
+            Step("meet", Plane((0, 0, 62), (0, 0, 1)), 12.0),
+        ),
+        face.box,
+    )
+
+
+def _neck(fat: float) -> Tube:
+    return _tube(
+        [
+            [0, 21, -150, 53 + fat],
+            [0, 16, -95, 48 + fat],
+            [0, 14, -55, 47 + 0.5 * fat],
+            [0, 18, -20, 48],
+            [0, 22, 15, 48],
+        ],
+        12,
+    )
 
 
 def _eyes() -> list[Step | Engraving]:

@@ -6,7 +6,7 @@ results of one run. What belongs to another plan, or to other inputs or another 
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -23,9 +23,9 @@ from cmfsim.io.metrics import (
     read_evaluation,
     read_evaluation_picture,
 )
+from cmfsim.io.prediction_schema import is_prediction_file
 from cmfsim.io.predictions import (
     fill_prediction,
-    is_prediction_file,
     is_result_file,
     predictions_of,
     read_prediction,
@@ -149,15 +149,13 @@ def write_results(
             names = fill_prediction(fresh / place, prediction, more)
             written.predictions.append(WrittenPrediction(place, names, prediction.summary))
         key = written.predictions[0].summary["case_key"]
-        compared = None
+        compared: Mapping[str, Any] | None
         if evaluation is not None:
             stage("writing the comparison")
             compared = _fill_evaluation(fresh, evaluation())
             written.files = [*compared["files"], EVALUATION_FILE]
-        elif (output / EVALUATION_FILE).exists() and EVALUATION_FILE not in stale_results(
-            output, key
-        ):
-            compared = read_evaluation(output)
+        else:
+            compared = _earlier_evaluation(output, key)
         if with_report:
             stage("writing the report")
             written.report = _report_of(fresh, output, written, compared)
@@ -187,16 +185,28 @@ def write_results(
     summary = None if evaluation is None else EVALUATION_FILE
     names = replacing_files(output, summary, is_result_file, fill, stale)
     written.left_out = [name for name in written.left_out if name not in names]
-    if written.left_out:
-        _log.warning(
-            "%s: removed %d files of another plan, other inputs or another version: %s",
-            output,
-            len(written.left_out),
-            ", ".join(_statements(written.left_out)),
-        )
-        if EVALUATION_FILE in written.left_out:
-            _log.warning("the comparison belonged to another plan: run cmfsim evaluate again")
+    _warn_of_removed(output, written.left_out)
     return written
+
+
+def _earlier_evaluation(output: Path, key: str) -> dict[str, Any] | None:
+    """The comparison that is in the folder, if it belongs to the predictions with this key."""
+    if (output / EVALUATION_FILE).exists() and EVALUATION_FILE not in stale_results(output, key):
+        return read_evaluation(output)
+    return None
+
+
+def _warn_of_removed(output: Path, names: Sequence[str]) -> None:
+    if not names:
+        return
+    _log.warning(
+        "%s: removed %d files of another plan, other inputs or another version: %s",
+        output,
+        len(names),
+        ", ".join(_statements(names)),
+    )
+    if EVALUATION_FILE in names:
+        _log.warning("the comparison belonged to another plan: run cmfsim evaluate again")
 
 
 def _statements(names: Iterable[str]) -> list[str]:

@@ -1,1 +1,1 @@
-"""Planning: new plans at once, measures of the face, plans for a wished face, and the page."""
+"""Planning: new plans at once, measures of the face, plans for a desired face, and the page."""

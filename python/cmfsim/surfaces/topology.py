@@ -1,4 +1,4 @@
-"""How triangles and tets hang together: edges, connected pieces, and consistent orientation."""
+"""Topology of triangles and tets: edges, connected pieces, and consistent orientation."""
 
 from dataclasses import dataclass
 from importlib import import_module
@@ -34,7 +34,7 @@ class Edges:
     opposed : (p,) bool
         Whether they run through that edge in opposite directions, as in a consistent surface.
     border : (b, 2) int64
-        Edges of one triangle, in its direction.
+        Edges with a single triangle, in its direction.
     border_triangles : (b,) int64
         That triangle.
     """
@@ -48,7 +48,7 @@ class Edges:
 
 
 def edges_of(triangles: Integers) -> Edges:
-    """The edges of triangles; none of them may name a vertex twice."""
+    """The edges of triangles; no triangle may name a vertex twice."""
     if not len(triangles):
         none = np.zeros((0, 2), dtype=np.int64)
         single = np.zeros(0, dtype=np.int64)
@@ -76,7 +76,7 @@ def edges_of(triangles: Integers) -> Edges:
 def component_labels(edges: Edges, n_triangles: int) -> Integers:
     """The number of the connected piece of each triangle, pieces in the order of their first one.
 
-    Pieces hang together by edges of two triangles: at a fork nobody knows which belong together.
+    Pieces are connected by edges with two triangles: at a fork, the connection is ambiguous.
     """
     return connected_labels(edges.pairs, n_triangles)
 
@@ -104,7 +104,7 @@ def connected_labels(pairs: Integers, count: int) -> Integers:
 
 
 def orientation_flips(edges: Edges, n_triangles: int) -> tuple[NDArray[np.bool_], bool]:
-    """Which triangles to turn round for a consistent surface, and whether there is such a choice.
+    """Which triangles to flip for a consistent surface, and whether there is such a choice.
 
     Each triangle is taken twice, as it is and turned; edges join the copies that agree. A piece
     whose two copies are joined has one side only (Möbius) and is left as it is. In each other piece
@@ -128,9 +128,9 @@ def orientation_flips(edges: Edges, n_triangles: int) -> tuple[NDArray[np.bool_]
 
 
 def tet_bodies(tets: NDArray[Any]) -> Integers:
-    """The number of the body of each tet; bodies hang together by faces.
+    """The number of the body of each tet; bodies are connected through faces.
 
-    What an edge or a node alone joins to the rest would swing about it without resistance.
+    A part attached by a single edge or node would move without resistance.
     """
     corners = np.sort(tets.astype(np.int64), axis=1)
     faces = corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)

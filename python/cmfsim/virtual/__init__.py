@@ -1,7 +1,7 @@
-"""Virtual patients: made heads, an operation, and the face that it truly makes (*in silico*).
+"""Virtual patients: synthetic heads, an operation, and the true face after it (*in silico*).
 
-The truth is computed by other means than the models that are tested on it: hyperelastic tissue, a
-finer mesh, the person's own muscles and contact that only pushes, solved with scikit-fem and PyAMG.
+The true face is computed independently of the models that are tested on it: hyperelastic tissue, a
+finer mesh, individual muscles and contact that only pushes, solved with scikit-fem and PyAMG.
 """
 
 from cmfsim.virtual.equilibrium import EquilibriumOptions

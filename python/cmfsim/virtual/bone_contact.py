@@ -1,7 +1,7 @@
-"""Tissue that slides on moving bones and teeth, may lift off, and is pushed back where it enters.
+"""Tissue that slides on moving bones and teeth, may lift off, and is pushed back out of them.
 
-This is the truth's contact: a penalty on smooth distances, without the surfaces, constraints and
-active sets of the tested models.
+This contact belongs to the true face: a penalty on smooth distances, without the surfaces,
+constraints and active sets of the models under test.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,10 +18,10 @@ from cmfsim.values.image_data import ImageData
 
 __all__ = ["BoneContact", "SmoothDistance"]
 
-# Pressure per depth of penetration, MPa/mm: pressures of soft tissue (some kPa) stay within a
-# tenth of a mm.
+# Pressure per depth of penetration, MPa/mm: under the pressures of soft tissue (a few kPa), nodes
+# penetrate by less than a tenth of a mm.
 STIFFNESS = 0.1
-# Depth over which that pressure sets in, mm: nodes that rest on bone would otherwise lie on a kink.
+# Depth over which the stiffness grows, mm: nodes that lie on bone would otherwise be at a kink.
 ONSET = 0.1
 # Standard deviation of the blur that rounds gaps between teeth, mm: half an edge of the mesh.
 RELIEF = 1.0
@@ -80,20 +80,20 @@ class SmoothDistance:
 class BoneContact:
     """Nodes that moving bones push, without friction and without pull.
 
-    A node that starts inside the blurred bone may stay as deep as it started.
+    A node that starts inside the blurred bone may stay at that depth.
 
     Attributes
     ----------
     points : (n, 3) float64, mm
         All nodes at rest.
     nodes : (k,) whole numbers
-        Those that touch.
+        Nodes that may touch bone.
     area : (k,) float64, mm²
-        Of the boundary about each.
+        Boundary area around each.
     bones : mapping of str to SmoothDistance
         At rest.
     motion : mapping of str to callable
-        The rigid motion (4, 4) of each bone after a part of its motion, 0 to 1.
+        The rigid motion (4, 4) of each bone after a fraction of it, 0 to 1.
     stiffness : float, MPa/mm
     """
 
@@ -112,7 +112,7 @@ class BoneContact:
                 raise CaseInputError(f"contact with {name!r}, whose motion is not given")
 
     def depths(self, displacements: Floats, part: float) -> dict[str, Floats]:
-        """How deep each touching node lies in each bone, (k,) mm; 0 outside."""
+        """Depth of each touching node in each bone, (k,) mm; 0 outside."""
         rest: Mapping[str, Floats] = self.__dict__["_rest"]
         return {
             name: np.maximum(rest[name] - bone(self._seen(name, displacements, part)), 0.0)
@@ -120,7 +120,7 @@ class BoneContact:
         }
 
     def _seen(self, name: str, displacements: Floats, part: float) -> Floats:
-        """The moved nodes in the frame of a bone that has moved by a part of its motion."""
+        """The moved nodes in the frame of a bone after a fraction of its motion."""
         matrix = self.motion[name](part)
         moved = (self.points + displacements)[self.nodes]
         return np.asarray((moved - matrix[:3, 3]) @ matrix[:3, :3])
@@ -140,7 +140,7 @@ class BoneContact:
     def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
         """The gradient of the energy, (n, 3) N, and the stiffness of each node, (n, 3, 3) N/mm.
 
-        Of the bone's curvature, that of hollows counts, which stiffens; that of edges does not.
+        Of the bone's curvature, only that of hollows counts, which stiffens, not that of edges.
         """
         force = np.zeros_like(self.points)
         blocks = np.zeros((len(self.points), 3, 3))
@@ -163,5 +163,5 @@ class BoneContact:
         return force, blocks
 
     def coupling(self, displacements: Floats, part: float) -> None:
-        """Nothing: each node meets bones alone."""
+        """None: nodes touch only bones, not each other."""
         del displacements, part

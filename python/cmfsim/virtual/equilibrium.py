@@ -1,4 +1,4 @@
-"""The equilibrium of the true tissue when bones move: Newton's method along the motion."""
+"""Equilibrium of the true tissue as bones move: Newton's method in steps of the motion."""
 
 import logging
 import time
@@ -20,27 +20,27 @@ __all__ = ["Contact", "Equilibrium", "EquilibriumOptions", "NoContact", "find_eq
 
 _log = logging.getLogger(__name__)
 
-# Forces below this part of stiffness times the area of the body are rounding.
+# Forces below this share of shear modulus times the body's size squared are rounding errors.
 LEAST_FORCE = 1e-9
-# Halvings of a step before it is given up.
+# Number of times that a step is halved before the search fails.
 HALVINGS = 12
-# Share of the fall of energy that the slope promises, asked of a step (Armijo).
+# Share of the decrease predicted by the slope that a step must achieve (Armijo 1966).
 ARMIJO = 1e-4
-# Falls of energy below this part of the shear modulus times volume are lost in rounding: there a
-# full step is taken.
+# Decreases of energy below this share of shear modulus times volume are lost in rounding: the full
+# step is then taken.
 ROUNDING = 1e-13
-# Where the true stiffness gives way or leads too far, so many steps are taken with a convex one.
+# Number of steps with a convex stiffness after the true one was indefinite or its step too long.
 CONVEX_ROUNDS = 4
-# Of the residual, relative, that each linear solve leaves at most; less where Newton's own residual
-# is less, down to the other.
+# Largest relative residual of a linear solve; it decreases with Newton's residual, down to the
+# second value.
 LOOSEST_SOLVE, TIGHTEST_SOLVE = 0.01, 1e-5
 MOST_ITERATIONS = 400
-# Nodes of the coarsest level, of which a dense pseudo-inverse is made: six unknowns each.
+# Nodes of the coarsest level, with six unknowns each, which is solved by a dense pseudo-inverse.
 MOST_COARSE = 60
 
 
 class Contact(Protocol):
-    """What presses on the tissue where bones have moved by a part of their motion."""
+    """Contact forces on the tissue after a fraction of the motion of the bones."""
 
     def energy(self, displacements: Floats, part: float) -> float:
         """N·mm."""
@@ -49,11 +49,11 @@ class Contact(Protocol):
         """The gradient of the energy, (n, 3) N, and the stiffness of each node, (n, 3, 3) N/mm."""
 
     def coupling(self, displacements: Floats, part: float) -> Any:
-        """What else its stiffness has, between nodes: (3n, 3n) scipy BSR N/mm, or None."""
+        """Further stiffness, between nodes: (3n, 3n) scipy BSR, N/mm, or None."""
 
 
 class NoContact:
-    """Nothing presses."""
+    """No contact."""
 
     def energy(self, displacements: Floats, part: float) -> float:
         """Nothing."""
@@ -72,19 +72,19 @@ class NoContact:
 
 @dataclass(frozen=True)
 class EquilibriumOptions:
-    """How the equilibrium is sought.
+    """Options of the search for equilibrium.
 
     Attributes
     ----------
     steps : int
-        Parts of the motion.
+        Number of steps into which the motion is divided.
     tolerance : float
-        Of the residual at the end: the norm of the forces on free nodes, in the largest that the
-        forces on held nodes had on the way.
+        Largest residual at the end: the norm of the forces on free nodes, relative to the largest
+        norm of the forces on held nodes so far.
     loose : float
-        The same at the end of each step but the last.
+        The same at the end of all other steps.
     most_rounds : int
-        Newton iterations of one step.
+        Maximum number of Newton iterations in a step.
     """
 
     steps: int = 2
@@ -101,19 +101,19 @@ class EquilibriumOptions:
 
 @dataclass(frozen=True, eq=False)
 class Equilibrium:
-    """The tissue at rest with its bones moved.
+    """The tissue in equilibrium with the bones moved.
 
     Attributes
     ----------
     displacements : (n, 3) float64, mm
     residual : float
-        Norm of the forces on free nodes, as `EquilibriumOptions.tolerance` measures it.
+        As defined for `EquilibriumOptions.tolerance`.
     energy : float, N·mm
-        Elastic, and of the contact.
+        Elastic energy plus that of contact.
     history : tuple of (float, float)
-        Part of the motion and residual of each Newton iteration.
+        Fraction of the motion and residual, for each Newton iteration.
     last_step : (n, 3) float64, mm
-        What the last Newton iteration changed.
+        Change of the displacements in the last Newton iteration.
     linear_iterations : int
     seconds : float
     """
@@ -134,15 +134,15 @@ def find_equilibrium(
     contact: Contact | None = None,
     options: EquilibriumOptions | None = None,
 ) -> Equilibrium:
-    """The equilibrium of a body whose held nodes have followed a path, free nodes at rest.
+    """The equilibrium of a body whose held nodes have moved along a path.
 
     Parameters
     ----------
     body : HyperelasticBody
     held : (k,) whole numbers
-        Nodes that bones hold.
+        Nodes with prescribed displacements.
     path : callable
-        Their displacements (k, 3) mm after a part of the motion, 0 to 1; zero at 0.
+        Their displacements (k, 3) mm after a fraction of the motion, 0 to 1; zero at 0.
     contact : Contact, optional
     options : EquilibriumOptions, optional
 
@@ -153,7 +153,7 @@ def find_equilibrium(
     Raises
     ------
     SolverError
-        Newton's method does not settle, or a tet is inside out at the end (names it).
+        Newton's method does not converge, or a tet is inverted at the end (with its index).
     CaseError
         (also `ValueError`) PyAMG or scikit-fem is not installed.
     """
@@ -189,7 +189,7 @@ class _Search:
         for before, part in pairwise(parts.tolist()):
             self._advance(before, part)
             last = part >= 1.0
-            residual = self._settle(part, self.options.tolerance if last else self.options.loose)
+            residual = self._converge(part, self.options.tolerance if last else self.options.loose)
             _log.info("truth: %3.0f %% of the motion, residual %.1e", 100.0 * part, residual)
         self._check()
         return Equilibrium(
@@ -210,13 +210,13 @@ class _Search:
         return self.body.forces(u) + force, stiffness
 
     def _stiffness(self, added: Floats, part: float, *, convex: bool) -> Any:
-        """Of tissue and contact; `added` as `_forces` gives it."""
+        """Stiffness of tissue and contact; `added` is the second result of `_forces`."""
         matrix = self.body.stiffness(self.u, added, convex=convex)
         coupling = self.contact.coupling(self.u, part)
         return matrix if coupling is None else matrix + coupling
 
     def _advance(self, part: float, target: float) -> None:
-        """Goes along the tangent to the target."""
+        """Predicts the state at the target along the tangent."""
         forces, added = self._forces(self.u, part)
         matrix = self._stiffness(added, part, convex=True)
         step = np.zeros_like(self.u)
@@ -228,7 +228,7 @@ class _Search:
         self.u[self.held] = self.path(target)
 
     def _check(self) -> None:
-        """Refuses tissue that is inside out."""
+        """Raises an error if a tet is inverted."""
         ratio = self.body.volume_ratios(self.u)
         worst = int(np.argmin(ratio))
         if ratio[worst] <= 0.0:
@@ -238,8 +238,8 @@ class _Search:
                 "bones squeeze the tissue there; plan a smaller motion, or use a finer mesh"
             )
 
-    def _settle(self, part: float, tolerance: float) -> float:
-        """Newton's method with line search; the residual reached."""
+    def _converge(self, part: float, tolerance: float) -> float:
+        """The residual that Newton's method with a line search reaches."""
         energy = self._energy(self.u, part)
         convex = 0
         for _ in range(self.options.most_rounds):
@@ -264,7 +264,7 @@ class _Search:
                 share *= 0.5
             else:
                 raise SolverError(
-                    f"Newton's method stalls after {part:.0%} of the motion at a residual of "
+                    f"Newton's method stalled at {part:.0%} of the motion with a residual of "
                     f"{residual:.1e} ({tolerance:.0e} is needed)"
                 )
             convex = max(convex - 1, 0) if convex or (true and share == 1.0) else CONVEX_ROUNDS
@@ -287,7 +287,7 @@ class _Search:
     def _step(
         self, right: Floats, added: Floats, part: float, precision: float, *, convex: bool
     ) -> tuple[Floats, bool]:
-        """Newton's step, (n, 3) mm, and whether the true stiffness gave it."""
+        """Newton's step, (n, 3) mm, and whether it was computed with the true stiffness."""
         step = np.zeros_like(self.u)
         for cut in (True,) if convex else (False, True):
             matrix = self._stiffness(added, part, convex=cut)
@@ -323,10 +323,10 @@ class _LinearSolver:
         self._cycle: Any = None
 
     def take(self, matrix: Any) -> None:
-        """Takes a matrix and makes its preconditioner.
+        """Stores a matrix and computes its preconditioner.
 
-        A new one each time: that of the matrix before takes several times the iterations, as tets
-        that are squeezed near bone stiffen by orders of magnitude.
+        The preconditioner of the previous matrix would take several times the iterations, since
+        tets that are squeezed near bone stiffen by orders of magnitude.
         """
         pyamg = third_party("pyamg", "virtual patients are solved", "study")
         self._matrix = matrix
@@ -350,9 +350,9 @@ class _LinearSolver:
         self._cycle = hierarchy.aspreconditioner(cycle="V")
 
     def solve(self, right: Floats, precision: float) -> tuple[Floats, bool]:
-        """A step (k, 3) that falls in energy, and whether it is the solution.
+        """A step (k, 3) that decreases the energy, and whether it is the solution.
 
-        It is not where the matrix curves downwards; then it is what was found before.
+        If the matrix has negative curvature, the step is the iterate found before that.
         """
         r = right.ravel().copy()
         x = np.zeros_like(r)

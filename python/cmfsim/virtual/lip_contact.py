@@ -1,7 +1,7 @@
-"""Lips that touch each other: frictionless, without pull, on their deformed surfaces.
+"""Frictionless, one-sided contact of the lips on their deformed surfaces.
 
-This is the truth's contact, a penalty on distances between deformed triangles: no seam, no active
-set and no code of the tested models.
+This contact belongs to the true face. It is a penalty on distances between deformed triangles, and
+shares neither the seam, nor the active set, nor any code with the models under test.
 """
 
 from dataclasses import dataclass
@@ -19,20 +19,21 @@ from cmfsim.virtual.open_mouth import MARGIN, MouthSlit
 
 __all__ = ["ContactSum", "Lip", "LipContact", "lips_of"]
 
-# Pressure per depth of penetration, MPa/mm: pressures between lips (some kPa) stay within a tenth
-# of a millimetre. A stiffer contact stalls Newton's method where rough surfaces slide.
+# Pressure per depth of penetration, MPa/mm: under the pressures between lips (a few kPa), they
+# penetrate by less than a tenth of a millimetre. With a stiffer contact, Newton's method stalls
+# where rough surfaces slide.
 STIFFNESS = 0.2
-# Depth over which that pressure sets in, mm.
+# Depth over which the stiffness grows to its full value, mm.
 ONSET = 0.05
-# Triangles whose middles lie nearest to a node are tried for its closest point.
+# Number of triangles, those with the nearest centroids, searched for a node's closest point.
 CANDIDATES = 32
-# A node this deep or deeper, mm, lies behind the other lip, not in it: lips are thicker than twice
-# that, and a step of Newton's method that leads further is cut.
+# A node deeper than this, mm, lies behind the other lip, not in it: lips are more than twice as
+# thick, and a Newton step that leads further is shortened.
 DEEPEST = 4.0
-# Least cosine between the way to the border of a lip's surface and the normal there, for which a
-# node lies behind it: others lie beside it.
+# Smallest cosine between the direction to the border of a lip's surface and the normal there for
+# which a node counts as behind the surface.
 BEHIND = 0.7
-# Parts of a triangle below this are none: the closest point lies on an edge or a corner.
+# Barycentric weights below this count as zero: the closest point is on an edge or at a corner.
 ON_EDGE = 1e-9
 
 
@@ -45,9 +46,9 @@ class Lip:
     triangles : (t, 3) whole numbers
         Boundary triangles, outward normals.
     nodes : (k,) whole numbers
-        Those of the triangles that meet the other lip.
+        Nodes of the triangles that may touch the other lip.
     area : (k,) float64, mm²
-        Of the boundary about each.
+        Boundary area around each.
     """
 
     triangles: NDArray[np.int64]
@@ -58,7 +59,7 @@ class Lip:
     def of(cls, triangles: NDArray[Any], area: Floats, nodes: NDArray[Any] | None = None) -> "Lip":
         """The lip of boundary triangles (t, 3); area (n,) mm² of every node of the mesh.
 
-        All nodes of the triangles meet the other lip if they are not given.
+        By default, all nodes of the triangles may touch the other lip.
         """
         chosen = np.unique(triangles if nodes is None else nodes).astype(np.int64)
         return cls(np.asarray(triangles, dtype=np.int64), chosen, area[chosen])
@@ -79,7 +80,7 @@ class Lip:
 
     @cached_property
     def border_nodes(self) -> NDArray[np.int64]:
-        """The nodes of edges that belong to one triangle alone."""
+        """Nodes of edges that belong to a single triangle."""
         bare = self.neighbours < 0
         ends = [self.triangles[np.roll(bare, shift, axis=1)] for shift in (1, 2)]
         return np.unique(np.concatenate(ends))
@@ -97,12 +98,12 @@ def lips_of(
     boundary : (t, 3) uint32
         Boundary triangles of the mesh.
     area : (n,) float64, mm²
-        Of the boundary about each node.
+        Boundary area around each node.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) The mesh has no upper or no lower lip, or its lips are one.
+        (also `ValueError`) The mesh has no upper or no lower lip, or the two are not separate.
     """
     side, inner = slit.lips(nodes)[boundary], slit.lips(nodes, MARGIN)
     lips = []
@@ -117,20 +118,20 @@ def lips_of(
 
 @dataclass(frozen=True, eq=False)
 class _Touch:
-    """Nodes of one lip and the points of the other that are closest to them.
+    """Nodes of one lip that are inside the other, with their closest points on it.
 
     Attributes
     ----------
     corners : (c, 4) int64
         The node, and the three of the triangle.
     parts : (c, 4) float64
-        1, and the weights of the closest point with their sign turned: parts @ places is the way
-        from the closest point to the node.
+        1, and the negative weights of the closest point: parts @ places is the vector from the
+        closest point to the node.
     normal : (c, 3) float64
         Unit vectors along which the distance grows.
     swing : (c, 3, 3) float64
-        Projections on the ways in which the normal turns when the node moves: none over a face,
-        across an edge, both across a corner.
+        Projections onto the directions in which a moving node rotates the normal: none on a face,
+        one on an edge, two at a corner.
     depth, area : (c,) float64, mm and mm²
     """
 
@@ -146,17 +147,17 @@ class _Touch:
 class LipContact:
     """Two lips that push each other apart, without friction.
 
-    Each node of either lip is pushed out of the other, each way with half the pressure, so that
-    neither lip is master. Pressure over depth is that of `BoneContact`, stiffer.
+    The nodes of each lip are pushed out of the other with half the pressure, so that neither lip is
+    the master. Pressure depends on depth as in `BoneContact`, but is higher.
 
     Attributes
     ----------
     points : (n, 3) float64, mm
-        All nodes at rest, where lips do not enter each other.
+        All nodes at rest, where the lips do not penetrate each other.
     upper, lower : Lip
     stiffness : float, MPa/mm
     onset : float, mm
-        Depth over which the pressure sets in.
+        Depth over which the stiffness grows to its full value.
     """
 
     points: Floats
@@ -180,15 +181,15 @@ class LipContact:
             )
 
     def penetration(self, displacements: Floats) -> float:
-        """The deepest that any node lies in the other lip, mm."""
+        """Largest depth of a node inside the other lip, mm."""
         return max(float(touch.depth.max(initial=0.0)) for touch in self._touches(displacements))
 
     def touching(self, displacements: Floats) -> int:
-        """How many nodes of both lips press on the other."""
+        """Number of nodes, of both lips, that press on the other lip."""
         return sum(int(np.count_nonzero(t.depth > 0.0)) for t in self._touches(displacements))
 
     def energy(self, displacements: Floats, part: float) -> float:
-        """∫ ∫ pressure d(depth) d(area), N·mm, half from either lip."""
+        """∫ ∫ pressure d(depth) d(area), N·mm, half of it from each lip."""
         del part
         total = 0.0
         for touch in self._touches(displacements):
@@ -209,7 +210,7 @@ class LipContact:
         return force, np.zeros((len(self.points), 3, 3))
 
     def _pressing(self, touch: _Touch) -> Floats:
-        """The force of each node, half from either lip, (c,) N."""
+        """Half of the contact force on each node, (c,) N: the other lip adds its half."""
         d, onset = touch.depth, self.onset
         pressure = np.where(d < onset, 0.5 * d**2 / onset, d - 0.5 * onset)
         return 0.5 * self.stiffness * touch.area * pressure
@@ -217,7 +218,7 @@ class LipContact:
     def coupling(self, displacements: Floats, part: float) -> Any:
         """∂ forces / ∂ displacements, (3n, 3n) N/mm, with the closest feature of each node frozen.
 
-        Over a face its normal is frozen, too; about an edge or a corner it turns, which stiffens.
+        On a face, the normal is frozen as well; on an edge or at a corner it rotates and stiffens.
         """
         del part
         rows, columns, data = [], [], []
@@ -243,18 +244,18 @@ class LipContact:
 
 
 def _touch(places: Floats, lip: Lip, other: Lip) -> _Touch:
-    """Where nodes of a lip lie in the other."""
+    """The nodes of a lip that are inside the other."""
     triangle, weights = _closest(places[lip.nodes], places, other.triangles)
     at = other.triangles[triangle]
     way = places[lip.nodes] - np.einsum("ck,cki->ci", weights, places[at])
     normal = _outward(places, other, triangle, weights)
     distance = np.linalg.norm(way, axis=1)
     behind = -(way * normal).sum(axis=1)
-    # What is closest to the border and not about behind it lies beside the surface.
+    # A node closest to the border is inside only if it is nearly straight behind it.
     least = np.where(_on_border(other, triangle, weights), BEHIND * distance, 0.0)
     inside = (behind > least) & (distance < DEEPEST)
     at, weights, depth = at[inside], weights[inside], distance[inside]
-    # On the surface itself the way has no direction, and no force.
+    # On the surface itself, the direction is undefined and the force zero.
     along = -way[inside] / np.maximum(depth, np.finfo(np.float64).tiny)[:, None]
     nodes = lip.nodes[inside]
     swing = _swing(along, places[at], weights)
@@ -287,7 +288,7 @@ def _closest(
 ) -> tuple[NDArray[np.int64], Floats]:
     """The triangle closest to each point, and the weights of its closest point.
 
-    Only the `CANDIDATES` triangles whose middles are nearest are looked at.
+    Only the `CANDIDATES` triangles with the nearest centroids are searched.
     """
     spatial = third_party("scipy.spatial", "contact of virtual patients is found", "study")
     tree = spatial.cKDTree(places[triangles].mean(axis=1))
@@ -300,7 +301,7 @@ def _closest(
         corners = places[triangles[candidate]]
         found = _weights(points, corners)
         apart = np.linalg.norm(points - np.einsum("ck,cki->ci", found, corners), axis=1)
-        # A tie goes to the lower number, so that the result does not depend on the order.
+        # The lower index wins a tie, so that the result does not depend on the order.
         closer = (apart < best) | ((apart == best) & (candidate < triangle))
         best[closer], triangle[closer] = apart[closer], candidate[closer]
         weights[closer] = found[closer]
@@ -310,7 +311,7 @@ def _closest(
 def _weights(points: Floats, corners: Floats) -> Floats:
     """Barycentric weights of the points of triangles (c, 3, 3) closest to points (c, 3).
 
-    The projection into the plane if it lies in the triangle, else the closest point of the edges.
+    The projection onto the plane if it is inside the triangle, otherwise the closest edge point.
     """
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     normal = np.cross(b - a, c - a)
@@ -338,8 +339,8 @@ def _weights(points: Floats, corners: Floats) -> Floats:
 def _outward(places: Floats, lip: Lip, triangle: NDArray[np.int64], weights: Floats) -> Floats:
     """Outward unit vectors at points of triangles, (c, 3), also right on edges and corners.
 
-    Angle-weighted normals (Bærentzen & Aanæs 2005): of the face inside it, of the two faces on an
-    edge, of all faces about a corner.
+    Angle-weighted normals (Bærentzen & Aanæs 2005): of one face in its interior, of both faces on
+    an edge, of all adjacent faces at a corner.
     """
     triangles = lip.triangles
     corners = places[triangles]
@@ -384,7 +385,7 @@ def _block_matrix(rows: NDArray[np.int64], columns: NDArray[np.int64], data: Flo
 
 @dataclass(frozen=True, eq=False)
 class ContactSum:
-    """Several contacts at once.
+    """Several contacts together.
 
     Attributes
     ----------
@@ -395,11 +396,11 @@ class ContactSum:
     contacts: tuple[Contact, ...]
 
     def energy(self, displacements: Floats, part: float) -> float:
-        """Of all, N·mm."""
+        """Sum of the energies, N·mm."""
         return sum(contact.energy(displacements, part) for contact in self.contacts)
 
     def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
-        """Of all, N and N/mm."""
+        """Sums of the forces, N, and of the nodes' stiffness, N/mm."""
         found = [contact.forces(displacements, part) for contact in self.contacts]
         return (
             np.asarray(sum(force for force, _ in found)),
@@ -407,7 +408,7 @@ class ContactSum:
         )
 
     def coupling(self, displacements: Floats, part: float) -> Any:
-        """Of all that couple nodes; none if none does."""
+        """Sum of the couplings; None if no contact couples nodes."""
         found = [contact.coupling(displacements, part) for contact in self.contacts]
         coupled = [matrix for matrix in found if matrix is not None]
         return sum(coupled[1:], start=coupled[0]) if coupled else None

@@ -1,8 +1,8 @@
 """The open mouth of a virtual patient: lips apart down to the tooth rows, and no tissue between.
 
-The skin of the phantom has a slit that ends in front of the teeth, and a CT shows no more. Lips
-that touch and slide need walls of their own: here the slit goes through, from corner to corner, and
-meets the space between the tooth rows, all as level functions, so that the mesh has smooth walls.
+The slit in the skin of the phantom ends in front of the teeth, as on a CT. Lips that touch and
+slide need separate surfaces: here the slit extends from corner to corner and back to the space
+between the tooth rows. Everything is a level function, so that the surfaces of the mesh are smooth.
 """
 
 from dataclasses import dataclass, replace
@@ -20,21 +20,21 @@ from cmfsim.values.anatomy import Anatomy
 
 __all__ = ["LEAST_GAP", "MARGIN", "MouthSlit", "with_open_mouth"]
 
-# Of the slit between the lips in the drawn head, mm: distance from the midline and height of its
-# line, as the phantom's skin has them. Its thickness is the same to near the corner, for the mesh
-# does not resolve a slit that narrows as the skin's does.
+# The slit between the lips in the canonical head, mm: distance from the midline and height of its
+# line, as in the phantom's skin. Its thickness is constant almost to the corner, because the mesh
+# does not resolve a slit that narrows like the skin's.
 DISTANCE = np.array([0.0, 12.0, 25.0])
 LINE = np.array([-44.4, -44.0, -44.5])
-# It is rounded off from here to its end, mm from the midline: the corner of the mouth.
+# It is rounded from here to its end, mm from the midline: the corner of the mouth.
 ROUNDED_FROM, CORNER = 20.0, 23.5
-# Lips must be this far apart in the phantom, mm: a slit narrower than that closes in the mesh.
+# Smallest gap between the lips of the phantom, mm: a narrower slit closes in the mesh.
 LEAST_GAP = 1.0
-# Lips reach this far above and below the line of the mouth and to the side, mm, and past the middle
-# of the tooth rows; the parts of them that meet the other lip end by a margin before that, so that
-# nothing is closest to a border.
+# Extent of the lips above and below the line of the mouth, to the side, and past the middle of the
+# tooth rows, mm. The parts that may touch the other lip are smaller by a margin, so that no closest
+# point is at a border.
 LIP_HEIGHT, LIP_SIDE, LIP_BACK = 16.0, 25.0, 4.0
 MARGIN = 4.0
-# Spacing of the surfaces of the tooth rows, and up to where their distance is known, mm.
+# Spacing of the surfaces of the tooth rows, and the range of their distances, mm.
 TEETH_SPACING, TEETH_REACH = 1.0, 12.0
 
 
@@ -45,12 +45,12 @@ class MouthSlit:
     Attributes
     ----------
     head : PhantomHead
-        Its lips stand apart by `LEAST_GAP` or more.
+        With a gap between the lips of `LEAST_GAP` or more.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) Lips nearer to each other.
+        (also `ValueError`) The gap is smaller.
     """
 
     head: PhantomHead
@@ -64,14 +64,14 @@ class MouthSlit:
             )
 
     def _drawn(self, points: Floats) -> tuple[Floats, Floats, Floats]:
-        """Distance from the midline, place from front to back and height in the drawn head."""
+        """Distance from the midline, front-to-back position, height in the canonical head, mm."""
         p = self.head.parameters
         u, v, w = self.head.warp.inverse(*np.asarray(points, dtype=np.float64).T)
         u, v, w = JawWarp(p, soft=True).inverse(np.abs(u), v, w)
         return np.asarray(u), np.asarray(v), np.asarray(w)
 
     def height(self, points: Floats) -> Floats:
-        """Height of points (k, 3) over the line of the mouth, (k,) mm; below it negative."""
+        """Height of points (k, 3) above the line of the mouth, (k,) mm; negative below it."""
         u, _, w = self._drawn(points)
         return np.asarray(self.head.parameters.scale * (w - np.interp(u, DISTANCE, LINE)))
 
@@ -86,9 +86,9 @@ class MouthSlit:
         return np.asarray(p.scale * np.minimum(level, _arch(u) - v))
 
     def lips(self, points: Floats, margin: float = 0.0) -> NDArray[np.int8]:
-        """Which lip points (k, 3) belong to, (k,): 1 the upper, −1 the lower, 0 none.
+        """The lip to which points (k, 3) belong, (k,): 1 the upper, −1 the lower, 0 none.
 
-        With a margin, mm, only what is further inside than that.
+        With a margin, mm, only points further inside than that count.
         """
         u, v, _ = self._drawn(points)
         height = self.height(points)
@@ -98,7 +98,7 @@ class MouthSlit:
 
 
 def _arch(u: Floats) -> Floats:
-    """Place from front to back of the middle line of the upper tooth row, mm."""
+    """Position from front to back of the middle line of the upper tooth row, mm."""
     x, y = np.array(UPPER_ARCH).T
     return np.asarray(np.interp(u, x, y))
 
@@ -112,12 +112,12 @@ def with_open_mouth(head: PhantomHead, anatomy: Anatomy, bite: float) -> Anatomy
     anatomy : Anatomy
         Level images of it.
     bite : float, mm
-        Where the distances from both tooth rows come to less, taken together, is no tissue.
+        There is no tissue where the distances to both tooth rows add up to less than this.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) The lips are nearer to each other than `LEAST_GAP`.
+        (also `ValueError`) The gap between the lips is smaller than `LEAST_GAP`.
     """
     slit = MouthSlit(head)
     skin = anatomy.skin
@@ -141,7 +141,7 @@ def with_open_mouth(head: PhantomHead, anatomy: Anatomy, bite: float) -> Anatomy
     for row in rows:
         surface = Surface(row.vertices, row.triangles)
         between += signed_distance_image(surface, shape, (sx, sy, sz), (x, y, z), band=TEETH_REACH)
-    # Half, for the sum of two distances changes twice as fast as one.
+    # Half, because the sum of two distances changes twice as fast as one of them.
     air = np.maximum(air, 0.5 * between)
     values = np.array(skin.values)
     index = tuple(slice(a, b) for a, b in zip(first, last, strict=True))

@@ -1,4 +1,4 @@
-"""The operation on the true tissue: what bones hold, what is stripped off them, what they push."""
+"""The operation on the true tissue: nodes attached to bone, stripped off it, and pushed by it."""
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -28,36 +28,36 @@ __all__ = [
     "without_gaps",
 ]
 
-# Tissue is stripped off both sides of a cut as a surgeon lifts the periosteum there: by this
-# length, mm, and by this multiple of how far the two sides part.
+# Tissue is stripped off both sides of a cut, as a surgeon lifts the periosteum there: over this
+# length, mm, plus this multiple of the distance by which the two sides separate.
 STRIPPED, STRIPPED_PER_SHIFT = 5.0, 1.5
-# Shifts below this are none, mm.
+# Shifts below this count as zero, mm.
 LEAST_SHIFT = 1e-6
-# Between bones that move against each other is no tissue within their shift and this, mm; cosine of
-# the angle between the ways to them from which on they count as one wall.
+# There is no tissue between bones that move relative to each other, within their shift plus this,
+# mm; cosine of the angle between the directions to them above which they count as one wall.
 BETWEEN, SAME_SIDE = 2.0, 0.5
-# A tet that bones hold at all four nodes may not change its volume to less than this part.
+# Smallest ratio of volumes of a tet with all four nodes attached to bone.
 LEAST_HELD_RATIO = 0.3
-# Up to this far from a bone its distance is known, on a grid of this spacing with this much room
-# about the tissue, mm: more than bones move in a step, or a gap is wide.
+# Distances to bone are known within this reach, on a grid of this spacing with this margin around
+# the tissue, mm: more than bones move in a step, and more than the width of a gap.
 REACH, SPACING, ROOM = 12.0, 1.5, 8.0
 
 
 @dataclass(frozen=True, eq=False)
 class Operation:
-    """What the bones do to the tissue.
+    """How the bones act on the tissue.
 
     Attributes
     ----------
     held : (k,) int64
-        Nodes that bones, or the planes that end the tissue, hold.
+        Nodes attached to bone, or fixed where the tissue ends.
     owner : (k,) int64
-        The segment that each is joined to, as an index into `motion`; −1: it stays.
+        Segment to which each is joined, as an index into `motion`; −1 if it does not move.
     motion : mapping of str to callable
-        The rigid motion (4, 4) of each segment after a part of its way, 0 to 1.
+        Rigid motion (4, 4) of each segment after a fraction of it, 0 to 1.
     contact : BoneContact
     stripped : int
-        Nodes that the operation freed from bone.
+        Number of nodes that the operation detached from bone.
     points : (k, 3) float64, mm
         The held nodes at rest.
     """
@@ -70,7 +70,7 @@ class Operation:
     points: Floats
 
     def path(self, part: float) -> Floats:
-        """The displacements of the held nodes after a part of the motion, (k, 3) mm."""
+        """Displacements of the held nodes after a fraction of the motion, (k, 3) mm."""
         moved = np.zeros_like(self.points)
         for number, motion in enumerate(self.motion.values()):
             mine = self.owner == number
@@ -81,7 +81,7 @@ class Operation:
 
 
 def screw(matrix: Floats, centre: Floats) -> Callable[[float], Floats]:
-    """The rigid motion (4, 4) after a part of it: the turn about a centre grows with the shift.
+    """The rigid motion (4, 4) after a fraction of it: rotation and translation grow together.
 
     Parameters
     ----------
@@ -100,10 +100,9 @@ def screw(matrix: Floats, centre: Floats) -> Callable[[float], Floats]:
 
 
 def bone_distances(nodes: Floats, segments: Mapping[str, BoneSegment]) -> dict[str, ImageData]:
-    """The depth in each segment, negative outside, mm, in the box of nodes and some room about it.
+    """Depth inside each segment, negative outside, mm, in the bounding box of nodes plus `ROOM`.
 
-    Unlike a segment's level, which knows two voxels about its surface, it is a distance up to
-    `REACH`.
+    A segment's level is a distance only within two voxels of its surface, this one up to `REACH`.
 
     Parameters
     ----------
@@ -127,15 +126,15 @@ def bone_distances(nodes: Floats, segments: Mapping[str, BoneSegment]) -> dict[s
 def without_bite(
     nodes: Floats, tets: NDArray[Any], upper: ImageData, lower: ImageData, gap: float
 ) -> NDArray[np.bool_]:
-    """Which tets are tissue, (m,): not in the slit between the tooth rows, where there is none.
+    """Which tets are tissue, (m,): those outside the gap between the tooth rows.
 
     Parameters
     ----------
     nodes, tets : (n, 3) mm, (m, 4)
     upper, lower : ImageData
-        Depths in the bones that bear the teeth.
+        Depths inside the bones that bear the teeth.
     gap : float, mm
-        A tet whose middle has both within this, taken together, lies between them.
+        A tet lies between them if the distances of its centroid to both add up to less than this.
     """
     middles = nodes[tets].mean(axis=1)
     return -upper.sample(middles) - lower.sample(middles) >= gap
@@ -148,21 +147,21 @@ def without_gaps(
     motions: Mapping[str, Floats],
     kept_between: Collection[str] = (),
 ) -> NDArray[np.bool_]:
-    """Which tets are tissue, (m,): not between bones that part or close, where none is left.
+    """Which tets are tissue, (m,): those not in the gap of two bones that move apart or together.
 
-    A surgeon opens these gaps, strips what is in them and takes bone away where segments meet. A
-    tet lies between two bones if its middle has both within their shift and `BETWEEN`, taken
-    together, and does not see both on the same side.
+    A surgeon opens these gaps, strips the tissue in them and removes bone where segments meet. A
+    tet lies between two bones if the distances of its centroid to both add up to less than their
+    shift plus `BETWEEN`, and the bones are not on the same side of it.
 
     Parameters
     ----------
     nodes, tets : (n, 3) mm, (m, 4)
     distances : mapping of str to ImageData
-        As `bone_distances` gives them.
+        As returned by `bone_distances`.
     motions : mapping of str to (4, 4) float64, mm
         Of each of them.
     kept_between : collection of str
-        Bones between which tissue stays: jaws that no cut separates, and whose mouth is open.
+        Bones between which tissue is kept: jaws that no cut separates, if the mouth is open.
     """
     middles = nodes[tets].mean(axis=1)
     kept = np.ones(len(middles), dtype=bool)
@@ -180,7 +179,7 @@ def without_gaps(
 
 
 def _towards(depth: ImageData, points: Floats) -> Floats:
-    """Unit vectors to a bone, (k, 3)."""
+    """Unit vectors towards a bone, (k, 3)."""
     steps = np.diag(depth.spacing)
     slope = np.column_stack([depth.sample(points + s) - depth.sample(points - s) for s in steps])
     length = np.linalg.norm(slope, axis=1, keepdims=True)
@@ -198,10 +197,10 @@ def operate(
     plan: Mapping[str, Floats],
     bared: NDArray[Any] | None = None,
 ) -> Operation:
-    """The operation of a plan on tissue whose nodes have their kinds.
+    """The operation that carries out a plan on tissue with classified nodes.
 
-    Joined and fixed nodes near a cut whose sides part are stripped off the bone: like sliding
-    nodes, they are then free of it and only pushed by it.
+    Joined and fixed nodes near a cut whose sides separate are stripped off the bone. Like sliding
+    nodes, they are then free, and bone can only push them.
 
     Parameters
     ----------
@@ -211,18 +210,18 @@ def operate(
         Boundary triangles.
     kinds : NodeKinds
     distances : mapping of str to ImageData
-        The depth in each segment.
+        Depth inside each segment.
     centres : mapping of str to (3,) float64, mm
-        About which each turns on its way.
+        Centre about which each segment rotates.
     plan : mapping of str to (4, 4) float64, mm
-        Segments that it does not name stay.
+        Segments that are not named do not move.
     bared : (k,) whole numbers, optional
-        Free nodes that may touch bone as well: of tissue that was opened.
+        Other free nodes that may touch bone, because the tissue next to them was opened.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) The plan moves what is no segment; scipy is not installed.
+        (also `ValueError`) The plan names an unknown segment; scipy is not installed.
     """
     for name in plan:
         if name not in distances:
@@ -259,11 +258,11 @@ def operate(
 
 
 def _near_cuts(nodes: Floats, held: NDArray[np.bool_], targets: Floats) -> NDArray[np.bool_]:
-    """Which held nodes lie so near to held nodes of another motion that tissue is stripped."""
+    """Which held nodes are stripped, being close to held nodes that move differently."""
     spatial = third_party("scipy.spatial", "virtual patients are made", "study")
     ids = np.flatnonzero(held)
     tree = spatial.cKDTree(nodes[ids])
-    # Largest shift between any two parts bounds the search.
+    # Twice the largest motion bounds the shift between any two nodes.
     most = float(np.linalg.norm(targets[ids], axis=1).max(initial=0.0))
     reach = STRIPPED + STRIPPED_PER_SHIFT * 2.0 * most
     found = np.zeros(len(nodes), dtype=bool)
@@ -274,7 +273,7 @@ def _near_cuts(nodes: Floats, held: NDArray[np.bool_], targets: Floats) -> NDArr
         near = np.array(tree.query_ball_point(nodes[ids[one]], reach))
         shift = np.linalg.norm(targets[ids[near]] - targets[ids[one]], axis=1)
         apart = np.linalg.norm(nodes[ids[near]] - nodes[ids[one]], axis=1)
-        # Within one rigid segment a turn shifts neighbours by its angle times their distance.
+        # Within a rigid segment, rotation shifts neighbours by its angle times their distance.
         torn = (shift > 0.5 * apart) & (apart < STRIPPED + STRIPPED_PER_SHIFT * shift)
         if torn.any():
             found[ids[one]] = True
@@ -285,7 +284,7 @@ def _near_cuts(nodes: Floats, held: NDArray[np.bool_], targets: Floats) -> NDArr
 def _crushed(
     nodes: Floats, tets: NDArray[Any], held: NDArray[np.bool_], targets: Floats
 ) -> NDArray[np.bool_]:
-    """Which nodes belong to tets that bones hold at every node and would turn inside out."""
+    """Which nodes belong to tets that are attached to bone at every node and would be inverted."""
     found = np.zeros(len(nodes), dtype=bool)
     whole = tets[held[tets].all(axis=1)]
     if len(whole):
@@ -301,7 +300,7 @@ def _volumes(nodes: Floats, tets: NDArray[Any]) -> Floats:
 
 
 def node_areas(nodes: Floats, triangles: NDArray[Any]) -> Floats:
-    """A third of the area of the boundary triangles about each node, mm²."""
+    """A third of the area of the boundary triangles around each node, mm²."""
     corners = nodes[triangles]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1) / 6.0

@@ -41,16 +41,15 @@ __all__ = [
 _log = logging.getLogger(__name__)
 
 
-# Standard deviations, mm: of a landmark's place along each axis, on the skull as one operator
-# repeats it, on the skin as the mean of several is; of the noise of a surface scanner at a point,
-# and of its waves.
+# Standard deviations, mm: of a landmark along each axis, on the skull for one operator and on the
+# skin for the mean of several; of a surface scanner's noise at a point, and of its waves.
 SKULL_NOISE, SKIN_NOISE = 0.7, 0.3
 SCAN_WHITE, SCAN_SMOOTH = 0.1, 0.2
-# Numbers that keep the draws of one patient apart, beside the seed and the patient's number.
+# Numbers that make the draws of one patient independent, next to seed and patient number.
 CT_DRAW, SKULL_DRAW, SKIN_DRAW, SCAN_DRAW, AFTER_DRAW = range(5)
-# Edge length of the mesh that the case file asks for, in that of the truth.
+# Edge length of the mesh in the case file, relative to the true mesh.
 COARSER = 1.25
-# Who is made unless others are asked for.
+# Patients made by default.
 PATIENTS_WITH_JOINED_LIPS = tuple(n for n, p in PATIENTS.items() if not p.separate_lips)
 TRUTH = "truth"
 RECORD = "truth.json"
@@ -71,8 +70,8 @@ def virtual_patients(
 ) -> list[Path]:
     """The case files of virtual patients, each in a folder of its own with the truth.
 
-    A patient who is there already, made with the same settings, is kept. `cohort.toml` in the
-    folder lists those who are complete, for `cmfsim study`.
+    Patients who exist already with the same settings are kept. `cohort.toml` in the folder lists
+    the complete ones, for `cmfsim study`.
 
     Parameters
     ----------
@@ -81,7 +80,7 @@ def virtual_patients(
     numbers : iterable of int
         1 to 6. Those whose lips meet, 5 and 6, take many times as long and are made on request.
     seed : int
-        Draws all noise; the same seed gives the same files.
+        Of all noise; the same seed produces the same files.
     edge_length : float, mm
         Of the true mesh.
     spacing : float, mm
@@ -141,7 +140,7 @@ def _write_cohort(folder: Path) -> None:
 
 
 def cohort_text(name: str, patients: Iterable[str]) -> str:
-    """The text of a `cohort.toml` beside the folders of patients."""
+    """The text of a `cohort.toml` next to the folders of patients."""
     lines = [
         "# `cmfsim study` with this file predicts every patient by every model.",
         f'format = "{COHORT_FORMAT}"',
@@ -170,27 +169,27 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
 ) -> Path:
     """The `case.toml` of a virtual patient, with CT and landmarks; the truth lies in `truth`.
 
-    *In silico*: a head made by code, an operation computed. Its tissue, mesh, muscles and contact
-    differ from those of the tested models; see docs/virtual_patients.md.
+    *In silico*: a synthetic head and a computed operation. Its tissue, mesh, muscles and contact
+    differ from those of the models under test; see docs/virtual_patients.md.
 
     Parameters
     ----------
     folder : path
-        Made if it is not there. An earlier truth in it is replaced once the new one is complete.
+        Created if needed. An earlier truth in it is replaced once the new one is complete.
     patient : int or VirtualPatient
-        1 to 6, or one that `drawn_patient` gives.
+        1 to 6, or a result of `drawn_patient`.
     seed : int
-        Draws the noise of CT, landmarks and scan.
+        Of the noise of CT, landmarks and scan.
     edge_length : float, mm
         Of the true mesh.
     refine : bool
-        Whether its tets are smaller where tissue is thin; they are where lips are separate.
+        Whether tets are smaller where tissue is thin; always so if the lips are separate.
     spacing : float, mm
         Of the CT.
     grid : float, mm
-        Spacing of the level images that the true mesh is made from.
+        Spacing of the level images from which the true mesh is made.
     skin_spacing : float, mm
-        Of the marching cubes that draw the skin.
+        Of the marching cubes that make the skin.
     options : EquilibriumOptions, optional
     progress : callable, optional
 
@@ -245,7 +244,7 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
     _write_truth(fresh, truth, _scan(truth, patient, seed), _landmarks_after(truth, patient, seed))
     settings = patient_settings(patient, seed, edge_length, spacing)
     _write_json(fresh / RECORD, _record(patient, truth, settings))
-    # Apart from the record, which the same seed reproduces to the last byte.
+    # In a separate file: the record is reproduced to the last byte by the same seed.
     times = {"seconds": time.perf_counter() - begun, "solve_seconds": truth.equilibrium.seconds}
     _write_json(fresh / TIMES, times)
     shutil.rmtree(folder / TRUTH, ignore_errors=True)
@@ -289,7 +288,7 @@ def _landmarks_after(
 def _record(
     patient: VirtualPatient, truth: PostoperativeTruth, settings: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What `truth.json` states: how the patient was made, and what the truth is."""
+    """Content of `truth.json`: how the patient was made, and the properties of the truth."""
     return {
         "what": "in silico: a synthetic head and a computed operation; no patient",
         "settings": settings,
@@ -312,12 +311,12 @@ def _write_json(path: Path, values: Mapping[str, Any]) -> None:
 
 
 def _draw(seed: int, patient: VirtualPatient, draw: int) -> int:
-    """A seed of one draw of one patient."""
+    """The seed of one draw for one patient."""
     return int(np.random.SeedSequence([seed, patient.number, draw]).generate_state(1)[0])
 
 
 def _placed(landmarks: Mapping[str, Floats], noise: float, seed: list[int]) -> dict[str, Floats]:
-    """Landmarks as they are placed, off by noise along each axis."""
+    """Landmarks with placement noise along each axis."""
     generator = np.random.default_rng(seed)
     return {
         label: point + noise * generator.standard_normal(3) for label, point in landmarks.items()
@@ -377,9 +376,9 @@ def _motion_lines(move: Relocation, skull: Mapping[str, Floats]) -> list[str]:
 def patient_settings(
     patient: VirtualPatient, seed: int, edge_length: float, spacing: float
 ) -> dict[str, Any]:
-    """What decides the files of a patient: kept in `truth.json`, and compared with it."""
-    # A drawn person is who the distributions of this version make of a number.
-    # Through JSON, so that tuples equal the lists that are read again.
+    """The settings that determine a patient's files; `truth.json` stores them for comparison."""
+    # A drawn patient depends on the distributions of this version.
+    # Through JSON, so that tuples equal the lists that are read back.
     drawn = patient.number > DRAWN
     person = {"person": json.loads(json.dumps(_described(patient)))} if drawn else {}
     return {
@@ -407,7 +406,7 @@ def _described(patient: VirtualPatient) -> dict[str, Any]:
 
 
 def _measured(truth: PostoperativeTruth) -> dict[str, Any]:
-    """What the solution says of itself."""
+    """Figures of the solution."""
     found = truth.equilibrium
     moved = truth.skin.vertices - truth.skin_before.vertices
     lips = truth.lips
@@ -457,7 +456,7 @@ def _write_truth(
 
 
 def is_made(folder: Path, settings: Mapping[str, Any]) -> bool:
-    """Whether a patient of these settings is there, complete."""
+    """Whether a complete patient with these settings exists."""
     record = folder / TRUTH / RECORD
     if not record.exists() or not (folder / "case.toml").exists():
         return False

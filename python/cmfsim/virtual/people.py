@@ -1,4 +1,4 @@
-"""The virtual patients P1 to P6: who they are, and what is done to them."""
+"""The virtual patients P1 to P6, and their operations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,13 +11,13 @@ __all__ = ["DRAWN", "PATIENTS", "Relocation", "VirtualPatient", "patient_named"]
 
 Triple = tuple[float, float, float]
 
-# Numbers above this are of patients drawn at random.
+# Numbers above this belong to patients drawn at random.
 DRAWN = 1000
 
 
 @dataclass(frozen=True)
 class Relocation:
-    """How a segment moves, in a planner's numbers (Kim et al. 2010, Table 2, is written so).
+    """The motion of a segment in a planner's numbers, as in Table 2 of Kim et al. (2010).
 
     Attributes
     ----------
@@ -38,29 +38,28 @@ class Relocation:
 
 @dataclass(frozen=True)
 class VirtualPatient:
-    """One person made by code, with the operation.
+    """A synthetic person with an operation.
 
     Attributes
     ----------
     number : int
     label : str
         Of the operation, in the paper's letters: MxA, MxSB maxilla advanced, set back; MA, MSB the
-        same of the mandible; G genioplasty.
+        same for the mandible; G genioplasty.
     parameters : HeadParameters
     muscle_thickness, muscle_stiffness : float
-        Of the true muscles, in those that the phantom draws and in the ordinary moduli.
+        Of the true muscles, relative to those of the phantom and to the default moduli.
     osteotomies : tuple of str
         Procedures, in their order.
     plan : mapping of str to Relocation
         By segment.
     separate_lips : bool
         Whether the true lips are separate down to the teeth and touch each other. Otherwise they
-        are one behind the slit that the skin shows, as on a CT.
+        are connected behind the slit in the skin, as on a CT.
     departures : mapping of str to Relocation
-        By segment, how the operation departs from the plan, on top of it. The case file has the
-        plan alone.
+        By segment, how the operation departs from the plan. The case file has only the plan.
     thickness_change : float
-        Share of its depth by which the soft tissue is thicker after the operation.
+        Swelling of the soft tissue after the operation, as a share of its depth.
     """
 
     number: int
@@ -87,8 +86,8 @@ class VirtualPatient:
 _BOTH_JAWS = ("le_fort_1", "bsso")
 _WITH_CHIN = ("le_fort_1", "bsso", "genioplasty")
 
-# Moves and people are ours, of the kind and size of the paper's four patients, not its numbers.
-# Lips stand 2 mm apart and teeth 2.5 mm, as in a patient who is scanned at rest.
+# People and motions are our own: of the kind and size of the paper's four patients, not its data.
+# Lips are 2 mm apart and teeth 2.5 mm, as in a patient who is scanned at rest.
 PATIENTS: Mapping[int, VirtualPatient] = MappingProxyType(
     {
         patient.number: patient
@@ -180,7 +179,7 @@ PATIENTS: Mapping[int, VirtualPatient] = MappingProxyType(
                     "chin": Relocation((-3.0, -1.5, 1.0), -2.0, (0.0, 0.0, 1.0), "infradentale"),
                 },
             ),
-            # Lips stand 2 mm apart here too: an open mandible widens `lip_gap`.
+            # Here too, lips are 2 mm apart: an open mandible widens `lip_gap`.
             # The mouth closes and the lower lip goes behind the upper one: turned about the
             # incisors, the mandible rises half as much at the molars.
             VirtualPatient(
@@ -233,7 +232,7 @@ def patient_named(number: int) -> VirtualPatient:
     Raises
     ------
     CaseError
-        (also `ValueError`) Another number than 1 to 6.
+        (also `ValueError`) A number other than 1 to 6.
     """
     if number not in PATIENTS:
         raise CaseInputError(f"patient is {number!r}: {', '.join(map(str, PATIENTS))} are there")

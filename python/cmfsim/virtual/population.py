@@ -1,7 +1,7 @@
 """Virtual patients drawn at random: shape, tissue, operation, plan and how it is carried out.
 
-docs/virtual_patients.md has the distributions with where they come from. A patient depends on seed
-and index alone, so that a population may be made in any order, in parts, and extended.
+docs/virtual_patients.md lists the distributions with their sources. A patient depends on seed and
+index only, so that a population can be made in any order, in parts, and extended.
 """
 
 from collections.abc import Mapping
@@ -30,12 +30,12 @@ OPERATIONS = (
 LABELS: Mapping[str, str] = {"le_fort_1": "Mx", "bsso": "M", "genioplasty": "G"}
 # By how much the mandible of a patient is too long or too short, mm; half of them each.
 DISCREPANCY: Distribution = (4.0, 1.2, 2.0)
-# What a plan moves, mm.
+# Motions of a plan, mm.
 MAXILLA_FORWARDS: Distribution = (4.0, 1.9, 3.0)
 MAXILLA_UP: Distribution = (0.5, 1.5, 3.0)
 CHIN_FORWARDS: Distribution = (3.0, 1.5, 3.0)
-# Of the mandible, beyond what corrects its length, and the share of the maxilla's way that it
-# follows.
+# Motion of the mandible beyond the correction of its length, and the share of the maxilla's motion
+# that it follows.
 MANDIBLE_BEYOND: Distribution = (0.0, 1.0, 2.0)
 MANDIBLE_UP: Distribution = (0.5, 0.5, 1.0)
 FOLLOWS = 0.5
@@ -43,22 +43,22 @@ FOLLOWS = 0.5
 LONGER = 0.5
 # Turns about the transverse axis, degrees.
 PITCH: Distribution = (0.0, 1.5, 3.0)
-# The shortest way of a mandible that is operated, mm.
+# The shortest motion of a mandible that is operated, mm.
 LEAST_WAY = 2.0
-# Of the logarithm of what sets a person's muscles apart from the phantom's.
+# Of the logarithm of the ratio of a person's muscles to the phantom's.
 MUSCLE_THICKNESS: Distribution = (0.0, 0.12, 0.25)
 MUSCLE_STIFFNESS: Distribution = (0.0, 0.5, 1.0)
-# Between the lips, mm, as in a patient who is scanned at rest; and between the teeth.
+# Gap between the lips, mm, as in a patient who is scanned at rest; and between the teeth.
 LIP_GAP: Distribution = (2.0, 0.5, 1.0)
 BITE_GAP = 2.5
-# Errors of the execution are cut at so many standard deviations: beyond, it is another operation.
+# Errors of execution are limited to this many standard deviations.
 MOST_ERRORS = 2.0
-# Of a chin beside the jaw that it is cut from, mm along each axis.
+# Of a chin relative to the jaw from which it is cut, mm along each axis.
 CHIN_ERROR = 0.5
 # Of the soft tissue, as a share of its depth.
 THICKNESS_CHANGE = next(source.sd for source in ADDED if source.name == "thickness change")
-# The share of a `HeadParameters` range, about its middle, that is drawn from: at the ends of
-# several ranges at once no person is.
+# Central share of a `HeadParameters` range from which values are drawn: no person is at the ends of
+# several ranges at once.
 MIDDLE = 0.7
 SHAPES = (
     "scale",
@@ -80,7 +80,7 @@ class _Draws:
         self.generator = np.random.default_rng([seed, index])
 
     def within(self, distribution: Distribution) -> float:
-        """A normal draw, cut at the largest departure, rounded as a plan is written."""
+        """A normal draw, limited to the largest departure and rounded as in a plan."""
         mean, sd, most = distribution
         off = float(np.clip(sd * self.generator.standard_normal(), -most, most))
         return round(mean + off, 2)
@@ -91,24 +91,24 @@ class _Draws:
 
 
 def drawn_patient(seed: int, index: int) -> VirtualPatient:
-    """The patient of an index in the population of a seed.
+    """One patient of the population that belongs to a seed.
 
     Parameters
     ----------
     seed : int
         0 or more.
     index : int
-        1 or more; the patient is called D and this number.
+        1 or more; the patient is named D with this number.
 
     Returns
     -------
     VirtualPatient
-        The same for the same seed and index, whatever else is drawn.
+        Always the same for the same seed and index.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) A seed or index that is no whole number of its range.
+        (also `ValueError`) A seed or index that is not a whole number in its range.
 
     Examples
     --------
@@ -147,7 +147,7 @@ def _person(draws: _Draws, *, only_maxilla: bool) -> HeadParameters:
         values[name] = round(middle + MIDDLE * (getattr(extreme, name) - middle), 4)
     longer = bool(draws.generator.random() < LONGER)
     excess = draws.within(DISCREPANCY)
-    # A maxilla is advanced by itself where the mandible is the longer one.
+    # A maxilla is advanced alone if the mandible is too long.
     values["mandible_advance"] = excess if longer or only_maxilla else -excess
     return replace(ordinary, **values, lip_gap=draws.within(LIP_GAP), bite_gap=BITE_GAP)
 
@@ -155,7 +155,7 @@ def _person(draws: _Draws, *, only_maxilla: bool) -> HeadParameters:
 def _plan(
     draws: _Draws, person: HeadParameters, osteotomies: tuple[str, ...]
 ) -> dict[str, Relocation]:
-    """What a planner would make of the person."""
+    """The plan that a surgeon would make for the person."""
     plan = {}
     forwards, up, pitch = (draws.within(d) for d in (MAXILLA_FORWARDS, MAXILLA_UP, PITCH))
     if "le_fort_1" in osteotomies:
@@ -169,7 +169,7 @@ def _plan(
         plan["mandible_body"] = Relocation((left, back, up), pitch, centre="infradentale")
     chin = draws.within(CHIN_FORWARDS)
     if "genioplasty" in osteotomies:
-        # With the body of the mandible, and further forward.
+        # Moves with the body of the mandible, and further forward.
         way = (left, round(back - chin, 2), up)
         plan["chin"] = Relocation(way, pitch, centre="infradentale")
     return plan
@@ -178,7 +178,7 @@ def _plan(
 def _departures(draws: _Draws, plan: Mapping[str, Relocation]) -> dict[str, Relocation]:
     """How the operation departs from the plan.
 
-    Jaws that are both operated are off together: a splint holds them in occlusion.
+    If both jaws are operated, they depart together, since a splint holds them in occlusion.
     """
     left, back, up, pitch, roll, yaw = (draws.error(source.sd) for source in PLAN)
     angle = float(np.linalg.norm([pitch, roll, yaw]))

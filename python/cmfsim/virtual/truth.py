@@ -1,4 +1,4 @@
-"""The face that an operation truly makes of a virtual patient: mesh, tissue, equilibrium, skin."""
+"""A virtual patient's true face after an operation: mesh, tissue, equilibrium, skin."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from cmfsim.pipeline.building import build_model
 from cmfsim.progress import Progress, no_progress
 from cmfsim.surfaces.depth import tissue_depth
 from cmfsim.surfaces.topology import tet_bodies
-from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.node_kinds import NodeKinds
@@ -48,15 +48,16 @@ from cmfsim.virtual.people import VirtualPatient
 __all__ = ["PostoperativeTruth", "largest_body", "postoperative_truth"]
 
 
-# Tissue of which the tooth rows together are nearer than the bite's own gap and this, mm, is none.
+# Where the sum of the distances to both tooth rows is less than the gap of the bite plus this, mm,
+# there is no tissue.
 BEYOND_BITE = 1.5
-# The same where the mouth is open and no other tissue is taken from between the jaws, mm.
+# The same if the mouth is open, and nothing else is removed from between the jaws, mm.
 BEYOND_OPEN_BITE = 4.0
-# Tissue is held from this height over the nasion on, mm: no operation of the jaws moves skin there.
+# Tissue is fixed from this height above the nasion, mm: no jaw surgery moves the skin there.
 ABOVE_NASION = 20.0
-# Parts of the motion where lips may meet.
+# Steps in which the bones move if the lips may touch.
 STEPS_WITH_LIPS = 6
-# Tissue that becomes thicker or thinner, mm: below lie cartilage (nose), eye, muscle and airway.
+# Depth to which tissue swells or shrinks, mm: deeper lie cartilage, eye, muscle and airway.
 MOST_SWELLING = 12.0
 # Nodes within this distance from the skin lie on it, mm.
 NEAR_SKIN = 0.5
@@ -64,7 +65,7 @@ NEAR_SKIN = 0.5
 
 @dataclass(frozen=True, eq=False)
 class PostoperativeTruth:
-    """A virtual patient after the operation, without the noise of a scanner.
+    """A virtual patient after the operation, without scanner noise.
 
     Attributes
     ----------
@@ -80,16 +81,16 @@ class PostoperativeTruth:
     segments : mapping of str to BoneSegment
         Before it.
     motions : mapping of str to (4, 4) float64, mm
-        Of every segment, as it was operated: the plan with the patient's departures from it. Those
-        that stay have the identity.
+        Actual motion of every segment: the plan plus the patient's departures from it; the identity
+        for segments that do not move.
     equilibrium : Equilibrium
     operation : Operation
     volume_ratios : (m,) float64
-        Volume after over before, of each tet.
+        Ratio of each tet's volume after the operation to that before.
     last_step : float, mm
-        The most that the last Newton iteration moved the skin.
+        Largest motion of the skin in the last Newton iteration.
     lips : LipContact or None
-        The contact of the lips, where these are separate.
+        The contact of the lips, if they are separate.
     """
 
     nodes: Floats
@@ -111,7 +112,7 @@ class PostoperativeTruth:
 
     @property
     def penetration(self) -> float:
-        """The deepest that any node lies in a bone, mm."""
+        """Largest depth of a node inside a bone, mm."""
         depths = self.operation.contact.depths(self.displacements, 1.0)
         return max((float(depth.max(initial=0.0)) for depth in depths.values()), default=0.0)
 
@@ -129,40 +130,40 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     lip_contact: bool = True,
     progress: Progress | None = None,
 ) -> PostoperativeTruth:
-    """The face after the operation of a case, by other means than those that are tested on it.
+    """The face after the operation of a case, computed independently of the models under test.
 
-    Bones are cut as the case says, and moved as it says but for the patient's departures from the
-    plan. All else is the person's own: anatomy from level functions instead of a segmented CT, a
-    mesh of its own edge length, the true muscles, hyperelastic tissue without small-strain limit,
-    contact that pushes and never pulls, periosteum stripped at the cuts, no tissue between the
-    tooth rows, skin that swells.
+    Bones are cut and moved according to the case, plus the patient's departures from the plan.
+    Everything else belongs to the virtual patient: anatomy from level functions instead of a
+    segmented CT, a separate mesh, the true muscles, hyperelastic tissue under large strain, contact
+    that pushes and never pulls, periosteum stripped at the cuts, no tissue between the tooth rows,
+    and skin that swells.
 
     Parameters
     ----------
     patient : VirtualPatient
-        Says how muscles differ from those that the phantom draws.
+        How the true muscles differ from those of the phantom, and the departures from the plan.
     head : PhantomHead
     case : Case
-        Osteotomies, plan and landmarks of it are used, its image is not read.
+        Its osteotomies, plan and landmarks are used; its image is not read.
     edge_length : float, mm
         Of the true mesh.
     refine : bool
-        Whether its tets are smaller where tissue is thin; they are where lips are separate.
+        Whether tets are smaller where tissue is thin; always so if the lips are separate.
     grid : float, mm
-        Spacing of the level images that the mesh is made from.
+        Spacing of the level images from which the mesh is made.
     skin_spacing : float, mm
-        Of the marching cubes that draw the skin.
+        Of the marching cubes that make the skin.
     options : EquilibriumOptions, optional
-        Where lips are separate the motion has `STEPS_WITH_LIPS` parts, if it is not given.
+        By default, `STEPS_WITH_LIPS` steps if the lips are separate.
     lip_contact : bool
-        False: separate lips do not touch each other but pass, to see what their contact does.
+        False lets separate lips pass through each other, to show the effect of their contact.
     progress : callable, optional
         Called with the name of each stage as it begins.
 
     Raises
     ------
     CmfsimError
-        (also `ValueError` where the input is at fault) What a stage cannot work with.
+        (also `ValueError` if the input is at fault) Any error of a stage.
     """
     stage = progress or no_progress
     length = as_positive("edge_length", edge_length)
@@ -171,13 +172,8 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
         options = EquilibriumOptions(steps=STEPS_WITH_LIPS)
     fine = _true_case(case, head, length, refine=refine or separate)
     stage("drawing the true anatomy")
-    anatomy = head.anatomy(as_positive("grid", grid))
-    bite = head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE
-    slit = MouthSlit(head) if separate else None
-    if slit is not None:
-        bite += BEYOND_OPEN_BITE - BEYOND_BITE
-        anatomy = with_open_mouth(head, anatomy, bite)
-    model = build_model(fine, progress=progress, check=False, anatomy=anatomy)
+    drawn = _drawn(head, as_positive("grid", grid), separate_lips=separate)
+    model = build_model(fine, progress=progress, check=False, anatomy=drawn.anatomy)
     segments = {segment.name: segment for segment in model.segments}
     motions = {name: _departure(patient, head, name) @ _motion(case, name) for name in segments}
 
@@ -189,34 +185,20 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
         model.kinds,
         distances,
         motions,
-        gap=bite,
-        open_mouth=slit is not None,
+        gap=drawn.bite,
+        open_mouth=drawn.slit is not None,
     )
     nodes, tets = opened.nodes, opened.tets
 
     stage("placing the true muscles")
     muscles = thickened(head.muscles, patient.muscle_thickness)
-    depth = anatomy.skin.sample(nodes)
+    depth = drawn.anatomy.skin.sample(nodes)
     fraction, fibre = muscle_field(head, muscles, nodes, tets, np.maximum(depth, 0.0))
     tissue = HyperelasticTissue.mixed(fraction, fibre, stiffness=patient.muscle_stiffness)
 
     stage("moving the bones")
     body = HyperelasticBody(nodes, tets, tissue)
-    boundary = TetMesh(nodes, tets).boundary_triangles()
-    lips, bared = None, opened.bared
-    if slit is not None:
-        lips = LipContact(nodes, *lips_of(slit, nodes, boundary, node_areas(nodes, boundary)))
-        bared = np.union1d(bared, np.concatenate([lips.upper.nodes, lips.lower.nodes]))
-    operation = operate(
-        nodes,
-        tets,
-        boundary,
-        opened.kinds,
-        distances=distances,
-        centres={name: s.surface.vertices.mean(axis=0) for name, s in segments.items()},
-        plan=motions,
-        bared=bared,
-    )
+    operation, lips = _operated(opened, drawn.slit, distances, segments, motions)
     contact: Contact = operation.contact
     if lips is not None and lip_contact:
         contact = ContactSum((operation.contact, lips))
@@ -249,7 +231,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
 
 
 def _true_case(case: Case, head: PhantomHead, edge_length: float, *, refine: bool) -> Case:
-    """The case as the true model is built from it: its own mesh, no muscles, nothing afterwards."""
+    """The case from which the true model is built: no muscles, nothing after the operation."""
     return replace(
         case,
         region=replace(case.region, upper=float(head.skull_landmarks["nasion"][2]) + ABOVE_NASION),
@@ -259,6 +241,52 @@ def _true_case(case: Case, head: PhantomHead, edge_length: float, *, refine: boo
         muscles=None,
         postoperative=None,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """The head's true anatomy; its mouth is open where the lips are separate."""
+
+    anatomy: Anatomy
+    # Gap between the tooth rows without tissue, mm.
+    bite: float
+    slit: MouthSlit | None
+
+
+def _drawn(head: PhantomHead, grid: float, *, separate_lips: bool) -> _Drawn:
+    anatomy = head.anatomy(grid)
+    bite = head.parameters.bite_gap * head.parameters.scale + BEYOND_BITE
+    if not separate_lips:
+        return _Drawn(anatomy, bite, None)
+    bite += BEYOND_OPEN_BITE - BEYOND_BITE
+    return _Drawn(with_open_mouth(head, anatomy, bite), bite, MouthSlit(head))
+
+
+def _operated(
+    tissue: "_Opened",
+    slit: MouthSlit | None,
+    distances: Mapping[str, ImageData],
+    segments: Mapping[str, BoneSegment],
+    motions: Mapping[str, Floats],
+) -> tuple[Operation, LipContact | None]:
+    """The operation on the tissue, and the contact of the lips where they are separate."""
+    nodes, tets = tissue.nodes, tissue.tets
+    boundary = TetMesh(nodes, tets).boundary_triangles()
+    lips, bared = None, tissue.bared
+    if slit is not None:
+        lips = LipContact(nodes, *lips_of(slit, nodes, boundary, node_areas(nodes, boundary)))
+        bared = np.union1d(bared, np.concatenate([lips.upper.nodes, lips.lower.nodes]))
+    operation = operate(
+        nodes,
+        tets,
+        boundary,
+        tissue.kinds,
+        distances=distances,
+        centres={name: s.surface.vertices.mean(axis=0) for name, s in segments.items()},
+        plan=motions,
+        bared=bared,
+    )
+    return operation, lips
 
 
 def _moved_skin(
@@ -293,7 +321,7 @@ def _motion(case: Case, segment: str) -> Floats:
 
 
 def _departure(patient: VirtualPatient, head: PhantomHead, segment: str) -> Floats:
-    """What the operation adds to the planned motion of a segment, (4, 4) mm."""
+    """The motion by which the operation departs from the plan of a segment, (4, 4) mm."""
     error = patient.departures.get(segment)
     if error is None:
         return np.eye(4)
@@ -302,7 +330,7 @@ def _departure(patient: VirtualPatient, head: PhantomHead, segment: str) -> Floa
 
 
 def _nearest(points: Floats, places: Floats) -> NDArray[np.intp]:
-    """The place that lies nearest to each point."""
+    """Index of the nearest place to each point."""
     spatial = third_party("scipy.spatial", "virtual patients are made", "study")
     return np.asarray(spatial.cKDTree(places).query(points)[1])
 
@@ -313,7 +341,7 @@ def _outward(
     after: Floats,
     segments: Mapping[str, BoneSegment],
 ) -> Floats:
-    """How far each vertex of the skin goes outward by a share of the tissue's depth, (v, 3) mm."""
+    """Swelling of each vertex of the skin: outward by a share of the tissue's depth, (v, 3) mm."""
     depth = tissue_depth(before.vertices, [segment.surface for segment in segments.values()])
     depth = np.minimum(depth, MOST_SWELLING)
     skin = Surface(before.vertices, before.triangles)
@@ -322,7 +350,7 @@ def _outward(
 
 @dataclass(frozen=True, eq=False)
 class _Opened:
-    """The tissue that is left when bite and gaps are open."""
+    """The tissue that remains when bite and gaps are open."""
 
     nodes: Floats
     tets: NDArray[np.uint32]
@@ -340,9 +368,9 @@ def _opened(
     gap: float,
     open_mouth: bool,
 ) -> _Opened:
-    """The largest body that is left without what lies between tooth rows and parted bones.
+    """The largest body that remains without the tissue between tooth rows and separated bones.
 
-    Where the mouth is open already, nothing is taken from between the jaws.
+    If the mouth is open already, nothing is removed from between the jaws.
     """
     upper = next((name for name in ("maxilla", "cranium") if name in distances), None)
     lower = next((name for name in ("mandible_body", "mandible") if name in distances), None)
@@ -366,9 +394,9 @@ def _opened(
 
 
 def largest_body(tets: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which tets belong to the largest body that holds together by faces, (m,).
+    """Which tets belong to the largest body connected through faces, (m,).
 
-    A flap that hangs on an edge or a node would swing without resistance.
+    A flap attached by a single edge or node would move without resistance.
 
     Parameters
     ----------
@@ -383,7 +411,7 @@ def _moved_sites(
     segments: Mapping[str, BoneSegment],
     motions: Mapping[str, Floats],
 ) -> dict[str, Floats]:
-    """Bone landmarks moved with the segment that each lies deepest in."""
+    """Bone landmarks, each moved with the segment in which it lies deepest."""
     points = np.array(list(sites.values()))
     names = list(segments)
     levels = np.array([segments[name].level.sample(points) for name in names])

@@ -1,4 +1,4 @@
-"""Muscles of a template moved into the tissue of a patient, once landmarks have carried them."""
+"""Muscles of a template, mapped to a patient by landmarks, then moved into the tissue."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,22 +24,22 @@ from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["FittedMuscle", "MuscleFit", "fit_muscles"]
 
-# Spacing of the displacement's coefficients, mm: the breadth of a strap muscle. Finer, a sheet
-# follows every voxel of a wall; coarser, it cannot follow the zygomatic arch.
+# Spacing of the displacement's coefficients, mm: the width of a strap muscle. With a finer one, a
+# thin muscle follows every voxel of bone; with a coarser one, it cannot follow the zygomatic arch.
 SPACING = 10.0
-# One point of a muscle's surface in each cube of this edge is moved into the room, mm.
+# One point of a muscle's surface in each cube of this edge is moved into the tissue, mm.
 POINT_SPACING = 3.0
-# Points by which a muscle's share outside is measured: a standard error of 2.5 % at most.
+# Points that measure the share of a muscle outside the tissue: standard error at most 2.5 %.
 SAMPLES = 400
-# On the template's bone, mm: as far as muscles are modelled off bone that they arise from.
+# Distance up to which a muscle counts as attached to the template's bone, mm.
 ATTACHED = 1.0
-# How deep in bone a muscle may stay that lies in the template's bone, mm: a voxel of a CT.
+# Depth inside bone that a muscle may keep if it is inside the template's bone, mm: a CT voxel.
 MOST_DEPTH = 1.0
-# The least stretch of space that a fit may have, and the largest: beyond, it is made stiffer.
+# Smallest and largest stretch of space that a fit may have; beyond them, space is made stiffer.
 STRETCHES = (0.5, 1.6)
 STIFFER = 3.0
 MOST_TRIES = 4
-# Change of a muscle's volume beyond which a finding says so.
+# Change of a muscle's volume beyond which it is reported.
 VOLUME_CHANGE = 0.05
 # Share of a muscle outside the tissue beyond which it is reported as not fitting.
 STILL_OUTSIDE = 0.15
@@ -47,15 +47,15 @@ STILL_OUTSIDE = 0.15
 
 @dataclass(frozen=True)
 class FittedMuscle:
-    """What a fit did to one muscle.
+    """The effect of a fit on one muscle.
 
     Attributes
     ----------
     outside_before, outside_after : float
-        Share of its volume in bone, in air or outside the skin, where the data show the head; each
-        with a standard error of 0.02 at most.
+        Share of its volume in bone, in air or outside the skin, within the field of view; the
+        standard error is at most 0.02.
     unseen : float
-        Share of its volume beyond the end of the data, where nothing is known of the room.
+        Share of its volume outside the field of view, where the tissue is unknown.
     volume_before, volume_after : float, mm³
     largest_move : float, mm
     """
@@ -69,7 +69,7 @@ class FittedMuscle:
 
     @property
     def volume_change(self) -> float:
-        """The change of its volume, as a part of it."""
+        """Relative change of its volume."""
         return self.volume_after / self.volume_before - 1.0
 
 
@@ -80,12 +80,12 @@ class MuscleFit:
     Attributes
     ----------
     musculature : MorphedMusculature
-        Surfaces and fibre courses moved; all else is that of the morph.
+        Surfaces and fibre courses are moved; everything else is unchanged.
     muscles : mapping of str to FittedMuscle
     stretches : (2,) tuple of float
         The least and the largest principal stretch of space at the muscles.
     stiffness : float
-        The factor on the energy of strain that kept stretches in bounds.
+        Factor on the strain energy that kept the stretches within bounds.
     findings : tuple of Finding
     seconds : float
     """
@@ -99,7 +99,7 @@ class MuscleFit:
 
     @property
     def helps(self) -> bool:
-        """Whether less of the muscles lies outside the tissue than before, and space is whole."""
+        """Whether less of the muscles is outside the tissue than before, without folding space."""
         before, after = (_summed(self.muscles, f"outside_{w}") for w in ("before", "after"))
         return after < before and self.stretches[0] > 0.0
 
@@ -127,15 +127,15 @@ class MuscleFit:
 def fit_muscles(morphed: MorphedMusculature, anatomy: Anatomy) -> MuscleFit:
     """Muscles moved out of bone, air and skin, by one smooth displacement of space for all.
 
-    Points on their surfaces are drawn into the tissue, those on the template's bone to the
-    patient's bone. Space resists strain and bending, and each muscle a change of its volume. One
-    displacement for all keeps muscles apart that were; no triangle turns over as long as space does
-    not, which is checked, and the space made stiffer where it does.
+    Points on their surfaces are pulled into the tissue, and those on the template's bone towards
+    the patient's bone. Space resists strain and bending, and each muscle resists a change of its
+    volume. Because one displacement moves all muscles, those that were separate stay separate, and
+    no triangle is inverted unless space folds: this is checked, and space made stiffer if it does.
 
     Parameters
     ----------
     morphed : MorphedMusculature
-        What `MuscleTemplate.morph` gives, in the frame of the anatomy.
+        Result of `MuscleTemplate.morph`, in the frame of the anatomy.
     anatomy : Anatomy
 
     Returns
@@ -145,12 +145,12 @@ def fit_muscles(morphed: MorphedMusculature, anatomy: Anatomy) -> MuscleFit:
     Raises
     ------
     MeshError
-        (also `ValueError`) A muscle that is no surface.
+        (also `ValueError`) A muscle that is not a valid surface.
 
     Notes
     -----
     Free-form deformation by B-splines: Rueckert et al. (1999), with quadratic splines. Landmarks
-    are not held: they lie on bone, where there is no muscle.
+    are not fixed: they lie on bone, where there is no muscle.
 
     Examples
     --------
@@ -203,7 +203,7 @@ def _compared(
     samples: Sequence[tuple[Floats, Floats]],
     muscles: Sequence[MuscleSurface],
 ) -> dict[str, FittedMuscle]:
-    """What became of each muscle: its vertices, and points within it before and after."""
+    """The effect on each muscle, from its vertices and from points inside it, before and after."""
     volumes, room = problem.volumes, problem.room
     first, last = volumes.enclosed(problem.vertices), volumes.enclosed(after)
     moves = np.linalg.norm(after - problem.vertices, axis=1)
@@ -222,7 +222,7 @@ def _compared(
 
 
 def _bounded(problem: Problem, points: Floats) -> tuple[Floats, tuple[float, float], float]:
-    """A displacement whose stretches at some points are in bounds, they, and the stiffness."""
+    """A displacement, its stretches at some points, and the stiffness that keeps them in bounds."""
     stiffness = 1.0
     for _ in range(MOST_TRIES):
         found = problem.solved(stiffness)
@@ -258,7 +258,7 @@ def _samples(index: int, muscle: MuscleSurface) -> Floats:
 
 
 def _targets(morphed: MorphedMusculature, begins: Sequence[int]) -> Targets:
-    """Vertices of the muscles' surfaces, and where the template has them beside its bone."""
+    """Vertices of the muscles' surfaces, and their places relative to the template's bone."""
     bone = Surface(morphed.template.skull.vertices, morphed.template.skull.triangles)
     carried = Surface(morphed.skull.vertices, morphed.skull.triangles)
     spread = [_spread(muscle.surface) for muscle in morphed.muscles]
@@ -279,7 +279,7 @@ def _targets(morphed: MorphedMusculature, begins: Sequence[int]) -> Targets:
 
 
 def _spread(surface: SurfaceData) -> tuple[NDArray[np.intp], Floats]:
-    """Vertices of a surface that are spread over it evenly, and the area for which each stands."""
+    """Vertices spread evenly over a surface, and the area that each represents."""
     vertices = surface.vertices
     triangles = np.asarray(surface.triangles, dtype=np.intp)
     cross = np.cross(
@@ -301,7 +301,7 @@ def _spread(surface: SurfaceData) -> tuple[NDArray[np.intp], Floats]:
 
 
 def _stretches(lattice: Lattice, found: Floats, points: Floats) -> tuple[float, float]:
-    """The least and largest principal stretch of space at points; below 0 where it turns over."""
+    """Smallest and largest principal stretch of space at points; negative where it folds."""
     slopes = [np.asarray(lattice.basis(points, axis) @ found) for axis in range(3)]
     gradient = np.stack(slopes, axis=2)
     whole = gradient + np.eye(3)
@@ -311,7 +311,7 @@ def _stretches(lattice: Lattice, found: Floats, points: Floats) -> tuple[float, 
 
 
 def _summed(done: Mapping[str, FittedMuscle], name: str) -> float:
-    """A share of all muscles together, by their volumes."""
+    """A share averaged over all muscles, weighted by volume."""
     volume = sum(m.volume_before for m in done.values())
     part = sum(getattr(m, name) * m.volume_before for m in done.values())
     return float(part / volume) if volume else 0.0

@@ -250,6 +250,23 @@ def _check_partners(template: TemplateData) -> Iterator[Finding]:
 
 
 def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Finding]:
+    yield from _check_muscle_surface(muscle)
+    if skull is None or not len(muscle.surface.vertices):
+        return
+    nearest = float(_distances(skull, muscle.surface.vertices).min())
+    if nearest > MUSCLE_DISTANCE:
+        yield Finding.warning(
+            "template-far-from-skull",
+            f"its distance from the skull is never below {nearest:.0f} mm (at most "
+            f"{MUSCLE_DISTANCE:g})",
+            where=muscle.name,
+            why="it lies in another frame or unit than the skull, or is not a muscle of the face",
+            fix="bring both into one frame",
+        )
+    yield from _check_course(muscle)
+
+
+def _check_muscle_surface(muscle: MuscleSurface) -> Iterator[Finding]:
     report = check_surface(muscle.surface)
     if report.volume < 0.0:
         yield Finding.error(
@@ -286,18 +303,10 @@ def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Find
             "affected",
             fix="nothing, if the muscle looks right",
         )
-    if skull is None or not len(muscle.surface.vertices):
-        return
-    nearest = float(_distances(skull, muscle.surface.vertices).min())
-    if nearest > MUSCLE_DISTANCE:
-        yield Finding.warning(
-            "template-far-from-skull",
-            f"its distance from the skull is never below {nearest:.0f} mm (at most "
-            f"{MUSCLE_DISTANCE:g})",
-            where=muscle.name,
-            why="it lies in another frame or unit than the skull, or is not a muscle of the face",
-            fix="bring both into one frame",
-        )
+
+
+def _check_course(muscle: MuscleSurface) -> Iterator[Finding]:
+    """Fibre lines that leave their muscle."""
     body = _searchable(muscle.surface)
     if body is None:
         return

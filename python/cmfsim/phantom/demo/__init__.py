@@ -1,4 +1,4 @@
-"""The embedded case: a made head of class III with its operation, and what is known of its face."""
+"""The embedded case: a synthetic class III head with its operation and its true face."""
 
 from cmfsim.phantom.demo.patient import DemoCase, write_demo_case
 from cmfsim.phantom.demo.truth import DemoTruth, read_demo_truth

@@ -1,4 +1,4 @@
-"""Measures that surgeons take of a face: angles and distances between named sites."""
+"""Measures of a face that surgeons use: angles and distances between named sites."""
 
 from cmfsim.planning.face_measures.definitions import FORMULAS, MEASURES, Measure, measure_sites
 from cmfsim.planning.face_measures.profile import MidlineProfile, midline_profile

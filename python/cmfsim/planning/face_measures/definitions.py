@@ -1,4 +1,4 @@
-"""What each measure is: a formula and the sites that it is taken between.
+"""Definitions of the measures: a formula and the sites to which it applies.
 
 Angles are those between three points in space. The E-line (Ricketts 1968) runs from the tip of the
 nose to the chin; distances from it are taken in the sagittal plane, positive in front. Heights are
@@ -25,15 +25,15 @@ class Measure:
     key : str
         Short stable name, such as "nasolabial_angle".
     label : str
-        What people call it.
+        Common name.
     unit : str
         "°" or "mm".
     formula : str
         A key of `FORMULAS`.
     sites : tuple of str
-        What the formula takes, in its order.
+        Arguments of the formula, in order.
     about : str
-        What is measured, in words.
+        Description.
 
     Examples
     --------
@@ -57,7 +57,7 @@ def _angle(a: Floats, vertex: Floats, b: Floats) -> float:
 
 
 def _in_front(point: Floats, upper: Floats, lower: Floats) -> float:
-    """How far a point lies in front of a line in the sagittal plane, mm."""
+    """Distance of a point in front of a line in the sagittal plane, mm."""
     (py, pz), (dy, dz) = (point - upper)[1:], (lower - upper)[1:]
     return float((py * dz - pz * dy) / np.hypot(dy, dz))
 
@@ -67,7 +67,7 @@ def _distance(a: Floats, b: Floats) -> float:
 
 
 def _height(a: Floats, b: Floats) -> float:
-    """How far `a` lies above `b` along S, mm."""
+    """Height of `a` above `b` along S, mm."""
     return float(a[2] - b[2])
 
 
@@ -192,7 +192,7 @@ MEASURES = (
 
 
 def measure_sites(places: Mapping[str, Floats]) -> dict[str, float | None]:
-    """The value of each measure at sites by name; None where one of its sites is not given.
+    """The value of each measure, from named sites; None if one of its sites is missing.
 
     Parameters
     ----------

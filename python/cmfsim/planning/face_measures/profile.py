@@ -1,4 +1,4 @@
-"""The midline profile: where the midsagittal plane cuts the skin, from the forehead downwards."""
+"""The midline profile: where the midsagittal plane cuts the skin, from the forehead down."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,20 +22,20 @@ MIDLINE = (
     "pogonion",
 )
 LEAST_MIDLINE = 2
-# How far behind the foremost point the profile is followed, mm: past throat and forehead.
+# Length of the profile behind the foremost point, mm: past throat and forehead.
 DEPTH = 110.0
 
 
 @dataclass(frozen=True, eq=False)
 class MidlineProfile:
-    """A polyline on the edges of a surface: it follows when the surface moves.
+    """A polyline whose points lie on edges of a surface and move with it.
 
     Attributes
     ----------
     ends : (n, 2) uint32
-        The vertices of the edge that each point lies on.
+        Vertices of the edge on which each point lies.
     share : (n,) float64
-        Where on the edge, from its first end.
+        Position along the edge, from 0 at its first vertex to 1.
     points : (n, 3) float64, mm
         From top to bottom.
     """
@@ -78,7 +78,7 @@ def midline_profile(surface: SurfaceData, landmarks: Mapping[str, ArrayLike]) ->
     (across, tilt), *_ = np.linalg.lstsq(rows, places[:, 0], rcond=None)
     vertices = surface.vertices
     side = vertices[:, 0] - across - tilt * (vertices[:, 2] - places[:, 2].mean())
-    # A vertex on the plane would be cut by no edge, or by all of its own.
+    # A vertex exactly on the plane would be crossed by none of its edges, or by all of them.
     side = np.where(np.abs(side) < 1e-9, 1e-9, side)
     chain = _chain(vertices, surface.triangles.astype(np.int64), side, places)
     ends = np.array(chain, dtype=np.uint32)
@@ -92,7 +92,7 @@ def midline_profile(surface: SurfaceData, landmarks: Mapping[str, ArrayLike]) ->
 def _chain(
     vertices: Floats, triangles: NDArray[np.int64], side: Floats, places: Floats
 ) -> list[tuple[int, int]]:
-    """The cut edges in a row, of the piece of the cut that comes nearest to the landmarks."""
+    """The edges that are cut, in order, of the part of the cut closest to the landmarks."""
     near: dict[tuple[int, int], list[tuple[int, int]]] = {}
     positive = side[triangles] > 0.0
     for corners in triangles[positive.any(axis=1) & ~positive.all(axis=1)].tolist():
@@ -121,7 +121,7 @@ def _chain(
 def _followed(
     near: Mapping[tuple[int, int], list[tuple[int, int]]], start: tuple[int, int], first: int
 ) -> list[tuple[int, int]]:
-    """The edges from one on, by its first or second neighbour, until the cut ends or closes."""
+    """The edges that follow one, in the direction of its first or second neighbour, to the end."""
     row, seen = [start], {start}
     steps = near[start][first : first + 1]
     while steps:
@@ -132,7 +132,7 @@ def _followed(
 
 
 def _front(points: Floats, places: Floats) -> NDArray[np.intp]:
-    """The stretch of the row at the face, from top to bottom; what lies further back goes."""
+    """The part of the row on the face, from top to bottom; everything further back is dropped."""
     nearest = int(np.argmin(np.linalg.norm(points - places[len(places) // 2], axis=1)))
     in_front = points[:, 1] <= points[:, 1].min() + DEPTH
     low = high = nearest

@@ -1,8 +1,8 @@
-"""The sites that a face is measured at: landmarks as given, and others found on its profile.
+"""Sites at which a face is measured: given landmarks, and others found on the profile.
 
-What a case gives is taken. Sites that it does not give are found once, on the profile before the
-operation, by their definitions (Farkas 1994; Legan and Burstone 1980), and then move with the skin:
-they are points of the tissue, not found again on the moved face.
+Sites that a case does not give are found by their definitions (Farkas 1994; Legan and Burstone
+1980), once, on the profile before the operation. They are points of the tissue and move with the
+skin; they are not found again on the moved face.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,21 +24,21 @@ __all__ = ["BoneSite", "FaceSites", "face_sites", "measure_face"]
 UPPER_INCISOR = "upper_incisor"
 # Segments that may bear the upper teeth, the smallest first.
 UPPER_BEARERS = ("maxilla", "midface", "cranium", "skull")
-# Glabella lies this far above nasion, mm.
+# Height of the glabella above the nasion, mm.
 GLABELLA = (8.0, 35.0)
-# Menton lies at most this far behind pogonion, mm; the throat is looked for this far below it.
+# Largest distance of menton behind pogonion, mm; range below it in which the throat is found, mm.
 MENTON_BEHIND = 25.0
 THROAT_BELOW = 45.0
-# The throat must be followed at least so far below menton to have an angle, mm.
+# Shortest profile below menton from which the angle of the throat is determined, mm.
 LEAST_THROAT = 20.0
-# How far from supradentale the edge of an incisor lies, mm: to the side, in depth, and below.
+# Largest distances of the edge of an incisor from supradentale, mm: sideways, in depth, below.
 INCISOR_SIDE, INCISOR_DEPTH, INCISOR_BELOW = 5.0, 9.0, 14.0
 # The edge of a lip is its furthest point towards the other lip; what lies deeper counts for less by
 # this share of its depth, so that it is not sought inside the mouth.
 LIP_DEPTH = 0.5
-# Lips whose edges are nearer than this, mm, are closed: the skin is one there, and cannot open.
+# Lips whose edges are closer than this, mm, are closed: their skin is connected and cannot open.
 LEAST_GAP = 0.3
-# An incisor whose edge is not this far below the bone's edge is none, mm.
+# Smallest length of an incisor below the edge of the bone, mm.
 LEAST_CROWN = 3.0
 
 
@@ -51,7 +51,7 @@ class BoneSite:
     place : (3,) float64, mm
         Before the operation.
     segment : str
-        The segment that it moves with.
+        The segment with which it moves.
     """
 
     place: Floats
@@ -67,9 +67,9 @@ class FaceSites:
     skin : mapping of str to (3,) float64, mm
     bone : mapping of str to BoneSite
     absent : mapping of str to str
-        Sites that measures need and that are not known, with the reason.
+        Unknown sites that measures need, each with the reason.
     found : tuple of str
-        Those that were found on the profile or the bone, not given by the case.
+        Sites that were found on the profile or the bone instead of given by the case.
     """
 
     skin: Mapping[str, Floats]
@@ -78,7 +78,7 @@ class FaceSites:
     found: tuple[str, ...]
 
     def why_absent(self, sites: tuple[str, ...]) -> str:
-        """Why a measure of these sites cannot be taken; empty where it can."""
+        """Why a measure is not available; empty if it is."""
         reasons: dict[str, list[str]] = {}
         for name in sites:
             if name in self.absent:
@@ -141,13 +141,13 @@ def face_sites(patient: PatientModel) -> FaceSites:
 
 
 def measure_face(prediction: Prediction, sites: FaceSites | None = None) -> dict[str, float | None]:
-    """The measures of a predicted face; None where a site is absent.
+    """The measures of a predicted face; None if a site is missing.
 
     Parameters
     ----------
     prediction : Prediction
     sites : FaceSites, optional
-        Those of its patient, where they are known already.
+        Sites of its patient; found if they are not given.
 
     Returns
     -------
@@ -181,7 +181,7 @@ def _at(profile: Floats, known: Mapping[str, Floats], name: str) -> int:
 
 
 def _between(profile: Floats, known: Mapping[str, Floats], upper: str, lower: str) -> Floats:
-    """The stretch of the profile from one landmark down to another."""
+    """The part of the profile between two landmarks, from top to bottom."""
     first, last = _at(profile, known, upper), _at(profile, known, lower)
     if last - first < 2:
         raise LandmarkInputError(f"{upper} does not lie above {lower} on the profile")
@@ -204,7 +204,7 @@ def _columella(profile: Floats, known: Mapping[str, Floats]) -> Floats:
 
 
 def _lips(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]:
-    """The profile of the upper and of the lower lip, divided where it lies deepest between them."""
+    """The profiles of the upper and the lower lip, divided at the deepest point between them."""
     part = _between(profile, known, "labiale_superius", "labiale_inferius")
     deepest = _deepest(part)
     if not 0 < deepest < len(part) - 1:
@@ -213,7 +213,7 @@ def _lips(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]
 
 
 def _deepest(part: Floats) -> int:
-    """The point of a stretch that lies furthest behind, or above, the line between its ends."""
+    """The point of a part of the profile furthest behind, or above, the line between its ends."""
     (dy, dz) = (part[-1] - part[0])[1:]
     away = part - part[0]
     return int(np.argmax(away[:, 2] * dy - away[:, 1] * dz))
@@ -230,7 +230,7 @@ def _stomion_inferius(profile: Floats, known: Mapping[str, Floats]) -> Floats:
 
 
 def _open(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]:
-    """The edges of lips that are apart."""
+    """The edges of lips that are open."""
     upper, lower = _stomion_superius(profile, known), _stomion_inferius(profile, known)
     if np.linalg.norm(upper - lower) < LEAST_GAP:
         raise LandmarkInputError("the lips are closed, and joined in this model")
@@ -246,7 +246,7 @@ def _lower_lip_edge(profile: Floats, known: Mapping[str, Floats]) -> Floats:
 
 
 def _sublabiale(profile: Floats, known: Mapping[str, Floats]) -> Floats:
-    """The point between lower lip and chin that lies furthest behind the line between them."""
+    """The point between lower lip and chin furthest behind the line that connects them."""
     part = _between(profile, known, "labiale_inferius", "pogonion")
     deepest = _deepest(part)
     if not 0 < deepest < len(part) - 1:
@@ -255,10 +255,10 @@ def _sublabiale(profile: Floats, known: Mapping[str, Floats]) -> Floats:
 
 
 def _below_pogonion(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, int]:
-    """The profile from pogonion on, and where on it menton is: its lowest point under the chin."""
+    """The profile from pogonion down, and the index of menton, its lowest point under the chin."""
     part = profile[_at(profile, known, "pogonion") :]
     under = np.flatnonzero(part[:, 1] <= part[0, 1] + MENTON_BEHIND)
-    # Up to where the profile first leaves the chin.
+    # Ends where the profile first leaves the chin.
     under = under[: int(np.argmax(np.diff(under, append=len(part) + 1) > 1)) + 1]
     lowest = int(under[np.argmin(part[under, 2])])
     if lowest in (0, len(part) - 1):
@@ -272,7 +272,7 @@ def _menton(profile: Floats, known: Mapping[str, Floats]) -> Floats:
 
 
 def _cervical_point(profile: Floats, known: Mapping[str, Floats]) -> Floats:
-    """Between chin and neck, the point furthest above the line from one to the other."""
+    """The point between chin and neck furthest above the line that connects them."""
     part, lowest = _below_pogonion(profile, known)
     throat = part[lowest:]
     throat = throat[throat[:, 2] >= throat[0, 2] - THROAT_BELOW]

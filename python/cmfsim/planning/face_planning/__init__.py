@@ -1,4 +1,4 @@
-"""Planning from the face: the bone moves that come nearest to a face that is wished for."""
+"""Planning from the face: the bone movements whose predicted face is closest to a desired one."""
 
 from cmfsim.planning.face_planning.planning import FacePlan, FaceSearch, plan_for_face
 from cmfsim.planning.face_planning.targets import MeasureTarget, PointTarget, SurfaceTarget, Target

@@ -1,8 +1,9 @@
-"""The plan whose face comes nearest to a target: Gauss-Newton over the plan operator.
+"""The plan whose face is closest to a target: Gauss-Newton steps with the plan operator.
 
-The unknowns are surgeons' numbers of each segment: forwards, up and left at its point, pitch, yaw
-and roll. Targets, and a prior that prefers small moves, give residuals in standard deviations; the
-inverse of their normal matrix is the covariance of the numbers. The result is solved exactly once.
+The unknowns are six numbers for each segment, as surgeons state them: forwards, up and left at its
+reference point, pitch, yaw and roll. Targets, and a prior that favours small movements, contribute
+residuals in standard deviations; the inverse of their normal matrix is the covariance of the
+numbers. The plan that is found is solved exactly, once.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,9 +22,9 @@ from cmfsim.values.prediction import Prediction
 
 __all__ = ["NUMBERS", "FacePlan", "FaceSearch", "plan_for_face"]
 
-# The numbers of a segment, in their order: mm and degrees.
+# Names of the numbers of a segment, in order: mm and degrees.
 NUMBERS = ("forwards", "up", "left", "pitch", "yaw", "roll")
-# A number within this of a bound is held by it, mm or degrees.
+# A number this close to a bound is at the bound, mm or degrees.
 AT_BOUND = 1e-6
 # Standard deviation of an undetermined number, mm or degrees; and the share of the prior's standard
 # deviation above which a number counts as open.
@@ -32,21 +33,21 @@ OPEN, OPEN_SHARE = 1e3, 0.5
 
 @dataclass(frozen=True, eq=False)
 class FaceSearch:
-    """How a plan is searched for.
+    """Options of the search for a plan.
 
     Attributes
     ----------
     segments : sequence of str or None
         Those that may move; by default, those that the reference moves.
     follows : mapping of str to str
-        Segments that keep their place relative to another one: {"mandible_body": "maxilla"} keeps
+        Segments that stay in place relative to another one: {"mandible_body": "maxilla"} keeps
         the final bite of the reference plan.
     shift, turn : float, mm and degrees
-        Bounds of every number, on either side of no movement.
+        Bounds of every number, in both directions.
     prior_shift, prior_turn : float or None, mm and degrees
-        Standard deviations of a prior about no movement; None for no prior.
+        Standard deviations of a prior that favours no movement; None for no prior.
     steps : int
-        Largest number of steps.
+        Maximum number of steps.
 
     Raises
     ------
@@ -127,7 +128,7 @@ def plan_for_face(
     *,
     exact: bool = True,
 ) -> FacePlan:
-    """The plan whose face comes nearest to targets.
+    """The plan whose predicted face is closest to the targets.
 
     Parameters
     ----------
@@ -135,7 +136,7 @@ def plan_for_face(
     targets : sequence of PointTarget, MeasureTarget and SurfaceTarget
     search : FaceSearch, optional
     exact : bool
-        Whether the plan is finally solved exactly, with contact.
+        Whether to solve the plan that was found exactly, with contact.
 
     Returns
     -------
@@ -206,7 +207,7 @@ def plan_for_face(
 
 
 def _rows(wishes: Sequence[Wish], places: Floats, plan: Mapping[str, Floats]) -> tuple[Floats, ...]:
-    """The residuals of each wish, with the places of all their points in a row."""
+    """The residuals of each target, from the positions of all points in one array."""
     ends = np.cumsum([len(wish.points) for wish in wishes])
     parts = np.split(places, ends[:-1])
     return tuple(wish.rows(part, plan) for wish, part in zip(wishes, parts, strict=True))
@@ -254,7 +255,7 @@ class _Space:
         surfaces = {s.name: s.surface.vertices for s in planning.patient.segments}
         self.skull, self.surfaces = skull, surfaces
         self.points = {name: self.stated(name, np.eye(4)).point for name in self.free}
-        # The motion from a leader's place to its follower's: the final bite.
+        # The motion of the follower relative to its leader: the final bite.
         self.bites = {
             follower: (leader, np.linalg.inv(reference[leader]) @ reference[follower])
             for follower, leader in search.follows.items()

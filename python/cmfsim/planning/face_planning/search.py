@@ -1,7 +1,7 @@
-"""Least squares with bounds: Levenberg-Marquardt steps in the numbers that no bound holds.
+"""Least squares with bounds: Levenberg-Marquardt steps in the numbers that are not at a bound.
 
-Minimised is |r(x)|² / 2. A step solves (JᵀJ + μ D) δ = −Jᵀr over the free numbers, D the diagonal
-of JᵀJ (Marquardt 1963); a number at its bound is free again where the gradient leads back inside.
+It minimises |r(x)|² / 2. A step solves (JᵀJ + μ D) δ = −Jᵀr for the free numbers, where D is the
+diagonal of JᵀJ (Marquardt 1963). A number at a bound is released when the gradient points inside.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ __all__ = ["Minimum", "bounded_least_squares"]
 # Forward differences, mm and degrees: residuals are smooth on this scale, and central differences
 # would cost twice as much.
 STEP = 1e-4
-# μ at the start, and what it is multiplied by after a step that failed or succeeded.
+# Initial μ, and its factors after a step that failed and after one that succeeded.
 FIRST_DAMPING, HARDER, SOFTER = 1e-3, 10.0, 0.1
 MOST_DAMPING = 1e12
 # A step below this, mm or degrees, ends the search.
@@ -25,7 +25,7 @@ STILL = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where a search ended.
+    """The result of a search.
 
     Attributes
     ----------
@@ -47,15 +47,15 @@ class Minimum:
 def bounded_least_squares(
     residuals: Callable[[Floats], Floats], start: Floats, low: Floats, high: Floats, *, steps: int
 ) -> Minimum:
-    """The minimum of a sum of squares within bounds, from a start.
+    """The minimum of a sum of squares within bounds, found from a starting point.
 
     Parameters
     ----------
     residuals : callable
-        Of (n,) numbers: (m,) residuals.
+        Maps (n,) numbers to (m,) residuals.
     start, low, high : (n,) float64
     steps : int
-        At most so many.
+        Maximum number of steps.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What is wished of a face: places of points, values of measures, a whole surface."""
+"""Targets for a face: positions of points, values of measures, a whole surface."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,17 +25,17 @@ __all__ = [
     "wish_of",
 ]
 
-# A point of the face further from the wished surface than this, mm, has no partner on it.
+# A point of the face further from the desired surface than this, mm, has no partner on it.
 MOST_APART = 25.0
-# A point whose partner lies on the border of the wished surface, within this of it, mm, has none.
+# A point whose closest point is within this distance of the surface's border, mm, has no partner.
 BORDER = 1.0
-# A node that a shift of 1 mm moves by less than this, mm, belongs to no face that plans change.
+# A node that a segment's movement of 1 mm moves by less than this, mm, is unaffected by plans.
 MOVES = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class PointTarget:
-    """Points of the face that should come to given places.
+    """Points of the face with their desired positions.
 
     Attributes
     ----------
@@ -44,15 +44,15 @@ class PointTarget:
     goals : (n, 3) float64, mm
         Where they should be.
     std : float, mm
-        How much a point may be off, along each axis.
+        Tolerance of a point along each axis.
     directions : (n, 3) float64 or None
-        Where given, only the way along these unit vectors counts: (0, 1, 0) and (0, 0, 1) for
+        If given, only distances along these unit vectors count: (0, 1, 0) and (0, 0, 1) for
         points of a profile photograph.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) No point, another count of goals or directions, NaN, a direction of 0.
+        (also `ValueError`) No point, a wrong number of goals or directions, NaN, a zero direction.
 
     Examples
     --------
@@ -96,7 +96,7 @@ class PointTarget:
 
 @dataclass(frozen=True)
 class MeasureTarget:
-    """A measure of the face that should have a value.
+    """A measure of the face with its desired value.
 
     Attributes
     ----------
@@ -104,12 +104,12 @@ class MeasureTarget:
         As in `MEASURES`, such as "nasolabial_angle".
     value : float, mm or degrees
     std : float, mm or degrees
-        How much it may be off.
+        Tolerance of the value.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) Another measure; a value that is not finite.
+        (also `ValueError`) An unknown measure; a value that is not finite.
 
     Examples
     --------
@@ -133,7 +133,7 @@ class MeasureTarget:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceTarget:
-    """A surface that the face should come to lie on.
+    """A desired surface of the face.
 
     Points of the face are drawn evenly over its vertices; each counts by its distance from the
     nearest point of the surface along the surface's normal there, so that it may slide on it.
@@ -141,10 +141,10 @@ class SurfaceTarget:
     Attributes
     ----------
     surface : SurfaceData
-        The wished face, in the frame of the case, outward.
+        The desired face, in the frame of the case, with outward normals.
     std : float, mm
     points : int
-        Points of the face that are drawn.
+        Number of points of the face to use.
 
     Examples
     --------
@@ -181,7 +181,7 @@ class Wish:
 
 
 def wish_of(planning: PlanningModel, target: Target) -> Wish:
-    """What a target asks of a patient's face.
+    """A target with the points of a patient's face on which it depends.
 
     Raises
     ------
@@ -197,9 +197,9 @@ def wish_of(planning: PlanningModel, target: Target) -> Wish:
 
 
 class CarriedPoints:
-    """The displacements of a few points under plans: columns and triangles that carry them alone.
+    """Displacements of a few points under plans, from the columns and triangles that carry them.
 
-    The same as `PlanningModel.carried`, at the cost of the points.
+    Equals `PlanningModel.carried`, but costs no more than the points need.
     """
 
     def __init__(self, planning: PlanningModel, points: Floats) -> None:
@@ -219,7 +219,7 @@ class CarriedPoints:
         self._correction = None if planning.correction is None else planning.correction.at(nodes)
 
     def displacements(self, plan: Motions) -> Floats:
-        """How the points move, (n, 3) mm."""
+        """Displacements of the points, (n, 3) mm."""
         moved = self._offset + self._matrix @ self._columns.numbers(plan)
         if self._correction is not None:
             moved = moved + self._correction.displacements(plan).ravel()
@@ -256,7 +256,7 @@ def _measure_wish(planning: PlanningModel, target: MeasureTarget) -> Wish:
     def rows(places: Floats, plan: Motions) -> Floats:
         found = {**dict(zip(names, places, strict=True)), **_bone_places(sites, plan)}
         value = measure_sites({name: found[name] for name in measure.sites})[target.key]
-        # Every site is there: the value is a number.
+        # All sites are known, so the value is a number.
         return np.array([(float(value or 0.0) - target.value) / target.std])
 
     return Wish(np.array([sites.skin[name] for name in names]).reshape(-1, 3), rows)
@@ -278,7 +278,7 @@ def _surface_wish(planning: PlanningModel, target: SurfaceTarget) -> Wish:
     kept = points[_has_partner(surface, _border_points(target.surface), points)]
     if not len(kept):
         raise CaseInputError(
-            f"the wished surface lies more than {MOST_APART:g} mm from the face: both must be in "
+            f"the desired surface lies more than {MOST_APART:g} mm from the face: both must be in "
             "the frame of the case"
         )
 

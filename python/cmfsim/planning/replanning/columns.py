@@ -1,8 +1,8 @@
-"""The columns of a plan operator with the centres that they are taken about.
+"""The columns of a plan operator, and the centres to which they refer.
 
-The displacement of the operator's nodes is u(q) = u₀ + Σ_s A_s q_s, with twelve numbers of each
-segment: q_s = (R − I row by row, t + (R − I) c_s) for the motion x ↦ R x + t. The core gives A and
-c_s; u₀ is its answer to the plan in which nothing moves.
+The displacement of the operator's nodes is u(q) = u₀ + Σ_s A_s q_s, with twelve numbers for each
+segment: q_s = (R − I row by row, t + (R − I) c_s) for the motion x ↦ R x + t. The core provides A
+and c_s; u₀ is the displacement under the plan that moves nothing.
 """
 
 from collections.abc import Mapping
@@ -18,9 +18,9 @@ from cmfsim.values.motion import rigid_motion
 
 __all__ = ["COLUMNS", "PlanColumns", "plan_columns"]
 
-# Numbers of a segment: nine of R − I, three of the shift of its centre.
+# Numbers of a segment: nine of R − I, three for the displacement of its centre.
 COLUMNS = 12
-# What the columns may differ by from the operator that they come from, mm for a turn of 7°.
+# Largest difference between the columns and their operator, mm, for a rotation by 7°.
 AGREEMENT = 1e-6
 
 
@@ -33,12 +33,12 @@ class PlanColumns:
     segments : tuple of str
         In the order of the columns.
     centres : (s, 3) float64, mm, LPS
-        The point of each segment that its columns are taken about.
+        The point of each segment to which its columns refer.
     matrix : (k, 3, 12 s) float64
-        Of each node and axis: for each segment nine columns of R − I, row by row, mm, and three of
-        the shift of its centre.
+        For each node and axis: nine columns per segment for R − I, row by row, mm, and three for
+        the displacement of its centre.
     offset : (k, 3) float64, mm
-        Displacements where no segment moves: rest gaps that contact closes.
+        Displacements if no segment moves: contact closes gaps that exist at rest.
     """
 
     segments: tuple[str, ...]
@@ -47,7 +47,7 @@ class PlanColumns:
     offset: Floats
 
     def numbers(self, plan: Mapping[str, ArrayLike]) -> Floats:
-        """The numbers q of a plan, (12 s,): R − I of each segment, then the shift of its centre."""
+        """The numbers q of a plan, (12 s,): R − I of each segment, then its centre's motion."""
         found = []
         for name, centre in zip(self.segments, self.centres, strict=True):
             matrix = np.asarray(plan[name], dtype=np.float64)
@@ -61,7 +61,7 @@ class PlanColumns:
 
 
 def plan_columns(operator: PlanOperator) -> PlanColumns:
-    """The columns of an operator, with their centres, checked against what it answers.
+    """The columns of an operator with their centres, checked against its displacements.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def plan_columns(operator: PlanOperator) -> PlanColumns:
     Raises
     ------
     SolverError
-        The columns do not give what the operator answers.
+        The columns do not reproduce the displacements of the operator.
     """
     names = tuple(operator.segments)
     rest = {name: np.eye(4) for name in names}
@@ -94,6 +94,6 @@ def _check(columns: PlanColumns, operator: PlanOperator) -> None:
     worst = float(np.abs(columns.displacements(plan) - operator(plan)).max(initial=0.0))
     if not worst <= AGREEMENT:
         raise SolverError(
-            f"the columns of the plan operator differ by {worst:.1e} mm from what it answers: "
-            f"at most {AGREEMENT:g} mm is rounding; please report this"
+            f"the columns of the plan operator differ from its displacements by {worst:.1e} mm; "
+            f"rounding explains at most {AGREEMENT:g} mm: please report this"
         )

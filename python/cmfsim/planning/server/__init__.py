@@ -1,4 +1,4 @@
-"""The planning page served on this machine: plans are solved exactly while they are made."""
+"""A local server for the planning page, which solves plans exactly as they are made."""
 
 from cmfsim.planning.server.server import PlanningServer, check_serving, serve_planning
 

@@ -1,9 +1,9 @@
-"""What a request must be before anything is done for it, and the plan that it holds.
+"""Checks that every request must pass, and the plan that it contains.
 
-The page of a patient is on the machine's own address alone, but any web site that is open in the
-same browser can send requests there. So each request needs the random token of this launch in its
-path, the very host and port as Host (a name that was made to lead here is refused), and, where it
-sends something, the page's own origin.
+The server listens on the local address only, but any web site open in the same browser can send
+requests to it. Every request must therefore have the random token of this launch in its path and
+the exact host and port as Host (against DNS rebinding). If it sends data, its Origin must be the
+page's own.
 """
 
 import hmac
@@ -18,14 +18,14 @@ from cmfsim.planning.replanning import PlanningModel
 
 __all__ = ["MOST_BYTES", "RefusedError", "check_headers", "check_token", "plan_of_body"]
 
-# A plan of fifty segments has some 16 kB.
+# A plan of fifty segments takes about 16 kB.
 MOST_BYTES = 65_536
-# No motion of a plan is longer, mm: what is further is an error of units.
+# Longest motion of a plan, mm: anything longer is a wrong unit.
 MOST_SHIFT = 1000.0
 
 
 class RefusedError(Exception):
-    """A request that is answered by an error alone."""
+    """A request that is answered with an error."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -33,7 +33,7 @@ class RefusedError(Exception):
 
 
 def check_token(given: str, token: str) -> None:
-    """Refuses a token that is not that of this launch; the time does not tell where it differs.
+    """Refuses any token but that of this launch, in constant time.
 
     Raises
     ------
@@ -44,12 +44,12 @@ def check_token(given: str, token: str) -> None:
 
 
 def check_headers(headers: Mapping[str, str], address: str, *, sends: bool) -> None:
-    """Refuses requests that were not sent by the page of this address.
+    """Refuses requests that the page at this address did not send.
 
     Parameters
     ----------
     headers : mapping of str to str
-        By names in lower case.
+        With names in lower case.
     address : str
         Host and port, such as "127.0.0.1:8765".
     sends : bool
@@ -83,7 +83,7 @@ def plan_of_body(planning: PlanningModel, body: bytes) -> dict[str, Floats]:
     Raises
     ------
     RefusedError
-        Not that; a motion that is not rigid, or longer than a metre.
+        Anything else; a motion that is not rigid, or longer than a metre.
     """
     try:
         values = json.loads(body)

@@ -1,4 +1,4 @@
-"""The server of a planning page: the page, and exact solutions of the plans that it sends."""
+"""The server of a planning page: sends the page, and exact solutions of the plans it receives."""
 
 import asyncio
 import contextlib
@@ -25,9 +25,9 @@ from cmfsim.planning.server.requests import (
 
 __all__ = ["PlanningServer", "check_serving", "serve_planning"]
 
-# This machine alone: no other one on the network can ask.
+# Local address only: no other machine on the network can connect.
 HOST = "127.0.0.1"
-# What every answer carries: it is kept nowhere, framed nowhere and read by no other site.
+# Headers of every response: never cached, never framed, never read by another site.
 SAFE_HEADERS = {
     "Cache-Control": "no-store",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -35,12 +35,12 @@ SAFE_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
 }
-# How long connections that are open may last after Ctrl-C, s.
+# Time that open connections have to finish after Ctrl-C, s.
 LAST_SECONDS = 1
 
 
 class PlanningServer:
-    """A server that answers for one patient on this machine.
+    """A local server for one patient.
 
     Parameters
     ----------
@@ -49,12 +49,12 @@ class PlanningServer:
     case_file : str
         For the command that the page shows.
     port : int
-        0 takes one that is free.
+        0 picks a free one.
 
     Attributes
     ----------
     url : str
-        Where the page is, with the token of this launch in it.
+        Address of the page, including the token of this launch.
 
     Raises
     ------
@@ -81,7 +81,7 @@ class PlanningServer:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
             self._socket.bind((HOST, port))
-            # From now on, so that a page that is opened at once waits for its answer.
+            # Listens from now on, so that a page opened immediately waits for its response.
             self._socket.listen()
         except OSError:
             self._socket.close()
@@ -98,7 +98,7 @@ class PlanningServer:
         self._server = self._uvicorn.Server(config)
 
     def run(self) -> None:
-        """Answers until `stop` is called or the process is interrupted."""
+        """Serves until `stop` is called or the process is interrupted."""
         try:
             self._server.run(sockets=[self._socket])
         finally:
@@ -110,7 +110,7 @@ class PlanningServer:
 
     def _application(self) -> Any:
         applications, routing = _module("starlette.applications"), _module("starlette.routing")
-        # Made in the loop that serves: one plan is solved at a time, with all threads.
+        # Created in the serving loop: plans are solved one at a time, with all threads.
         turn: list[asyncio.Lock] = []
 
         async def page(request: Any) -> Any:
@@ -141,7 +141,7 @@ class PlanningServer:
         )
 
     def _guarded(self, request: Any, *, sends: bool) -> Any:
-        """The refusal of a request that is not the page's own; None for one that is."""
+        """The refusal of a request that the page did not send; None otherwise."""
         try:
             check_headers(request.headers, self._address, sends=sends)
             check_token(request.path_params["token"], self._token)
@@ -155,7 +155,7 @@ class PlanningServer:
         )
 
     def _solved(self, plan: Any) -> Any:
-        """The exact displacements of the skin's nodes, float32, and figures of the solution."""
+        """The exact displacements of the skin's nodes, float32, with a summary of the solution."""
         begun = time.perf_counter()
         prediction = self._planning.solve(plan)
         shift = np.ascontiguousarray(prediction.skin_displacements, dtype="<f4")
@@ -198,9 +198,9 @@ def serve_planning(
     case_file : str
         For the command that the page shows.
     port : int
-        0 takes one that is free.
+        0 picks a free one.
     on_start : callable, optional
-        Called with the address of the page, which holds the token of this launch.
+        Called with the address of the page, including the token of this launch.
 
     Raises
     ------
@@ -218,13 +218,13 @@ def serve_planning(
     server = PlanningServer(planning, content, case_file=case_file, port=port)
     if on_start is not None:
         on_start(server.url)
-    # Uvicorn ends its connections first, and then raises it again.
+    # Uvicorn closes its connections first, then raises it again.
     with contextlib.suppress(KeyboardInterrupt):
         server.run()
 
 
 def check_serving() -> None:
-    """Finds before any work whether pages can be served.
+    """Checks that pages can be served, before any work is done.
 
     Raises
     ------
