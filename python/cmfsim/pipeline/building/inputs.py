@@ -85,6 +85,7 @@ def read_anatomy(
             landmarks=landmarks or None,
             progress=lambda stage: progress(f"segmenting the head: {stage}"),
         )
+        refuse_errors(anatomy, case.where("image"))
         return anatomy, (*read.findings, *anatomy.findings)
     given_surfaces = case.surfaces
     if given_surfaces is None:  # a Case has the one or the other
@@ -102,6 +103,16 @@ def read_anatomy(
     skin = surfaces.pop("skin")
     anatomy = anatomy_from_surfaces(skin, surfaces, spacing=spacing)
     return anatomy, (*findings, *anatomy.findings)
+
+
+def refuse_errors(anatomy: Anatomy, where: str) -> None:
+    """Raise `CaseInputError` for the first error that segmentation found, such as a flipped image.
+
+    Its surfaces can be looked at, but a face predicted from them would be wrong.
+    """
+    for finding in anatomy.findings:
+        if finding.severity == "error":
+            raise CaseInputError(f"{where}: {finding.what} ({finding.code}); {finding.fix}")
 
 
 def segment_options(case: Case) -> SegmentOptions:

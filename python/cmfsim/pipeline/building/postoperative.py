@@ -12,7 +12,11 @@ from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, RegistrationError
 from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.io.images import read_image_file
-from cmfsim.pipeline.building.inputs import read_case_landmarks, segment_options
+from cmfsim.pipeline.building.inputs import (
+    read_case_landmarks,
+    refuse_errors,
+    segment_options,
+)
 from cmfsim.surfaces.levels import surface_of_level
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.case_parts import CasePostoperative
@@ -159,6 +163,7 @@ def _scanned(case: Case, given: CasePostoperative) -> Postoperative:
     from cmfsim.imaging import segment_head  # noqa: PLC0415
 
     head = segment_head(read.image, segment_options(case), landmarks=there or None)
+    refuse_errors(head, case.where("postoperative.image"))
     levels = list(head.bones.values())
     bone = levels[0].with_values(np.maximum.reduce([b.values for b in levels]))
     return Postoperative(
