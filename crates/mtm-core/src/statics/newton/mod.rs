@@ -4,24 +4,28 @@
 //! negative curvature at each integration point has been removed, so that every step goes downhill. Sliding
 //! constraints n·u = g are enforced by projection, as in the linear system.
 
+mod descent;
 mod hierarchy;
 mod sliding;
+mod tangents;
 
 use std::sync::{Arc, OnceLock};
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::Symbolic;
-use crate::algebra::constraints::{Constraint, add_offsets, projected, projected_rhs};
+use crate::algebra::constraints::Constraint;
 use crate::algebra::multigrid::Multigrid;
 use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, Shortfall};
 use crate::mechanics::strain_energy::StrainEnergy;
-use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
+use crate::mechanics::strain_energy::TangentKind::{self, Exact};
 use crate::mechanics::tensors::MassTensors;
 use crate::statics::effort::Solve;
-use crate::statics::iterative::{Extremes, Iterative, hierarchy};
-use crate::statics::newton::hierarchy::{Found, SharedHierarchy};
-use crate::statics::options::{Interrupt, Method, StaticOptions};
+use crate::statics::iterative::Extremes;
+use crate::statics::newton::descent::{Step, by_tangent};
+use crate::statics::newton::hierarchy::SharedHierarchy;
+use crate::statics::newton::tangents::Moves;
+use crate::statics::options::{Method, StaticOptions};
 use crate::statics::reduction::{ReducedPattern, Reduction};
 use crate::statics::row_conditions::RowConditions;
 use crate::statics::solution::Clock;
@@ -34,29 +38,11 @@ pub(crate) use sliding::Slide;
 const MAX_STEPS: usize = 40;
 /// Smallest share of the plan that is tried.
 const LEAST_SHARE: f64 = 1.0 / 64.0;
-/// Share of the slope by which a step must decrease the energy (Armijo 1966).
-const DESCENT: f64 = 1e-4;
-/// Shortest step of the line search relative to the full one.
-const SHORTEST: f64 = 1.0 / 1024.0;
-/// Rounding error of the energy relative to its parts: a smaller decrease cannot be detected.
-const ENERGY_ROUNDING: f64 = 1e-12;
 /// Error that conjugate gradients may leave in a step, relative to the tolerance of the solution.
 const STEP_TOLERANCE: f64 = 0.1;
 /// The same relative to the length of the previous step, whose own error is larger until the last steps (Dembo,
 /// Eisenstat & Steihaug 1982).
 const STEP_SHARE: f64 = 1e-3;
-
-/// Longest step of the search relative to the full one.
-const LONGEST: f64 = 16.0;
-/// Length of a step, relative to the length at which the exact tangent was not positive definite, below which
-/// it is tried again.
-const RETRY_EXACT: f64 = 0.5;
-/// Length of a step with the exact tangent, relative to the step before, above which the tangent counts as
-/// indefinite: near the solution steps become shorter.
-const LONGER: f64 = 8.0;
-/// Length of a step over all displacements, below which conjugate gradients use the exact tangent: at rest it
-/// is positive definite, and further away they would detect indefiniteness only by chance.
-const NEAR_REST: f64 = 0.05;
 
 /// How tangent systems are solved.
 enum TangentSolver {
@@ -135,30 +121,6 @@ struct Pose {
     size: f64,
     /// Its derivative with respect to each row.
     slope: Vec<[f64; 3]>,
-}
-
-/// A step of Newton's method.
-struct Step {
-    rows: Vec<[f64; 3]>,
-    /// Slope of the merit along it.
-    slope: f64,
-    /// Increase of the merit that is accepted, N mm.
-    slack: f64,
-}
-
-/// How the boundary moves in a step.
-struct Moves<'a> {
-    /// Displacement of each constrained row along its normal.
-    constraints: &'a [Constraint],
-    /// Displacements of the nodes that are not unknowns; none if they do not move.
-    change: Option<&'a [[f64; 3]]>,
-}
-
-impl Step {
-    /// Largest displacement, mm.
-    fn length(&self) -> f64 {
-        self.rows.iter().fold(0.0, |m, v| m.max(norm(*v)))
-    }
 }
 
 impl Equilibrium {
@@ -354,108 +316,6 @@ impl Equilibrium {
         self.descend(pose, target, (f64::INFINITY, &[]), step, solve)
     }
 
-    /// The result of Newton's steps from `pose`. `next` computes each step from a pose, the tangent to use, and
-    /// the error allowed in the step, mm.
-    ///
-    /// `finest`: the error allowed in the last step, mm; `on_walls`: the rows that no step carries further than
-    /// computed.
-    fn descend(
-        &self,
-        mut pose: Pose,
-        target: &Target<'_>,
-        (finest, on_walls): (f64, &[u32]),
-        mut next: impl FnMut(&Pose, (TangentKind, f64)) -> Result<Step>,
-        solve: &mut Solve<'_>,
-    ) -> Result<Vec<[f64; 3]>> {
-        let by_factor = matches!(self.solver, TangentSolver::Cholesky(_));
-        // Step length below which the exact tangent is worth trying.
-        let mut near = if by_factor { f64::INFINITY } else { NEAR_REST * reach(&pose, target) };
-        let mut length = f64::INFINITY;
-        // Error of the state once it is small enough, when one step with the accuracy of the last one is still
-        // to be done.
-        let mut ending = None;
-        for _ in 0..MAX_STEPS {
-            if (solve.interrupted)() {
-                return Err(MtmError::Interrupted);
-            }
-            let mut allowed = self.allowed(&pose, target, length);
-            if ending.is_some() {
-                allowed = allowed.min(finest);
-            }
-            let first = if length <= near { Exact } else { Definite };
-            let (mut step, mut kind) = by_tangent(first, |kind| next(&pose, (kind, allowed)))?;
-            // Conjugate gradients do not always notice that a tangent is indefinite.
-            if !by_factor && kind == Exact && step.length() > LONGER * length {
-                (step, kind) = (next(&pose, (Definite, allowed))?, Definite);
-            }
-            if kind != first {
-                near = RETRY_EXACT * length;
-            }
-            solve.effort.iterations += 1;
-            let before = length;
-            length = step.length();
-            solve.effort.history.push(length);
-            // With a tangent that is not that of the energy, convergence is linear, at the rate of the last
-            // step.
-            let own = kind == Exact || length == 0.0;
-            let gain = if own { 1.0 } else { 1.0 - (length / before).min(1.0) };
-            let goal = self.options.tolerance * reach(&pose, target);
-            let bound = length / gain + allowed;
-            let bound = ending.filter(|_| length <= goal).unwrap_or(bound);
-            ending = (bound <= goal).then_some(bound);
-            if ending.is_some() && allowed <= finest {
-                solve.effort.error_estimate = bound;
-                return Ok(moved_by(&self.reduction, &pose.u, &step.rows, 1.0));
-            }
-            pose = self.search(pose, target, &step, kind, on_walls)?;
-        }
-        let limit = self.options.tolerance * reach(&pose, target);
-        Err(lost("the estimated error of a node", length, limit, " mm"))
-    }
-
-    /// The state at the end of `step`, shortened until it lies downhill, up to the slack of the step.
-    ///
-    /// If the tangent is not that of the energy, steps are lengthened as long as the energy keeps decreasing: a
-    /// curvature with its sign reversed limits how far the quadratic model can be trusted, but does not locate
-    /// the minimum. Rows `on_walls` stay at the end of the step.
-    fn search(
-        &self,
-        pose: Pose,
-        target: &Target<'_>,
-        step: &Step,
-        kind: TangentKind,
-        on_walls: &[u32],
-    ) -> Result<Pose> {
-        let at = |share: f64| {
-            let mut u = moved_by(&self.reduction, &pose.u, &step.rows, share);
-            if share > 1.0 {
-                for &row in on_walls {
-                    let j = self.reduction.unknowns[row as usize] as usize;
-                    u[j] = add(pose.u[j], step.rows[row as usize]);
-                }
-            }
-            self.pose(u, target)
-        };
-        let mut share = 1.0;
-        while share >= SHORTEST {
-            let mut next = at(share)?;
-            let rounding = ENERGY_ROUNDING * pose.size.max(next.size);
-            if next.merit <= pose.merit + DESCENT * share * step.slope + step.slack + rounding {
-                while kind == Definite && (1.0..LONGEST).contains(&share) {
-                    share *= 2.0;
-                    let further = at(share)?;
-                    if further.merit >= next.merit - rounding {
-                        break;
-                    }
-                    next = further;
-                }
-                return Ok(next);
-            }
-            share *= 0.5;
-        }
-        Err(lost("the share of the last step that lowers the energy", share, SHORTEST, ""))
-    }
-
     /// Error allowed in the next step from `pose`, mm, after a step of `length`; 0 for a factorisation.
     fn allowed(&self, pose: &Pose, target: &Target<'_>, length: f64) -> f64 {
         if matches!(self.solver, TangentSolver::Cholesky(_)) {
@@ -491,91 +351,6 @@ impl Equilibrium {
         }
         Ok(Pose { u, merit, size, slope })
     }
-
-    /// Tangent system at `pose` on the rows, without constraints and springs: its matrix, and the right-hand
-    /// side if the other nodes move by `change`.
-    fn tangent(
-        &self,
-        pose: &Pose,
-        kind: TangentKind,
-        change: Option<&[[f64; 3]]>,
-    ) -> Result<(BlockMatrix, Vec<[f64; 3]>)> {
-        let mut b: Vec<[f64; 3]> = pose.slope.iter().map(|&s| scaled(s, -1.0)).collect();
-        let matrix = self.energy.with_stiffness(&pose.u, kind, |full| {
-            if let Some(change) = change {
-                for (b, f) in b.iter_mut().zip(self.reduction.rows(&full.multiply(change))) {
-                    *b = sub(*b, f);
-                }
-            }
-            self.pattern.get_or_init(|| self.reduction.pattern(full)).taken_from(full)
-        })?;
-        Ok((matrix, b))
-    }
-
-    /// Newton step from `pose` on the rows.
-    ///
-    /// `how`: the tangent, and the error allowed in the step, mm.
-    fn step(
-        &self,
-        pose: &Pose,
-        target: &Target<'_>,
-        moves: &Moves<'_>,
-        (kind, allowed): (TangentKind, f64),
-        interrupted: Interrupt<'_>,
-    ) -> Result<Vec<[f64; 3]>> {
-        let &Moves { constraints, change } = moves;
-        target.hierarchy.serve(kind == Definite, |kept| {
-            let (mut matrix, b) = self.tangent(pose, kind, change)?;
-            for (row, spring) in &target.conditions.springs {
-                matrix.add_to_diagonal(*row, spring.axis, spring.stiffness);
-            }
-            let rhs = projected_rhs(&matrix, &b, constraints);
-            if !constraints.is_empty() {
-                matrix = projected(&matrix, constraints);
-            }
-            let (mut value, multigrid, iterations) = match &self.solver {
-                TangentSolver::Cholesky(symbolic) => {
-                    (symbolic.factor(&matrix)?.solve(&rhs), None, 0)
-                }
-                TangentSolver::Pcg => {
-                    let system = self.by_iteration(matrix, constraints, kept)?;
-                    let (rows, iterations) = system.step(&rhs, allowed, interrupted)?;
-                    (rows, Some(system.multigrid().clone()), iterations)
-                }
-            };
-            add_offsets(&mut value, constraints);
-            Ok(Found { value, multigrid, iterations })
-        })
-    }
-
-    /// The tangent system of the projected `matrix`, to be solved by conjugate gradients with the hierarchy
-    /// `kept`, or with its own.
-    fn by_iteration(
-        &self,
-        matrix: BlockMatrix,
-        constraints: &[Constraint],
-        kept: Option<Arc<Multigrid>>,
-    ) -> Result<Iterative> {
-        let multigrid = match kept {
-            Some(kept) => kept,
-            None => {
-                let positions = self.reduction.rows(self.tensors.element_nodes().positions());
-                let normals: Vec<(usize, [f64; 3])> =
-                    constraints.iter().map(|c| (c.row, c.normal)).collect();
-                Arc::new(hierarchy(&matrix, &positions, &normals, self.tissue)?)
-            }
-        };
-        let options =
-            StaticOptions { tolerance: STEP_TOLERANCE * self.options.tolerance, ..self.options };
-        Ok(Iterative::new(matrix, multigrid, self.tissue, Method::Pcg, &options))
-    }
-
-    /// Keeps the hierarchy of the first tangent for other plans; later tangents of this one get their own.
-    fn leave_rest(&self, target: &Target<'_>) {
-        if let Some(multigrid) = target.hierarchy.take() {
-            self.at_rest.get_or_init(|| multigrid);
-        }
-    }
 }
 
 /// The error for a `quantity` that Newton's method did not bring to `limit`.
@@ -585,22 +360,6 @@ fn lost(quantity: &'static str, value: f64, limit: f64, unit: &'static str) -> M
         iterations: MAX_STEPS,
         shortfall: Shortfall { quantity, value, limit, unit },
         advice: "divide the plan into smaller moves, fix flat tets, or use kinematics=\"linear\"",
-    }
-}
-
-/// The result of `solve` with the tangent `first`, or with the definite one if the exact one is not positive
-/// definite; and the tangent used.
-fn by_tangent<T>(
-    first: TangentKind,
-    mut solve: impl FnMut(TangentKind) -> Result<T>,
-) -> Result<(T, TangentKind)> {
-    match solve(first) {
-        Err(MtmError::NotPositiveDefinite { .. } | MtmError::NotConverged { .. })
-            if first == Exact =>
-        {
-            Ok((solve(Definite)?, Definite))
-        }
-        other => Ok((other?, first)),
     }
 }
 

@@ -1,0 +1,163 @@
+//! Newton's steps downhill: which tangent each takes, and how far it goes.
+
+use crate::error::{MtmError, Result};
+use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
+use crate::statics::effort::Solve;
+use crate::statics::newton::{
+    Equilibrium, MAX_STEPS, Pose, TangentSolver, Target, lost, moved_by, reach,
+};
+use crate::vector::{add, norm};
+
+/// Share of the slope by which a step must decrease the energy (Armijo 1966).
+const DESCENT: f64 = 1e-4;
+/// Shortest step of the line search relative to the full one.
+const SHORTEST: f64 = 1.0 / 1024.0;
+/// Rounding error of the energy relative to its parts: a smaller decrease cannot be detected.
+const ENERGY_ROUNDING: f64 = 1e-12;
+/// Longest step of the search relative to the full one.
+const LONGEST: f64 = 16.0;
+/// Length of a step, relative to the length at which the exact tangent was not positive definite, below which
+/// it is tried again.
+const RETRY_EXACT: f64 = 0.5;
+/// Length of a step with the exact tangent, relative to the step before, above which the tangent counts as
+/// indefinite: near the solution steps become shorter.
+const LONGER: f64 = 8.0;
+/// Length of a step over all displacements, below which conjugate gradients use the exact tangent: at rest it
+/// is positive definite, and further away they would detect indefiniteness only by chance.
+const NEAR_REST: f64 = 0.05;
+
+/// A step of Newton's method.
+pub(super) struct Step {
+    pub rows: Vec<[f64; 3]>,
+    /// Slope of the merit along it.
+    pub slope: f64,
+    /// Increase of the merit that is accepted, N mm.
+    pub slack: f64,
+}
+
+impl Step {
+    /// Largest displacement, mm.
+    pub(super) fn length(&self) -> f64 {
+        self.rows.iter().fold(0.0, |m, v| m.max(norm(*v)))
+    }
+}
+
+impl Equilibrium {
+    /// The result of Newton's steps from `pose`. `next` computes each step from a pose, the tangent to use, and
+    /// the error allowed in the step, mm.
+    ///
+    /// `finest`: the error allowed in the last step, mm; `on_walls`: the rows that no step carries further than
+    /// computed.
+    pub(super) fn descend(
+        &self,
+        mut pose: Pose,
+        target: &Target<'_>,
+        (finest, on_walls): (f64, &[u32]),
+        mut next: impl FnMut(&Pose, (TangentKind, f64)) -> Result<Step>,
+        solve: &mut Solve<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        let by_factor = matches!(self.solver, TangentSolver::Cholesky(_));
+        // Step length below which the exact tangent is worth trying.
+        let mut near = if by_factor { f64::INFINITY } else { NEAR_REST * reach(&pose, target) };
+        let mut length = f64::INFINITY;
+        // Error of the state once it is small enough, when one step with the accuracy of the last one is still
+        // to be done.
+        let mut ending = None;
+        for _ in 0..MAX_STEPS {
+            if (solve.interrupted)() {
+                return Err(MtmError::Interrupted);
+            }
+            let mut allowed = self.allowed(&pose, target, length);
+            if ending.is_some() {
+                allowed = allowed.min(finest);
+            }
+            let first = if length <= near { Exact } else { Definite };
+            let (mut step, mut kind) = by_tangent(first, |kind| next(&pose, (kind, allowed)))?;
+            // Conjugate gradients do not always notice that a tangent is indefinite.
+            if !by_factor && kind == Exact && step.length() > LONGER * length {
+                (step, kind) = (next(&pose, (Definite, allowed))?, Definite);
+            }
+            if kind != first {
+                near = RETRY_EXACT * length;
+            }
+            solve.effort.iterations += 1;
+            let before = length;
+            length = step.length();
+            solve.effort.history.push(length);
+            // With a tangent that is not that of the energy, convergence is linear, at the rate of the last
+            // step.
+            let own = kind == Exact || length == 0.0;
+            let gain = if own { 1.0 } else { 1.0 - (length / before).min(1.0) };
+            let goal = self.options.tolerance * reach(&pose, target);
+            let bound = length / gain + allowed;
+            let bound = ending.filter(|_| length <= goal).unwrap_or(bound);
+            ending = (bound <= goal).then_some(bound);
+            if ending.is_some() && allowed <= finest {
+                solve.effort.error_estimate = bound;
+                return Ok(moved_by(&self.reduction, &pose.u, &step.rows, 1.0));
+            }
+            pose = self.search(pose, target, &step, kind, on_walls)?;
+        }
+        let limit = self.options.tolerance * reach(&pose, target);
+        Err(lost("the estimated error of a node", length, limit, " mm"))
+    }
+
+    /// The state at the end of `step`, shortened until it lies downhill, up to the slack of the step.
+    ///
+    /// If the tangent is not that of the energy, steps are lengthened as long as the energy keeps decreasing: a
+    /// curvature with its sign reversed limits how far the quadratic model can be trusted, but does not locate
+    /// the minimum. Rows `on_walls` stay at the end of the step.
+    fn search(
+        &self,
+        pose: Pose,
+        target: &Target<'_>,
+        step: &Step,
+        kind: TangentKind,
+        on_walls: &[u32],
+    ) -> Result<Pose> {
+        let at = |share: f64| {
+            let mut u = moved_by(&self.reduction, &pose.u, &step.rows, share);
+            if share > 1.0 {
+                for &row in on_walls {
+                    let j = self.reduction.unknowns[row as usize] as usize;
+                    u[j] = add(pose.u[j], step.rows[row as usize]);
+                }
+            }
+            self.pose(u, target)
+        };
+        let mut share = 1.0;
+        while share >= SHORTEST {
+            let mut next = at(share)?;
+            let rounding = ENERGY_ROUNDING * pose.size.max(next.size);
+            if next.merit <= pose.merit + DESCENT * share * step.slope + step.slack + rounding {
+                while kind == Definite && (1.0..LONGEST).contains(&share) {
+                    share *= 2.0;
+                    let further = at(share)?;
+                    if further.merit >= next.merit - rounding {
+                        break;
+                    }
+                    next = further;
+                }
+                return Ok(next);
+            }
+            share *= 0.5;
+        }
+        Err(lost("the share of the last step that lowers the energy", share, SHORTEST, ""))
+    }
+}
+
+/// The result of `solve` with the tangent `first`, or with the definite one if the exact one is not positive
+/// definite; and the tangent used.
+pub(super) fn by_tangent<T>(
+    first: TangentKind,
+    mut solve: impl FnMut(TangentKind) -> Result<T>,
+) -> Result<(T, TangentKind)> {
+    match solve(first) {
+        Err(MtmError::NotPositiveDefinite { .. } | MtmError::NotConverged { .. })
+            if first == Exact =>
+        {
+            Ok((solve(Definite)?, Definite))
+        }
+        other => Ok((other?, first)),
+    }
+}

@@ -1,0 +1,109 @@
+//! The tangent system of a state, and its solution by a factorisation or by conjugate gradients.
+
+use std::sync::Arc;
+
+use crate::algebra::blocks::BlockMatrix;
+use crate::algebra::constraints::{Constraint, add_offsets, projected, projected_rhs};
+use crate::algebra::multigrid::Multigrid;
+use crate::error::Result;
+use crate::mechanics::strain_energy::TangentKind::{self, Definite};
+use crate::statics::iterative::{Iterative, hierarchy};
+use crate::statics::newton::hierarchy::Found;
+use crate::statics::newton::{Equilibrium, Pose, STEP_TOLERANCE, TangentSolver, Target};
+use crate::statics::options::{Interrupt, Method, StaticOptions};
+use crate::vector::{scaled, sub};
+
+/// How the boundary moves in a step.
+pub(super) struct Moves<'a> {
+    /// Displacement of each constrained row along its normal.
+    pub constraints: &'a [Constraint],
+    /// Displacements of the nodes that are not unknowns; none if they do not move.
+    pub change: Option<&'a [[f64; 3]]>,
+}
+
+impl Equilibrium {
+    /// Tangent system at `pose` on the rows, without constraints and springs: its matrix, and the right-hand
+    /// side if the other nodes move by `change`.
+    pub(super) fn tangent(
+        &self,
+        pose: &Pose,
+        kind: TangentKind,
+        change: Option<&[[f64; 3]]>,
+    ) -> Result<(BlockMatrix, Vec<[f64; 3]>)> {
+        let mut b: Vec<[f64; 3]> = pose.slope.iter().map(|&s| scaled(s, -1.0)).collect();
+        let matrix = self.energy.with_stiffness(&pose.u, kind, |full| {
+            if let Some(change) = change {
+                for (b, f) in b.iter_mut().zip(self.reduction.rows(&full.multiply(change))) {
+                    *b = sub(*b, f);
+                }
+            }
+            self.pattern.get_or_init(|| self.reduction.pattern(full)).taken_from(full)
+        })?;
+        Ok((matrix, b))
+    }
+
+    /// Newton step from `pose` on the rows.
+    ///
+    /// `how`: the tangent, and the error allowed in the step, mm.
+    pub(super) fn step(
+        &self,
+        pose: &Pose,
+        target: &Target<'_>,
+        moves: &Moves<'_>,
+        (kind, allowed): (TangentKind, f64),
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        let &Moves { constraints, change } = moves;
+        target.hierarchy.serve(kind == Definite, |kept| {
+            let (mut matrix, b) = self.tangent(pose, kind, change)?;
+            for (row, spring) in &target.conditions.springs {
+                matrix.add_to_diagonal(*row, spring.axis, spring.stiffness);
+            }
+            let rhs = projected_rhs(&matrix, &b, constraints);
+            if !constraints.is_empty() {
+                matrix = projected(&matrix, constraints);
+            }
+            let (mut value, multigrid, iterations) = match &self.solver {
+                TangentSolver::Cholesky(symbolic) => {
+                    (symbolic.factor(&matrix)?.solve(&rhs), None, 0)
+                }
+                TangentSolver::Pcg => {
+                    let system = self.by_iteration(matrix, constraints, kept)?;
+                    let (rows, iterations) = system.step(&rhs, allowed, interrupted)?;
+                    (rows, Some(system.multigrid().clone()), iterations)
+                }
+            };
+            add_offsets(&mut value, constraints);
+            Ok(Found { value, multigrid, iterations })
+        })
+    }
+
+    /// The tangent system of the projected `matrix`, to be solved by conjugate gradients with the hierarchy
+    /// `kept`, or with its own.
+    fn by_iteration(
+        &self,
+        matrix: BlockMatrix,
+        constraints: &[Constraint],
+        kept: Option<Arc<Multigrid>>,
+    ) -> Result<Iterative> {
+        let multigrid = match kept {
+            Some(kept) => kept,
+            None => {
+                let positions = self.reduction.rows(self.tensors.element_nodes().positions());
+                let normals: Vec<(usize, [f64; 3])> =
+                    constraints.iter().map(|c| (c.row, c.normal)).collect();
+                Arc::new(hierarchy(&matrix, &positions, &normals, self.tissue)?)
+            }
+        };
+        let options =
+            StaticOptions { tolerance: STEP_TOLERANCE * self.options.tolerance, ..self.options };
+        Ok(Iterative::new(matrix, multigrid, self.tissue, Method::Pcg, &options))
+    }
+
+    /// Keeps the hierarchy of the first tangent for other plans; later tangents of this one get their own.
+    pub(super) fn leave_rest(&self, target: &Target<'_>) {
+        if let Some(multigrid) = target.hierarchy.take() {
+            self.at_rest.get_or_init(|| multigrid);
+        }
+    }
+}
