@@ -176,6 +176,12 @@ def solved_scene(scene: Scene, solver: StaticSolver) -> tuple[SceneResult, Solut
     )
     inverted, findings = _inverted(solver, solution)
     findings += _contact_findings(solution)
+    if len(solution.contact_nodes):
+        # A scene without sliding does not pay for it.
+        from cmfsim.solving.slip import slip_finding  # noqa: PLC0415
+
+        slipped = slip_finding(scene, solution.displacements)
+        findings += [] if slipped is None else [told(slipped)]
     summary: dict[str, Any] = {
         "scene_sha256": scene.sha256(),
         "n_nodes": scene.n_nodes,

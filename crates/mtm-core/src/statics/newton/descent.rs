@@ -3,10 +3,11 @@
 use crate::error::{MtmError, Result};
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::statics::effort::Solve;
+use crate::statics::newton::step::{Step, by_tangent};
 use crate::statics::newton::{
     Equilibrium, MAX_STEPS, Pose, TangentSolver, Target, lost, moved_by, reach,
 };
-use crate::vector::{add, norm};
+use crate::vector::add;
 
 /// Share of the slope by which a step must decrease the energy (Armijo 1966).
 const DESCENT: f64 = 1e-4;
@@ -25,22 +26,6 @@ const LONGER: f64 = 8.0;
 /// Length of a step over all displacements, below which conjugate gradients use the exact tangent: at rest it
 /// is positive definite, and further away they would detect indefiniteness only by chance.
 const NEAR_REST: f64 = 0.05;
-
-/// A step of Newton's method.
-pub(super) struct Step {
-    pub rows: Vec<[f64; 3]>,
-    /// Slope of the merit along it.
-    pub slope: f64,
-    /// Increase of the merit that is accepted, N mm.
-    pub slack: f64,
-}
-
-impl Step {
-    /// Largest displacement, mm.
-    pub(super) fn length(&self) -> f64 {
-        self.rows.iter().fold(0.0, |m, v| m.max(norm(*v)))
-    }
-}
 
 impl Equilibrium {
     /// The result of Newton's steps from `pose`. `next` computes each step from a pose, the tangent to use, and
@@ -143,21 +128,5 @@ impl Equilibrium {
             share *= 0.5;
         }
         Err(lost("the share of the last step that lowers the energy", share, SHORTEST, ""))
-    }
-}
-
-/// The result of `solve` with the tangent `first`, or with the definite one if the exact one is not positive
-/// definite; and the tangent used.
-pub(super) fn by_tangent<T>(
-    first: TangentKind,
-    mut solve: impl FnMut(TangentKind) -> Result<T>,
-) -> Result<(T, TangentKind)> {
-    match solve(first) {
-        Err(MtmError::NotPositiveDefinite { .. } | MtmError::NotConverged { .. })
-            if first == Exact =>
-        {
-            Ok((solve(Definite)?, Definite))
-        }
-        other => Ok((other?, first)),
     }
 }

@@ -7,6 +7,7 @@
 mod descent;
 mod hierarchy;
 mod sliding;
+mod step;
 mod tangents;
 
 use std::sync::{Arc, OnceLock};
@@ -22,9 +23,8 @@ use crate::mechanics::strain_energy::TangentKind::{self, Exact};
 use crate::mechanics::tensors::MassTensors;
 use crate::statics::effort::Solve;
 use crate::statics::iterative::Extremes;
-use crate::statics::newton::descent::{Step, by_tangent};
 use crate::statics::newton::hierarchy::SharedHierarchy;
-use crate::statics::newton::tangents::Moves;
+use crate::statics::newton::step::{Moves, Step, by_tangent};
 use crate::statics::options::{Method, StaticOptions};
 use crate::statics::reduction::{ReducedPattern, Reduction};
 use crate::statics::row_conditions::RowConditions;

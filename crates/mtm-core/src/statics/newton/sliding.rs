@@ -7,8 +7,8 @@ use crate::contact::{ContactState, Sliding};
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::statics::effort::Solve;
-use crate::statics::newton::descent::{Step, by_tangent};
 use crate::statics::newton::hierarchy::Found;
+use crate::statics::newton::step::{Step, by_tangent};
 use crate::statics::newton::{
     Equilibrium, Pose, STEP_SHARE, STEP_TOLERANCE, TangentSolver, Target, along_slope, moved_by,
     reach,

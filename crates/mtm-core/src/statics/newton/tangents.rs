@@ -9,17 +9,10 @@ use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Definite};
 use crate::statics::iterative::{Iterative, hierarchy};
 use crate::statics::newton::hierarchy::Found;
+use crate::statics::newton::step::Moves;
 use crate::statics::newton::{Equilibrium, Pose, STEP_TOLERANCE, TangentSolver, Target};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::vector::{scaled, sub};
-
-/// How the boundary moves in a step.
-pub(super) struct Moves<'a> {
-    /// Displacement of each constrained row along its normal.
-    pub constraints: &'a [Constraint],
-    /// Displacements of the nodes that are not unknowns; none if they do not move.
-    pub change: Option<&'a [[f64; 3]]>,
-}
 
 impl Equilibrium {
     /// Tangent system at `pose` on the rows, without constraints and springs: its matrix, and the right-hand
