@@ -47,6 +47,7 @@ struct Scratch {
     forces: Vec<[f64; 3]>,
     /// Tangent of each quadrature point times its volume, N mm.
     tangents: Vec<Tangent>,
+    /// Tangent stiffness, N/mm.
     matrix: Option<BlockMatrix>,
 }
 
@@ -183,7 +184,11 @@ impl StrainEnergy {
     /// # Errors
     /// Displacements of the wrong number, or not finite.
     pub fn stiffness(&self, u: &[[f64; 3]], kind: TangentKind) -> Result<BlockMatrix> {
-        self.with_stiffness(u, kind, BlockMatrix::clone)
+        self.tensors.check_displacements(u)?;
+        let mut scratch = self.take_scratch();
+        let matrix = self.assembled(u, kind, &mut scratch);
+        self.keep_scratch(scratch);
+        Ok(matrix)
     }
 
     /// The result of `read` for the tangent stiffness under displacements of all nodes.
@@ -194,11 +199,20 @@ impl StrainEnergy {
         read: impl FnOnce(&BlockMatrix) -> T,
     ) -> Result<T> {
         self.tensors.check_displacements(u)?;
+        let mut scratch = self.take_scratch();
+        let matrix = self.assembled(u, kind, &mut scratch);
+        let result = read(&matrix);
+        scratch.matrix = Some(matrix);
+        self.keep_scratch(scratch);
+        Ok(result)
+    }
+
+    /// The tangent stiffness, in the memory of `scratch` where that has some.
+    fn assembled(&self, u: &[[f64; 3]], kind: TangentKind, scratch: &mut Scratch) -> BlockMatrix {
         let nodes = self.nodes();
         let mesh = nodes.mesh();
         let averaged = self.averaged(u);
         let n_points = nodes.n_points();
-        let mut scratch = self.take_scratch();
         scratch.tangents.resize(mesh.n_tets() * n_points, Tangent::zeros());
         scratch.tangents.par_chunks_mut(n_points).enumerate().for_each(|(t, own)| {
             let pressure = averaged.as_ref().map_or(0.0, |a| a.pressures[t]);
@@ -223,10 +237,7 @@ impl StrainEnergy {
             let gradients = patches.gradients(mesh, |t| averaged.slopes[t]);
             patches.add_to(mesh, &gradients, &mut matrix);
         }
-        let result = read(&matrix);
-        scratch.matrix = Some(matrix);
-        self.keep_scratch(scratch);
-        Ok(result)
+        matrix
     }
 
     fn averaged(&self, u: &[[f64; 3]]) -> Option<Averaged> {
