@@ -205,7 +205,7 @@ impl Equilibrium {
     ) -> Result<Solved> {
         let clock = Clock::new();
         let scale = solve.scale;
-        let shared = SharedHierarchy::starting(self.at_rest.get());
+        let shared = SharedHierarchy::starting(&self.at_rest);
         let hierarchy = &shared;
         let conditions = RowConditions::default;
         let target = || Target { prescribed, loads, conditions: conditions(), scale, hierarchy };
@@ -296,9 +296,7 @@ impl Equilibrium {
             let moves = Moves { constraints: &constraints, change: Some(&change) };
             self.step(&start, target, &moves, (kind, allowed), interrupted)
         })?;
-        if constraints.is_empty() {
-            self.leave_rest(target);
-        }
+        target.hierarchy.leave_rest(&self.at_rest);
         let mut ahead = start.u;
         for (value, d) in ahead.iter_mut().zip(&change) {
             *value = add(*value, *d);

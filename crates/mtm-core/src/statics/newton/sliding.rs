@@ -69,7 +69,7 @@ impl Equilibrium {
             let start = Start { change: Some(&change), ..Start::default() };
             self.settled(&rest, &wanted, &start, (kind, first), interrupted)
         })?;
-        self.leave_rest(target);
+        target.hierarchy.leave_rest(&self.at_rest);
         solve.effort.iterations += 1;
         let ahead: Vec<[f64; 3]> = rest.u.iter().zip(&change).map(|(a, b)| add(*a, *b)).collect();
         let pose = self.pose(moved_by(&self.reduction, &ahead, &rows, 1.0), target)?;
@@ -138,9 +138,10 @@ impl Equilibrium {
             let Settled { rows, contact, .. } =
                 system.solve_with_contact(&b, &settle, &mut solve)?;
             let step = rows.iter().zip(&here).map(|(x, u)| sub(*x, *u)).collect();
-            let iterations = solve.effort.iterations / contact.iterations.max(1);
-            // Under contact, iterations with an earlier hierarchy cost more than a new one.
+            // Under contact only the hierarchy at rest is kept, for other plans: iterations with that of an earlier
+            // tangent cost more than a new one.
             let multigrid = start.change.and_then(|_| system.multigrid().cloned());
+            let iterations = solve.effort.iterations;
             Ok(Found { value: (step, contact), multigrid, iterations })
         })
     }

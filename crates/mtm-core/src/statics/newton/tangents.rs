@@ -92,11 +92,4 @@ impl Equilibrium {
             StaticOptions { tolerance: STEP_TOLERANCE * self.options.tolerance, ..self.options };
         Ok(Iterative::new(matrix, multigrid, self.tissue, Method::Pcg, &options))
     }
-
-    /// Keeps the hierarchy of the first tangent for other plans; later tangents of this one get their own.
-    pub(super) fn leave_rest(&self, target: &Target<'_>) {
-        if let Some(multigrid) = target.hierarchy.take() {
-            self.at_rest.get_or_init(|| multigrid);
-        }
-    }
 }
