@@ -21,11 +21,18 @@ const LONGEST: f64 = 16.0;
 /// it is tried again.
 const RETRY_EXACT: f64 = 0.5;
 /// Length of a step with the exact tangent, relative to the step before, above which the tangent counts as
-/// indefinite: near the solution steps become shorter.
+/// indefinite unless the whole step goes downhill: near the solution steps become shorter.
 const LONGER: f64 = 8.0;
 /// Length of a step over all displacements, below which conjugate gradients use the exact tangent: at rest it
 /// is positive definite, and further away they would detect indefiniteness only by chance.
 const NEAR_REST: f64 = 0.05;
+/// Ratio of moduli above which stiff parts that turn on soft ones make single steps short far from the solution:
+/// on a bar with bands of 1e6 times the modulus, a step of 0.02 mm was followed by one of 0.14 mm.
+const STIFF_PARTS: f64 = 500.0;
+/// Steps over which convergence is judged with such parts.
+const WINDOW: usize = 3;
+/// Length of a step relative to the one before, below which Newton's method converges quadratically in any case.
+const QUADRATIC: f64 = 1e-3;
 
 impl Equilibrium {
     /// The result of Newton's steps from `pose`. `next` computes each step from a pose, the tangent to use, and
@@ -59,7 +66,8 @@ impl Equilibrium {
             let first = if length <= near { Exact } else { Definite };
             let (mut step, mut kind) = by_tangent(first, |kind| next(&pose, (kind, allowed)))?;
             // Conjugate gradients do not always notice that a tangent is indefinite.
-            if !by_factor && kind == Exact && step.length() > LONGER * length {
+            let is_long = !by_factor && kind == Exact && step.length() > LONGER * length;
+            if is_long && !self.descends_fully(&pose, target, &step) {
                 (step, kind) = (next(&pose, (Definite, allowed))?, Definite);
             }
             if kind != first {
@@ -74,7 +82,10 @@ impl Equilibrium {
             let own = kind == Exact || length == 0.0;
             let gain = if own { 1.0 } else { 1.0 - (length / before).min(1.0) };
             let goal = self.options.tolerance * reach(&pose, target);
-            let bound = length / gain + allowed;
+            let has_stiff_parts = self.tissue.contrast > STIFF_PARTS;
+            let left =
+                if has_stiff_parts { left_after(&solve.effort.history) } else { length / gain };
+            let bound = left + allowed;
             let bound = ending.filter(|_| length <= goal).unwrap_or(bound);
             ending = (bound <= goal).then_some(bound);
             if ending.is_some() && allowed <= finest {
@@ -85,6 +96,13 @@ impl Equilibrium {
         }
         let limit = self.options.tolerance * reach(&pose, target);
         Err(lost("the estimated error of a node", length, limit, " mm"))
+    }
+
+    /// Whether the whole `step` goes downhill.
+    fn descends_fully(&self, pose: &Pose, target: &Target<'_>, step: &Step) -> bool {
+        let end = moved_by(&self.reduction, &pose.u, &step.rows, 1.0);
+        // Without an energy at its end it does not.
+        self.pose(end, target).is_ok_and(|end| step.descends(pose, &end, 1.0))
     }
 
     /// The state at the end of `step`, shortened until it lies downhill, up to the slack of the step.
@@ -113,12 +131,11 @@ impl Equilibrium {
         let mut share = 1.0;
         while share >= SHORTEST {
             let mut next = at(share)?;
-            let rounding = ENERGY_ROUNDING * pose.size.max(next.size);
-            if next.merit <= pose.merit + DESCENT * share * step.slope + step.slack + rounding {
+            if step.descends(&pose, &next, share) {
                 while kind == Definite && (1.0..LONGEST).contains(&share) {
                     share *= 2.0;
                     let further = at(share)?;
-                    if further.merit >= next.merit - rounding {
+                    if further.merit >= next.merit - rounding(&pose, &next) {
                         break;
                     }
                     next = further;
@@ -129,4 +146,32 @@ impl Equilibrium {
         }
         Err(lost("the share of the last step that lowers the energy", share, SHORTEST, ""))
     }
+}
+
+impl Step {
+    /// Whether `end`, at `share` of the step from `pose`, lies downhill, up to the slack of the step.
+    fn descends(&self, pose: &Pose, end: &Pose, share: f64) -> bool {
+        let limit = pose.merit + DESCENT * share * self.slope + self.slack;
+        end.merit <= limit + rounding(pose, end)
+    }
+}
+
+/// Bound of the error after steps of these `lengths`, mm, if each of the last ones may have been too short: the
+/// longest of the last three, and all that follow at the rate from the three before.
+fn left_after(lengths: &[f64]) -> f64 {
+    let longest = |lengths: &[f64]| lengths.iter().copied().fold(0.0, f64::max);
+    let (earlier, last) = lengths.split_at(lengths.len().saturating_sub(WINDOW));
+    if let [.., before, now] = *last
+        && now <= QUADRATIC * before
+    {
+        return now;
+    }
+    let before = longest(&earlier[earlier.len().saturating_sub(WINDOW)..]);
+    let rate = (longest(last) / before).powf(1.0 / WINDOW as f64);
+    if rate < 1.0 { longest(last) / (1.0 - rate) } else { f64::INFINITY }
+}
+
+/// Rounding error of the difference in energy of two states, N mm.
+fn rounding(one: &Pose, other: &Pose) -> f64 {
+    ENERGY_ROUNDING * one.size.max(other.size)
 }
