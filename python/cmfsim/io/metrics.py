@@ -11,6 +11,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.files import replacing
 from cmfsim.io.summaries import (
     checked_file,
+    file_of,
     finding,
     listing,
     mapping,
@@ -68,11 +69,12 @@ def _regions(where: str, value: object) -> None:
         mapping(_STATISTICS, most=100)(f"{where}.regions", value["regions"])
 
 
-def _file_name(where: str, value: object) -> None:
-    if not isinstance(value, str) or not is_evaluation_file(value):
-        raise CaseInputError(f"{where} is {value!r:.60}: an evaluation has no file of that name")
+def is_evaluation_file(name: str) -> bool:
+    """Whether an evaluation is written as files of this name, among others."""
+    return EVALUATION_FILES.fullmatch(name) is not None
 
 
+_FILE_NAME = file_of("an evaluation", is_evaluation_file)
 _EVALUATION = table(
     {
         "case": text,
@@ -80,7 +82,7 @@ _EVALUATION = table(
         "case_key": text,
         "models": mapping(_regions, keys=one_of(*MODELS)),
         "failed": mapping(text, keys=one_of(*MODELS)),
-        "files": listing(_file_name),
+        "files": listing(_FILE_NAME),
     },
     {
         "not_operated": optional(table({"regions": mapping(_STATISTICS, most=100)})),
@@ -102,11 +104,6 @@ _EVALUATION = table(
         "warnings": listing(text),
     },
 )
-
-
-def is_evaluation_file(name: str) -> bool:
-    """Whether an evaluation is written as files of this name, among others."""
-    return EVALUATION_FILES.fullmatch(name) is not None
 
 
 def read_evaluation(folder: str | os.PathLike[str]) -> dict[str, Any]:
@@ -134,7 +131,7 @@ def read_evaluation_picture(
     CaseError
         (also `ValueError`) It is none of that evaluation, or no PNG.
     """
-    _file_name("files", name)
+    _FILE_NAME("files", name)
     return read_picture(checked_file(Path(folder), evaluation, name, AGAIN))
 
 

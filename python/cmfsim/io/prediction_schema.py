@@ -2,8 +2,8 @@
 
 import re
 
-from cmfsim.errors import CaseInputError
 from cmfsim.io.summaries import (
+    file_of,
     finding,
     flag,
     listing,
@@ -42,11 +42,6 @@ def _motion(where: str, value: object) -> None:
     table({}, {"mean": number(0.0, 1e6), "bending": number(0.0, 1e6)})(where, value)
     rigid = isinstance(value, dict) and "translation" in value
     (_RIGID if rigid else _MOVED)(where, value)
-
-
-def _file_name(where: str, value: object) -> None:
-    if not isinstance(value, str) or not is_prediction_file(value):
-        raise CaseInputError(f"{where} is {value!r:.60}: a prediction has no file of that name")
 
 
 _SOLUTION = table(
@@ -133,7 +128,7 @@ PREDICTION = table(
         "solution": _SOLUTION,
         "findings": listing(finding),
         "parts": mapping(listing(text), most=10, keys=one_of("bones", "muscles")),
-        "files": listing(_file_name),
+        "files": listing(file_of("a prediction", is_prediction_file)),
     },
     {
         "note": text,

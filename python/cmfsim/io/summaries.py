@@ -21,6 +21,7 @@ from cmfsim.values.finding import SEVERITIES
 __all__ = [
     "Check",
     "checked_file",
+    "file_of",
     "finding",
     "flag",
     "listing",
@@ -228,6 +229,16 @@ def plain(where: str, value: object, depth: int = 0) -> None:
             )
     elif value is not None and not isinstance(value, bool):
         number()(where, value)
+
+
+def file_of(result: str, is_its: Callable[[str], bool]) -> Check:
+    """A name that files of a result have, such as "a prediction"."""
+
+    def check(where: str, value: object) -> None:
+        if not isinstance(value, str) or not is_its(value):
+            raise CaseInputError(f"{where} is {value!r:.60}: {result} has no file of that name")
+
+    return check
 
 
 def flag(where: str, value: object) -> None:
