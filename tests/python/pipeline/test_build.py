@@ -18,7 +18,7 @@ import cmfsim
 import phantom_case
 from cmfsim.cli import main
 from cmfsim.io import models
-from cmfsim.pipeline.building import case_model, tissue_mesh
+from cmfsim.pipeline.building import assembly, case_model, tissue_mesh
 from head_case import HeadCase
 
 pytest.importorskip("skimage", reason="needs scikit-image (pip install 'cmfsim[imaging]')")
@@ -380,7 +380,8 @@ def test_a_stage_that_fails_leaves_the_old_results(
         monkeypatch.setattr(case_model, "read_anatomy", lambda *_: (small_model.anatomy, ()))
     if stage == "write_model":
         monkeypatch.setattr(case_model, "build_model", lambda *_, **__: small_model)
-    monkeypatch.setattr(case_model, stage, fail)
+    owner = assembly if stage == "segment_data" else case_model
+    monkeypatch.setattr(owner, stage, fail)
     found, out, err = run("build", ellipsoids, "-q", "--no-doctor")
     assert (found, out) == (code, "")
     assert said in err
@@ -660,7 +661,7 @@ def test_files_of_one_name_in_two_folders_have_their_own_hashes(ellipsoids):
     (folder / "cranium.ply").write_bytes(bone)
     text = ellipsoids.read_text(encoding="utf-8")
     ellipsoids.write_text(text.replace('"mandible.ply"', '"other/cranium.ply"'), encoding="utf-8")
-    hashes = case_model.input_hashes(cmfsim.Case.load(ellipsoids))
+    hashes = assembly.input_hashes(cmfsim.Case.load(ellipsoids))
     assert hashes["cranium.ply"] != hashes["other/cranium.ply"]
 
 

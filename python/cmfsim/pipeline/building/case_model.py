@@ -1,17 +1,12 @@
 """Builds the patient's model of a case, and writes it."""
 
 import logging
-import platform
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from cmfsim._core import TetMesh, __version__
 from cmfsim.bones import (
     CuttingPlane,
     Procedure,
@@ -22,64 +17,27 @@ from cmfsim.bones import (
 )
 from cmfsim.checks import Floats
 from cmfsim.doctor import diagnose
-from cmfsim.doctor.landmarks import (
-    LANDMARK_CODES,
-)
+from cmfsim.doctor.landmarks import LANDMARK_CODES
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Case, CaseOrPath, as_case, write_model
-from cmfsim.lips import LipSeam, seam_faces
-from cmfsim.meshing import (
-    MeshReport,
-    TissueRegion,
-    report_of_part,
-    tissue_level,
-)
-from cmfsim.node_kinds import (
-    DentalArches,
-    KindOptions,
-    classify_nodes,
-    dental_arches,
-    kind_options,
-    lifted_tissue,
-    segment_data,
-)
+from cmfsim.meshing import tissue_level
+from cmfsim.node_kinds import KindOptions, dental_arches, kind_options
 from cmfsim.pictures import picture_anatomy, picture_node_kinds
-from cmfsim.pipeline.building.case_checks import cut_segments, misplaced, plan_sizes, untouched
-from cmfsim.pipeline.building.clefts import without_clefts
-from cmfsim.pipeline.building.contacts import CaseContacts, arch_sheets, mean_edge
-from cmfsim.pipeline.building.ends import end_findings
-from cmfsim.pipeline.building.held import held_part
-from cmfsim.pipeline.building.inputs import (
-    case_key,
-    check_output,
-    input_hashes,
-    read_anatomy,
-    read_case_landmarks,
-)
-from cmfsim.pipeline.building.landmarks import found_landmarks, landmark_summary
-from cmfsim.pipeline.building.lips import (
-    CaseLipContact,
-    find_seam,
-    lip_contact,
-    lip_summary,
-    separated_at_seam,
-)
+from cmfsim.pipeline.building.assembly import assembled
+from cmfsim.pipeline.building.case_checks import misplaced, plan_sizes
+from cmfsim.pipeline.building.inputs import check_output, read_anatomy, read_case_landmarks
+from cmfsim.pipeline.building.landmarks import found_landmarks
+from cmfsim.pipeline.building.lips import find_seam
 from cmfsim.pipeline.building.motions import PlannedBones, planned_bones
+from cmfsim.pipeline.building.nodes import nodes_of
+from cmfsim.pipeline.building.parts import Head, Tissue
 from cmfsim.pipeline.building.postoperative import Postoperative
-from cmfsim.pipeline.building.skin_part import on_skin
 from cmfsim.pipeline.building.stages import BuildOptions, Stages
-from cmfsim.pipeline.building.tissue_mesh import end_planes, region_of, tissue_mesh
+from cmfsim.pipeline.building.tissue_mesh import region_of, tissue_mesh
 from cmfsim.progress import Progress, no_progress
-from cmfsim.registration.proposed import ProposedLandmarks
-from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding, OnFindings
-from cmfsim.values.image_data import ImageData
-from cmfsim.values.lifted_tissue import LiftedTissue
-from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.patient_model import PatientModel
-from cmfsim.values.scene import Scene, SegmentData
-from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["build_case", "build_model", "model_of"]
 
@@ -208,11 +166,11 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
     if case.landmarks.proposed and not landmarks:
         proposed, anatomy = found_landmarks(case, anatomy, stages, is_read=options.anatomy is None)
         landmarks = {} if proposed is None else proposed.points
-    head = _Head(case, landmarks, anatomy, proposed)
+    head = Head(case, landmarks, anatomy, proposed)
     bones, procedures = _bones(head, stages, options.after)
     tissue = _tissue(head, stages, bones, kinds)
-    nodes = _nodes(head, stages, bones, tissue, kinds)
-    patient = _assembled(head, stages, bones, nodes, procedures)
+    nodes = nodes_of(head, stages, bones, tissue, kinds)
+    patient = assembled(head, stages, bones, nodes, procedures)
     if case.muscles is None:
         return patient
     stages.begin("placing and sampling the muscles")
@@ -222,48 +180,8 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
     return with_muscles(patient, case.muscles, mesh=nodes.mesh)
 
 
-@dataclass(frozen=True, eq=False)
-class _Head:
-    """A case with what was read of it."""
-
-    case: Case
-    landmarks: Mapping[str, Mapping[str, Floats]]
-    anatomy: Anatomy
-    proposed: ProposedLandmarks | None = None
-
-    @property
-    def skull(self) -> Mapping[str, Floats]:
-        return self.landmarks.get("skull", {})
-
-
-@dataclass(frozen=True, eq=False)
-class _Tissue:
-    """The soft tissue of a head, and the tets that fill it."""
-
-    region: TissueRegion
-    level: ImageData
-    mesh: TetMesh
-    report: MeshReport
-    arches: DentalArches | None
-    seam: LipSeam | None
-
-
-@dataclass(frozen=True, eq=False)
-class _Nodes:
-    """The mesh that is solved on, and what its nodes do."""
-
-    mesh: TetMesh
-    report: MeshReport
-    kinds: NodeKinds
-    contacts: CaseContacts
-    level: ImageData
-    seam: LipSeam | None
-    lips: CaseLipContact
-    lifted: LiftedTissue | None
-
-
 def _bones(
-    head: _Head, stages: Stages, after: Postoperative | None
+    head: Head, stages: Stages, after: Postoperative | None
 ) -> tuple[PlannedBones, tuple[Procedure, ...]]:
     """The segments of the bones with their motions, and the procedures that cut them."""
     case = head.case
@@ -288,7 +206,7 @@ def _bones(
     return bones, cut.procedures
 
 
-def _tissue(head: _Head, stages: Stages, bones: PlannedBones, options: KindOptions) -> _Tissue:
+def _tissue(head: Head, stages: Stages, bones: PlannedBones, options: KindOptions) -> Tissue:
     case, anatomy = head.case, head.anatomy
     stages.begin("finding the soft tissue")
     region = region_of(head.case, head.anatomy, head.skull)
@@ -307,122 +225,7 @@ def _tissue(head: _Head, stages: Stages, bones: PlannedBones, options: KindOptio
     mesh, report, noticed = tissue_mesh(case, level, anatomy, seam)
     stages.add(noticed)
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
-    return _Tissue(region, level, mesh, report, arches, seam)
-
-
-def _nodes(
-    head: _Head, stages: Stages, bones: PlannedBones, tissue: _Tissue, options: KindOptions
-) -> _Nodes:
-    case, anatomy, mesh, report = head.case, head.anatomy, tissue.mesh, tissue.report
-    moved = [*dict.fromkeys([*cut_segments(case), *bones.motions])]
-    arches, seam = tissue.arches, tissue.seam
-    contacts = CaseContacts()
-    if arches is not None:
-        stages.begin("making the contact sheets")
-        edge = case.mesh.edge_length if case.mesh.file is None else mean_edge(mesh)
-        contacts = arch_sheets(anatomy, bones.segments, arches, options, edge)
-        stages.add(contacts.findings)
-
-    stages.begin("classifying nodes")
-    classified = classify_nodes(
-        mesh.nodes,
-        mesh.boundary_triangles(),
-        anatomy,
-        bones.segments,
-        moved=moved,
-        landmarks=head.skull,
-        fixed_planes=end_planes(tissue.region),
-        options=options,
-        arches=arches,
-        contacts=contacts.surfaces,
-    )
-    stages.add(classified.findings)
-    kinds, whole = classified.kinds, mesh.n_tets
-    if case.mesh.file is None:
-        mesh, kinds, noticed = without_clefts(mesh, kinds, bones.segments, moved, case.mesh.cleft)
-        stages.add(noticed)
-    mesh, kinds, noticed = held_part(mesh, kinds)
-    stages.add(noticed)
-    lips = CaseLipContact({}, kinds)
-    if seam is not None:
-        stages.begin("separating the lips")
-        mesh, kinds, noticed = separated_at_seam(mesh, kinds, seam)
-        stages.add(noticed)
-        lips = lip_contact(
-            mesh,
-            kinds,
-            seam,
-            height=case.lips.height,
-            arches=arches,
-            contacts=contacts,
-            segments=bones.segments,
-        )
-        kinds = lips.kinds
-    if mesh.n_tets < whole or lips.regions:
-        report = report_of_part(mesh, report)
-    found = end_findings(
-        mesh.nodes,
-        mesh.boundary_triangles(),
-        kinds,
-        anatomy,
-        tissue.region,
-        segments=bones.segments,
-        moved=moved,
-    )
-    stages.add(found)
-    stages.add(untouched(case, mesh, kinds, bones))
-    stages.drop_repeated()
-    lifted = lifted_tissue(mesh.nodes, kinds, bones.segments, moved, options)
-    return _Nodes(mesh, report, kinds, contacts, tissue.level, seam, lips, lifted)
-
-
-def _assembled(
-    head: _Head,
-    stages: Stages,
-    bones: PlannedBones,
-    nodes: _Nodes,
-    procedures: Sequence[Procedure],
-) -> PatientModel:
-    """The patient without muscles."""
-    case, anatomy, kinds = head.case, head.anatomy, nodes.kinds
-    stages.begin("assembling the scene")
-    places, boundary = nodes.mesh.nodes, nodes.mesh.boundary_triangles()
-    slid = nodes.contacts.of_scene(bones.segments, kinds)
-    scene = _scene(case, nodes, bones, slid)
-    departures = nodes.contacts.summary(bones.segments, kinds, places, slid)
-    is_skin = on_skin(places, boundary, anatomy, nodes.level)
-    if nodes.lips.regions:
-        # What the lips turn to each other is inside the mouth.
-        is_skin &= ~seam_faces(places, boundary)
-    skin = boundary[is_skin]
-    stages.end()
-    return PatientModel(
-        name=case.name,
-        scene=scene,
-        kinds=kinds,
-        boundary_triangles=boundary,
-        skin_triangles=skin,
-        segments=bones.segments,
-        anatomy=anatomy,
-        fat=case.tissue,
-        landmarks=head.landmarks,
-        lifted=nodes.lifted,
-        lips=nodes.lips.regions,
-        findings=tuple(stages.findings),
-        summary={
-            **_summary(head, nodes, stages, procedures),
-            "contact": departures,
-            **({} if nodes.seam is None else {"lips": lip_summary(nodes.seam, nodes.lips)}),
-            **({} if bones.achieved is None else {"achieved": bones.achieved.as_dict()}),
-            **(
-                {"plan_fits": {name: fit.as_dict() for name, fit in bones.fits.items()}}
-                if bones.fits
-                else {}
-            ),
-            "plan_sources": dict(bones.sources),
-        },
-        detailed_skin=partial(detailed_surface, "skin", anatomy.skin),
-    )
+    return Tissue(region, level, mesh, report, arches, seam)
 
 
 def _draw(model: PatientModel, folder: Path) -> list[str]:
@@ -465,63 +268,3 @@ def _kind_options(case: Case) -> KindOptions:
         return kind_options(case.node_kinds)
     except CaseInputError as error:
         raise CaseInputError(f"{case.where('node_kinds')}: {error}") from error
-
-
-def _scene(
-    case: Case, nodes: _Nodes, bones: PlannedBones, contacts: Mapping[str, SurfaceData]
-) -> Scene:
-    mesh, kinds, lips, lifted = nodes.mesh, nodes.kinds, nodes.lips, nodes.lifted
-    data = segment_data(kinds, bones.segments, contacts=contacts)
-    # Teeth that no node is attached to or slides on may still be before the lips.
-    data |= {o.segment: SegmentData() for o in lips.obstacles if o.segment not in data}
-    plan = {name: bones.motions.get(name, np.eye(4)) for name in data}
-    fixed = kinds.nodes("fixed")
-    if lifted is not None:
-        fixed = lifted.fixed(fixed, plan[lifted.segment])
-    return Scene(
-        nodes=mesh.nodes,
-        tets=mesh.tets,
-        tissue=case.tissue,
-        segments=data,
-        plan=plan,
-        fixed=fixed,
-        options=case.solver,
-        touching=lips.touching,
-        obstacles=lips.obstacles,
-    )
-
-
-def _summary(
-    head: _Head, nodes: _Nodes, stages: Stages, procedures: Sequence[Procedure]
-) -> dict[str, Any]:
-    case, kinds, grid = head.case, nodes.kinds, head.anatomy.skin
-    inputs = input_hashes(case)
-    return {
-        "case": case.name,
-        "note": case.note,
-        "nodes": {name: len(kinds.nodes(name)) for name in NODE_KINDS},
-        "segments": {
-            name: {kind: len(kinds.nodes(kind, name)) for kind in ("joined", "sliding")}
-            for name in kinds.segments
-        },
-        "mesh": nodes.report.as_dict(),
-        "grid": {
-            "shape": list(grid.values.shape),
-            "spacing": grid.spacing.tolist(),
-            "origin": grid.lowest.tolist(),
-        },
-        "bones": list(head.anatomy.bones),
-        **({} if head.proposed is None else {"landmarks": landmark_summary(head.proposed)}),
-        "osteotomies": [
-            {"procedure": placed.kind, "options": dict(placed.options)} for placed in procedures
-        ],
-        "findings": [asdict(finding) for finding in stages.findings],
-        "timings": dict(stages.seconds),
-        "inputs": inputs,
-        "inputs_key": case_key(case, inputs),
-        "versions": {
-            "cmfsim": __version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
-    }

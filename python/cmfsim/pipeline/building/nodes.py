@@ -1,0 +1,90 @@
+"""What each node of the soft tissue does, and which tets are left."""
+
+from cmfsim.meshing import report_of_part
+from cmfsim.node_kinds import KindOptions, classify_nodes, lifted_tissue
+from cmfsim.pipeline.building.case_checks import cut_segments, untouched
+from cmfsim.pipeline.building.clefts import without_clefts
+from cmfsim.pipeline.building.contacts import CaseContacts, arch_sheets, mean_edge
+from cmfsim.pipeline.building.ends import end_findings
+from cmfsim.pipeline.building.held import held_part
+from cmfsim.pipeline.building.lips import CaseLipContact, lip_contact, separated_at_seam
+from cmfsim.pipeline.building.motions import PlannedBones
+from cmfsim.pipeline.building.parts import Head, Nodes, Tissue
+from cmfsim.pipeline.building.stages import Stages
+from cmfsim.pipeline.building.tissue_mesh import end_planes
+
+__all__ = ["nodes_of"]
+
+
+def nodes_of(
+    head: Head, stages: Stages, bones: PlannedBones, tissue: Tissue, options: KindOptions
+) -> Nodes:
+    """What the nodes of the tissue do: joined, sliding, fixed or free, with contact and lips."""
+    case, anatomy, mesh, report = head.case, head.anatomy, tissue.mesh, tissue.report
+    moved = [*dict.fromkeys([*cut_segments(case), *bones.motions])]
+    contacts = _contacts(head, stages, bones, tissue, options)
+    stages.begin("classifying nodes")
+    classified = classify_nodes(
+        mesh.nodes,
+        mesh.boundary_triangles(),
+        anatomy,
+        bones.segments,
+        moved=moved,
+        landmarks=head.skull,
+        fixed_planes=end_planes(tissue.region),
+        options=options,
+        arches=tissue.arches,
+        contacts=contacts.surfaces,
+    )
+    stages.add(classified.findings)
+    kinds, whole = classified.kinds, mesh.n_tets
+    if case.mesh.file is None:
+        mesh, kinds, noticed = without_clefts(mesh, kinds, bones.segments, moved, case.mesh.cleft)
+        stages.add(noticed)
+    mesh, kinds, noticed = held_part(mesh, kinds)
+    stages.add(noticed)
+    lips = CaseLipContact({}, kinds)
+    if tissue.seam is not None:
+        stages.begin("separating the lips")
+        mesh, kinds, noticed = separated_at_seam(mesh, kinds, tissue.seam)
+        stages.add(noticed)
+        lips = lip_contact(
+            mesh,
+            kinds,
+            tissue.seam,
+            height=case.lips.height,
+            arches=tissue.arches,
+            contacts=contacts,
+            segments=bones.segments,
+        )
+        kinds = lips.kinds
+    if mesh.n_tets < whole or lips.regions:
+        report = report_of_part(mesh, report)
+    found = end_findings(
+        mesh.nodes,
+        mesh.boundary_triangles(),
+        kinds,
+        anatomy,
+        tissue.region,
+        segments=bones.segments,
+        moved=moved,
+    )
+    stages.add(found)
+    stages.add(untouched(case, mesh, kinds, bones))
+    stages.drop_repeated()
+    lifted = lifted_tissue(mesh.nodes, kinds, bones.segments, moved, options)
+    return Nodes(mesh, report, kinds, contacts, tissue.level, tissue.seam, lips, lifted)
+
+
+def _contacts(
+    head: Head, stages: Stages, bones: PlannedBones, tissue: Tissue, options: KindOptions
+) -> CaseContacts:
+    """The surfaces along the dental arches that tissue slides on: none without arches."""
+    if tissue.arches is None:
+        return CaseContacts()
+    stages.begin("making the contact sheets")
+    mesh = head.case.mesh
+    edge = mesh.edge_length if mesh.file is None else mean_edge(tissue.mesh)
+    contacts = arch_sheets(head.anatomy, bones.segments, tissue.arches, options, edge)
+    stages.add(contacts.findings)
+    return contacts

@@ -1,0 +1,61 @@
+"""What one stage of building a model hands to the next."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from cmfsim._core import TetMesh
+from cmfsim.checks import Floats
+from cmfsim.io import Case
+from cmfsim.lips import LipSeam
+from cmfsim.meshing import MeshReport, TissueRegion
+from cmfsim.node_kinds import DentalArches
+from cmfsim.pipeline.building.contacts import CaseContacts
+from cmfsim.pipeline.building.lips import CaseLipContact
+from cmfsim.registration.proposed import ProposedLandmarks
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.lifted_tissue import LiftedTissue
+from cmfsim.values.node_kinds import NodeKinds
+
+__all__ = ["Head", "Nodes", "Tissue"]
+
+
+@dataclass(frozen=True, eq=False)
+class Head:
+    """A case with what was read of it."""
+
+    case: Case
+    landmarks: Mapping[str, Mapping[str, Floats]]
+    anatomy: Anatomy
+    proposed: ProposedLandmarks | None = None
+
+    @property
+    def skull(self) -> Mapping[str, Floats]:
+        """Landmarks of the skull by name, mm."""
+        return self.landmarks.get("skull", {})
+
+
+@dataclass(frozen=True, eq=False)
+class Tissue:
+    """The soft tissue of a head, and the tets that fill it."""
+
+    region: TissueRegion
+    level: ImageData
+    mesh: TetMesh
+    report: MeshReport
+    arches: DentalArches | None
+    seam: LipSeam | None
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """The mesh that is solved on, and what its nodes do."""
+
+    mesh: TetMesh
+    report: MeshReport
+    kinds: NodeKinds
+    contacts: CaseContacts
+    level: ImageData
+    seam: LipSeam | None
+    lips: CaseLipContact
+    lifted: LiftedTissue | None
