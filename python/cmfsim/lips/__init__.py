@@ -1,4 +1,4 @@
-"""The lips: where they meet, and what of a mesh's boundary each of them is."""
+"""The lips: the seam between them, and the part of a mesh's boundary that belongs to each."""
 
 from cmfsim.lips.regions import lip_regions, seam_faces
 from cmfsim.lips.seam import LIP_LANDMARKS, LipSeam, lip_seam

@@ -18,22 +18,24 @@ __all__ = ["MouthLine", "SkinProfiles", "crease_line", "skin_profiles", "smoothe
 
 # Grid of the profiles, mm: planes across, places along a profile, and steps of a ray into the head.
 COLUMN, STEP, RAY = 1.0, 0.5, 0.5
-# How far to the side of the middle profiles are taken, mm: half the widest mouth, and room.
+# Profiles are taken up to this far to either side of the middle, mm: half the widest mouth, plus a
+# margin.
 ASIDE = 40.0
-# How far ahead of the arches' fronts rays start, and how far behind them they end, mm.
+# Rays start this far in front of the arches and end this far behind their fronts, mm.
 AHEAD, BEHIND = 45.0, 40.0
-# The profiles go on above and below the fronts of the arches, mm: a chord has ends there.
+# Profiles extend this far above and below the fronts of the arches, mm, to leave room for the ends
+# of chords.
 ROOM = 10.0
-# Half the length of the chords under which a crease is measured, mm: from lip to lip.
+# Half the length of the chords from lip to lip under which the depth of a crease is measured, mm.
 CHORD = 8.0
-# A crease is at least so deep under its chord in the middle of the mouth, mm. At the corners it is
-# shallower than the latter, or than half of its median depth in the middle if that is less.
+# A crease is at least this deep in the middle of the mouth, mm. It ends at the corners, where it is
+# shallower than the second figure or than half its median depth in the middle, whichever is less.
 MIDDLE_DEPTH, CORNER_DEPTH = 0.5, 1.2
-# Half the part of the mouth that counts as its middle, mm.
+# Half the width of the part of the mouth that counts as its middle, mm.
 MIDDLE = 10.0
 # Half the width of the narrowest mouth, mm.
 NARROWEST = 12.0
-# Largest slope of the path from plane to plane, mm per mm, and the one that costs as much as a mm
+# Largest slope of the path from plane to plane, mm per mm, and the slope that costs as much as 1 mm
 # of depth.
 MOST_SLOPE, COSTLY_SLOPE = 1.5, 1.6
 # Length over which the line is smoothed, mm: fine enough for the bow of the upper lip.
@@ -52,7 +54,7 @@ class SkinProfiles:
     ahead : (p, q) float64, mm
         Of the foremost tissue or bone; the ray's end where there is none.
     depth : (p, q) float64, mm
-        How far it lies under the chords from place to place above and below, `CHORD` at most away.
+        Its depth under the chords between points at most `CHORD` above and below.
     """
 
     across: Floats
@@ -89,7 +91,7 @@ class MouthLine:
     def between(self, right: float, left: float, profiles: SkinProfiles) -> "MouthLine":
         """The line from one corner to another, (to the left, mm), with points at both ends.
 
-        Past its own ends it goes on over the skin at the same height.
+        Beyond its own ends it continues over the skin at the same height.
         """
         columns = profiles.across
         inner = columns[(columns > right + 0.5 * COLUMN) & (columns < left - 0.5 * COLUMN)]
@@ -106,7 +108,7 @@ def skin_profiles(anatomy: Anatomy, frame: MouthFrame) -> SkinProfiles:
     Parameters
     ----------
     anatomy : Anatomy
-        Hollows that are open to the front count as outside.
+        Cavities that open to the front count as outside.
     frame : MouthFrame
     """
     count = round(ASIDE / COLUMN)
@@ -122,7 +124,7 @@ def skin_profiles(anatomy: Anatomy, frame: MouthFrame) -> SkinProfiles:
 
 
 def solid(anatomy: Anatomy, points: Floats) -> Floats:
-    """The level of tissue and bone at points, positive inside; hollows are outside."""
+    """The level of tissue and bone at points, positive inside; cavities are outside."""
     level = anatomy.skin.sample(points)
     if anatomy.air is not None:
         level = np.minimum(level, -anatomy.air.sample(points))
@@ -130,7 +132,7 @@ def solid(anatomy: Anatomy, points: Floats) -> Floats:
 
 
 def _first_inside(level: Floats, rays: Floats) -> Floats:
-    """Where rays first come to what is inside, between their samples; their end if nowhere."""
+    """Where rays first enter tissue or bone, interpolated; their end if they do not."""
     inside = level > 0.0
     hit = inside.any(axis=2)
     first = np.argmax(inside, axis=2)
@@ -143,7 +145,7 @@ def _first_inside(level: Floats, rays: Floats) -> Floats:
 
 
 def _chord_depth(ahead: Floats) -> Floats:
-    """How far each place of the profiles lies under the highest chord over it, mm."""
+    """The depth of each point of the profiles under the highest chord above it, mm."""
     reach = round(CHORD / STEP)
     n = ahead.shape[1]
     highest = np.full(ahead.shape, -np.inf)
@@ -156,9 +158,9 @@ def _chord_depth(ahead: Floats) -> Floats:
 
 
 def crease_line(profiles: SkinProfiles, frame: MouthFrame) -> MouthLine | None:
-    """The line where the lips meet, as the profiles show it; None where they show none.
+    """The line where the lips meet, found in the profiles; None if they show no crease.
 
-    It ends at the corners of the mouth, where the crease does.
+    It ends at the corners of the mouth, where the crease ends.
 
     Parameters
     ----------
@@ -193,14 +195,14 @@ def crease_line(profiles: SkinProfiles, frame: MouthFrame) -> MouthLine | None:
 
 
 def _deepest_path(depth: Floats) -> NDArray[np.intp]:
-    """One place of each profile, along which depth is large and changes of height are small."""
+    """One point of each profile: a deep path whose height changes little."""
     n_columns, n = depth.shape
     most = round(MOST_SLOPE * COLUMN / STEP)
     best = depth[0].copy()
     came = np.zeros((n_columns, n), dtype=np.intp)
     for column in range(1, n_columns):
         score = np.full(n, -np.inf)
-        # Small steps first, so that of equal paths the straighter one is kept.
+        # Small steps first: of equally good paths the straighter one is kept.
         for step in sorted(range(-most, most + 1), key=abs):
             cost = (step * STEP / COLUMN / COSTLY_SLOPE) ** 2
             moved = np.full(n, -np.inf)
@@ -218,10 +220,10 @@ def _deepest_path(depth: Floats) -> NDArray[np.intp]:
 
 
 def _valley(profiles: SkinProfiles, row: int, place: int) -> tuple[float, float]:
-    """Height and place ahead of the bottom of a profile's valley, between its samples."""
+    """Height and forward position of the bottom of a profile's valley, interpolated."""
     depth = profiles.depth[row]
     near = slice(max(place - 3, 0), place + 4)
-    # The middle of what lies within a quarter of a mm of the deepest: gaps have flat ends.
+    # Gaps have flat ends: take the middle of what lies within 0.25 mm of the deepest point.
     weight = np.maximum(depth[near] - depth[near].max() + 0.25, 0.0)
     height = float((weight * profiles.heights[near]).sum() / weight.sum())
     ahead = profiles.ahead[row]

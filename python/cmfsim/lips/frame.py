@@ -26,7 +26,7 @@ class MouthFrame:
     half_width : float, mm
         Half the distance between the second molars.
     molars : float, mm
-        How far ahead of the origin the second molars lie; negative.
+        Forward position of the second molars relative to the origin; negative.
     """
 
     origin: Floats

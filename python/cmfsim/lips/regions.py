@@ -1,4 +1,4 @@
-"""The two lips on the boundary of a mesh that was separated at their seam."""
+"""Finds the two lips on the boundary of a mesh that was separated at their seam."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,10 +17,10 @@ __all__ = ["lip_regions", "seam_faces"]
 # A triangle lies above or below the seam, and not past a corner of the mouth or behind the teeth,
 # where the way to it leads off the normal of the seam by this share of its length, or so many mm.
 ASLANT, ASLANT_MM = 0.5, 1.0
-# A triangle is looked at from so far inside the tissue, as a share of its size, for its side.
+# The side of a triangle is judged from a point this far inside the tissue, relative to its size.
 INSIDE = 0.25
-# Patches below this share of the largest are scraps. The side towards the teeth may be a patch of
-# its own, where the cut ends at an edge of many triangles.
+# Patches smaller than this share of the largest are dropped. The side facing the teeth may be a
+# separate patch where the cut ends at an edge shared by many triangles.
 LEAST_PATCH = 0.1
 
 
@@ -43,9 +43,9 @@ def lip_regions(
         Before nodes of the lips are released. Joined and fixed nodes may be corners of a lip's
         triangles, as at the edges of teeth, which would else cut it in two, but are no nodes of it.
     seam : SurfaceData
-        Open, its normals towards the upper lip; from in front of the skin to past the teeth.
+        Open, with normals towards the upper lip; from in front of the skin to behind the teeth.
     height : float, mm
-        How far from the seam the lips reach.
+        How far the lips extend from the seam.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def _sides(
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
     inwards = normal / np.maximum(area, np.finfo(float).tiny)[:, None]
-    # On the faces that the lips turn to each other the seam itself tells nothing.
+    # Faces on the seam itself lie on neither side of it: a point inside their tissue decides.
     places = centroids - INSIDE * np.sqrt(area)[:, None] * inwards
     side = np.zeros(len(triangles), dtype=np.int8)
     vertices = seam.vertices

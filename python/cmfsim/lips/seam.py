@@ -22,10 +22,10 @@ from cmfsim.values.surface_data import SurfaceData
 __all__ = ["LIP_LANDMARKS", "LipSeam", "lip_seam"]
 
 LIP_LANDMARKS = ("cheilion_R", "cheilion_L", "labiale_superius", "labiale_inferius")
-# A cheilion within this distance of the line that the skin shows is where the mouth ends, mm; a
-# landmark further away is reported.
+# The mouth ends at a cheilion landmark if that lies within this distance of the line found on the
+# skin, mm; a landmark further away is reported.
 TRUSTED = 8.0
-# Between the fronts of the arches lips are open if their gap is this high, mm.
+# Lips whose gap between the fronts of the arches is at least this high are open, mm.
 OPEN = 0.5
 
 
@@ -64,7 +64,7 @@ def lip_seam(
     way: str = "auto",
     depth: float = LIP_DEPTH,
 ) -> LipSeam:
-    """The seam between the lips, from the gap or crease that the skin shows, else from landmarks.
+    """The seam between the lips, from the gap or crease on the skin, otherwise from landmarks.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def lip_seam(
     way : str
         "auto", or "landmarks": from them alone.
     depth : float, mm
-        How far it goes on past the teeth.
+        How far it extends behind the teeth.
 
     Returns
     -------
@@ -160,7 +160,7 @@ def _landmark_line(
         return None
     inner = profiles.across[(profiles.across > right[0]) & (profiles.across < left[0])]
     at = np.concatenate([[right[0]], inner, [left[0]]])
-    # A parabola on either side of the stomion, level there.
+    # A parabola on either side of the stomion, horizontal there.
     end = np.where(at < stomion[0], right[0], left[0])
     height = np.where(at < stomion[0], right[2], left[2])
     share = (at - stomion[0]) / (end - stomion[0])
@@ -171,7 +171,7 @@ def _landmark_line(
 def _with_corners(
     line: MouthLine, profiles: SkinProfiles, frame: MouthFrame, marks: Mapping[str, Floats]
 ) -> MouthLine:
-    """The line that the skin shows, ending at the corners of the mouth that landmarks mark."""
+    """The line found on the skin, ending at the corners of the mouth marked by landmarks."""
     ends = [float(line.across[0]), float(line.across[-1])]
     for number, name in enumerate(LIP_LANDMARKS[:2]):
         if name in marks and _distance(line, frame, marks[name]) <= TRUSTED:
@@ -235,7 +235,7 @@ def _outside(line: MouthLine, frame: MouthFrame, marks: Mapping[str, Floats]) ->
 
 
 def _told(source: str, way: str) -> list[Finding]:
-    """That landmarks alone placed the seam, where that was not asked for."""
+    """A finding where landmarks alone placed the seam without having been asked for."""
     if source != "landmarks" or way == "landmarks":
         return []
     return [

@@ -17,31 +17,31 @@ from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["LipSheet", "lip_sheet"]
 
-# How far behind the foremost place of the mouth's line the rows' centre lies, mm: about the radius
-# of an arch in front.
+# Distance of the centre of the rows behind the foremost point of the mouth's line, mm: about the
+# radius of an arch in front.
 CENTRE = 30.0
-# Bone is looked for so far above and below a row, mm, and so far along it.
+# Bone is searched for within these distances above and below a row, and along it, mm.
 BONE_HEIGHT, BONE_LENGTH = 5.0, 28.0
-# Teeth on either side bridge gaps in a row of so many columns.
+# Teeth on either side bridge gaps of up to this many columns in a row.
 BRIDGED = 4
-# Bone at the height of a row ends it where it lies no more than this behind the nearest, mm: the
-# lower teeth under the edges of the upper ones.
+# Bone at the height of a row ends it if it lies at most this far behind the nearest bone, mm: lower
+# teeth under the edges of the upper ones.
 OVERJET = 12.0
-# Share of the rows that meet bone at least.
+# Least share of rows that must meet bone.
 LEAST_MET = 0.6
 # Step of a row from the skin backwards, mm, and of the search for bone.
 STEP, BONE_STEP = 1.0, 0.5
-# How far the sheet goes on in front of the lips, mm.
+# How far the sheet extends in front of the lips, mm.
 IN_FRONT = 2.0
-# The lips' red lies so far above and below their line at most, mm.
+# The red of the lips extends at most this far above and below their line, mm.
 RED = 10.0
-# What is between the lips is a gap up to this height, mm.
+# An opening between the lips counts as a gap up to this height, mm.
 HIGHEST_GAP = 14.0
-# Step in which the edges of a gap are looked for, mm.
+# Step of the search for the edges of a gap, mm.
 FINE = 0.25
 # Length over which heights are smoothed from column to column, in columns.
 SMOOTH = 4.0
-# A gap is as deep as this at least, mm, and its opening is measured so far in front of its end.
+# Least depth of a gap, and the distance in front of its end at which its opening is measured, mm.
 LEAST_GAP, WITHIN = 3.0, 1.0
 
 
@@ -52,7 +52,7 @@ class LipSheet:
     Attributes
     ----------
     surface : SurfaceData
-        Open, its normals upwards.
+        Open, with normals pointing up.
     thickness : float, mm
         Median length of its rows from the mouth's line to the arches: the thickness of the lips.
     opening : float, mm
@@ -68,7 +68,7 @@ class LipSheet:
 def lip_sheet(
     anatomy: Anatomy, frame: MouthFrame, profiles: SkinProfiles, line: MouthLine, depth: float
 ) -> LipSheet | None:
-    """The sheet from a mouth's line to the arches; None where it meets no bone there.
+    """The sheet from the mouth's line to the arches; None if it meets no bone.
 
     Where the skin shows a gap between the lips the sheet is its mid-surface, and goes on behind its
     end at the same height.
@@ -80,12 +80,12 @@ def lip_sheet(
     profiles : SkinProfiles
     line : MouthLine
     depth : float, mm
-        How far the sheet goes on past the teeth, into the cleft between their rows.
+        How far the sheet extends behind the teeth, into the cleft between the tooth rows.
     """
     base = np.column_stack([line.across, line.ahead])
     centre = np.array([0.5 * (line.across[0] + line.across[-1]), line.ahead.max() - CENTRE])
     inwards = centre - base
-    # Beside the centre rows run straight inwards, not ahead again.
+    # Rows beside the centre run straight inwards and do not turn forward again.
     inwards[:, 1] = np.minimum(inwards[:, 1], 0.0)
     inwards = inwards / np.linalg.norm(inwards, axis=1)[:, None]
     met = _bone_met(anatomy, frame, line, base, inwards)
@@ -139,13 +139,13 @@ def _bone_met(
 
 
 def _widened(values: Floats, reach: int) -> Floats:
-    """The largest of the values up to so many places away on either side."""
+    """The largest value within a number of positions on either side."""
     padded = np.pad(values, reach, mode="edge")
     return np.asarray(np.max([padded[k : k + len(values)] for k in range(2 * reach + 1)], axis=0))
 
 
 def _in_front(profiles: SkinProfiles, line: MouthLine) -> Floats:
-    """How far the lips stand out before the line, and somewhat more, mm."""
+    """How far the lips protrude in front of the line, plus a margin, mm."""
     found = []
     for across, ahead, height in zip(line.across, line.ahead, line.heights, strict=True):
         column = int(np.argmin(np.abs(profiles.across - across)))
@@ -157,7 +157,7 @@ def _in_front(profiles: SkinProfiles, line: MouthLine) -> Floats:
 def _heights(
     anatomy: Anatomy, frame: MouthFrame, line: MouthLine, plane: Floats, away: Floats
 ) -> tuple[Floats, float]:
-    """The heights of the sheet at places of the plane, and the opening in its middle, mm."""
+    """The heights of the sheet at points of the plane, and the opening in its middle, mm."""
     n_columns, n_rows = plane.shape[:2]
     count = round(0.5 * HIGHEST_GAP / FINE)
     fine = np.linspace(-count * FINE, count * FINE, 2 * count + 1)
