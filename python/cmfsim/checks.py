@@ -11,6 +11,7 @@ from cmfsim.errors import CaseInputError
 __all__ = [
     "Floats",
     "Indices",
+    "as_direction",
     "as_floats",
     "as_index_rows",
     "as_indices",
@@ -66,6 +67,17 @@ def as_rows(name: str, value: ArrayLike, width: int) -> Floats:
 def as_point(name: str, value: ArrayLike) -> Floats:
     """A read-only (3,) float64 copy of a place or a direction."""
     return cast("Floats", as_rows(name, np.reshape(np.asarray(value), (1, -1)), 3)[0])
+
+
+def as_direction(name: str, value: ArrayLike) -> Floats:
+    """A read-only unit vector along a direction of any length but zero."""
+    direction = as_point(name, value)
+    # The largest component first: a length below 1e-154 would underflow when squared.
+    largest = float(np.abs(direction).max())
+    if largest == 0.0:
+        raise CaseInputError(f"{name} is (0, 0, 0): give a direction of any length")
+    direction = direction / largest
+    return cast("Floats", frozen(direction / np.linalg.norm(direction)))
 
 
 def _whole_numbers(name: str, value: ArrayLike, count: int | None, of: str) -> Indices:

@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_point, as_rows, as_text, check_instance
+from cmfsim.checks import Floats, as_direction, as_point, as_rows, as_text, check_instance
 from cmfsim.errors import CaseInputError
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
@@ -48,16 +48,8 @@ class CuttingPlane:
     def __init__(self, point: ArrayLike, normal: ArrayLike, name: str = "plane") -> None:
         as_text("plane name", name)
         where = f"plane {name!r}"
-        place = as_point(f"{where} point", point)
-        direction = as_point(f"{where} normal", normal)
-        largest = float(np.abs(direction).max())
-        if largest == 0.0:
-            raise CaseInputError(f"{where} normal is (0, 0, 0): give a direction of any length")
-        direction = direction / largest
-        direction = direction / np.linalg.norm(direction)
-        direction.setflags(write=False)
-        object.__setattr__(self, "point", place)
-        object.__setattr__(self, "normal", direction)
+        object.__setattr__(self, "point", as_point(f"{where} point", point))
+        object.__setattr__(self, "normal", as_direction(f"{where} normal", normal))
         object.__setattr__(self, "name", name)
 
     def distance(self, points: ArrayLike) -> Floats:

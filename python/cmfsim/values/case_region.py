@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_point, as_rows
+from cmfsim.checks import Floats, as_direction, as_point, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.values.frozen import Frozen
 
@@ -42,14 +42,8 @@ class Plane(Frozen):
     normal: Floats
 
     def __init__(self, point: ArrayLike, normal: ArrayLike) -> None:
-        place = as_point("plane point", point)
-        direction = as_point("plane normal", normal)
-        largest = float(np.abs(direction).max())
-        if largest == 0.0:
-            raise CaseInputError("plane normal is (0, 0, 0): give its direction, any length")
-        scaled = direction / largest
-        object.__setattr__(self, "point", place)
-        object.__setattr__(self, "normal", scaled / np.linalg.norm(scaled))
+        object.__setattr__(self, "point", as_point("plane point", point))
+        object.__setattr__(self, "normal", as_direction("plane normal", normal))
 
     def distance(self, points: ArrayLike) -> Floats:
         """The signed distances of (n, 3) points from the plane, mm: positive along its normal."""
