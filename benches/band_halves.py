@@ -15,12 +15,12 @@ import numpy as np
 
 import cmfsim
 from cmfsim.benchmark.bands import COVERAGE, calibrated_band
-from cmfsim.benchmark.patients import patients_of
+from cmfsim.benchmark.markdown import table
+from cmfsim.benchmark.patients import far_from_models, patients_of
+from cmfsim.io.populations import PARTS
 
 # Quantiles of the coverage over splits that are printed.
 ENDS = (0.05, 0.95)
-# Parts of a population: all of them.
-PARTS = ("train", "calibration", "test")
 
 
 def coverage(
@@ -48,22 +48,26 @@ def main() -> None:
         raise SystemExit(f"{args.model}: patients without a standard deviation")
     regions = list(band.cases[0].scores)
     scores = np.array([[case.scores[region] for region in regions] for case in band.cases])
-    departure = np.array([patient.departure for patient in patients], float)
-    far = departure > np.median(departure)
+    names = far_from_models(patients)
+    if not names:
+        raise SystemExit(f"{args.folder}: it is not stated how far patients are from the models")
+    far = np.isin([case.case for case in band.cases], names)
     rng = np.random.default_rng(args.seed)
     shares = np.array([coverage(scores, far, rng) for _ in range(args.splits)])
     pooled = shares.mean(axis=2, keepdims=True)
-    table = np.concatenate([pooled, shares], axis=2)
+    columns = np.concatenate([pooled, shares], axis=2)
+    rows = [
+        [region, *(_spread(values) for values in columns[:, :, column].T)]
+        for column, region in enumerate(["all regions", *regions])
+    ]
+    titles = ["region", "covered: mean (5–95 % of splits)", "of the half farthest from the models"]
     print(f"{len(patients)} patients, {args.splits} splits into halves, {args.model}\n")
-    print("| region | covered: mean (5–95 % of splits) | of the half farthest from the models |")
-    print("|---|---|---|")
-    for column, region in enumerate(["all regions", *regions]):
-        cells = [
-            f"{100 * values.mean():.1f} ({100 * low:.0f}–{100 * high:.0f}) %"
-            for values in table[:, :, column].T
-            for low, high in [np.quantile(values, ENDS)]
-        ]
-        print(f"| {region} | {' | '.join(cells)} |")
+    print(table(titles, rows))
+
+
+def _spread(shares: np.ndarray) -> str:
+    low, high = np.quantile(shares, ENDS)
+    return f"{100 * shares.mean():.1f} ({100 * low:.0f}–{100 * high:.0f}) %"
 
 
 if __name__ == "__main__":

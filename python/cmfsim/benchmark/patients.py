@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,7 @@ from cmfsim.io import Case, read_landmarks, read_surface
 from cmfsim.io.populations import MADE, Population
 from cmfsim.solving.uncertainty import ADDED, PLAN, Source
 
-__all__ = ["LIPS", "BenchmarkPatient", "patients_of"]
+__all__ = ["LIPS", "BenchmarkPatient", "far_from_models", "patients_of"]
 
 LIPS = "lips"
 SKIN, CASE = "skin.ply", "case.toml"
@@ -157,3 +157,14 @@ def patients_of(
                     "cmfsim virtual-patients --count"
                 )
     return [BenchmarkPatient(name, folder / name) for name in names]
+
+
+def far_from_models(patients: Sequence[BenchmarkPatient]) -> tuple[str, ...]:
+    """The half of the patients whose truth differs most from what predictions can know.
+
+    None of them where it is not stated how much the truth of each differs.
+    """
+    known = [(p.departure, p.name) for p in patients if p.departure is not None]
+    if len(known) < len(patients):
+        return ()
+    return tuple(sorted(name for _, name in sorted(known)[(len(known) + 1) // 2 :]))

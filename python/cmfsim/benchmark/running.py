@@ -18,7 +18,7 @@ from cmfsim.benchmark.entries import (
     patient_entries,
     times_of,
 )
-from cmfsim.benchmark.patients import BenchmarkPatient, patients_of
+from cmfsim.benchmark.patients import BenchmarkPatient, far_from_models, patients_of
 from cmfsim.benchmark.results import MethodResult
 from cmfsim.benchmark.scores import score
 from cmfsim.benchmark.skin_predictions import read_skin_prediction
@@ -154,7 +154,7 @@ def run_benchmark(
         population.named(FAILED, part),
         tuple(results),
         dict(population.settings),
-        _far(patients),
+        far_from_models(patients),
     )
     return Benchmark(table, _write(place / RESULTS, table, predictions))
 
@@ -188,14 +188,6 @@ def _predict_each(
     for done, (index, _) in enumerate(answers(function, jobs, workers, scheduler), 1):
         if progress is not None:
             progress(f"{done} of {len(jobs)}  {Path(jobs[index]['patient']).name} predicted")
-
-
-def _far(patients: Sequence[BenchmarkPatient]) -> tuple[str, ...]:
-    """The half of the patients whose truth differs most from what predictions can know."""
-    known = [(p.departure, p.name) for p in patients if p.departure is not None]
-    if len(known) < len(patients):
-        return ()
-    return tuple(sorted(name for _, name in sorted(known)[(len(known) + 1) // 2 :]))
 
 
 def _methods(predictions: Path) -> list[str]:
