@@ -31,7 +31,8 @@ const NEAR_REST: f64 = 0.05;
 const STIFF_PARTS: f64 = 500.0;
 /// Steps over which convergence is judged with such parts.
 const WINDOW: usize = 3;
-/// Length of a step relative to the one before, below which Newton's method converges quadratically in any case.
+/// Length of a step relative to the one before, or to the error asked for, below which the step counts as the
+/// whole error with such parts as well: Newton's method converges quadratically, or only rounding is left.
 const QUADRATIC: f64 = 1e-3;
 
 impl Equilibrium {
@@ -55,6 +56,8 @@ impl Equilibrium {
         // Error of the state once it is small enough, when one step with the accuracy of the last one is still
         // to be done.
         let mut ending = None;
+        // Steps of earlier descents are no sign of how this one converges.
+        let start = solve.effort.history.len();
         for _ in 0..MAX_STEPS {
             if (solve.interrupted)() {
                 return Err(MtmError::Interrupted);
@@ -77,14 +80,16 @@ impl Equilibrium {
             let before = length;
             length = step.length();
             solve.effort.history.push(length);
-            // With a tangent that is not that of the energy, convergence is linear, at the rate of the last
-            // step.
-            let own = kind == Exact || length == 0.0;
-            let gain = if own { 1.0 } else { 1.0 - (length / before).min(1.0) };
             let goal = self.options.tolerance * reach(&pose, target);
-            let has_stiff_parts = self.tissue.contrast > STIFF_PARTS;
-            let left =
-                if has_stiff_parts { left_after(&solve.effort.history) } else { length / gain };
+            let left = if self.tissue.contrast > STIFF_PARTS {
+                left_after(&solve.effort.history[start..], goal)
+            } else if kind == Exact || length == 0.0 {
+                length
+            } else {
+                // With a tangent that is not that of the energy, convergence is linear, at the rate of the last
+                // step.
+                length / (1.0 - (length / before).min(1.0))
+            };
             let bound = left + allowed;
             let bound = ending.filter(|_| length <= goal).unwrap_or(bound);
             ending = (bound <= goal).then_some(bound);
@@ -157,14 +162,15 @@ impl Step {
 }
 
 /// Bound of the error after steps of these `lengths`, mm, if each of the last ones may have been too short: the
-/// longest of the last three, and all that follow at the rate from the three before.
-fn left_after(lengths: &[f64]) -> f64 {
+/// longest of the last three, and all that follow at the rate from the three before. `goal` is the error that is
+/// asked for, mm.
+fn left_after(lengths: &[f64], goal: f64) -> f64 {
     let longest = |lengths: &[f64]| lengths.iter().copied().fold(0.0, f64::max);
     let (earlier, last) = lengths.split_at(lengths.len().saturating_sub(WINDOW));
-    if let [.., before, now] = *last
-        && now <= QUADRATIC * before
+    if let [before @ .., now] = last
+        && *now <= QUADRATIC * before.last().map_or(goal, |before| before.max(goal))
     {
-        return now;
+        return *now;
     }
     let before = longest(&earlier[earlier.len().saturating_sub(WINDOW)..]);
     let rate = (longest(last) / before).powf(1.0 / WINDOW as f64);
