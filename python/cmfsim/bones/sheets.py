@@ -26,6 +26,9 @@ Mask = NDArray[np.bool_]
 
 # Grid that the sheet is made on, mm.
 SPACING = 1.0
+# Decimals of coordinates, mm, on which voxels may depend: later ones are rounding, which differs from
+# one processor to the next, and a surface on grid points would move with it by a voxel.
+DECIMALS = 6
 # Half the width of the gaps between teeth that are bridged, and of those of lost teeth, mm.
 BRIDGE = 3.0
 LOST_TOOTH = 6.0
@@ -190,7 +193,7 @@ class _Grid:
         self.name, self.arch, self.options = name, arch, options
         self.axes: Floats = _frame(across, forwards, -out)
         self.origin: Floats = arch.middle
-        tip = self.axes @ (arch.tip - self.origin)
+        tip = self._place(arch.tip)
         side = arch.half_width + options.beside + ROOM
         self.low = np.array([-side, -options.behind - ROOM, -options.above - ROOM + min(tip[2], 0)])
         self.high = np.array([side, tip[1] + ROOM, max(arch.depth_front, arch.depth_molars) + 5.0])
@@ -200,11 +203,15 @@ class _Grid:
         self.axes = _frame(across, forwards, normal)
         shift = float(self.axes[2] @ (edge - self.origin))
         self.origin = self.origin + shift * self.axes[2]
-        self.tip: Floats = self.axes @ (arch.tip - self.origin)
-        self.low[2] = -shift - options.above - ROOM + min(tip[2], 0)
+        self.tip: Floats = self._place(arch.tip)
+        self.low[2] = np.round(-shift - options.above - ROOM + min(tip[2], 0), DECIMALS)
         self.high[2] = BEYOND
         self._sample(bone)
         self.margin = 3
+
+    def _place(self, point: Floats) -> Floats:
+        """The coordinates on the grid of a point in space."""
+        return np.round(self.axes @ (point - self.origin), DECIMALS)
 
     def _sample(self, bone: ImageData) -> None:
         self.lines = [
@@ -213,7 +220,7 @@ class _Grid:
         ]
         self.shape = tuple(len(line) for line in self.lines)
         places = np.stack(np.meshgrid(*self.lines, indexing="ij"), axis=-1).reshape(-1, 3)
-        world = self.origin + places @ self.axes
+        world = np.round(self.origin + places @ self.axes, DECIMALS)
         values = bone.sample(world)
         # What the image does not hold is no bone, however its border is coloured.
         held = ((world >= bone.lowest) & (world <= bone.highest)).all(axis=1)
