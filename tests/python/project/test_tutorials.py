@@ -21,6 +21,9 @@ DOCS = Path(__file__).parents[3] / "docs"
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.ipynb"))
 # A cell that takes longer hangs, s: the longest needs ten on an idle core.
 LONGEST_CELL = 300
+# By how much printed numbers, mm, may differ from those of another processor: a tutorial's head has a
+# mesh of 7 mm, and signed means of its regions differed by 0.07 mm.
+PROCESSORS = 0.1
 # Numbers on their own, and not the digits of a name.
 NUMBERS = r"(?<![\w.])[+-]?\d+(?:\.\d*)?(?:e[+-]?\d+)?(?![\w.])"
 NUMBER = r"(-?[0-9.]+(?:e-?[0-9]+)?)"
@@ -112,14 +115,14 @@ def test_the_evaluation_finds_the_model_that_made_the_face(ran):
 
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
 def test_saved_outputs_are_those_of_this_version(ran, path):
-    """Words are the same; numbers are to 2 %, or both are rounding errors."""
+    """Words are the same, and numbers as far as processors agree."""
     fresh, pictures = ran(path.stem)
     saved, saved_pictures = printed(nbformat.read(path, as_version=4))
     assert saved_pictures == pictures
     again = "python scripts/save_tutorials.py"
     assert re.sub(NUMBERS, "#", saved) == re.sub(NUMBERS, "#", fresh), again
     ours, theirs = ([float(n) for n in re.findall(NUMBERS, text)] for text in (saved, fresh))
-    assert ours == pytest.approx(theirs, rel=0.02, abs=0.02), again
+    assert ours == pytest.approx(theirs, rel=0.02, abs=PROCESSORS), again
 
 
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
