@@ -26,8 +26,8 @@ Mask = NDArray[np.bool_]
 
 # Grid that the sheet is made on, mm.
 SPACING = 1.0
-# Decimals of coordinates, mm, on which voxels may depend: later ones are rounding, which differs from
-# one processor to the next, and a surface on grid points would move with it by a voxel.
+# Decimals of coordinates, mm, on which voxels may depend: later ones are rounding, which differs
+# from one processor to the next, and a surface on grid points would move with it by a voxel.
 DECIMALS = 6
 # Half the width of the gaps between teeth that are bridged, and of those of lost teeth, mm.
 BRIDGE = 3.0

@@ -126,8 +126,10 @@ def test_a_sheet_goes_on_past_the_edge(sheet, jaw):
 
 
 def test_no_voxel_depends_on_the_last_digits_of_a_processor(sheet, jaw, monkeypatch):
-    """The jaw's faces lie on grid points; a plane through its teeth that is turned by rounding, as
-    another processor's least squares turn it, makes the same sheet."""
+    """A plane through the teeth that is turned by rounding makes the same sheet.
+
+    The jaw's faces lie on grid points, and another processor's least squares differ by as much.
+    """
     plane, rng = sheets._plane, np.random.default_rng(4)
     monkeypatch.setattr(sheets, "_plane", lambda points: plane(points) + 1e-14 * rng.normal(size=3))
     for _ in range(3):

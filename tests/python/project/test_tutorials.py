@@ -21,8 +21,8 @@ DOCS = Path(__file__).parents[3] / "docs"
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.ipynb"))
 # A cell that takes longer hangs, s: the longest needs ten on an idle core.
 LONGEST_CELL = 300
-# By how much printed numbers, mm, may differ from those of another processor: a tutorial's head has a
-# mesh of 7 mm, and signed means of its regions differed by 0.07 mm.
+# By how much printed numbers, mm, may differ from those of another processor: a tutorial's head has
+# a mesh of 7 mm, and signed means of its regions differed by 0.07 mm.
 PROCESSORS = 0.1
 # Numbers on their own, and not the digits of a name.
 NUMBERS = r"(?<![\w.])[+-]?\d+(?:\.\d*)?(?:e[+-]?\d+)?(?![\w.])"
