@@ -2,10 +2,9 @@
 //! steps.
 //!
 //! Contact is detected by closest points, so no step of the plan may take one part through another: bones move
-//! by a quarter of a tissue edge at a time. Each step first uses the tangent planes at its start, which move
-//! with the bones and have no far side, and then the surfaces actually met by the nodes. Intermediate steps do
-//! few, approximate rounds; at the end of the plan the rounds continue until nothing penetrates and nothing
-//! changes.
+//! by a tissue edge at a time. Each step first uses the tangent planes at its start, which move with the bones
+//! and have no far side, and then the surfaces actually met by the nodes. Intermediate steps do few, approximate
+//! rounds; at the end of the plan the rounds continue until nothing penetrates and nothing changes.
 
 use std::sync::Arc;
 
@@ -25,7 +24,7 @@ use crate::statics::system::{Solved, System};
 use crate::vector::{add, between, dot, norm, scaled, sub};
 
 /// Motion of the bones in one step, over the mean edge of the tissue that may be touched.
-const STEP_EDGES: f64 = 0.25;
+const STEP_EDGES: f64 = 1.0;
 /// Depth, over the same edge, that a node may reach in a step; if it goes deeper, the step is halved.
 const DEEP_EDGES: f64 = 0.75;
 /// Shortest step, as a share of the plan.
