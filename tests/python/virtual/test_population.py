@@ -2,6 +2,9 @@
 
 import hashlib
 import json
+import os
+import subprocess
+import sys
 from collections import Counter
 
 import numpy as np
@@ -134,10 +137,17 @@ def test_the_skin_is_thicker_where_nothing_moved(made):
 
 
 def test_another_process_gives_the_same_bytes(made, tmp_path):
-    """The patient made in this process, with its threads, against that of a worker."""
+    """The patient made by a process of three threads, against that of a worker, which has one."""
     folder, _ = made
     job = {"folder": str(tmp_path), "seed": 1, "index": 1, **COARSE}
-    assert population_folder.make_patient(**job) == ("made", "")
+    code = f"from cmfsim.virtual.population_folder import make_patient; make_patient(**{job!r})"
+    threads = {"RAYON_NUM_THREADS": "3", "OPENBLAS_NUM_THREADS": "3"}
+    path = os.pathsep.join(sys.path)
+    subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, **threads, "PYTHONPATH": path},
+        check=True,
+    )
     assert files_of(tmp_path / "D001") == files_of(folder / "D001")
 
 
