@@ -36,18 +36,22 @@ settings.load_profile("cmfsim")
 # The files that take longest, first: a process that meets one of them last works on it alone, while
 # the others have nothing left to do. `make test` keeps this order (--no-loadscope-reorder).
 LONGEST = (
-    "virtual/test_virtual_patients.py",
-    "pipeline/test_hard_heads.py",
     "imaging/test_imaging.py",
-    "pipeline/test_prediction.py",
-    "pipeline/test_build.py",
+    "pipeline/test_hard_heads.py",
     "cli/test_crash_safety.py",
-    "solving/test_contact_plans.py",
-    "project/test_tutorials.py",
-    "pipeline/test_case_lips.py",
-    "phantom/test_phantom.py",
-    "planning/test_planning_page.py",
+    "pipeline/test_prediction.py",
     "phantom/test_demo.py",
+    "pipeline/test_case_lips.py",
+    "pipeline/test_build.py",
+    "study/test_study_outputs.py",
+    "project/test_tutorials.py",
+    "virtual/test_population.py",
+    "doctor/test_landmark_places.py",
+    "registration/test_jaw_evidence.py",
+    "phantom/test_phantom.py",
+    "bones/test_achieved.py",
+    "pictures/test_labels.py",
+    "virtual/test_virtual_patients.py",
 )
 
 
