@@ -26,7 +26,7 @@ PYTHON_DIRS := python tests/python scripts examples benches fuzz slicer
 CORE_FEATURES := --features mtm-core/metis
 
 .DEFAULT_GOAL := help
-.PHONY: help build test test-rust test-python lint format wheel notices bench peers stability elements frontier fuzz demo docs tutorials clean
+.PHONY: help build test test-rust test-python lint lint-rust lint-python format wheel notices bench peers stability elements frontier fuzz demo docs tutorials clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sort | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 16
@@ -60,9 +60,13 @@ test-rust: $(ENV_STAMP)
 test-python: $(DEVELOP_STAMP)
 	"$(PY)" -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-lint: $(DEVELOP_STAMP) ## rustfmt, clippy, ruff, mypy, stubtest, the import rules and the licences
+lint: lint-rust lint-python ## rustfmt, clippy, ruff, mypy, stubtest, the import rules and the licences
+
+lint-rust: $(ENV_STAMP)
 	cargo fmt --all --check
 	cargo clippy --profile lint --workspace --all-targets $(CARGO_FLAGS) $(CORE_FEATURES) -- -D warnings
+
+lint-python: $(DEVELOP_STAMP)
 	"$(BIN)/ruff" check $(PYTHON_DIRS)
 	"$(BIN)/ruff" format --check $(PYTHON_DIRS)
 	"$(BIN)/mypy" --strict

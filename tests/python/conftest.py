@@ -14,6 +14,13 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 # in every process wait for one another a hundred times as long as such a product takes. NumPy reads
 # this when it is imported, which no plugin has done yet; commands that tests start inherit it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# The processes of xdist share the cores: threads of the core, of ITK and of Mesa's software
+# renderer for every core in every process would wait for one another as well. No result depends on
+# their number; the tests of that set it themselves.
+if processes := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
+    threads = str(max(1, (os.cpu_count() or 1) // processes))
+    for name in ("RAYON_NUM_THREADS", "ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "LP_NUM_THREADS"):
+        os.environ.setdefault(name, threads)
 
 # A commit passes or fails whenever it is run: hypothesis draws the same examples every time, unless
 # CMFSIM_TEST_RANDOM=1 asks for new ones.
@@ -29,18 +36,22 @@ settings.load_profile("cmfsim")
 # The files that take longest, first: a process that meets one of them last works on it alone, while
 # the others have nothing left to do. `make test` keeps this order (--no-loadscope-reorder).
 LONGEST = (
-    "virtual/test_virtual_patients.py",
-    "pipeline/test_hard_heads.py",
     "imaging/test_imaging.py",
-    "pipeline/test_prediction.py",
-    "pipeline/test_build.py",
+    "pipeline/test_hard_heads.py",
     "cli/test_crash_safety.py",
-    "solving/test_contact_plans.py",
-    "project/test_tutorials.py",
-    "pipeline/test_case_lips.py",
-    "phantom/test_phantom.py",
-    "planning/test_planning_page.py",
+    "pipeline/test_prediction.py",
     "phantom/test_demo.py",
+    "pipeline/test_case_lips.py",
+    "pipeline/test_build.py",
+    "study/test_study_outputs.py",
+    "project/test_tutorials.py",
+    "virtual/test_population.py",
+    "doctor/test_landmark_places.py",
+    "registration/test_jaw_evidence.py",
+    "phantom/test_phantom.py",
+    "bones/test_achieved.py",
+    "pictures/test_labels.py",
+    "virtual/test_virtual_patients.py",
 )
 
 

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +13,9 @@ from cmfsim.errors import LandmarkInputError
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 
 __all__ = ["REGIONS", "SKIN_LANDMARKS", "UNMOVED_REGIONS", "skin_regions", "unmoved_regions"]
+
+# Left and up in the view from the front, mm.
+Place = tuple[float, float]
 
 PAIRS = ("exocanthion", "endocanthion", "alare", "cheilion")
 REGIONS: Mapping[str, str] = MappingProxyType(
@@ -120,7 +124,7 @@ def unmoved_regions(
 def _regions(
     points: ArrayLike,
     landmarks: Mapping[str, ArrayLike],
-    outlines: Callable[[Mapping[str, Floats]], dict[str, list[tuple[float, float]]]],
+    outlines: Callable[[Mapping[str, Floats]], dict[str, list[Place]]],
 ) -> dict[str, NDArray[np.bool_]]:
     """The points within each outline in the view from the front."""
     missing = [name for name in SKIN_LANDMARKS if name not in landmarks]
@@ -183,81 +187,87 @@ def _check_face(at: Mapping[str, Floats]) -> None:
         )
 
 
-def _outlines(at: Mapping[str, Floats]) -> dict[str, list[tuple[float, float]]]:
+def _outlines(at: Mapping[str, Floats]) -> dict[str, list[Place]]:
     """Each region's outline in the view from the front: (left, up), mm."""
-    middle = at["subnasale"][0]
-    base = at["subnasale"][1]
-    eyes = float(
-        np.mean([at[f"{p}_{s}"][1] for p in ("exocanthion", "endocanthion") for s in "LR"])
-    )
-    lower, chin = at["labiale_inferius"][1], at["pogonion"][1]
+    heights = _heights(at)
+    fold, bottom, lid, brow = heights.fold, heights.bottom, heights.lid, heights.brow
+    root = _pair(at, "alare", NOSE_ROOT, float(at["nasion"][1]))
+    wing = _pair(at, "alare", NOSE_WIDTH, heights.wing)
+    base = _pair(at, "alare", NOSE_WIDTH, float(at["subnasale"][1]))
+    cheilion = [at[f"cheilion_{side}"] for side in "LR"]
+    corner = [(float(place[0]), float(place[1])) for place in cheilion]
+    crease = _pair(at, "cheilion", CHIN_WIDTH, fold)
+    chin = _pair(at, "cheilion", CHIN_WIDTH, bottom)
+    left, right = (place[0] for place in _pair(at, "exocanthion", SIDE, 0.0))
     mouth = 0.5 * (at["labiale_superius"][:2] + at["labiale_inferius"][:2])
-    fold = lower + FOLD * (chin - lower)
-    bottom = chin + CHIN * (chin - lower)
-    lid = eyes + LID * (base - eyes)
-    brow = eyes - BROW * (base - eyes)
-
-    def out(name: str, side: str, factor: float) -> float:
-        """A landmark's place from the midline, scaled."""
-        return float(middle + factor * (at[f"{name}_{side}"][0] - middle))
-
-    def both(name: str, factor: float, height: float) -> list[tuple[float, float]]:
-        """The places at its left and its right, at a height."""
-        return [(out(name, side, factor), height) for side in "LR"]
-
-    wings = 0.5 * (at["alare_L"][1] + at["alare_R"][1])
-    wing = wings + 0.4 * (wings - base)
-    root_left, root_right = both("alare", NOSE_ROOT, float(at["nasion"][1]))
-    wing_left, wing_right = both("alare", NOSE_WIDTH, float(wing))
-    base_left, base_right = both("alare", NOSE_WIDTH, float(base))
-    corner_left, corner_right = (tuple(at[f"cheilion_{s}"][:2]) for s in "LR")
-    fold_left, fold_right = both("cheilion", CHIN_WIDTH, float(fold))
     line = (float(mouth[0]), float(mouth[1]))
-
-    def cheek(side: str) -> list[tuple[float, float]]:
-        root, broad, foot, corner, crease = (
-            (root_left, wing_left, base_left, corner_left, fold_left)
-            if side == "L"
-            else (root_right, wing_right, base_right, corner_right, fold_right)
-        )
-        # Where the side of the nose is as high as the lower lid.
-        part = (lid - broad[1]) / (root[1] - broad[1])
-        beside = broad[0] + part * (root[0] - broad[0])
-        outer = out("exocanthion", side, SIDE)
-        return [(beside, lid), broad, foot, corner, crease, (outer, fold), (outer, lid)]
-
-    side_left, side_right = both("exocanthion", SIDE, 0.0)
+    cheeks = [
+        [_beside(root[k], wing[k], lid), wing[k], base[k], corner[k], crease[k]]
+        + [(outer, fold), (outer, lid)]
+        for k, outer in enumerate((left, right))
+    ]
     return {
-        "face": [
-            (side_left[0], brow),
-            (side_left[0], bottom),
-            (side_right[0], bottom),
-            (side_right[0], brow),
-        ],
-        "lower face": [
-            (side_left[0], lid),
-            (side_left[0], bottom),
-            (side_right[0], bottom),
-            (side_right[0], lid),
-        ],
-        "nose": [root_left, wing_left, base_left, base_right, wing_right, root_right],
-        "upper lip": [base_left, corner_left, line, corner_right, base_right],
-        "lower lip": [corner_left, fold_left, fold_right, corner_right, line],
-        "chin": [fold_left, *both("cheilion", CHIN_WIDTH, float(bottom)), fold_right],
-        "left cheek": cheek("L"),
-        "right cheek": cheek("R"),
+        "face": [(left, brow), (left, bottom), (right, bottom), (right, brow)],
+        "lower face": [(left, lid), (left, bottom), (right, bottom), (right, lid)],
+        "nose": [root[0], wing[0], base[0], base[1], wing[1], root[1]],
+        "upper lip": [base[0], corner[0], line, corner[1], base[1]],
+        "lower lip": [corner[0], crease[0], crease[1], corner[1], line],
+        "chin": [crease[0], *chin, crease[1]],
+        "left cheek": cheeks[0],
+        "right cheek": cheeks[1],
     }
 
 
-def _unmoved_outlines(at: Mapping[str, Floats]) -> dict[str, list[tuple[float, float]]]:
+class _Heights(NamedTuple):
+    """Heights that bound regions, mm."""
+
+    fold: float
+    bottom: float
+    lid: float
+    brow: float
+    wing: float
+
+
+def _heights(at: Mapping[str, Floats]) -> _Heights:
+    """The heights of the fold below the lip, chin, lower lid, brow and wings of the nose."""
+    base = at["subnasale"][1]
+    eyes = _eyes(at)
+    lower, chin = at["labiale_inferius"][1], at["pogonion"][1]
+    wings = 0.5 * (at["alare_L"][1] + at["alare_R"][1])
+    return _Heights(
+        fold=float(lower + FOLD * (chin - lower)),
+        bottom=float(chin + CHIN * (chin - lower)),
+        lid=float(eyes + LID * (base - eyes)),
+        brow=float(eyes - BROW * (base - eyes)),
+        wing=float(wings + 0.4 * (wings - base)),
+    )
+
+
+def _eyes(at: Mapping[str, Floats]) -> float:
+    """The mean height of the corners of both eyes, mm."""
+    corners = [at[f"{p}_{s}"][1] for p in ("exocanthion", "endocanthion") for s in "LR"]
+    return float(np.mean(corners))
+
+
+def _pair(at: Mapping[str, Floats], name: str, factor: float, height: float) -> list[Place]:
+    """Left and right landmark of a name at a height, their distance from the midline scaled."""
+    middle = at["subnasale"][0]
+    return [(float(middle + factor * (at[f"{name}_{side}"][0] - middle)), height) for side in "LR"]
+
+
+def _beside(root: Place, wing: Place, height: float) -> Place:
+    """Where the side of the nose, from its root to its wing, has a height."""
+    part = (height - wing[1]) / (root[1] - wing[1])
+    return wing[0] + part * (root[0] - wing[0]), height
+
+
+def _unmoved_outlines(at: Mapping[str, Floats]) -> dict[str, list[Place]]:
     """The outlines of `UNMOVED_REGIONS` in the view from the front: (left, up), mm."""
     middle, base = at["subnasale"][0], at["subnasale"][1]
-    eyes = float(
-        np.mean([at[f"{p}_{s}"][1] for p in ("exocanthion", "endocanthion") for s in "LR"])
-    )
+    eyes = _eyes(at)
     left, right = (float(at[f"exocanthion_{side}"][0] - middle) for side in "LR")
 
-    def box(inner: float, outer: float, heights: tuple[float, float]) -> list[tuple[float, float]]:
+    def box(inner: float, outer: float, heights: tuple[float, float]) -> list[Place]:
         low, high = (eyes + share * (eyes - base) for share in heights)
         near, far = middle + inner, middle + outer
         return [(near, low), (near, high), (far, high), (far, low)]

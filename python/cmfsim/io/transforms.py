@@ -1,7 +1,7 @@
-"""Relocations in files: ITK's transforms (`.tfm`, `.h5`) and 4 × 4 matrices, read and written.
+"""Files of relocations: ITK transforms (`.tfm`, `.h5`) and 4 × 4 matrices, read and written.
 
-A transform file does not record whether it carries the bone to where it goes or back from there, so
-the direction is stated by whoever names the file (docs/formats.md).
+A transform file does not record whether it moves the bone to its new position or back from it, so
+the caller or the case file states the direction (docs/formats.md).
 """
 
 import os
@@ -36,11 +36,11 @@ MATRIX_SUFFIXES = (".txt", ".mat")
 HDF5_SUFFIXES = (".h5", ".hdf5", ".hdf")
 ITK_HEADER = "#Insight Transform File"
 COMPOSITE = "CompositeTransform"
-# What a matrix means if neither the caller nor the file states it: a motion that somebody typed.
+# How a matrix is read if neither the caller nor the file states it: as a motion typed by hand.
 DEFAULT_DIRECTION, DEFAULT_FRAME = "to-parent", "LPS"
 # Turns RAS coordinates into LPS and back.
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
-# What to state, as part of an error.
+# The choice of directions, as part of an error message.
 DIRECTION_CHOICE = (
     'direction = "from-parent" if the file takes the moved bone back to its old place, as 3D '
     "Slicer saves a transform that was applied to the bone; "
@@ -48,24 +48,24 @@ DIRECTION_CHOICE = (
     "after (moving image) to the bone before (fixed image)"
 )
 ITK_IS_LPS = "is an ITK transform, which is always LPS: remove frame"
-# A comment by which `write_transform` states frame and direction.
+# The comment in which `write_transform` records frame and direction.
 STATED = re.compile(r"^#.*\bmm, (LPS|RAS)(?:, (to-parent|from-parent))?\s*$")
 
 
 @dataclass(frozen=True, eq=False)
 class TransformFile:
-    """The motion in a transform file, and how the file was understood.
+    """The motion in a transform file, and how the file was interpreted.
 
     Attributes
     ----------
     matrix : (4, 4) float64, mm
         The motion of the bone: x ↦ R x + t on LPS points.
     direction : str
-        "to-parent" or "from-parent", as the numbers of the file were taken.
+        "to-parent" or "from-parent": how the numbers of the file were interpreted.
     frame : str
         "LPS" or "RAS".
     assumed : tuple of str
-        Which of "direction" and "frame" were stated by neither the caller nor the file.
+        Which of "direction" and "frame" neither the caller nor the file stated.
     """
 
     matrix: Floats
@@ -75,13 +75,13 @@ class TransformFile:
 
     @property
     def text(self) -> str:
-        """How the file was understood, in words."""
+        """How the file was interpreted, in words."""
         assumed = f" ({' and '.join(self.assumed)} assumed)" if self.assumed else ""
         return f"{self.direction}, {self.frame}{assumed}"
 
 
 def is_itk_file(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is an ITK transform by its ending; `.txt` and `.mat` may be as well."""
+    """Whether a file's suffix marks it as an ITK transform; `.txt` and `.mat` may hold one too."""
     return Path(path).suffix.lower() in (".tfm", *HDF5_SUFFIXES)
 
 
@@ -103,12 +103,11 @@ def read_transform(
         MatrixOffsetTransformBase or Rigid3DTransform with their centre, or a CompositeTransform of
         one of them; or `.txt` or `.mat` with a 4 × 4 matrix in text.
     direction : str
-        "to-parent": the file carries the bone from where it is to where it goes, and is the motion
-        itself. "from-parent": it carries the moved bone back, and is inverted. Needed for ITK
-        files; a 4 × 4 matrix is "to-parent" if nothing is stated.
+        "to-parent": the file moves the bone from its present to its new position, so it is the
+        motion itself. "from-parent": it moves the relocated bone back, and is inverted. Required
+        for ITK files; a 4 × 4 matrix is "to-parent" by default.
     frame : str
-        "LPS" or "RAS": the coordinates of a 4 × 4 matrix, LPS if nothing is stated. ITK files are
-        LPS always.
+        "LPS" or "RAS": the coordinates of a 4 × 4 matrix, LPS by default. ITK files are always LPS.
 
     Returns
     -------
@@ -120,9 +119,9 @@ def read_transform(
     FileNotFoundError
         The file does not exist.
     CaseError
-        (also `ValueError`) No direction for an ITK file; a direction or frame other than the file's
-        own comment states; not a transform, several transforms, another kind, a wrong count of
-        numbers (with the line), scale or shear.
+        (also `ValueError`) No direction for an ITK file; a direction or frame that contradicts the
+        file's own comment; not a transform, several transforms, an unsupported kind, a wrong count
+        of numbers (with the line), scale or shear.
 
     Notes
     -----
@@ -145,7 +144,7 @@ def read_transform(
 def read_transform_file(
     path: str | os.PathLike[str], *, direction: str | None = None, frame: str | None = None
 ) -> TransformFile:
-    """The motion in a transform file with how it was understood: as `read_transform`."""
+    """The motion in a transform file, and how it was interpreted; as `read_transform` otherwise."""
     path = Path(path)
     if direction is not None:
         check_one_of("direction", direction, DIRECTIONS)
@@ -218,19 +217,19 @@ def write_transform(
     Parameters
     ----------
     path : path
-        Replaced when all is written.
+        An existing file is replaced once the new one is complete.
     matrix : (4, 4) float64, mm
         A rigid motion of LPS points.
     direction : str
-        "to-parent" writes the motion itself, "from-parent" its inverse, which 3D Slicer shows as
-        the motion. Needed for `.tfm`; a `.txt` is "to-parent" if left out.
+        "to-parent" writes the motion itself, "from-parent" its inverse, which 3D Slicer displays as
+        the motion. Required for `.tfm`; a `.txt` is "to-parent" by default.
     frame : str
-        "LPS" or "RAS": the coordinates in which a `.txt` is written.
+        "LPS" or "RAS": the coordinates of a `.txt`.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) Another ending, RAS or no direction in a `.tfm`.
+        (also `ValueError`) Another suffix; RAS or no direction for a `.tfm`.
     BoundaryError
         (also `ValueError`) Not a rigid motion.
 
@@ -310,7 +309,7 @@ class _Found:
     kind: str
     parameters: Floats
     fixed: Floats
-    # What stands before an error about each: the line of a text.
+    # Prefix of an error message about each entry: its line in a text file.
     where: Mapping[str, str]
 
 
@@ -366,7 +365,7 @@ def _unknown_kind(where: str, kind: str) -> CaseInputError:
 
 
 def _matrix_of(found: Sequence[tuple[str, Floats, Floats] | _Found]) -> Floats:
-    """The matrix of the only rigid transform, which may be the only one of a composite."""
+    """The matrix of the only rigid transform, alone or in a composite."""
     all_of = [f if isinstance(f, _Found) else _Found(*f, MappingProxyType({})) for f in found]
     inner = [f for f in all_of if f.kind != COMPOSITE]
     if len(inner) != 1 or len(all_of) - len(inner) > 1:
@@ -385,7 +384,7 @@ def _matrix_of(found: Sequence[tuple[str, Floats, Floats] | _Found]) -> Floats:
             f"{one.where.get('Parameters', '')}Parameters holds {len(one.parameters)} numbers: "
             f"{one.kind} needs {counts}"
         )
-    # Euler3DTransform has a fourth number, the order of its turns.
+    # Euler3DTransform has a fourth number, the order of its rotations.
     allowed = (0, 3, 4) if one.kind == "Euler3DTransform" else (0, 3)
     if len(one.fixed) not in allowed:
         raise CaseInputError(
@@ -447,7 +446,7 @@ def _inverse(matrix: Floats) -> Floats:
 
 
 def _euler(parameters: Floats, fixed: Floats) -> Floats:
-    """Rz Rx Ry, or Rz Ry Rx where the file's fourth fixed number says so; angles in radians."""
+    """Rz Rx Ry, or Rz Ry Rx if the file's fourth fixed number is not 0; angles in radians."""
     (sx, sy, sz), (cx, cy, cz) = np.sin(parameters[:3]), np.cos(parameters[:3])
     rx = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
     ry = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
@@ -480,7 +479,7 @@ def _no_turn(parameters: Floats, fixed: Floats) -> Floats:
     return np.eye(3)
 
 
-# Count of parameters and the rotation that they mean.
+# Number of parameters of each kind, and the rotation that they describe.
 ITK_KINDS: Mapping[str, tuple[int, Callable[[Floats, Floats], Floats]]] = MappingProxyType(
     {
         "Euler3DTransform": (6, _euler),

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import Floats
 
-__all__ = ["Level", "Table", "smooth_curve", "smooth_max", "smooth_step", "turn_about"]
+__all__ = ["Level", "Table", "clipped", "smooth_curve", "smooth_max", "smooth_step", "turn_about"]
 
 # Values of a level, or coordinates, in float32 on grids and float64 at points.
 Level = NDArray[np.floating]
@@ -26,9 +26,17 @@ def smooth_max(a: Level, b: Level, melt: float) -> Level:
     return highest + h * h * (0.25 * melt)
 
 
+def clipped(share: Level) -> Level:
+    """The value in [0, 1] closest to a share.
+
+    `np.clip` takes nearly twice as long for the few points of a brick or a ray.
+    """
+    return np.minimum(np.maximum(share, 0.0), 1.0)
+
+
 def smooth_step(value: Level | float, start: float, end: float) -> Level:
     """0 up to `start`, 1 from `end` on, C¹ between; `end` may lie below `start`."""
-    t = np.clip((np.asarray(value) - start) / (end - start), 0.0, 1.0)
+    t = clipped((np.asarray(value) - start) / (end - start))
     return t * t * (3.0 - 2.0 * t)
 
 

@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from cmfsim.checks import Floats
-from cmfsim.phantom.curves import Level, Table, smooth_max, smooth_step
+from cmfsim.phantom.curves import Level, Table, clipped, smooth_max, smooth_step
 
 __all__ = [
     "REACH",
@@ -198,7 +198,7 @@ class Tube:
             ux, uy, uz = bx - ax, by - ay, bz - az
             size = max(ux * ux + uy * uy + uz * uz, TINY)
             px, py, pz = x - ax, y - ay, z - az
-            t = np.clip((px * ux + py * uy + pz * uz) / size, 0.0, 1.0)
+            t = clipped((px * ux + py * uy + pz * uz) / size)
             d = np.sqrt((px - t * ux) ** 2 + (py - t * uy) ** 2 + (pz - t * uz) ** 2)
             best = np.maximum(best, ar + t * (br - ar) - d)
         return best
@@ -244,7 +244,7 @@ class FlatTube:
             ux, uy, uz = (self.points[i + 1] - self.points[i]).tolist()
             size = max(ux * ux + uy * uy + uz * uz, TINY)
             px, py, pz = x - ax, y - ay, z - az
-            t = np.clip((px * ux + py * uy + pz * uz) / size, 0.0, 1.0)
+            t = clipped((px * ux + py * uy + pz * uz) / size)
             qx, qy, qz = px - t * ux, py - t * uy, pz - t * uz
             d2 = qx * qx + qy * qy + qz * qz
             n, dn = self.normals[i].tolist(), (self.normals[i + 1] - self.normals[i]).tolist()
@@ -361,7 +361,7 @@ class Engraving:
             (ax, az), (bx, bz) = self.curve[i].tolist(), self.curve[i + 1].tolist()
             ux, uz = bx - ax, bz - az
             px, pz = x - ax, z - az
-            t = np.clip((px * ux + pz * uz) / max(ux * ux + uz * uz, TINY), 0.0, 1.0)
+            t = clipped((px * ux + pz * uz) / max(ux * ux + uz * uz, TINY))
             d2 = (px - t * ux) ** 2 + (pz - t * uz) ** 2
             value = self.depth[i] + t * (self.depth[i + 1] - self.depth[i])
             depth = np.where(d2 < near, value, depth)

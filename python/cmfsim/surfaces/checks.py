@@ -1,7 +1,7 @@
-"""What is wrong with a triangle surface: borders, debris, orientation, crossings, slivers.
+"""Checks of a triangle surface: borders, debris, orientation, crossings, slivers.
 
-Everything here looks and changes nothing; `repair_surface` repairs. Costs are a few sorts of the
-edges, and for crossings a grid over the triangles.
+Nothing here changes a surface; `repair_surface` does. The checks sort the edges a few times; the
+search for crossings sorts the triangles into a grid.
 """
 
 from dataclasses import dataclass
@@ -24,13 +24,13 @@ __all__ = [
     "check_surface",
 ]
 
-# Largest coordinate of which areas and volumes are still numbers, mm.
+# Largest coordinate for which areas and volumes stay finite, mm.
 MAX_COORDINATE = 1e90
 
-# A triangle whose height is below this share of its longest edge is a line, not a triangle: its
-# normal is rounding error for coordinates of some 1000 mm at double precision.
+# A triangle whose height is below this share of its longest edge has no area: with coordinates of
+# some 1000 mm in double precision, its normal is rounding error.
 DEGENERATE_HEIGHT = 1e-9
-# Below this share it is a sliver: distances to it are sound, its normal points anywhere.
+# Below this share it is a sliver: distances to it are accurate, but its normal is not.
 SLIVER_HEIGHT = 0.01
 
 
@@ -41,7 +41,7 @@ class BorderLoop:
     Attributes
     ----------
     vertices : (k,) int64
-        In the order in which the triangles at the border run.
+        In the direction of the triangles along the border.
     length : float, mm
     centre : (3,) float64, mm
         Mean of the vertices.
@@ -61,7 +61,7 @@ class Component:
     n_triangles : int
     area : float, mm²
     volume : float, mm³
-        Signed, of the triangles as they are; means little if the piece is not closed.
+        Signed, with the triangles oriented as they are; meaningful only if the piece is closed.
     centre : (3,) float64, mm
     is_closed : bool
     """
@@ -88,20 +88,20 @@ class SurfaceReport:
     degenerate : (k,) int64
         Triangles without area.
     duplicate : (k,) int64
-        Triangles with the same corners as an earlier one, either way round.
+        Triangles with the same corners as an earlier one, in either orientation.
     slivers : (k,) int64
-        Triangles far lower than long, degenerate ones left out.
+        Triangles much lower than they are long, without the degenerate ones.
     non_manifold : (k, 2) int64
-        Edges of more than two triangles, as vertices.
+        Edges shared by more than two triangles, each as its two vertices.
     inconsistent : int
-        Edges that both their triangles run through in the same direction.
+        Number of edges that both adjacent triangles traverse in the same direction.
     orientable : bool
     borders : tuple of BorderLoop
         Longest first.
     components : tuple of Component
         Largest area first.
     crossings : (k, 2) int64 or None
-        Pairs of triangles that cut through each other; None if they were not looked for.
+        Pairs of triangles that intersect; None if crossings were not checked.
     crossing_points : (k, 3) float64, mm, or None
         A place near each crossing.
     """
@@ -130,19 +130,19 @@ class SurfaceReport:
 
 
 def check_extent(vertices: Floats) -> None:
-    """Refuses coordinates so large that areas and volumes would not be numbers.
+    """Raises an error for coordinates so large that areas and volumes would overflow.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) With the vertex.
+        (also `ValueError`) A coordinate above 1e90 mm; the message names its vertex.
     """
     far = np.argwhere(np.abs(vertices) > MAX_COORDINATE)
     if len(far):
         vertex, axis = far[0]
         raise CaseInputError(
             f"surface vertex {vertex} has the coordinate {vertices[vertex, axis]:g} mm: at most "
-            f"{MAX_COORDINATE:g} is worked with"
+            f"{MAX_COORDINATE:g} is supported"
         )
 
 
@@ -152,10 +152,10 @@ def check_surface(surface: SurfaceData, *, crossings: bool = True) -> SurfaceRep
     Parameters
     ----------
     surface : SurfaceData
-        With vertices in the same place made one, as `read_surface` does: else every triangle of an
-        STL file has a border of its own.
+        With coincident vertices merged, as `read_surface` does; otherwise every triangle of an STL
+        file has a border of its own.
     crossings : bool
-        Whether to look for triangles that cut through each other, the costliest check.
+        Whether to check for triangles that intersect, which is the most expensive check.
 
     Returns
     -------
@@ -179,8 +179,8 @@ def check_surface(surface: SurfaceData, *, crossings: bool = True) -> SurfaceRep
     check_extent(vertices)
     degenerate, slivers = thin_triangles(vertices, triangles)
     duplicate = duplicate_triangles(triangles)
-    # Repetitions would look like forks. A triangle without area still joins its neighbours, unless
-    # it names a vertex twice, when they are joined without it.
+    # Duplicates would look like non-manifold edges. A triangle without area still connects its
+    # neighbours; one that names a vertex twice is not needed for that, as they share an edge.
     keep = has_three_corners(triangles)
     keep[duplicate] = False
     kept = triangles[keep]
@@ -238,7 +238,7 @@ def has_three_corners(triangles: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def duplicate_triangles(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The triangles whose corners an earlier one has too, in any order."""
+    """The triangles that have the corners of an earlier one, in any order."""
     if not len(triangles):
         return np.zeros(0, dtype=np.int64)
     _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
@@ -250,8 +250,8 @@ def duplicate_triangles(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
 def border_loops(vertices: Floats, edges: Edges) -> tuple[BorderLoop, ...]:
     """The closed borders of a surface, longest first.
 
-    A walk along the border that comes back to a vertex ends a loop there, so that two loops which
-    touch at a vertex are two.
+    A walk along the border ends a loop where it returns to a vertex, so two loops that touch at a
+    vertex stay separate.
     """
     starts, ends = edges.border.T
     after: dict[int, list[int]] = {}
@@ -271,7 +271,7 @@ def border_loops(vertices: Floats, edges: Edges) -> tuple[BorderLoop, ...]:
             else:
                 seen[vertex] = len(walk)
                 walk.append(vertex)
-        # What is left over here is a border that inconsistent triangles interrupt.
+        # What remains is a border that inconsistent triangles interrupt.
         if len(walk) > 1:
             loops.append(walk)
     found = [_border_loop(vertices, np.array(loop, dtype=np.int64)) for loop in loops]
@@ -288,7 +288,7 @@ def _areas_volumes(vertices: Floats, triangles: NDArray[np.int64]) -> tuple[Floa
     """Area of each triangle, and its share of the signed volume about the middle of the surface."""
     if not len(triangles):
         return np.zeros(0), np.zeros(0)
-    # About the middle, or the digits of a small volume far from the origin cancel.
+    # Relative to the middle: far from the origin, the digits of a small volume would cancel.
     middle = vertices[triangles].mean(axis=(0, 1))
     a, b, c = (vertices[triangles[:, i]] - middle for i in range(3))
     normals = np.cross(b - a, c - a)

@@ -1,4 +1,4 @@
-"""Triangle surfaces repaired: welded, cleaned, oriented, closed; each repair is a finding."""
+"""Repair of triangle surfaces: merged, cleaned, oriented, closed; each repair is a finding."""
 
 from dataclasses import dataclass
 
@@ -32,11 +32,11 @@ class RepairOptions:
     Attributes
     ----------
     weld_distance : float
-        Vertices closer than this share of the surface's extent become one. 1e-7 is 0.03 µm on a
-        head: below what single precision tells apart.
+        Vertices closer than this share of the surface's extent are merged. 1e-7 is 0.03 µm on a
+        head: less than the resolution of single precision.
     keep_share : float
-        Pieces with less than this share of the largest piece's area are dropped: 0 keeps all, 1
-        keeps the largest alone.
+        Pieces with less than this share of the largest piece's area are dropped: 0 keeps all of
+        them, 1 keeps only the largest.
     close_borders : bool
         Whether borders are closed by caps.
 
@@ -60,7 +60,7 @@ class RepairOptions:
 def clean_surface(surface: SurfaceData) -> SurfaceData:
     """The surface without triangles that have no area or repeat others, and without stray vertices.
 
-    What remains is fit for `cmfsim.Surface`; it may be empty of triangles.
+    The result is valid input for `cmfsim.Surface`; it may have no triangles.
     """
     vertices = surface.vertices
     triangles = surface.triangles.astype(np.int64)
@@ -73,30 +73,30 @@ def clean_surface(surface: SurfaceData) -> SurfaceData:
 def repair_surface(
     surface: SurfaceData, name: str, options: RepairOptions | None = None
 ) -> tuple[SurfaceData, tuple[Finding, ...]]:
-    """A closed, outward surface made from one that is nearly so, with a finding for each repair.
+    """A closed surface with outward normals from one that is nearly so, and a finding per repair.
 
-    Vertices in the same place become one; triangles without area and repeated ones are dropped, and
-    so are small pieces; triangles are flipped until neighbours agree and the largest piece
-    encloses a positive volume; other pieces that enclose a negative one stay if they lie inside the
-    largest (hollows) and are turned if not; borders are closed by caps.
+    Coincident vertices are merged. Triangles without area, duplicate triangles and small pieces are
+    dropped. Triangles are flipped until neighbours agree and the largest piece encloses a positive
+    volume; another piece that encloses a negative volume is kept as it is inside the largest, where
+    it is a hollow, and turned elsewhere. Borders are closed by caps.
 
     Parameters
     ----------
     surface : SurfaceData
     name : str
-        What findings call it.
+        The surface's name in findings.
     options : RepairOptions, optional
 
     Returns
     -------
     SurfaceData
     tuple of Finding
-        Notes; a warning where a cap is far from flat.
+        Notes, and a warning for each cap that is far from flat.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) No triangle with an area is left; a coordinate above 1e90 mm.
+        (also `ValueError`) No triangle with an area remains; a coordinate above 1e90 mm.
 
     Examples
     --------
@@ -142,7 +142,7 @@ def repair_surface(
             if len(loop.vertices) < 3:
                 continue
             cap, bulge = cap_loop(vertices, loop.vertices)
-            # What lies on a line closes a slit that is closed already.
+            # Triangles of a cap that lie on a line would close a slit of no width.
             cap = np.delete(cap, thin_triangles(vertices, cap)[0], axis=0)
             if not len(cap):
                 continue
@@ -152,8 +152,8 @@ def repair_surface(
     return _compact(vertices, triangles, surface.crease_angle), tuple(findings)
 
 
-# A cap whose border strays further than this share of its length from a plane covers a region
-# whose shape nobody knows.
+# A cap whose border departs from a plane by more than this share of its length covers a region of
+# unknown shape.
 FLAT_SHARE = 0.05
 
 
@@ -180,7 +180,7 @@ def _compact(vertices: Floats, triangles: Integers, crease_angle: float) -> Surf
 def _welded(
     vertices: Floats, triangles: Integers, weld_distance: float
 ) -> tuple[Floats, Integers, int]:
-    """Vertices with those nearer than a share of the extent made one, the first of each kept."""
+    """Vertices, merged where closer than a share of the extent; the first of each group is kept."""
     if not len(vertices):
         return vertices, triangles, 0
     extent = float((vertices.max(axis=0) - vertices.min(axis=0)).max())
@@ -195,7 +195,8 @@ def _welded(
 def _near_pairs(vertices: Floats, distance: float) -> Integers:
     """Pairs of vertices that lie within a distance, by grids shifted by half a cell each way.
 
-    Any two nearer than the distance share a cell of twice that width in one of the eight grids.
+    Any two that are closer than the distance share a cell, of twice that width, in one of the eight
+    grids.
     """
     pairs = [np.zeros((0, 2), dtype=np.int64)]
     low = vertices.min(axis=0)
@@ -210,19 +211,19 @@ def _near_pairs(vertices: Floats, distance: float) -> Integers:
     return np.concatenate(pairs)
 
 
-# Rounds and number of flat triangles up to which they are removed without opening a slit; a surface
-# with more is broken in another way.
+# Rounds, and number of flat triangles, up to which these are removed without opening a slit; a
+# surface with more of them has another defect.
 FLAT_ROUNDS, MAX_FLAT = 8, 2000
 # Share of the longest edge below which the shortest is a point.
 POINT_SHARE = 1e-3
 
 
 def _without_flat(vertices: Floats, triangles: Integers) -> tuple[Integers, int, int]:
-    """Triangles without those that have no area or repeat others, and how many of each went.
+    """Triangles without flat and duplicate ones, and how many of each were removed.
 
-    Dropping a flat triangle would leave a slit of no width. One with two corners in the same place
-    goes when these become one; one with a corner on its longest edge takes that edge from the
-    triangle across, which is then cut in two at the corner.
+    Deleting a flat triangle would leave a slit of no width. One with two coincident corners
+    disappears when these are merged. One with a corner on its longest edge is merged into the
+    triangle across that edge, which is split in two at the corner.
     """
     n_flat = len(thin_triangles(vertices, triangles)[0])
     n_again = 0
@@ -253,7 +254,7 @@ def _without_flat(vertices: Floats, triangles: Integers) -> tuple[Integers, int,
 
 
 def _with_turned_edges(triangles: Integers, flat: Integers, longest: Integers) -> Integers:
-    """Triangles where each flat one and its neighbour across its longest edge are cut anew."""
+    """Triangles with the longest edge of each flat one flipped, in it and in its neighbour."""
     triangles = triangles.copy()
     done: set[int] = set()
     for number, corner in zip(flat.tolist(), longest.tolist(), strict=True):
@@ -287,7 +288,7 @@ def _without_debris(
 
 
 def _outward(vertices: Floats, triangles: Integers) -> tuple[Integers, int]:
-    """Triangles turned round until neighbours agree and solid pieces enclose positive volumes."""
+    """Triangles flipped until neighbours agree and solid pieces enclose positive volumes."""
     edges = edges_of(triangles)
     flips, _ = orientation_flips(edges, len(triangles))
     labels = component_labels(edges, len(triangles))
@@ -299,7 +300,7 @@ def _outward(vertices: Floats, triangles: Integers) -> tuple[Integers, int]:
     largest = int(np.argmax(areas))
     turn = np.zeros(len(volumes), dtype=bool)
     if volumes[largest] < 0.0:
-        # A file that is inside out as a whole keeps its hollows when all of it is turned.
+        # A surface that is inside out as a whole keeps its hollows if all of it is turned.
         turn[:] = True
         volumes = -volumes
     inward = [piece for piece in np.flatnonzero(volumes < 0.0) if piece != largest]

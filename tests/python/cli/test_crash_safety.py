@@ -20,6 +20,7 @@ import cmfsim
 from cmfsim.cli import main
 from cmfsim.io import finish_writing, replacing_files
 from head_case import HeadCase
+from shared_values import without_pictures
 
 pytest.importorskip("meshio")
 pytest.importorskip("scipy")
@@ -142,10 +143,7 @@ def case(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def no_pictures(tmp_path_factory, monkeypatch):
     """Processes without PyVista: pictures take most of the time."""
-    folder = tmp_path_factory.mktemp("without")
-    (folder / "pyvista.py").write_text("raise ImportError('left out')", encoding="utf-8")
-    paths = [str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+    monkeypatch.setenv("PYTHONPATH", without_pictures(tmp_path_factory.mktemp("without")))
 
 
 def command(case, words, **options):

@@ -9,22 +9,20 @@ import cmfsim
 from cmfsim.cli import main
 from cmfsim.io.predictions import read_prediction
 from cmfsim.phantom.demo import write_demo_case
-from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline import predicting
 from cmfsim.pipeline.outputs import write_results
-from cmfsim.pipeline.predicting import build_patient
 from cmfsim.surfaces.depth import tissue_depth
-
-EDGE = 14.0
+from shared_values import COARSE_EDGE, coarse_demo_patient
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    return write_demo_case(tmp_path_factory.mktemp("band"), edge_length=EDGE)
+    return write_demo_case(tmp_path_factory.mktemp("band"), edge_length=COARSE_EDGE)
 
 
 @pytest.fixture(scope="module")
-def patient(made):
-    return build_patient(made.case, ("M+S",), BuildOptions(anatomy=made.anatomy, check=False))
+def patient(tmp_path_factory):
+    return coarse_demo_patient(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +162,11 @@ def test_the_command_line_refuses_a_band_before_any_work(made, plain, tmp_path, 
     assert not made.case.output.exists()
 
 
-def test_the_command_line_states_a_band_and_what_it_is_worth(made, plain, tmp_path, capsys):
+def test_the_command_line_states_a_band_and_what_it_is_worth(
+    made, patient, plain, tmp_path, capsys, monkeypatch
+):
+    """On the patient that is built already."""
+    monkeypatch.setattr(predicting, "build_patient", lambda *_: patient)
     path = tmp_path / "calibration.json"
     cmfsim.write_calibration(path, calibration_for(plain))
     output = tmp_path / "out"

@@ -20,6 +20,7 @@ from cmfsim.cli import main
 from cmfsim.io import models
 from cmfsim.pipeline.building import assembly, case_model, tissue_mesh
 from head_case import HeadCase
+from shared_values import drawn_levels
 
 pytest.importorskip("skimage", reason="needs scikit-image (pip install 'cmfsim[imaging]')")
 meshio = pytest.importorskip("meshio", reason="needs meshio (pip install 'cmfsim[mesh]')")
@@ -62,9 +63,9 @@ def head():
 
 
 @pytest.fixture(scope="session")
-def truth(head):
+def truth(tmp_path_factory):
     """The head as it was drawn, as levels."""
-    return head.anatomy(2.0)
+    return drawn_levels(tmp_path_factory, 2.0)
 
 
 @pytest.fixture(scope="session")

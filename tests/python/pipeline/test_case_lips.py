@@ -43,6 +43,16 @@ def model(head, anatomy, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def coarse(head, anatomy, tmp_path_factory):
+    """The same with larger tets: lips that press on each other take as many solves as facets."""
+
+    def change(text):
+        return text.replace("edge_length = 7.0", "edge_length = 10.0") + LIPS
+
+    return model_of(tmp_path_factory.mktemp("coarse"), head, anatomy, change)
+
+
+@pytest.fixture(scope="module")
 def lower_jaw(head, anatomy, tmp_path_factory):
     """Only the mandible is operated: the upper teeth are the cranium's, which stays."""
 
@@ -158,17 +168,17 @@ def test_a_prediction_without_contact_warns_that_lips_may_pass_through_each_othe
     assert "lips-without-contact" not in codes["whole"]
 
 
-def test_lips_press_on_each_other_and_do_not_pass(model):
+def test_lips_press_on_each_other_and_do_not_pass(coarse):
     """From the case file to equilibrium: what was separated touches, pushes and never pulls."""
-    result = cmfsim.predict_patient(model, "H+S").result
+    result = cmfsim.predict_patient(coarse, "H+S").result
     touching = result.summary["touching"]
     assert touching["pressed"] > 10
     assert touching["penetration"] < 0.2
     without = cmfsim.solve_scene(
-        dataclasses.replace(cmfsim.model_scene(model, "H+S"), touching=(), obstacles=())
+        dataclasses.replace(cmfsim.model_scene(coarse, "H+S"), touching=(), obstacles=())
     )
     moved = np.linalg.norm(result.displacements - without.displacements, axis=1)
-    lips = np.concatenate([region.nodes for region in model.lips.values()])
+    lips = np.concatenate([region.nodes for region in coarse.lips.values()])
     assert moved[lips].max() > 0.5
     assert np.median(moved) < 0.05 * moved[lips].max()
 
@@ -238,21 +248,21 @@ def test_nothing_moves_when_nothing_moves(model):
     assert touching["penetration"] < 1e-9
 
 
-def test_lips_do_not_enter_each_other_when_the_mandible_rises(model):
+def test_lips_do_not_enter_each_other_when_the_mandible_rises(coarse):
     """By 4 mm, which closes the gap of 3 mm between the lips; without contact they pass through."""
     plan = {"mandible_body": cmfsim.rigid_motion(translation=(0.0, 0.0, 4.0))}
-    result = solved(model, plan)
+    result = solved(coarse, plan)
     touching = result.summary["touching"]
     # Coarse lips may end with a node that meets two facets by turns: the result then warns.
     warned = [f["code"] for f in result.summary.get("findings", [])]
     assert touching["converged"] or "touching-stopped" in warned
     assert touching["pressed"] > 5
     assert touching["penetration"] < 0.1
-    free = dataclasses.replace(model.scene, touching=(), obstacles=())
-    assert _deepest(model, result) < 0.1
-    through = solved(dataclasses.replace(model, scene=free), plan)
+    free = dataclasses.replace(coarse.scene, touching=(), obstacles=())
+    assert _deepest(coarse, result) < 0.1
+    through = solved(dataclasses.replace(coarse, scene=free), plan)
     assert "touching" not in through.summary
-    assert _deepest(model, through) > 0.25
+    assert _deepest(coarse, through) > 0.25
 
 
 def _deepest(model, result):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import re
 import sys
 from html import escape
@@ -15,6 +14,7 @@ import phantom_case
 from cmfsim.cli import main
 from cmfsim.pipeline.evaluating import evaluation_key
 from cmfsim.report import case_document, render_page
+from shared_values import drawn_levels, without_pictures
 
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")
@@ -27,7 +27,7 @@ def case(tmp_path_factory):
     """The phantom from surfaces, coarse, with its own skin after the operation yet to come."""
     head = cmfsim.make_head()
     folder = tmp_path_factory.mktemp("phantom")
-    path = phantom_case.surface_case(folder, head, head.anatomy(3.0))
+    path = phantom_case.surface_case(folder, head, drawn_levels(tmp_path_factory, 3.0))
     text = path.read_text(encoding="utf-8").replace("edge_length = 7.0", "edge_length = 10.0")
     path.write_text(text + COARSE, encoding="utf-8")
     return cmfsim.Case.load(path)
@@ -200,11 +200,7 @@ def test_a_study_keeps_what_is_finished_and_reports_what_fails(
 ):
     """Its processes are without PyVista: pictures take most of the time."""
     pytest.importorskip("jinja2")
-    absent = tmp_path / "absent"
-    absent.mkdir()
-    (absent / "pyvista.py").write_text("raise ImportError('left out')", encoding="utf-8")
-    paths = [str(absent), *filter(None, [os.environ.get("PYTHONPATH")])]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+    monkeypatch.setenv("PYTHONPATH", without_pictures(tmp_path / "absent"))
     cohort = tmp_path / "cohort.toml"
     cohort.write_text(
         'format = "cmfsim-cohort"\nversion = 1\nname = "two"\nnote = "in silico"\nmodels = ["H"]\n'

@@ -13,6 +13,7 @@ from cmfsim.pipeline.building.refinement import (
     allowed_halvings,
     needed_halvings,
 )
+from shared_values import drawn_levels
 
 # Hollows are told from tissue with scipy.
 pytest.importorskip("scipy", reason="needs scipy (pip install 'cmfsim[imaging]')")
@@ -67,10 +68,10 @@ def test_a_head_with_one_jaw_has_no_mouth(renamed):
     assert not needed_halvings(level, anatomy).any()
 
 
-def test_the_lips_of_the_phantom_have_tets_of_half_the_edge():
+def test_the_lips_of_the_phantom_have_tets_of_half_the_edge(tmp_path_factory):
     """At an edge of 5 mm lips are not thin; a lattice has twelve tets in a cube."""
     head = cmfsim.make_head()
-    anatomy = head.anatomy(2.0)
+    anatomy = drawn_levels(tmp_path_factory, 2.0)
     level, _ = tissue_level(anatomy, TissueRegion((0, -40, 0), lower=-75.0, upper=0.0))
     edge, ends = 5.0, ("superius", "inferius")
     lips = np.mean([head.skin_landmarks[f"labiale_{end}"] for end in ends], axis=0)

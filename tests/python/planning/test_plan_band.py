@@ -7,15 +7,12 @@ import pytest
 
 import cmfsim
 import cmfsim.planning.page.content
-from cmfsim.phantom.demo import write_demo_case
-from cmfsim.pipeline.building.stages import BuildOptions
-from cmfsim.pipeline.predicting import build_patient
 
 pytest.importorskip("skimage")
 
 from browser_page import open_page, until
+from shared_values import coarse_demo_patient
 
-EDGE = 14.0
 # One calibration case would be too few: the factors are those of ten.
 SCORES = np.linspace(0.8, 2.6, 10)
 
@@ -23,8 +20,7 @@ SCORES = np.linspace(0.8, 2.6, 10)
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory):
     """A coarse head with muscles and sliding tissue."""
-    made = write_demo_case(tmp_path_factory.mktemp("band"), edge_length=EDGE)
-    return build_patient(made.case, ("M+S",), BuildOptions(anatomy=made.anatomy, check=False))
+    return coarse_demo_patient(tmp_path_factory)
 
 
 @pytest.fixture(scope="module", params=["M", "M+S"])

@@ -7,7 +7,7 @@ import pytest
 
 import cmfsim
 import contact_plans
-import phantom_case
+from shared_values import phantom_model
 
 pytest.importorskip("skimage", reason="needs scikit-image (pip install 'cmfsim[imaging]')")
 
@@ -16,11 +16,8 @@ REACH = (6.0, 6.0)
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
-    """A made head, coarse, from its surfaces."""
-    head = cmfsim.make_head()
-    folder = tmp_path_factory.mktemp("surfaces")
-    path = phantom_case.surface_case(folder, head, head.anatomy(2.0))
-    return cmfsim.build_case(cmfsim.Case.load(path))
+    """A synthetic head, coarse, from its surfaces."""
+    return phantom_model(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")

@@ -7,16 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import cmfsim
-from cmfsim.phantom.demo import write_demo_case
-from cmfsim.pipeline.building.stages import BuildOptions
-from cmfsim.pipeline.predicting import build_patient
 from cmfsim.solving.models import model_scene
 from cmfsim.solving.rates import skin_rates
 from cmfsim.solving.simulation import scene_plan, scene_solver, solved_scene
 from cmfsim.solving.tissue_changes import tissue_parts
 from cmfsim.solving.uncertainty import PLAN
+from shared_values import coarse_demo_patient
 
-EDGE = 14.0
 # Half the distance between the two solutions of a difference, in standard deviations.
 HALF = 0.05
 # Contact and equations are solved far below what the differences show, mm and share.
@@ -25,8 +22,7 @@ OPTIONS = {"contact_tolerance": 1e-7, "tolerance": 1e-11, "method": "cholesky"}
 
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory):
-    made = write_demo_case(tmp_path_factory.mktemp("rates"), edge_length=EDGE)
-    return build_patient(made.case, ("M+S",), BuildOptions(anatomy=made.anatomy, check=False))
+    return coarse_demo_patient(tmp_path_factory)
 
 
 def solved(patient, model):

@@ -14,6 +14,7 @@ import phantom_case
 from cmfsim.cli import main
 from cmfsim.report import render_page, study_document
 from cmfsim.report.study import table3_text
+from shared_values import drawn_levels, without_pictures
 
 pytest.importorskip("skimage")
 pytest.importorskip("jinja2")
@@ -55,10 +56,13 @@ def _patient(folder, head, anatomy, share):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two patients in a folder, and a cohort file that names a third who is not there."""
+    """Two patients in a folder, and a cohort file that names a third who is not there.
+
+    The processes that work on a case draw nothing; the figures of the study are drawn by this one.
+    """
     folder = tmp_path_factory.mktemp("cohort")
     head = cmfsim.make_head()
-    anatomy = head.anatomy(3.0)
+    anatomy = drawn_levels(tmp_path_factory, 3.0)
     _patient(folder / "P1", head, anatomy, 1.0)
     _patient(folder / "P2", head, anatomy, 0.4)
     (folder / "cohort.toml").write_text(
@@ -67,7 +71,9 @@ def folder(tmp_path_factory):
         '[[cases]]\nname = "gone"\nfile = "nowhere/case.toml"\n',
         encoding="utf-8",
     )
-    assert main(["study", str(folder), "-q", "--workers", "1"]) == 1
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", without_pictures(tmp_path_factory.mktemp("absent")))
+        assert main(["study", str(folder), "-q", "--workers", "1"]) == 1
     return folder
 
 
@@ -221,8 +227,9 @@ def test_figures_show_every_patient_and_model(folder):
     assert "as the paper&#39;s Figure 10" in page or "as the paper's Figure 10" in page
 
 
-def test_a_study_is_drawn_from_what_it_left_and_nothing_else(folder, tmp_path):
+def test_a_study_is_drawn_from_what_it_left_and_nothing_else(folder, tmp_path, monkeypatch):
     """Errors that were changed after the study are refused; a run again works on that case."""
+    monkeypatch.setenv("PYTHONPATH", without_pictures(tmp_path / "absent"))
     copied = tmp_path / "copy"
     shutil.copytree(folder, copied)
     cohort = replace(cmfsim.Cohort.load(copied), cases={"P1": copied / "P1" / "case.toml"})

@@ -1,11 +1,15 @@
 //! The only error type of the crate: each variant states a fact, with the offending index and value.
 
+mod kind;
 mod ranges;
+mod shortfall;
 
 use thiserror::Error;
 
+pub use kind::ErrorKind;
 pub use ranges::LARGEST_COORDINATE;
 pub(crate) use ranges::{check_coordinates, check_displacements, check_finite_rows, check_forces};
+pub use shortfall::Shortfall;
 
 /// What went wrong, where, how much, and what to do about it.
 ///
@@ -402,105 +406,6 @@ fn shown(value: f64) -> String {
         format!("{value:e}")
     } else {
         value.to_string()
-    }
-}
-
-/// A quantity that an iteration did not reduce to the required value.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Shortfall {
-    /// The quantity, in words.
-    pub quantity: &'static str,
-    /// Its final value; infinite if it could not be computed.
-    pub value: f64,
-    /// The required value.
-    pub limit: f64,
-    /// Its unit with a space before it; empty if it has none.
-    pub unit: &'static str,
-}
-
-impl std::fmt::Display for Shortfall {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { quantity, value, limit, unit } = self;
-        if value.is_finite() {
-            write!(f, "{quantity} is {value:.3e}{unit} where {limit:.3e}{unit} was asked for")
-        } else {
-            write!(f, "{quantity} could not be computed, and {limit:.3e}{unit} was asked for")
-        }
-    }
-}
-
-/// The family an error belongs to; the Python exceptions carry the same names.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum ErrorKind {
-    /// Nodes, tets, surfaces.
-    Mesh,
-    /// Tissue constants and stiffness.
-    Material,
-    /// Node kinds, segments, plans.
-    Boundary,
-    /// Contact surfaces and the contact solver.
-    Contact,
-    /// Solver options and outcomes.
-    Solver,
-    /// Landmarks and points that are to be aligned.
-    Registration,
-    /// The caller asked to stop.
-    Interrupted,
-}
-
-impl MtmError {
-    /// The family of the error.
-    pub fn kind(&self) -> ErrorKind {
-        match self {
-            Self::Empty { kind, .. }
-            | Self::Length { kind, .. }
-            | Self::NotFinite { kind, .. }
-            | Self::OutOfRange { kind, .. }
-            | Self::IndexOutOfRange { kind, .. }
-            | Self::NotRigid { kind, .. }
-            | Self::UnknownName { kind, .. } => *kind,
-            Self::DuplicateNode { .. }
-            | Self::InvertedTet { .. }
-            | Self::DegenerateTet { .. }
-            | Self::DuplicateTet { .. }
-            | Self::UnusedNode { .. }
-            | Self::DegenerateTriangle { .. } => ErrorKind::Mesh,
-            Self::AsymmetricStiffness { .. }
-            | Self::IndefiniteMaterial { .. }
-            | Self::FibreNotUnit { .. } => ErrorKind::Material,
-            Self::NodeOfTwoKinds { .. }
-            | Self::Segment { .. }
-            | Self::TouchingPair { .. }
-            | Self::Plan { .. }
-            | Self::Unconstrained { .. } => ErrorKind::Boundary,
-            Self::ContactSurface { .. } | Self::ContactNotConverged { .. } => ErrorKind::Contact,
-            Self::NotPositiveDefinite { .. }
-            | Self::NotConverged { .. }
-            | Self::NoThreads { .. }
-            | Self::OutOfMemory { .. } => ErrorKind::Solver,
-            Self::TooFewPoints { .. }
-            | Self::CoincidentPoints { .. }
-            | Self::FlatPoints { .. }
-            | Self::NotDetermined { .. }
-            | Self::IcpNotConverged { .. } => ErrorKind::Registration,
-            Self::Interrupted => ErrorKind::Interrupted,
-        }
-    }
-
-    /// Whether the input is at fault (Python: the error is also a `ValueError`), rather than a numerical
-    /// outcome.
-    pub fn is_input(&self) -> bool {
-        !matches!(
-            self,
-            Self::ContactNotConverged { .. }
-                | Self::NotPositiveDefinite { .. }
-                | Self::NotConverged { .. }
-                | Self::IcpNotConverged { .. }
-                | Self::OutOfMemory { .. }
-                | Self::NoThreads { .. }
-                | Self::Interrupted
-        )
     }
 }
 

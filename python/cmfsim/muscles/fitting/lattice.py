@@ -1,4 +1,4 @@
-"""A smooth displacement of space: quadratic B-splines on a lattice, with an energy of bending."""
+"""A smooth displacement of space: quadratic B-splines on a lattice, with strain and bending."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,18 +13,18 @@ from cmfsim.extras import third_party
 
 __all__ = ["Lattice", "sparse"]
 
-# Coefficients of the quadratic B-spline that reach a place, along each axis.
+# Number of coefficients of the quadratic B-spline that influence a point, along each axis.
 REACH = 3
 
 
 def sparse(name: str = "scipy.sparse") -> Any:
-    """The package scipy.sparse, or one below it."""
+    """The package scipy.sparse, or a package inside it."""
     return third_party(name, "muscles are fitted", "imaging", CaseInputError)
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """The places of the coefficients of a displacement: only those that reach a muscle.
+    """The positions of the coefficients of a displacement: only those that influence a muscle.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class Lattice:
     spacing : float, mm
     shape : (3,) int
     number : (nx, ny, nz) int
-        The number of a coefficient; −1 where there is none.
+        The index of each coefficient; −1 where there is none.
     """
 
     origin: Floats
@@ -42,7 +42,7 @@ class Lattice:
 
     @classmethod
     def round(cls, points: Floats, spacing: float) -> Self:
-        """The lattice whose displacement is known at some points.
+        """The lattice that determines the displacement at the given points.
 
         Parameters
         ----------
@@ -74,7 +74,7 @@ class Lattice:
         ----------
         points : (n, 3) float64, mm
         derivative : int, optional
-            Along which axis.
+            The axis along which to differentiate; by default, the displacement itself.
 
         Returns
         -------
@@ -105,7 +105,7 @@ class Lattice:
         Returns
         -------
         first, second : (…, size) scipy.sparse.csr_matrix
-            Rows have the weight of a cell's volume: the sum of squares is an integral over space.
+            Rows are weighted by a cell's volume, so the sum of squares is an integral over space.
         """
         root = self.spacing**1.5
         first = [self._stencil([((0, 0, 0), -1.0), (e, 1.0)]) for e in _UNITS]
@@ -117,7 +117,7 @@ class Lattice:
             for b in range(a):
                 both = tuple(x + y for x, y in zip(_UNITS[a], _UNITS[b], strict=True))
                 corners = [((0, 0, 0), 1.0), (_UNITS[a], -1.0), (_UNITS[b], -1.0), (both, 1.0)]
-                # The mixed derivative stands twice in the sum over all pairs.
+                # The mixed derivative occurs twice in the sum over all pairs.
                 second.append(self._stencil([(o, np.sqrt(2.0) * w) for o, w in corners]))
         stack = sparse().vstack
         return (
@@ -126,7 +126,7 @@ class Lattice:
         )
 
     def _stencil(self, parts: list[tuple[tuple[int, ...], float]]) -> Any:
-        """A difference wherever the lattice has all of its coefficients."""
+        """A difference at each position where the lattice has all of its coefficients."""
         reach = np.max([offset for offset, _ in parts], axis=0)
         last = self.shape - reach
         views = []
@@ -145,10 +145,10 @@ _UNITS = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
 def _values(part: Floats) -> Floats:
-    """The three quadratic B-splines at a part of a cell."""
+    """The three quadratic B-splines at a fraction of a cell."""
     return np.stack([0.5 * (1 - part) ** 2, 0.5 + part * (1 - part), 0.5 * part**2], axis=1)
 
 
 def _slopes(part: Floats) -> Floats:
-    """Their derivatives, by the cell's edge."""
+    """Their derivatives with respect to that fraction."""
     return np.stack([part - 1.0, 1.0 - 2.0 * part, part], axis=1)

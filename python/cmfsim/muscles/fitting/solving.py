@@ -1,4 +1,4 @@
-"""The displacement that takes muscles out of bone, skin and air: penalties, by least squares."""
+"""The displacement that moves muscles out of bone, skin and air: penalties, by least squares."""
 
 import logging
 from dataclasses import dataclass
@@ -17,35 +17,36 @@ __all__ = ["Problem", "Targets"]
 
 _log = logging.getLogger(__name__)
 
-# How deep below the surface of the skin, or off bone, a muscle's own surface ends, mm. Half a
-# voxel: so that what is placed right stays right on the mesh.
+# Gap between a muscle's surface and the skin or bone, mm. Half a voxel, so that a muscle placed
+# correctly is still correct on the mesh.
 GAP = 0.25
-# A muscle further out than this is not misplaced: there the head is another, or ends; mm.
+# Points further outside than this are ignored, mm: the head differs from the template there, or
+# ends.
 FURTHEST = 10.0
-# Weights beside 1 mm of penetration on 1 mm² of a muscle's surface. Strain: a muscle 10 mm thick
-# that is strained by 0.1 costs as much as its two surfaces 0.2 mm out of place.
+# Weights relative to 1 mm of penetration on 1 mm² of a muscle's surface. Strain: a muscle 10 mm
+# thick that is strained by 0.1 costs as much as its two surfaces misplaced by 0.2 mm.
 STRAIN = 0.15
-# Curvature over the lattice's spacing counts this much as strain does.
+# Weight of curvature times the lattice's spacing, relative to strain.
 BENDING = 1.0
-# A part of a muscle's volume, as displacement of its surface: outweighs penetration.
+# Weight of a change of volume, expressed as a displacement of the surface: outweighs penetration.
 VOLUME = 200.0
-# A place of attachment off its bone counts less than one in a place that it cannot have.
+# Weight of an attachment that is off its bone: less than that of a point outside the tissue.
 ATTACHMENT = 0.15
 ITERATIONS = 5
-# Of the conjugate gradients of each iteration: the next one corrects it.
+# Of the conjugate gradients in each iteration; the next iteration corrects what is left.
 TOLERANCE = 1e-3
 MOST_CG_STEPS = 400
 
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """Vertices spread over the surfaces of muscles, and what is wanted of them.
+    """Vertices spread over the surfaces of muscles, and where they should be.
 
     Attributes
     ----------
     vertices : (n,) int
     area : (n,) float64, mm²
-        Of the surface that a vertex stands for.
+        Area of the surface that each vertex represents.
     outward : (n, 3) float64
         Unit vectors away from the template's bone next to it.
     attached : (n,) bool
@@ -63,7 +64,7 @@ class Targets:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Muscles where landmarks put them, the room that they have, and what may move.
+    """Muscles as placed by landmarks, the room available to them, and the displacement allowed.
 
     Attributes
     ----------
@@ -81,11 +82,11 @@ class Problem:
     basis: Any
 
     def solved(self, stiffness: float) -> Floats:
-        """The coefficients of the displacement that is best for all muscles.
+        """The coefficients of the best displacement for all muscles.
 
-        Gauss-Newton iterations on the sum of squares of: how far vertices are out of their room or
-        off their bone, each along the distance's own gradient; the change of each muscle's volume;
-        strain and bending of space.
+        Gauss-Newton iterations on the sum of squares of the distance of vertices from their room or
+        from their bone, along the gradient of that distance; of the change of each muscle's volume;
+        and of strain and bending of space.
 
         Parameters
         ----------
@@ -119,10 +120,10 @@ class Problem:
         return found
 
     def _volume_rows(self) -> tuple[Floats, Floats]:
-        """The slope of each muscle's volume by the coefficients, and the weight that it has.
+        """The derivative of each muscle's volume with respect to the coefficients, and its weight.
 
-        By the root of the muscle's area: a volume by an area is a displacement, which counts over
-        the area. Open surfaces have no volume to keep.
+        Both are divided by the root of the muscle's area: volume over area is a displacement, which
+        counts in proportion to the area. Open surfaces have no volume to preserve.
         """
         slopes, areas = self.volumes.slopes(self.vertices)
         scale = np.sqrt(VOLUME / areas) * np.array(self.volumes.is_closed)
@@ -142,18 +143,18 @@ def _energy(lattice: Lattice) -> Any:
 
 
 def _wanted(room: Room, targets: Targets, points: Floats) -> tuple[Floats, Floats, Floats]:
-    """How far each point is to move, along which direction, and the weight of that."""
+    """How far each point should move, in which direction, and with which weight."""
     distance, gradient = sampled(room.tissue, points)
     bone, bone_gradient = sampled(room.bone, points)
-    # Within bone the way out is on the side on which the template has the muscle, not the nearest:
-    # through a thin ramus it would be the other one.
+    # A point inside bone moves to the side on which the template has the muscle: in a thin ramus,
+    # the nearest side may be the other one.
     behind = (bone < 0.0) & (np.einsum("na,na->n", gradient, targets.outward) < 0.0)
     gradient = np.where(behind[:, None], targets.outward, gradient)
     distance = np.where(behind, -_way_out(room.bone, points, targets.outward, behind), distance)
-    # As deep in bone as in the template is right.
+    # A muscle may be as deep in bone as it is in the template.
     residual = GAP - targets.depth - distance
     weight = np.where(residual > 0.0, targets.area, 0.0)
-    # Attachments are held at their bone from both sides.
+    # Attachments are drawn to their bone from both sides.
     off = targets.attached & (residual <= 0.0) & (bone < FURTHEST)
     residual = np.where(off, np.minimum(GAP - targets.depth - bone, 0.0), residual)
     gradient = np.where(off[:, None], bone_gradient, gradient)
@@ -165,7 +166,7 @@ def _wanted(room: Room, targets: Targets, points: Floats) -> tuple[Floats, Float
 def _way_out(
     level: ImageData, points: Floats, direction: Floats, asked: NDArray[np.bool_]
 ) -> Floats:
-    """How far it is along a direction until a distance is positive, mm; 0 where not asked."""
+    """The path along a direction to where a distance is positive, mm; 0 where not asked for."""
     way = np.zeros(len(points))
     inside = np.flatnonzero(asked)
     step = 0.5 * float(level.spacing[0])
@@ -187,7 +188,7 @@ def sampled(level: ImageData, points: Floats) -> tuple[Floats, Floats]:
 
 
 def _rows(basis: Any, direction: Floats, weight: Floats) -> Any:
-    """One row a point: its displacement along a direction, from coefficients (x, y, z by turns)."""
+    """One row per point: its displacement along a direction. Columns: x, y, z of a coefficient."""
     wide = np.repeat(3 * basis.indices, 3).reshape(-1, 3) + np.arange(3)
     each = np.diff(basis.indptr)
     data = basis.data[:, None] * np.repeat(weight[:, None] * direction, each, axis=0)
@@ -198,7 +199,7 @@ def _rows(basis: Any, direction: Floats, weight: Floats) -> Any:
 def _least(rows: Any, volume_rows: Floats, energy: Any, right: Floats, start: Floats) -> Floats:
     """The solution of (RᵀR + VᵀV + E) x = b by conjugate gradients, near a first guess.
 
-    E acts on each axis alike. The products are never formed: RᵀR has 243 entries in a row.
+    E acts on each axis in the same way. RᵀR, with 243 entries per row, is never formed.
     """
     solvers = sparse("scipy.sparse.linalg")
     back = rows.T.tocsr()
@@ -214,7 +215,7 @@ def _least(rows: Any, volume_rows: Floats, energy: Any, right: Floats, start: Fl
     size = (start.size, start.size)
     whole = solvers.LinearOperator(size, matvec=product)
     jacobi = solvers.LinearOperator(size, matvec=lambda x: scale * x.ravel())
-    # Named `tol` before scipy 1.12 and `rtol` after: the absolute one has one name.
+    # The relative tolerance is `tol` before scipy 1.12 and `rtol` after, the absolute one `atol`.
     limit = TOLERANCE * float(np.linalg.norm(right))
     x, _ = solvers.cg(whole, right, x0=start.ravel(), atol=limit, maxiter=MOST_CG_STEPS, M=jacobi)
     return np.asarray(x, dtype=float).reshape(start.shape)

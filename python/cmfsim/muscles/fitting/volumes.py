@@ -1,4 +1,4 @@
-"""What closed muscles enclose, all at once, and how that changes with the places of vertices."""
+"""The volumes of closed muscles, and their derivatives with respect to the vertices."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ __all__ = ["Volumes"]
 
 @dataclass(frozen=True, eq=False)
 class Volumes:
-    """Surfaces one after the other: vertices are numbered through.
+    """Surfaces whose vertices are numbered consecutively, surface after surface.
 
     Attributes
     ----------
@@ -23,7 +23,7 @@ class Volumes:
         Of each surface.
     is_closed : tuple of bool
     begins : tuple of int
-        The first vertex of each, and their number.
+        The first vertex of each surface, then the number of all vertices.
     """
 
     triangles: tuple[NDArray[np.intp], ...]
@@ -32,7 +32,7 @@ class Volumes:
 
     @classmethod
     def of(cls, surfaces: Sequence[SurfaceData]) -> Self:
-        """Those of surfaces whose vertices are joined in their order."""
+        """The volumes of surfaces whose vertices are concatenated in this order."""
         begins = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
         triangles = [np.asarray(s.triangles, dtype=np.intp) for s in surfaces]
         return cls(tuple(triangles), tuple(map(_is_closed, triangles)), tuple(begins.tolist()))
@@ -42,7 +42,7 @@ class Volumes:
         return values[self.begins[surface] : self.begins[surface + 1]]
 
     def enclosed(self, vertices: Floats) -> Floats:
-        """What each surface encloses, (k,) mm³; of an open one, as if a cone closed it."""
+        """The volume of each surface, (k,) mm³; a cone closes an open one."""
         volumes = []
         for i, triangles in enumerate(self.triangles):
             own = self.part(vertices, i)
@@ -51,7 +51,7 @@ class Volumes:
         return np.array(volumes)
 
     def slopes(self, vertices: Floats) -> tuple[Floats, Floats]:
-        """The derivative of the volumes by the vertices, (n, 3) mm², and their areas, (k,) mm²."""
+        """The derivative of volume with respect to each vertex, (n, 3) mm², and areas, (k,) mm²."""
         slopes, areas = np.zeros_like(vertices), np.zeros(len(self.triangles))
         for i, triangles in enumerate(self.triangles):
             own = self.part(vertices, i)
@@ -67,7 +67,7 @@ class Volumes:
 
 
 def _is_closed(triangles: NDArray[np.intp]) -> bool:
-    """Whether each edge runs once in either direction."""
+    """Whether each edge is traversed once in either direction."""
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     n = int(triangles.max()) + 1
     forth, back = edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0]

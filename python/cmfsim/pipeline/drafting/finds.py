@@ -86,7 +86,7 @@ class SurfaceFind:
     @property
     def extent(self) -> Floats:
         """Its length along each axis, in its file's unit, (3,)."""
-        return np.asarray(np.ptp(np.asarray(self.surface.vertices), axis=0), dtype=np.float64)
+        return np.asarray(np.ptp(self.surface.vertices, axis=0), dtype=np.float64)
 
     @property
     def is_moved(self) -> bool:

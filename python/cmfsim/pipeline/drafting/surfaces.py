@@ -359,7 +359,7 @@ def _shown_frame(
 
 
 def _middle(find: SurfaceFind) -> Floats:
-    return np.asarray(np.asarray(find.surface.vertices).mean(axis=0), dtype=np.float64)
+    return np.asarray(find.surface.vertices.mean(axis=0), dtype=np.float64)
 
 
 def _choose_after(anatomy: Anatomy, found: Sequence[SurfaceFind]) -> None:

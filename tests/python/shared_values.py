@@ -1,0 +1,95 @@
+"""Values that tests of several files need, made once in a run of the suite, whatever process asks.
+
+They are pickled in the folder of temporary files that the processes of pytest-xdist share, which
+every run makes anew: no value outlives the code that made it.
+"""
+
+import contextlib
+import os
+import pickle
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import cmfsim
+import phantom_case
+from cmfsim.phantom.demo import write_demo_case
+from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline.predicting import build_patient
+
+try:
+    import fcntl
+except ImportError:  # Windows: two processes may make the same value, and either is right.
+    fcntl = None
+
+# Tet edges of the coarse patient, mm.
+COARSE_EDGE = 14.0
+
+
+def shared(temporary: pytest.TempPathFactory, name: str, make: Callable[[Path], Any]) -> Any:
+    """The value of a name; `make` is given a new folder and called if nobody has made it yet."""
+    base = temporary.getbasetemp()
+    folder = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    path = folder / f"shared-{name}.pickle"
+    with _locked(path.with_suffix(".lock")):
+        if not path.exists():
+            value = make(temporary.mktemp(name))
+            part = path.with_suffix(f".{os.getpid()}")
+            with part.open("wb") as file:
+                _Pickler(file, pickle.HIGHEST_PROTOCOL).dump(value)
+            part.replace(path)
+    return pickle.loads(path.read_bytes())
+
+
+class _Pickler(pickle.Pickler):
+    """Splines of the core, which muscles keep, travel as what they are made of."""
+
+    def reducer_override(self, value: Any) -> Any:
+        if isinstance(value, cmfsim.ThinPlateSpline):
+            return cmfsim.ThinPlateSpline, (value.source, value.target, value.smoothing)
+        return NotImplemented
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """While one process is in here, others wait; a process that dies lets go."""
+    with path.open("w") as file:
+        if fcntl is not None:
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def coarse_demo_patient(temporary: pytest.TempPathFactory) -> cmfsim.PatientModel:
+    """The patient of the embedded case on a coarse mesh, with muscles and sliding tissue."""
+
+    def make(folder: Path) -> cmfsim.PatientModel:
+        made = write_demo_case(folder, edge_length=COARSE_EDGE)
+        return build_patient(made.case, ("M+S",), BuildOptions(anatomy=made.anatomy, check=False))
+
+    return shared(temporary, "coarse-demo-patient", make)
+
+
+def drawn_levels(temporary: pytest.TempPathFactory, spacing: float) -> cmfsim.Anatomy:
+    """The phantom as it was drawn, as levels of a spacing in mm."""
+    return shared(
+        temporary, f"drawn-levels-{spacing:g}", lambda _: cmfsim.make_head().anatomy(spacing)
+    )
+
+
+def phantom_model(temporary: pytest.TempPathFactory) -> cmfsim.PatientModel:
+    """The model of the phantom's surfaces, as `phantom_case` writes them."""
+
+    def make(folder: Path) -> cmfsim.PatientModel:
+        head, anatomy = cmfsim.make_head(), drawn_levels(temporary, 2.0)
+        return cmfsim.build_model(phantom_case.surface_case(folder, head, anatomy), check=False)
+
+    return shared(temporary, "phantom-model", make)
+
+
+def without_pictures(folder: Path) -> str:
+    """A PYTHONPATH for processes without PyVista, made in a folder: pictures take most time."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "pyvista.py").write_text("raise ImportError('left out')", encoding="utf-8")
+    return os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
