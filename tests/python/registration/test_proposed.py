@@ -9,6 +9,7 @@ import cmfsim
 import real_heads
 from cmfsim.phantom.average_head import average_head
 from cmfsim.pipeline.proposing import read_template_head
+from cmfsim.registration.proposed import measured_biases
 from cmfsim.registration.proposed.groups import JAW_SITES
 
 pytest.importorskip("scipy")
@@ -56,6 +57,15 @@ def test_stored_average_head_is_the_synthetic_head():
         assert stored.keys() == own.keys()
         for name, place in own.items():
             np.testing.assert_allclose(stored[name], place, atol=1e-9)
+
+
+def test_stored_biases_are_those_that_the_definitions_have():
+    # The file is made again where a definition changes: scripts/make_average_head.py.
+    average = average_head()
+    for stored, own in zip(average.biases, measured_biases(average, average), strict=True):
+        assert stored.keys() == own.keys()
+        for name, bias in own.items():
+            np.testing.assert_allclose(stored[name], bias, atol=1e-6)
 
 
 def test_every_site_of_a_synthetic_person_is_found_within_3_mm(person, found):

@@ -162,11 +162,10 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
     if anatomy is None:
         anatomy, noticed = read_anatomy(case, landmarks.get("skull", {}), stages.begin)
         stages.add(noticed)
-    proposed = None
     if case.landmarks.proposed and not landmarks:
-        proposed, anatomy = found_landmarks(case, anatomy, stages, is_read=options.anatomy is None)
-        landmarks = {} if proposed is None else proposed.points
-    head = Head(case, landmarks, anatomy, proposed)
+        head = found_landmarks(case, anatomy, stages, is_read=options.anatomy is None)
+    else:
+        head = Head(case, landmarks, anatomy)
     bones, procedures = _bones(head, stages, options.after)
     tissue = _tissue(head, stages, bones, kinds)
     nodes = nodes_of(head, stages, bones, tissue, kinds)

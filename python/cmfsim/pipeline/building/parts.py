@@ -16,18 +16,32 @@ from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.lifted_tissue import LiftedTissue
 from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["Head", "Nodes", "Tissue"]
 
 
 @dataclass(frozen=True, eq=False)
 class Head:
-    """A case with what was read of it."""
+    """A case with what was read of it.
+
+    Attributes
+    ----------
+    case : Case
+    landmarks : mapping of str to mapping of str to (3,) float64, mm
+        "skull" and "skin".
+    anatomy : Anatomy
+    proposed : ProposedLandmarks or None
+        The landmarks, where they were found automatically.
+    skin : SurfaceData or None
+        The skin in full detail, where finding them has made it.
+    """
 
     case: Case
     landmarks: Mapping[str, Mapping[str, Floats]]
     anatomy: Anatomy
     proposed: ProposedLandmarks | None = None
+    skin: SurfaceData | None = None
 
     @property
     def skull(self) -> Mapping[str, Floats]:
