@@ -3,10 +3,12 @@
 import logging
 import time
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from cmfsim._core import TetMesh
 from cmfsim.bones import (
     CuttingPlane,
     Procedure,
@@ -166,17 +168,26 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         head = found_landmarks(case, anatomy, stages, is_read=options.anatomy is None)
     else:
         head = Head(case, landmarks, anatomy)
+    if case.muscles is None:
+        return _without_muscles(head, stages, kinds, options)[0]
+    # A case without muscles loads nothing of them.
+    from cmfsim.pipeline.building.muscles import placed_muscles, with_muscles  # noqa: PLC0415
+
+    # Muscles are placed by landmarks in the head, whatever its mesh: beside the other stages.
+    with ThreadPoolExecutor(1) as beside:
+        placing = beside.submit(placed_muscles, case.name, case.muscles, head.skull, head.anatomy)
+        patient, mesh = _without_muscles(head, stages, kinds, options)
+        stages.begin("placing and sampling the muscles")
+        return with_muscles(patient, case.muscles, mesh=mesh, placed=placing.result)
+
+
+def _without_muscles(
+    head: Head, stages: Stages, kinds: KindOptions, options: BuildOptions
+) -> tuple[PatientModel, TetMesh]:
     bones, procedures = _bones(head, stages, options.after)
     tissue = _tissue(head, stages, bones, kinds)
     nodes = nodes_of(head, stages, bones, tissue, kinds)
-    patient = assembled(head, stages, bones, nodes, procedures)
-    if case.muscles is None:
-        return patient
-    stages.begin("placing and sampling the muscles")
-    # A case without muscles loads nothing of them.
-    from cmfsim.pipeline.building.muscles import with_muscles  # noqa: PLC0415
-
-    return with_muscles(patient, case.muscles, mesh=nodes.mesh)
+    return assembled(head, stages, bones, nodes, procedures), nodes.mesh
 
 
 def _bones(
