@@ -7,6 +7,7 @@ results of one run. What belongs to another plan, or to other inputs or another 
 import contextlib
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -37,17 +38,20 @@ from cmfsim.io.slicer_output import SLICER_FILE, write_slicer_bundle
 from cmfsim.io.summaries import write_summary
 from cmfsim.muscles.template import joined_surface
 from cmfsim.pictures import (
+    Painter,
+    PictureJob,
+    band_picture,
     chart_errors,
-    picture_band,
     picture_distances,
     picture_muscles,
-    picture_plan,
-    picture_prediction,
+    plan_picture,
+    prediction_picture,
 )
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.planning.page import PAGE_FILE, page_state
 from cmfsim.progress import Progress
 from cmfsim.report import Document, Figure, case_document, write_page
+from cmfsim.values.musculature import Musculature
 from cmfsim.values.prediction import MODELS, Prediction
 
 __all__ = [
@@ -143,9 +147,11 @@ def write_results(
             stage(f"writing {prediction.model}")
             place = "" if n_models == 1 else prediction.model
             (fresh / place).mkdir(exist_ok=True)
-            more = partial(
-                _more_files, prediction, pictures=pictures(prediction.model), slicer=slicer
-            )
+            begun = {}
+            if pictures(prediction.model):
+                for name, job in _pictures_of(prediction):
+                    begun[name] = painter.begin(job, fresh / place / name)
+            more = partial(_more_files, prediction, begun, slicer=slicer)
             names = fill_prediction(fresh / place, prediction, more)
             written.predictions.append(WrittenPrediction(place, names, prediction.summary))
         key = written.predictions[0].summary["case_key"]
@@ -183,7 +189,8 @@ def write_results(
 
     # A comparison lists its files; those of predictions are found by their names.
     summary = None if evaluation is None else EVALUATION_FILE
-    names = replacing_files(output, summary, is_result_file, fill, stale)
+    with Painter() as painter:
+        names = replacing_files(output, summary, is_result_file, fill, stale)
     written.left_out = [name for name in written.left_out if name not in names]
     _warn_of_removed(output, written.left_out)
     return written
@@ -215,39 +222,42 @@ def _statements(names: Iterable[str]) -> list[str]:
     return [name for name in names if name.endswith((".json", ".html"))] or names
 
 
-def _more_files(prediction: Prediction, folder: Path, *, pictures: bool, slicer: bool) -> list[str]:
+def _more_files(
+    prediction: Prediction, begun: Mapping[str, "Future[None]"], folder: Path, *, slicer: bool
+) -> list[str]:
     """The names of the files of a prediction that were asked for beside those of each."""
-    names = _draw(prediction, folder) if pictures else []
+    names = []
     if slicer:
         write_slicer_bundle(folder / SLICER_FILE, prediction)
         names.append(SLICER_FILE)
+    return [*_drawn(begun), *names]
+
+
+def _drawn(begun: Mapping[str, "Future[None]"]) -> list[str]:
+    """The names of the pictures that were begun and could be drawn."""
+    names: list[str] = []
+    with optional_pictures():
+        for name, picture in begun.items():
+            picture.result()
+            names.append(name)
     return names
 
 
-def _draw(prediction: Prediction, folder: Path) -> list[str]:
-    drawn: list[str] = []
-    with optional_pictures():
-        for name, draw in _pictures_of(prediction):
-            draw(folder / name)
-            drawn.append(name)
-    return drawn
-
-
-def _pictures_of(prediction: Prediction) -> Iterator[tuple[str, Callable[[Path], None]]]:
-    yield "prediction.png", partial(picture_prediction, prediction=prediction)
-    yield "plan.png", partial(picture_plan, prediction=prediction)
-    if prediction.band is not None:
-        yield "band.png", partial(picture_band, prediction=prediction)
+def _pictures_of(prediction: Prediction) -> Iterator[tuple[str, PictureJob]]:
     if prediction.muscles is not None:
         segments = prediction.patient.segments
         yield (
             "muscles.png",
-            partial(
+            PictureJob(
                 picture_muscles,
-                musculature=prediction.muscles,
+                musculature=Musculature(prediction.muscles.muscles),
                 skull=joined_surface([segment.surface for segment in segments]),
             ),
         )
+    yield "plan.png", plan_picture(prediction)
+    yield "prediction.png", prediction_picture(prediction)
+    if prediction.band is not None:
+        yield "band.png", band_picture(prediction)
 
 
 @contextlib.contextmanager
