@@ -16,7 +16,7 @@ from cmfsim.imaging.cupping import without_cupping
 from cmfsim.imaging.intensity import weak_bone
 from cmfsim.imaging.jaw import part_jaws
 from cmfsim.imaging.metal import find_metal, metal_within
-from cmfsim.imaging.morphology import Block, Mask, Volume
+from cmfsim.imaging.morphology import Mask
 from cmfsim.imaging.noise import without_noise
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import find_skin
@@ -57,7 +57,8 @@ def segment_head(
     Returns
     -------
     Anatomy
-        With bones "cranium" (with the cervical spine) and "mandible", or "skull".
+        On the part of the grid that holds the head, with bones "cranium" (with the cervical spine)
+        and "mandible", or "skull".
 
     Raises
     ------
@@ -91,8 +92,8 @@ def segment_head(
     skin = find_skin(work, metal, options)
     _check_head(work, skin.mask)
     say("bone")
-    # The couch and the air around the head need no more work.
-    whole, work, metal = work, work.part(skin.box), metal_within(metal, skin.box)
+    # The couch and the air around the head need no more work, here or later.
+    work, metal = work.part(skin.box), metal_within(metal, skin.box)
     smooth, noisy = without_noise(metal.hu)
     metal = replace(metal, hu=smooth)
     bone = find_bone(work, metal, skin, options)
@@ -107,7 +108,7 @@ def segment_head(
     ]
     # A smoothed rim may not carry bone past the skin.
     level = np.minimum(bone_level(bone, options), skin.level)
-    bones = {"skull": _image(whole, level, skin.box)}
+    bones = {"skull": work.image(level)}
     teeth = None
     if options.part_jaws:
         say("jaw")
@@ -115,15 +116,15 @@ def segment_head(
         all_findings += jaws.findings
         if jaws.side is not None:
             bones = {
-                "cranium": _image(whole, np.minimum(level, -jaws.side), skin.box),
-                "mandible": _image(whole, np.minimum(level, jaws.side), skin.box),
+                "cranium": work.image(np.minimum(level, -jaws.side)),
+                "mandible": work.image(np.minimum(level, jaws.side)),
             }
         dense = teeth_level(bone, work, jaws.occlusal_height)
-        teeth = None if dense is None else _image(whole, dense, skin.box)
+        teeth = None if dense is None else work.image(dense)
     say("air")
     hollow = air_level(work, skin, bone, options)
-    air = None if hollow is None else _image(whole, hollow, skin.box)
-    outer = _image(whole, skin.level, skin.box)
+    air = None if hollow is None else work.image(hollow)
+    outer = work.image(skin.level)
     return Anatomy(outer, bones, air, teeth, tuple(all_findings))
 
 
@@ -136,13 +137,6 @@ def _check_head(work: Working, inside: Mask) -> None:
             f"has at least {LEAST_HEAD:g}; is the head cut off, empty (a phantom), or the scale "
             "wrong?"
         )
-
-
-def _image(whole: Working, level: Volume, box: Block) -> ImageData:
-    """A level on the working grid, of which it was made on a block: outside elsewhere."""
-    values = np.full(whole.hu.shape, np.float32(-1.0))
-    values[box] = level
-    return whole.image(values)
 
 
 def _checked(landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:
