@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,7 @@ from cmfsim.pipeline.building.landmarks import found_landmarks
 from cmfsim.pipeline.building.lips import find_seam
 from cmfsim.pipeline.building.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.nodes import nodes_of
-from cmfsim.pipeline.building.parts import Head, Tissue
+from cmfsim.pipeline.building.parts import Head, MeshedTissue, Tissue
 from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.stages import BuildOptions, Stages
 from cmfsim.pipeline.building.tissue_mesh import region_of, tissue_mesh
@@ -168,24 +168,29 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         head = found_landmarks(case, anatomy, stages, is_read=options.anatomy is None)
     else:
         head = Head(case, landmarks, anatomy)
-    if case.muscles is None:
-        return _without_muscles(head, stages, kinds, options)[0]
-    # A case without muscles loads nothing of them.
-    from cmfsim.pipeline.building.muscles import placed_muscles, with_muscles  # noqa: PLC0415
+    # Tissue and muscles are placed by the anatomy and its landmarks, whatever becomes of the bones.
+    with ThreadPoolExecutor(2) as beside:
+        tissue = beside.submit(_meshed, head)
+        if case.muscles is None:
+            return _without_muscles(head, stages, kinds, options, tissue)[0]
+        # A case without muscles loads nothing of them.
+        from cmfsim.pipeline.building.muscles import placed_muscles, with_muscles  # noqa: PLC0415
 
-    # Muscles are placed by landmarks in the head, whatever its mesh: beside the other stages.
-    with ThreadPoolExecutor(1) as beside:
         placing = beside.submit(placed_muscles, case.name, case.muscles, head.skull, head.anatomy)
-        patient, mesh = _without_muscles(head, stages, kinds, options)
+        patient, mesh = _without_muscles(head, stages, kinds, options, tissue)
         stages.begin("placing and sampling the muscles")
         return with_muscles(patient, case.muscles, mesh=mesh, placed=placing.result)
 
 
 def _without_muscles(
-    head: Head, stages: Stages, kinds: KindOptions, options: BuildOptions
+    head: Head,
+    stages: Stages,
+    kinds: KindOptions,
+    options: BuildOptions,
+    meshed: "Future[MeshedTissue]",
 ) -> tuple[PatientModel, TetMesh]:
     bones, procedures = _bones(head, stages, options.after)
-    tissue = _tissue(head, stages, bones, kinds)
+    tissue = _tissue(head, stages, bones, kinds, meshed)
     nodes = nodes_of(head, stages, bones, tissue, kinds)
     return assembled(head, stages, bones, nodes, procedures), nodes.mesh
 
@@ -216,26 +221,42 @@ def _bones(
     return bones, cut.procedures
 
 
-def _tissue(head: Head, stages: Stages, bones: PlannedBones, options: KindOptions) -> Tissue:
+def _meshed(head: Head) -> MeshedTissue:
+    """The tissue of a head, with its mesh where no seam between the lips has to be found first."""
+    region = region_of(head.case, head.anatomy, head.skull)
+    level, findings = tissue_level(head.anatomy, region)
+    if head.case.lips.contact:
+        return MeshedTissue(region, level, findings)
+    return MeshedTissue(region, level, findings, tissue_mesh(head.case, level, head.anatomy))
+
+
+def _tissue(
+    head: Head,
+    stages: Stages,
+    bones: PlannedBones,
+    options: KindOptions,
+    meshed: "Future[MeshedTissue]",
+) -> Tissue:
     case, anatomy = head.case, head.anatomy
     stages.begin("finding the soft tissue")
-    region = region_of(head.case, head.anatomy, head.skull)
-    level, noticed = tissue_level(head.anatomy, region)
-    stages.add(noticed)
-
     arches = seam = None
     if options.sliding or case.lips.contact:
         arches = dental_arches(anatomy, bones.segments, head.skull)
+    stages.begin("filling the tissue with tets")
+    found = meshed.result()
+    stages.add(found.findings)
+    filled = found.filled
     if case.lips.contact:
         stages.begin("finding the seam between the lips")
         seam = find_seam(case, anatomy, arches, head.landmarks.get("skin", {}))
         stages.add(seam.findings)
-
-    stages.begin("filling the tissue with tets")
-    mesh, report, noticed = tissue_mesh(case, level, anatomy, seam)
+        stages.begin("filling the tissue with tets")
+    if filled is None:
+        filled = tissue_mesh(case, found.level, anatomy, seam)
+    mesh, report, noticed = filled
     stages.add(noticed)
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
-    return Tissue(region, level, mesh, report, arches, seam)
+    return Tissue(found.region, found.level, mesh, report, arches, seam)
 
 
 def _draw(model: PatientModel, folder: Path) -> list[str]:

@@ -13,6 +13,7 @@ from cmfsim.pipeline.building.contacts import CaseContacts
 from cmfsim.pipeline.building.lips import CaseLipContact
 from cmfsim.registration.proposed import ProposedLandmarks
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.lifted_tissue import LiftedTissue
 from cmfsim.values.node_kinds import NodeKinds
@@ -47,6 +48,26 @@ class Head:
     def skull(self) -> Mapping[str, Floats]:
         """Landmarks of the skull by name, mm."""
         return self.landmarks.get("skull", {})
+
+
+@dataclass(frozen=True, eq=False)
+class MeshedTissue:
+    """The soft tissue of a head before its bones are known to be cut.
+
+    Attributes
+    ----------
+    region : TissueRegion
+    level : ImageData
+    findings : tuple of Finding
+    filled : tuple or None
+        The tets that fill it, their report and the findings on them; None where they have to
+        follow the seam between the lips.
+    """
+
+    region: TissueRegion
+    level: ImageData
+    findings: tuple[Finding, ...]
+    filled: tuple[TetMesh, MeshReport, tuple[Finding, ...]] | None = None
 
 
 @dataclass(frozen=True, eq=False)
