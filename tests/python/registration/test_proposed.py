@@ -11,6 +11,8 @@ from cmfsim.phantom.average_head import average_head
 from cmfsim.pipeline.proposing import read_template_head
 from cmfsim.registration.proposed import measured_biases
 from cmfsim.registration.proposed.groups import JAW_SITES
+from cmfsim.registration.proposed.judgement import missing_sites
+from cmfsim.registration.proposed.pose import Pose
 
 pytest.importorskip("scipy")
 
@@ -66,6 +68,26 @@ def test_stored_biases_are_those_that_the_definitions_have():
         assert stored.keys() == own.keys()
         for name, bias in own.items():
             np.testing.assert_allclose(stored[name], bias, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "lost"),
+    [
+        ("suborbital_L", {"endocanthion_L", "exocanthion_L"}),
+        (
+            "pogonion",
+            {"pogonion", "subnasale", "labiale_superius", "labiale_inferius"}
+            | {f"{name}_{letter}" for name in ("alare", "cheilion") for letter in "LR"},
+        ),
+    ],
+)
+def test_sites_of_the_skin_are_gone_with_those_that_they_are_found_from(wrong, lost):
+    average = average_head()
+    skull = {**average.skull, wrong: average.skull[wrong] + [0.0, 0.0, -60.0]}
+    pose = Pose(np.zeros(3), np.eye(3), 1.0, 0.0)
+    gone = missing_sites(skull, average.skin_landmarks, [], pose, has_jaw=True)
+    assert set(gone.skull) == {wrong}
+    assert set(gone.skin) == lost
 
 
 def test_every_site_of_a_synthetic_person_is_found_within_3_mm(person, found):
