@@ -27,11 +27,12 @@ from cmfsim.node_kinds import KindOptions, dental_arches, kind_options
 from cmfsim.pictures import picture_anatomy, picture_node_kinds
 from cmfsim.pipeline.building.assembly import assembled
 from cmfsim.pipeline.building.case_checks import misplaced, plan_sizes
+from cmfsim.pipeline.building.contacts import mean_edge
 from cmfsim.pipeline.building.inputs import check_output, read_anatomy, read_case_landmarks
 from cmfsim.pipeline.building.landmarks import found_landmarks
 from cmfsim.pipeline.building.lips import find_seam
 from cmfsim.pipeline.building.motions import PlannedBones, planned_bones
-from cmfsim.pipeline.building.nodes import nodes_of
+from cmfsim.pipeline.building.nodes import made_contacts, nodes_of
 from cmfsim.pipeline.building.parts import Head, MeshedTissue, Tissue
 from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.stages import BuildOptions, Stages
@@ -242,6 +243,11 @@ def _tissue(
     arches = seam = None
     if options.sliding or case.lips.contact:
         arches = dental_arches(anatomy, bones.segments, head.skull)
+    contacts = None
+    if case.mesh.file is None:
+        # While the tissue is meshed.
+        edge = case.mesh.edge_length
+        contacts = made_contacts(head, stages, bones, arches, options, edge_length=edge)
     stages.begin("filling the tissue with tets")
     found = meshed.result()
     stages.add(found.findings)
@@ -256,7 +262,10 @@ def _tissue(
     mesh, report, noticed = filled
     stages.add(noticed)
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
-    return Tissue(found.region, found.level, mesh, report, arches, seam)
+    if contacts is None:
+        edge = mean_edge(mesh)
+        contacts = made_contacts(head, stages, bones, arches, options, edge_length=edge)
+    return Tissue(found.region, found.level, mesh, report, arches, seam, contacts)
 
 
 def _draw(model: PatientModel, folder: Path) -> list[str]:

@@ -72,7 +72,7 @@ class MeshedTissue:
 
 @dataclass(frozen=True, eq=False)
 class Tissue:
-    """The soft tissue of a head, and the tets that fill it."""
+    """The soft tissue of a head, the tets that fill it, and what it slides on."""
 
     region: TissueRegion
     level: ImageData
@@ -80,6 +80,7 @@ class Tissue:
     report: MeshReport
     arches: DentalArches | None
     seam: LipSeam | None
+    contacts: CaseContacts
 
 
 @dataclass(frozen=True, eq=False)
