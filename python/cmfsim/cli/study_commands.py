@@ -3,7 +3,9 @@
 import argparse
 import json
 import sys
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +50,9 @@ def predict(options: argparse.Namespace) -> int:
         band.check(models)
     prepare(case, report=not options.no_report)
     notices = Notices(quiet=options.quiet)
+    begun = time.perf_counter()
     findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
+    before = {} if options.no_doctor else {"checking the case": time.perf_counter() - begun}
     failed: dict[str, CmfsimError] = {}
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         predictions = predict_models(
@@ -63,7 +67,7 @@ def predict(options: argparse.Namespace) -> int:
         )
         written = write_results(
             case.output,
-            _at_least_one(predictions, failed),
+            _timed(_at_least_one(predictions, failed), before),
             len(models),
             stage=progress.stage,
             with_report=not options.no_report,
@@ -98,6 +102,13 @@ def _at_least_one(
         yield prediction
     if not found:
         raise next(iter(failed.values()))
+
+
+def _timed(predictions: Iterable[Prediction], before: Mapping[str, float]) -> Iterator[Prediction]:
+    """The predictions with the seconds of what came before them among their timings."""
+    for prediction in predictions:
+        timings = {**before, **prediction.summary["timings"]}
+        yield replace(prediction, summary={**prediction.summary, "timings": timings})
 
 
 def evaluate(options: argparse.Namespace) -> int:

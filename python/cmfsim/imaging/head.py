@@ -1,7 +1,8 @@
 """The way from a CT to an anatomy, stage by stage."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -11,15 +12,15 @@ from cmfsim.checks import Floats, as_point
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.air import air_level
 from cmfsim.imaging.attached import attached_findings
-from cmfsim.imaging.bone import bone_level, find_bone, teeth_level
+from cmfsim.imaging.bone import Bone, bone_level, find_bone, teeth_level
 from cmfsim.imaging.cupping import without_cupping
 from cmfsim.imaging.intensity import weak_bone
 from cmfsim.imaging.jaw import part_jaws
 from cmfsim.imaging.metal import find_metal, metal_within
-from cmfsim.imaging.morphology import Block, Mask, Volume
+from cmfsim.imaging.morphology import Mask
 from cmfsim.imaging.noise import without_noise
 from cmfsim.imaging.options import SegmentOptions
-from cmfsim.imaging.skin import find_skin
+from cmfsim.imaging.skin import Skin, find_skin
 from cmfsim.imaging.view import view_findings
 from cmfsim.imaging.working import Working, working_grid
 from cmfsim.progress import Progress
@@ -57,7 +58,8 @@ def segment_head(
     Returns
     -------
     Anatomy
-        With bones "cranium" (with the cervical spine) and "mandible", or "skull".
+        On the part of the grid that holds the head, with bones "cranium" (with the cervical spine)
+        and "mandible", or "skull".
 
     Raises
     ------
@@ -91,40 +93,62 @@ def segment_head(
     skin = find_skin(work, metal, options)
     _check_head(work, skin.mask)
     say("bone")
-    # The couch and the air around the head need no more work.
-    whole, work, metal = work, work.part(skin.box), metal_within(metal, skin.box)
+    # The couch and the air around the head need no more work, here or later.
+    work, metal = work.part(skin.box), metal_within(metal, skin.box)
     smooth, noisy = without_noise(metal.hu)
     metal = replace(metal, hu=smooth)
     bone = find_bone(work, metal, skin, options)
-    all_findings += [
-        *noisy,
-        *weak_bone(work.hu[skin.mask], options.least_bone),
-        *metal.findings,
-        *skin.findings,
-        *bone.findings,
-        *view_findings(work, skin, bone),
-        *attached_findings(work, skin, bone),
-    ]
+    with ThreadPoolExecutor(1) as beside:
+        noticed = beside.submit(_noticed, work, skin, bone, options)
+        bones, teeth, jaws = _bones(work, bone, skin, points, options=options, say=say)
+        say("air")
+        hollow = air_level(work, skin, bone, options)
+        all_findings += [
+            *noisy,
+            *noticed.result()[0],
+            *metal.findings,
+            *skin.findings,
+            *bone.findings,
+            *noticed.result()[1],
+            *jaws,
+        ]
+    air = None if hollow is None else work.image(hollow)
+    return Anatomy(work.image(skin.level), bones, air, teeth, tuple(all_findings))
+
+
+def _noticed(
+    work: Working, skin: Skin, bone: Bone, options: SegmentOptions
+) -> tuple[Sequence[Finding], Sequence[Finding]]:
+    """What is noticed on the scan's values, and on what it shows of the head."""
+    values = weak_bone(work.hu[skin.mask], options.least_bone)
+    return values, [*view_findings(work, skin, bone), *attached_findings(work, skin, bone)]
+
+
+def _bones(
+    work: Working,
+    bone: Bone,
+    skin: Skin,
+    points: Mapping[str, Floats] | None,
+    *,
+    options: SegmentOptions,
+    say: Progress,
+) -> tuple[dict[str, ImageData], ImageData | None, Sequence[Finding]]:
+    """The levels of bones and teeth, and the findings on how the jaws were separated."""
     # A smoothed rim may not carry bone past the skin.
     level = np.minimum(bone_level(bone, options), skin.level)
-    bones = {"skull": _image(whole, level, skin.box)}
-    teeth = None
-    if options.part_jaws:
-        say("jaw")
-        jaws = part_jaws(work, bone, points)
-        all_findings += jaws.findings
-        if jaws.side is not None:
-            bones = {
-                "cranium": _image(whole, np.minimum(level, -jaws.side), skin.box),
-                "mandible": _image(whole, np.minimum(level, jaws.side), skin.box),
-            }
-        dense = teeth_level(bone, work, jaws.occlusal_height)
-        teeth = None if dense is None else _image(whole, dense, skin.box)
-    say("air")
-    hollow = air_level(work, skin, bone, options)
-    air = None if hollow is None else _image(whole, hollow, skin.box)
-    outer = _image(whole, skin.level, skin.box)
-    return Anatomy(outer, bones, air, teeth, tuple(all_findings))
+    if not options.part_jaws:
+        return {"skull": work.image(level)}, None, ()
+    say("jaw")
+    jaws = part_jaws(work, bone, points)
+    parts = {"skull": level}
+    if jaws.side is not None:
+        parts = {
+            "cranium": np.minimum(level, -jaws.side),
+            "mandible": np.minimum(level, jaws.side),
+        }
+    bones = {name: work.image(part) for name, part in parts.items()}
+    dense = teeth_level(bone, work, jaws.occlusal_height)
+    return bones, None if dense is None else work.image(dense), jaws.findings
 
 
 def _check_head(work: Working, inside: Mask) -> None:
@@ -136,13 +160,6 @@ def _check_head(work: Working, inside: Mask) -> None:
             f"has at least {LEAST_HEAD:g}; is the head cut off, empty (a phantom), or the scale "
             "wrong?"
         )
-
-
-def _image(whole: Working, level: Volume, box: Block) -> ImageData:
-    """A level on the working grid, of which it was made on a block: outside elsewhere."""
-    values = np.full(whole.hu.shape, np.float32(-1.0))
-    values[box] = level
-    return whole.image(values)
 
 
 def _checked(landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:

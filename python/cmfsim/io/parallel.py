@@ -21,7 +21,7 @@ from cmfsim import errors
 from cmfsim.errors import CaseError
 from cmfsim.io.cluster import on_cluster
 
-__all__ = ["answer_alone", "answers", "serve"]
+__all__ = ["Worker", "answer_alone", "answers", "serve"]
 
 # The child's program: it finds the same modules as its parent, and nothing else is run.
 PROGRAM = (
@@ -58,8 +58,8 @@ def answers(
     if scheduler is not None:
         yield from _on_cluster(function, jobs, scheduler)
         return
-    idle: queue.SimpleQueue[_Worker] = queue.SimpleQueue()
-    started: list[_Worker] = []
+    idle: queue.SimpleQueue[Worker] = queue.SimpleQueue()
+    started: list[Worker] = []
 
     def ask(job: Mapping[str, Any]) -> Any:
         worker = idle.get()
@@ -71,7 +71,7 @@ def answers(
     pool = ThreadPoolExecutor(workers)
     try:
         for _ in range(min(workers, len(jobs))):
-            started.append(_Worker())
+            started.append(Worker())
             idle.put(started[-1])
         running = {pool.submit(ask, job): index for index, job in enumerate(jobs)}
         for future in as_completed(running):
@@ -99,14 +99,14 @@ def _on_cluster(
 
 def answer_alone(function: str, job: Mapping[str, Any]) -> Any:
     """The answer to one job from a process of its own, which has one thread wherever it runs."""
-    worker = _Worker()
+    worker = Worker()
     try:
         return worker.answer(function, job)
     finally:
         worker.end()
 
 
-class _Worker:
+class Worker:
     """A process that takes jobs one after the other, a line of JSON each."""
 
     def __init__(self) -> None:
@@ -124,7 +124,13 @@ class _Worker:
         stream.write(json.dumps(value).encode() + b"\n")
         stream.flush()
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether the process is gone, as after a crash of a library."""
+        return self._process.poll() is not None
+
     def answer(self, function: str, job: Mapping[str, Any]) -> Any:
+        """What the function answers to a job; see `answers`."""
         line = b""
         try:
             self._send({"function": function, "job": dict(job)})
@@ -145,6 +151,7 @@ class _Worker:
         return found["answer"]
 
     def end(self) -> None:
+        """Ends the process, whatever it is doing."""
         self._process.kill()
         self._process.wait()
         for stream in (self._process.stdin, self._process.stdout):

@@ -37,9 +37,11 @@ __all__ = [
     "read_prediction_picture",
     "stale_results",
     "write_prediction",
+    "write_timings",
 ]
 
 PREDICTION_FILE = "prediction.json"
+TIMINGS_FILE = "timings.json"
 AGAIN = "run cmfsim predict again"
 
 
@@ -258,12 +260,18 @@ def fill_prediction(
     names.extend(f"{name}.vtp" for name in parts)
     if draw is not None:
         names.extend(draw(fresh))
-    _write_json(fresh / "timings.json", prediction.summary["timings"])
-    names.append("timings.json")
     summary = {"case_key": "", **prediction.summary, "parts": parts}
-    summary["files"] = [*names, PREDICTION_FILE]
+    own = [TIMINGS_FILE, PREDICTION_FILE]
+    summary["files"] = [*names, *own]
+    # Timings are for people: what comes after the prediction is added to them.
+    write_timings(fresh, prediction.summary["timings"])
     write_summary(fresh / PREDICTION_FILE, summary, sealed=names)
-    return [*names, PREDICTION_FILE]
+    return [*names, *own]
+
+
+def write_timings(folder: Path, seconds: Mapping[str, float]) -> None:
+    """Writes the seconds of each stage, in their order, to `timings.json` of a prediction."""
+    _write_json(folder / TIMINGS_FILE, seconds)
 
 
 def _write_parts(folder: Path, prediction: Prediction) -> dict[str, list[str]]:

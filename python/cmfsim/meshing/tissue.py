@@ -19,6 +19,8 @@ __all__ = ["TissueRegion", "near_skin", "tissue_level"]
 Levels = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+# Layers of a grid that are worked on at a time.
+SLAB = 16
 # A level is clipped two voxels from its surface, like those of given surfaces.
 BAND_IN_VOXELS = 2.0
 # Radius of the openings through which the cranial cavity meets the face, mm: fissures of the orbit
@@ -111,8 +113,7 @@ def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tup
     np.minimum(level, -bone, out=level)
     if anatomy.air is not None:
         np.minimum(level, -anatomy.air.values, out=level)
-    for distance in _inward_distances(grid, region):
-        np.minimum(level, distance, out=level)
+    _within_region(level, grid, region)
     if not (level > 0.0).any():
         raise MeshInputError(
             "no soft tissue lies in front of the posterior plane: check its point and normal, "
@@ -129,17 +130,26 @@ def near_skin(anatomy: Anatomy, depth: float) -> Mask:
     return _core.distance_image(outside, (sx, sy, sz), within=depth) < depth
 
 
-def _inward_distances(grid: ImageData, region: TissueRegion) -> Iterator[Levels]:
-    """Distance into the region from each of its planes, in the scale of a level."""
+def _within_region(level: Levels, grid: ImageData, region: TissueRegion) -> None:
+    """Bounds a level by the planes of a region: the distance into it, in the scale of a level."""
     band = BAND_IN_VOXELS * float(grid.spacing.max())
     x, y, z = grid.axes()
     point, normal = np.asarray(region.point), np.asarray(region.normal)
-    behind = (x - point[0]) * normal[0] + (y - point[1]) * normal[1] + (z - point[2]) * normal[2]
-    yield np.clip(-behind / band, -1.0, 1.0).astype(np.float32)
+    dx, dy, dz = (
+        (axis - place) * part for axis, place, part in zip((x, y, z), point, normal, strict=True)
+    )
+    # In slabs: distances in double precision of the whole grid would be its largest array.
+    for begin in range(0, len(level), SLAB):
+        part = slice(begin, begin + SLAB)
+        behind = dx[part] + dy + dz
+        inwards = np.clip(-behind / band, -1.0, 1.0).astype(np.float32)
+        np.minimum(level[part], inwards, out=level[part])
     if region.lower is not None:
-        yield np.clip((z - region.lower) / band, -1.0, 1.0).astype(np.float32)
+        above = np.clip((z - region.lower) / band, -1.0, 1.0).astype(np.float32)
+        np.minimum(level, above, out=level)
     if region.upper is not None:
-        yield np.clip((region.upper - z) / band, -1.0, 1.0).astype(np.float32)
+        below = np.clip((region.upper - z) / band, -1.0, 1.0).astype(np.float32)
+        np.minimum(level, below, out=level)
 
 
 def _without_hollows(
@@ -171,7 +181,7 @@ def _without_hollows(
     to_hollow = _core.distance_image(hollow, spacing)
     to_outer = _core.distance_image(open_tissue & ~hollow, spacing)
     hollow |= tissue & ~open_tissue & (to_hollow < to_outer)
-    np.minimum(level, np.where(hollow, np.float32(-1.0), level), out=level)
+    np.minimum(level, np.float32(-1.0), out=level, where=hollow)
     volume = float(np.count_nonzero(hollow)) * sx * sy * sz
     if volume < NOTEWORTHY_HOLLOW:
         return

@@ -1,14 +1,16 @@
 """The ordinary synthetic head as surfaces with landmarks, ready to compare other heads with."""
 
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.checks import Floats
 from cmfsim.phantom.model import PhantomHead, make_head
-from cmfsim.registration.proposed import TemplateHead
+from cmfsim.registration.proposed import TemplateHead, measured_biases
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
@@ -22,24 +24,18 @@ GRAIN = 1.0 / 100.0
 SPACING, MOST_TRIANGLES = 1.5, 16_000
 BONES = ("cranium", "mandible")
 PARTS = (*BONES, "skin")
+KINDS = {"skull": SKULL_LANDMARKS, "skin": SKIN_LANDMARKS}
 
 
 @lru_cache(maxsize=1)
 def average_head() -> TemplateHead:
     """The ordinary synthetic head: cranium and mandible with their teeth, skin, all landmarks.
 
-    Its frame is that of `make_head`. Surfaces and landmarks come with the package
-    (`scripts/make_average_head.py` makes them again): finding the landmarks on the head takes a
-    second.
+    Its frame is that of `make_head`. Surfaces, landmarks and the biases of the definitions come
+    with the package (`scripts/make_average_head.py` makes them again).
     """
     with np.load(Path(__file__).with_name(FILE), allow_pickle=False) as stored:
-        parts = {name: _unpacked(stored, name) for name in PARTS}
-        skull, skin = (
-            dict(zip(names, stored[f"{kind}_landmarks"], strict=True))
-            for kind, names in (("skull", SKULL_LANDMARKS), ("skin", SKIN_LANDMARKS))
-        )
-    bones = {bone: parts[bone] for bone in BONES}
-    return TemplateHead("synthetic head", bones, skull, parts["skin"], skin)
+        return _unpacked(stored)
 
 
 def drawn_head(head: PhantomHead, name: str) -> TemplateHead:
@@ -65,9 +61,29 @@ def write_average_head(path: Path) -> None:
         packed[f"{name}_triangles"] = surface.triangles.astype(np.uint16)
     packed["skull_landmarks"] = np.array([template.skull[name] for name in SKULL_LANDMARKS])
     packed["skin_landmarks"] = np.array([template.skin_landmarks[name] for name in SKIN_LANDMARKS])
+    # Of the head as it is read: rounded.
+    rounded = _unpacked(packed)
+    for (kind, names), biases in zip(KINDS.items(), measured_biases(rounded, rounded), strict=True):
+        packed[f"{kind}_biases"] = np.array([biases[name] for name in names])
     np.savez_compressed(path, allow_pickle=False, **packed)
 
 
-def _unpacked(stored: "np.lib.npyio.NpzFile", name: str) -> SurfaceData:
-    vertices: Floats = stored[f"{name}_vertices"].astype(np.float64) * GRAIN
-    return SurfaceData(vertices, stored[f"{name}_triangles"].astype(np.uint32))
+def _unpacked(stored: Mapping[str, NDArray[Any]]) -> TemplateHead:
+    """The head of arrays by name."""
+
+    def surface(name: str) -> SurfaceData:
+        vertices: Floats = stored[f"{name}_vertices"].astype(np.float64) * GRAIN
+        return SurfaceData(vertices, stored[f"{name}_triangles"].astype(np.uint32))
+
+    def points(what: str) -> list[dict[str, Floats]]:
+        return [
+            dict(zip(names, stored[f"{kind}_{what}"], strict=True)) for kind, names in KINDS.items()
+        ]
+
+    skull, skin = points("landmarks")
+    biases = None
+    if "skull_biases" in stored:
+        of_skull, of_skin = points("biases")
+        biases = (of_skull, of_skin)
+    bones = {bone: surface(bone) for bone in BONES}
+    return TemplateHead("synthetic head", bones, skull, surface("skin"), skin, biases)

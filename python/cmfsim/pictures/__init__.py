@@ -9,7 +9,8 @@ from cmfsim.pictures.anatomy import (
     picture_segments,
     segment_colours,
 )
-from cmfsim.pictures.bands import picture_band
+from cmfsim.pictures.bands import band_picture, picture_band
+from cmfsim.pictures.beside import Painter, PictureJob
 from cmfsim.pictures.charts import MODEL_COLOURS, chart_errors
 from cmfsim.pictures.distances import (
     DISTANCE_LIMIT,
@@ -17,7 +18,12 @@ from cmfsim.pictures.distances import (
     picture_distance_grid,
     picture_distances,
 )
-from cmfsim.pictures.faces import picture_plan, picture_prediction
+from cmfsim.pictures.faces import (
+    picture_plan,
+    picture_prediction,
+    plan_picture,
+    prediction_picture,
+)
 from cmfsim.pictures.landmarks import picture_landmarks
 from cmfsim.pictures.muscles import picture_muscles
 from cmfsim.pictures.window import ViewPart, has_screen, view_parts
@@ -28,7 +34,10 @@ __all__ = [
     "MODEL_COLOURS",
     "SEGMENT_COLOURS",
     "SKIN_COLOUR",
+    "Painter",
+    "PictureJob",
     "ViewPart",
+    "band_picture",
     "chart_errors",
     "distance_colour",
     "has_screen",
@@ -42,6 +51,8 @@ __all__ = [
     "picture_plan",
     "picture_prediction",
     "picture_segments",
+    "plan_picture",
+    "prediction_picture",
     "segment_colours",
     "view_parts",
 ]

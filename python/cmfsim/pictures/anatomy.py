@@ -81,7 +81,7 @@ def picture_segments(
     def paint(plotter: Any, view: View) -> None:
         del view
         for segment in segments:
-            add_bone(plotter, segment, colours[segment.name])
+            add_bone(plotter, segment.surface, colours[segment.name])
 
     views = tuple(View(name, name) for name in ("front", "left front", "left"))
     draw(path, views, corners, size, paint, legend=list(colours.items()))
@@ -120,7 +120,7 @@ def picture_anatomy(
     def paint(plotter: Any, view: View) -> None:
         del view
         for segment in segments:
-            add_bone(plotter, segment, colours[segment.name])
+            add_bone(plotter, segment.surface, colours[segment.name])
         shape = polydata(skin.vertices, skin.triangles)
         plotter.add_mesh(shape, color=SKIN_COLOUR, opacity=0.35, smooth_shading=True)
 
@@ -237,10 +237,10 @@ def segment_colours(names: Sequence[str]) -> dict[str, str]:
     return {n: SEGMENT_COLOURS[n] if n in SEGMENT_COLOURS else next(others) for n in names}
 
 
-def add_bone(plotter: Any, segment: BoneSegment, colour: str) -> None:
-    """Adds a bone segment in a colour to a view."""
+def add_bone(plotter: Any, surface: SurfaceData, colour: str) -> None:
+    """Adds the surface of a bone segment in a colour to a view."""
     plotter.add_mesh(
-        polydata(segment.surface.vertices, segment.surface.triangles),
+        polydata(surface.vertices, surface.triangles),
         color=colour,
         smooth_shading=True,
         split_sharp_edges=True,

@@ -1,17 +1,21 @@
 """The band of a prediction painted on its skin."""
 
 import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cmfsim.errors import CaseInputError
+from cmfsim.pictures.beside import PictureJob
 from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.distances import NOT_EVALUATED
 from cmfsim.pictures.skin_ends import skin_ends, trimmed
 from cmfsim.values.prediction import Prediction
+from cmfsim.values.skin_band import SkinBand
+from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["picture_band"]
+__all__ = ["band_picture", "picture_band", "picture_half_width"]
 
 # Left round the face, as a share of its extent.
 MARGIN = 0.12
@@ -44,10 +48,21 @@ def picture_band(
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_band("band.png", prediction)  # doctest: +SKIP
     """
-    band = prediction.band
-    if band is None:
+    band_picture(prediction, size=size).draw(Path(path))
+
+
+def band_picture(prediction: Prediction, *, size: tuple[int, int] = SIZE) -> PictureJob:
+    """The picture that `picture_band` writes, to be drawn later."""
+    if prediction.band is None:
         raise CaseInputError("the prediction has no band: use predict_with_band")
-    skin, half = prediction.skin, band.half_width
+    return PictureJob(picture_half_width, skin=prediction.skin, band=prediction.band, size=size)
+
+
+def picture_half_width(
+    path: str | os.PathLike[str], *, skin: SurfaceData, band: SkinBand, size: tuple[int, int]
+) -> None:
+    """Writes a picture of half the width of a band; see `picture_band`."""
+    half = band.half_width
     vertices = skin.vertices
     known = ~np.ma.getmaskarray(half)
     # What lies beyond the face, as at the cut of the neck, would have the scale to itself.

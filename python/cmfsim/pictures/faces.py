@@ -1,19 +1,28 @@
 """Pictures of a plan and of the face that it is predicted to give."""
 
 import os
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
+from cmfsim.pictures.beside import PictureJob
 from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
-from cmfsim.pictures.skin_ends import skin_ends, trimmed
+from cmfsim.pictures.skin_ends import SkinEnds, skin_ends, trimmed
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["picture_plan", "picture_prediction"]
+__all__ = [
+    "picture_faces",
+    "picture_motions",
+    "picture_plan",
+    "picture_prediction",
+    "plan_picture",
+    "prediction_picture",
+]
 
 # Of six views in two rows, pixels.
 TWO_ROWS = (1650, 1240)
@@ -52,17 +61,40 @@ def picture_prediction(
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_prediction("prediction.png", prediction)  # doctest: +SKIP
     """
-    before, after = prediction.face_before, prediction.face
+    prediction_picture(prediction, size=size).draw(Path(path))
+
+
+def prediction_picture(prediction: Prediction, *, size: tuple[int, int] = TWO_ROWS) -> PictureJob:
+    """The picture that `picture_prediction` writes, to be drawn later."""
+    return PictureJob(
+        picture_faces,
+        before=prediction.face_before,
+        after=prediction.face,
+        ends=skin_ends(prediction.skin_before),
+        # The mesh's own skin ends in a ragged rim; a whole head goes on past the picture.
+        is_trimmed=prediction.patient.face is None,
+        size=size,
+    )
+
+
+def picture_faces(
+    path: str | os.PathLike[str],
+    *,
+    before: SurfaceData,
+    after: SurfaceData,
+    ends: SkinEnds,
+    is_trimmed: bool,
+    size: tuple[int, int],
+) -> None:
+    """Writes a picture of a face before and after; see `picture_prediction`."""
     moved = np.linalg.norm(after.vertices - before.vertices, axis=1)
     largest = max(float(moved.max()), LEAST_SCALE)
-    ends = skin_ends(prediction.skin_before)
 
     def paint(plotter: Any, view: View) -> None:
         surface = before if view.caption.startswith("before") else after
         shape = polydata(surface.vertices, surface.triangles)
         shape.point_data["movement"] = moved
-        if prediction.patient.face is None:
-            # The mesh's own skin ends in a ragged rim; a whole head goes on past the picture.
+        if is_trimmed:
             shape = trimmed(shape, ends)
         if not view.caption.startswith("movement"):
             plotter.add_mesh(shape, color=SKIN_COLOUR, **SKIN_SHADING)
@@ -114,28 +146,51 @@ def picture_plan(
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_plan("plan.png", prediction)  # doctest: +SKIP
     """
-    segments, after = prediction.patient.segments, prediction.bones
-    moved = [
-        replace(s, surface=SurfaceData(after[s.name][1], after[s.name][0].triangles))
-        for s in segments
-    ]
-    shifts = {
-        name: np.linalg.norm(vertices - surface.vertices, axis=1)
-        for name, (surface, vertices) in after.items()
-    }
-    still = {name for name, shift in shifts.items() if np.quantile(shift, 0.99) < STAYS}
-    colours = segment_colours([s.name for s in segments])
-    corners = bounds([s.surface.vertices for s in (*segments, *moved)])
+    plan_picture(prediction, size=size).draw(Path(path))
+
+
+def plan_picture(prediction: Prediction, *, size: tuple[int, int] = SIZE) -> PictureJob:
+    """The picture that `picture_plan` writes, to be drawn later."""
+    after = prediction.bones
+    plan = {name: m["clinical"] for name, m in prediction.summary.get("plan", {}).items()}
+    return PictureJob(
+        picture_motions,
+        before={s.name: s.surface for s in prediction.patient.segments},
+        after={
+            s.name: SurfaceData(after[s.name][1], after[s.name][0].triangles)
+            for s in prediction.patient.segments
+        },
+        still=[
+            name
+            for name, (surface, vertices) in after.items()
+            if np.quantile(np.linalg.norm(vertices - surface.vertices, axis=1), 0.99) < STAYS
+        ],
+        words=plan_lines(plan),
+        size=size,
+    )
+
+
+def picture_motions(
+    path: str | os.PathLike[str],
+    *,
+    before: Mapping[str, SurfaceData],
+    after: Mapping[str, SurfaceData],
+    still: Sequence[str],
+    words: Sequence[str],
+    size: tuple[int, int],
+) -> None:
+    """Writes a picture of segments of bone before and after; see `picture_plan`."""
+    colours = segment_colours(list(before))
+    corners = bounds([s.vertices for s in (*before.values(), *after.values())])
 
     def paint(plotter: Any, view: View) -> None:
         del view
-        for before, now in zip(segments, moved, strict=True):
-            add_bone(plotter, now, colours[now.name])
-            if now.name not in still:
-                shape = polydata(before.surface.vertices, before.surface.triangles)
+        for name, now in after.items():
+            add_bone(plotter, now, colours[name])
+            if name not in still:
+                shape = polydata(before[name].vertices, before[name].triangles)
                 plotter.add_mesh(shape, color=GHOST_COLOUR, opacity=0.3, smooth_shading=True)
 
     views = tuple(View(name, name) for name in ("right", "front", "left"))
     legend = [*colours.items(), ("before", GHOST_COLOUR)]
-    plan = {name: m["clinical"] for name, m in prediction.summary.get("plan", {}).items()}
-    draw(path, views, corners, size, paint, legend=legend, words=plan_lines(plan))
+    draw(path, views, corners, size, paint, legend=legend, words=words)

@@ -6,7 +6,9 @@ results of one run. What belongs to another plan, or to other inputs or another 
 
 import contextlib
 import logging
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -31,23 +33,27 @@ from cmfsim.io.predictions import (
     read_prediction,
     read_prediction_picture,
     stale_results,
+    write_timings,
 )
 from cmfsim.io.skin_errors import skin_errors_file, write_skin_errors
 from cmfsim.io.slicer_output import SLICER_FILE, write_slicer_bundle
 from cmfsim.io.summaries import write_summary
 from cmfsim.muscles.template import joined_surface
 from cmfsim.pictures import (
+    Painter,
+    PictureJob,
+    band_picture,
     chart_errors,
-    picture_band,
     picture_distances,
     picture_muscles,
-    picture_plan,
-    picture_prediction,
+    plan_picture,
+    prediction_picture,
 )
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.planning.page import PAGE_FILE, page_state
 from cmfsim.progress import Progress
 from cmfsim.report import Document, Figure, case_document, write_page
+from cmfsim.values.musculature import Musculature
 from cmfsim.values.prediction import MODELS, Prediction
 
 __all__ = [
@@ -63,6 +69,7 @@ _log = logging.getLogger(__name__)
 
 # Pictures of a case's report, in the folder of its prediction and in its own.
 PREDICTION_PICTURES = ("prediction", "band", "plan", "muscles")
+REPORT_STAGE = "writing the report"
 BOXES_CAPTION = (
     "Sizes of the errors by region: quartiles, median, mean (diamond), whiskers to 1.5 boxes, and "
     "beyond them each outlier, with their number above (as the paper's Figure 9)."
@@ -98,6 +105,45 @@ class WrittenResults:
     files: list[str] = field(default_factory=list)
     report: str | None = None
     left_out: list[str] = field(default_factory=list)
+
+
+@dataclass
+class _Clock:
+    """The seconds of each stage of predictions, and of the work after them, by place.
+
+    Attributes
+    ----------
+    seconds : dict of str to dict of str to float
+    place : str or None
+        Of the prediction that is worked on; None for all of them.
+    """
+
+    seconds: dict[str, dict[str, float]] = field(default_factory=dict)
+    place: str | None = None
+    _within: float = 0.0
+
+    def begin(self, place: str, seconds: Mapping[str, float]) -> None:
+        """Goes on to a prediction, which took some seconds."""
+        self.place, self.seconds[place] = place, dict(seconds)
+
+    @contextlib.contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Adds a stage; one within another counts once."""
+        begun, outer = time.perf_counter(), self._within
+        self._within = 0.0
+        try:
+            yield
+        finally:
+            took = time.perf_counter() - begun
+            for place in self.seconds if self.place is None else [self.place]:
+                before = self.seconds[place].get(name, 0.0)
+                self.seconds[place][name] = before + took - self._within
+            self._within = outer + took
+
+    def write(self, fresh: Path) -> None:
+        """Writes the timings of each prediction below a folder."""
+        for place, of_prediction in self.seconds.items():
+            write_timings(fresh / place, of_prediction)
 
 
 def write_results(
@@ -137,17 +183,23 @@ def write_results(
         What a prediction or a file ends in; the folder is then as it was.
     """
     written = WrittenResults()
+    clock = _Clock()
 
     def fill(fresh: Path) -> list[str]:
         for prediction in predictions:
             stage(f"writing {prediction.model}")
             place = "" if n_models == 1 else prediction.model
             (fresh / place).mkdir(exist_ok=True)
-            more = partial(
-                _more_files, prediction, pictures=pictures(prediction.model), slicer=slicer
-            )
-            names = fill_prediction(fresh / place, prediction, more)
+            begun = {}
+            if pictures(prediction.model):
+                for name, job in _pictures_of(prediction):
+                    begun[name] = painter.begin(job, fresh / place / name)
+            more = partial(_more_files, prediction, begun, clock, slicer=slicer)
+            clock.begin(place, prediction.summary["timings"])
+            with clock.timed("writing the files"):
+                names = fill_prediction(fresh / place, prediction, more)
             written.predictions.append(WrittenPrediction(place, names, prediction.summary))
+        clock.place = None
         key = written.predictions[0].summary["case_key"]
         compared: Mapping[str, Any] | None
         if evaluation is not None:
@@ -157,8 +209,10 @@ def write_results(
         else:
             compared = _earlier_evaluation(output, key)
         if with_report:
-            stage("writing the report")
-            written.report = _report_of(fresh, output, written, compared)
+            stage(REPORT_STAGE)
+            with clock.timed(REPORT_STAGE):
+                written.report = _report_of(fresh, output, written, compared)
+        clock.write(fresh)
         if evaluation is not None and written.report is not None:
             written.files.append(written.report)
         if evaluation is not None and compared is not None:
@@ -183,7 +237,8 @@ def write_results(
 
     # A comparison lists its files; those of predictions are found by their names.
     summary = None if evaluation is None else EVALUATION_FILE
-    names = replacing_files(output, summary, is_result_file, fill, stale)
+    with Painter() as painter:
+        names = replacing_files(output, summary, is_result_file, fill, stale)
     written.left_out = [name for name in written.left_out if name not in names]
     _warn_of_removed(output, written.left_out)
     return written
@@ -215,39 +270,49 @@ def _statements(names: Iterable[str]) -> list[str]:
     return [name for name in names if name.endswith((".json", ".html"))] or names
 
 
-def _more_files(prediction: Prediction, folder: Path, *, pictures: bool, slicer: bool) -> list[str]:
+def _more_files(
+    prediction: Prediction,
+    begun: Mapping[str, "Future[None]"],
+    clock: "_Clock",
+    folder: Path,
+    *,
+    slicer: bool,
+) -> list[str]:
     """The names of the files of a prediction that were asked for beside those of each."""
-    names = _draw(prediction, folder) if pictures else []
+    names = []
     if slicer:
         write_slicer_bundle(folder / SLICER_FILE, prediction)
         names.append(SLICER_FILE)
+    with clock.timed("waiting for the pictures"):
+        pictures = _drawn(begun)
+    return [*pictures, *names]
+
+
+def _drawn(begun: Mapping[str, "Future[None]"]) -> list[str]:
+    """The names of the pictures that were begun and could be drawn."""
+    names: list[str] = []
+    with optional_pictures():
+        for name, picture in begun.items():
+            picture.result()
+            names.append(name)
     return names
 
 
-def _draw(prediction: Prediction, folder: Path) -> list[str]:
-    drawn: list[str] = []
-    with optional_pictures():
-        for name, draw in _pictures_of(prediction):
-            draw(folder / name)
-            drawn.append(name)
-    return drawn
-
-
-def _pictures_of(prediction: Prediction) -> Iterator[tuple[str, Callable[[Path], None]]]:
-    yield "prediction.png", partial(picture_prediction, prediction=prediction)
-    yield "plan.png", partial(picture_plan, prediction=prediction)
-    if prediction.band is not None:
-        yield "band.png", partial(picture_band, prediction=prediction)
+def _pictures_of(prediction: Prediction) -> Iterator[tuple[str, PictureJob]]:
     if prediction.muscles is not None:
         segments = prediction.patient.segments
         yield (
             "muscles.png",
-            partial(
+            PictureJob(
                 picture_muscles,
-                musculature=prediction.muscles,
+                musculature=Musculature(prediction.muscles.muscles),
                 skull=joined_surface([segment.surface for segment in segments]),
             ),
         )
+    yield "plan.png", plan_picture(prediction)
+    yield "prediction.png", prediction_picture(prediction)
+    if prediction.band is not None:
+        yield "band.png", band_picture(prediction)
 
 
 @contextlib.contextmanager

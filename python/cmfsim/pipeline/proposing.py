@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,6 +33,8 @@ __all__ = [
     "read_template_head",
 ]
 
+# Surfaces that are made at a time.
+SURFACES_AT_ONCE = 2
 # The finding of a segmentation that separated the jaws without landmarks.
 BY_SHAPE = "jaws-parted-by-shape"
 # A site that moves by more when the jaws are separated again is doubtful, mm.
@@ -102,9 +105,15 @@ def head_surfaces(anatomy: Anatomy) -> tuple[dict[str, SurfaceData], SurfaceData
     CaseError
         (also `ValueError`) scikit-image is missing.
     """
+    levels = {**anatomy.bones, "skin": anatomy.skin}
     found: dict[str, SurfaceData] = {}
-    for name, level in {**anatomy.bones, "skin": anatomy.skin}.items():
-        surface = anatomy.surfaces.get(name) or detailed_surface(name, level)
+    # One is smoothed while another is decimated, as pieces of cut bones are.
+    with ThreadPoolExecutor(SURFACES_AT_ONCE) as pool:
+        made = pool.map(
+            lambda name: anatomy.surfaces.get(name) or detailed_surface(name, levels[name]), levels
+        )
+        surfaces = dict(zip(levels, made, strict=True))
+    for name, surface in surfaces.items():
         if surface is None:
             raise CaseInputError(
                 "finding landmarks needs surfaces, which need scikit-image: install "

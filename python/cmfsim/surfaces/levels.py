@@ -212,7 +212,10 @@ def block_of(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp
 def _without_slits(
     triangles: NDArray[np.int64], points: Floats
 ) -> tuple[NDArray[np.int64], Floats]:
-    """Vertices in the same place made one, triangles that thereby lose a corner dropped."""
+    """Vertices in the same place made one, triangles that thereby lose a corner dropped.
+
+    A voxel that is hardly inside has all vertices of its surface in its centre: nothing is left.
+    """
     # Vertices lie on the edges of voxels' cells: those of two edges meet at a voxel's centre only.
     centred = np.flatnonzero((points == np.rint(points)).all(axis=1))
     _, first, back = np.unique(points[centred], axis=0, return_index=True, return_inverse=True)
@@ -225,7 +228,10 @@ def _without_slits(
         & (joined[:, 1] != joined[:, 2])
         & (joined[:, 2] != joined[:, 0])
     )
-    return joined[kept], points[own]
+    left, places = joined[kept], points[own]
+    used = np.zeros(len(places), dtype=bool)
+    used[left] = True
+    return (np.cumsum(used) - 1)[left], places[used]
 
 
 def _smoothed(points: Floats, triangles: NDArray[np.int64], rounds: int) -> Floats:

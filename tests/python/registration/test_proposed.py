@@ -9,7 +9,11 @@ import cmfsim
 import real_heads
 from cmfsim.phantom.average_head import average_head
 from cmfsim.pipeline.proposing import read_template_head
+from cmfsim.registration.proposed import measured_biases
 from cmfsim.registration.proposed.groups import JAW_SITES
+from cmfsim.registration.proposed.judgement import missing_sites
+from cmfsim.registration.proposed.pose import Pose, find_pose
+from cmfsim.values.motion import rigid_motion
 
 pytest.importorskip("scipy")
 
@@ -58,6 +62,35 @@ def test_stored_average_head_is_the_synthetic_head():
             np.testing.assert_allclose(stored[name], place, atol=1e-9)
 
 
+def test_stored_biases_are_those_that_the_definitions_have():
+    # The file is made again where a definition changes: scripts/make_average_head.py.
+    average = average_head()
+    for stored, own in zip(average.biases, measured_biases(average, average), strict=True):
+        assert stored.keys() == own.keys()
+        for name, bias in own.items():
+            np.testing.assert_allclose(stored[name], bias, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "lost"),
+    [
+        ("suborbital_L", {"endocanthion_L", "exocanthion_L"}),
+        (
+            "pogonion",
+            {"pogonion", "subnasale", "labiale_superius", "labiale_inferius"}
+            | {f"{name}_{letter}" for name in ("alare", "cheilion") for letter in "LR"},
+        ),
+    ],
+)
+def test_sites_of_the_skin_are_gone_with_those_that_they_are_found_from(wrong, lost):
+    average = average_head()
+    skull = {**average.skull, wrong: average.skull[wrong] + [0.0, 0.0, -60.0]}
+    pose = Pose(np.zeros(3), np.eye(3), 1.0, 0.0)
+    gone = missing_sites(skull, average.skin_landmarks, [], pose, has_jaw=True)
+    assert set(gone.skull) == {wrong}
+    assert set(gone.skin) == lost
+
+
 def test_every_site_of_a_synthetic_person_is_found_within_3_mm(person, found):
     _, _, head = person
     errors = [
@@ -89,6 +122,22 @@ def test_a_turned_and_shifted_head_has_its_landmarks_at_the_same_places(person, 
         assert len(apart) == len(before)
         assert np.mean(apart) < 0.5
         assert max(apart) < 2.5
+
+
+@pytest.mark.parametrize("lean", [24.0, -24.0])
+def test_the_plane_of_symmetry_of_a_leaning_skull_without_its_vault_is_found(lean):
+    """The mirror image of a head that leans lies far from it: the first fit was 18 degrees off."""
+    cranium = average_head().bones["cranium"]
+    low = np.asarray(cranium.vertices)[:, 2] < 45.0
+    used, triangles = np.unique(
+        cranium.triangles[low[cranium.triangles].all(axis=1)], return_inverse=True
+    )
+    turn = rigid_motion(angle=lean, axis=(0, 1, 0))[:3, :3]
+    below = cmfsim.SurfaceData(
+        np.asarray(cranium.vertices)[used] @ turn.T, triangles.reshape(-1, 3)
+    )
+    pose = find_pose(below, cranium)
+    assert pose.axes[0] @ turn[:, 0] > np.cos(np.radians(1.5))
 
 
 def test_an_open_jaw_carries_its_sites_and_leaves_the_cranium_alone(person, found):

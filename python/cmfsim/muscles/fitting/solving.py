@@ -119,7 +119,7 @@ class Problem:
             _log.debug("fit %d: %d points, %.2f mm", iteration, np.count_nonzero(used), out)
         return found
 
-    def _volume_rows(self) -> tuple[Floats, Floats]:
+    def _volume_rows(self) -> tuple[Any, Floats]:
         """The derivative of each muscle's volume with respect to the coefficients, and its weight.
 
         Both are divided by the root of the muscle's area: volume over area is a displacement, which
@@ -132,7 +132,7 @@ class Problem:
             (self.basis[begins[i] : begins[i + 1]].T @ self.volumes.part(slopes, i)).ravel() * s
             for i, s in enumerate(scale)
         ]
-        return np.array(rows), scale
+        return sparse().csr_matrix(np.array(rows)), scale
 
 
 def _energy(lattice: Lattice) -> Any:
@@ -196,26 +196,41 @@ def _rows(basis: Any, direction: Floats, weight: Floats) -> Any:
     return sparse().csr_matrix((data.ravel(), wide.ravel(), 3 * basis.indptr), shape=shape)
 
 
-def _least(rows: Any, volume_rows: Floats, energy: Any, right: Floats, start: Floats) -> Floats:
+def _least(rows: Any, volume_rows: Any, energy: Any, right: Floats, start: Floats) -> Floats:
     """The solution of (RᵀR + VᵀV + E) x = b by conjugate gradients, near a first guess.
 
-    E acts on each axis in the same way. RᵀR, with 243 entries per row, is never formed.
+    E acts on each axis in the same way. RᵀR, with 243 entries per row, is never formed. Every sum
+    has one order, whatever the number of threads.
     """
-    solvers = sparse("scipy.sparse.linalg")
-    back = rows.T.tocsr()
+    back, volume_back = rows.T.tocsr(), volume_rows.T.tocsr()
     diagonal = np.asarray(rows.multiply(rows).sum(axis=0)).ravel()
-    diagonal += np.repeat(energy.diagonal(), 3) + np.einsum("ra,ra->a", volume_rows, volume_rows)
+    diagonal += np.asarray(volume_rows.multiply(volume_rows).sum(axis=0)).ravel()
+    diagonal += np.repeat(energy.diagonal(), 3)
     scale = 1.0 / np.maximum(diagonal, np.finfo(float).eps)
 
     def product(x: Floats) -> Floats:
         bent = (energy @ x.reshape(start.shape)).ravel()
-        result: Floats = back @ (rows @ x) + volume_rows.T @ (volume_rows @ x) + bent
+        result: Floats = back @ (rows @ x) + volume_back @ (volume_rows @ x) + bent
         return result
 
-    size = (start.size, start.size)
-    whole = solvers.LinearOperator(size, matvec=product)
-    jacobi = solvers.LinearOperator(size, matvec=lambda x: scale * x.ravel())
-    # The relative tolerance is `tol` before scipy 1.12 and `rtol` after, the absolute one `atol`.
-    limit = TOLERANCE * float(np.linalg.norm(right))
-    x, _ = solvers.cg(whole, right, x0=start.ravel(), atol=limit, maxiter=MOST_CG_STEPS, M=jacobi)
+    x = start.ravel()
+    residual = right - product(x)
+    limit = TOLERANCE**2 * _dot(right, right)
+    ahead = scale * residual
+    along, slope = ahead, _dot(residual, ahead)
+    for _ in range(MOST_CG_STEPS):
+        if _dot(residual, residual) <= limit:
+            break
+        pulled = product(along)
+        step = slope / _dot(along, pulled)
+        x = x + step * along
+        residual = residual - step * pulled
+        ahead = scale * residual
+        before, slope = slope, _dot(residual, ahead)
+        along = ahead + (slope / before) * along
     return np.asarray(x, dtype=float).reshape(start.shape)
+
+
+def _dot(a: Floats, b: Floats) -> float:
+    """The sum of products in one order: BLAS splits it between its threads."""
+    return float(np.einsum("a,a->", a, b))

@@ -74,8 +74,12 @@ def assembled(
             ),
             "plan_sources": dict(bones.sources),
         },
-        detailed_skin=partial(detailed_surface, "skin", anatomy.skin),
+        detailed_skin=partial(_detailed_skin, head),
     )
+
+
+def _detailed_skin(head: Head) -> SurfaceData | None:
+    return head.skin or detailed_surface("skin", head.anatomy.skin)
 
 
 def _scene(

@@ -3,10 +3,12 @@
 import logging
 import time
 from collections.abc import Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from cmfsim._core import TetMesh
 from cmfsim.bones import (
     CuttingPlane,
     Procedure,
@@ -25,12 +27,13 @@ from cmfsim.node_kinds import KindOptions, dental_arches, kind_options
 from cmfsim.pictures import picture_anatomy, picture_node_kinds
 from cmfsim.pipeline.building.assembly import assembled
 from cmfsim.pipeline.building.case_checks import misplaced, plan_sizes
+from cmfsim.pipeline.building.contacts import mean_edge
 from cmfsim.pipeline.building.inputs import check_output, read_anatomy, read_case_landmarks
 from cmfsim.pipeline.building.landmarks import found_landmarks
 from cmfsim.pipeline.building.lips import find_seam
 from cmfsim.pipeline.building.motions import PlannedBones, planned_bones
-from cmfsim.pipeline.building.nodes import nodes_of
-from cmfsim.pipeline.building.parts import Head, Tissue
+from cmfsim.pipeline.building.nodes import made_contacts, nodes_of
+from cmfsim.pipeline.building.parts import Head, MeshedTissue, Tissue
 from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.stages import BuildOptions, Stages
 from cmfsim.pipeline.building.tissue_mesh import region_of, tissue_mesh
@@ -162,22 +165,35 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
     if anatomy is None:
         anatomy, noticed = read_anatomy(case, landmarks.get("skull", {}), stages.begin)
         stages.add(noticed)
-    proposed = None
     if case.landmarks.proposed and not landmarks:
-        proposed, anatomy = found_landmarks(case, anatomy, stages, is_read=options.anatomy is None)
-        landmarks = {} if proposed is None else proposed.points
-    head = Head(case, landmarks, anatomy, proposed)
-    bones, procedures = _bones(head, stages, options.after)
-    tissue = _tissue(head, stages, bones, kinds)
-    nodes = nodes_of(head, stages, bones, tissue, kinds)
-    patient = assembled(head, stages, bones, nodes, procedures)
-    if case.muscles is None:
-        return patient
-    stages.begin("placing and sampling the muscles")
-    # A case without muscles loads nothing of them.
-    from cmfsim.pipeline.building.muscles import with_muscles  # noqa: PLC0415
+        head = found_landmarks(case, anatomy, stages, is_read=options.anatomy is None)
+    else:
+        head = Head(case, landmarks, anatomy)
+    # Tissue and muscles are placed by the anatomy and its landmarks, whatever becomes of the bones.
+    with ThreadPoolExecutor(2) as beside:
+        tissue = beside.submit(_meshed, head)
+        if case.muscles is None:
+            return _without_muscles(head, stages, kinds, options, tissue)[0]
+        # A case without muscles loads nothing of them.
+        from cmfsim.pipeline.building.muscles import placed_muscles, with_muscles  # noqa: PLC0415
 
-    return with_muscles(patient, case.muscles, mesh=nodes.mesh)
+        placing = beside.submit(placed_muscles, case.name, case.muscles, head.skull, head.anatomy)
+        patient, mesh = _without_muscles(head, stages, kinds, options, tissue)
+        stages.begin("placing and sampling the muscles")
+        return with_muscles(patient, case.muscles, mesh=mesh, placed=placing.result)
+
+
+def _without_muscles(
+    head: Head,
+    stages: Stages,
+    kinds: KindOptions,
+    options: BuildOptions,
+    meshed: "Future[MeshedTissue]",
+) -> tuple[PatientModel, TetMesh]:
+    bones, procedures = _bones(head, stages, options.after)
+    tissue = _tissue(head, stages, bones, kinds, meshed)
+    nodes = nodes_of(head, stages, bones, tissue, kinds)
+    return assembled(head, stages, bones, nodes, procedures), nodes.mesh
 
 
 def _bones(
@@ -206,26 +222,50 @@ def _bones(
     return bones, cut.procedures
 
 
-def _tissue(head: Head, stages: Stages, bones: PlannedBones, options: KindOptions) -> Tissue:
+def _meshed(head: Head) -> MeshedTissue:
+    """The tissue of a head, with its mesh where no seam between the lips has to be found first."""
+    region = region_of(head.case, head.anatomy, head.skull)
+    level, findings = tissue_level(head.anatomy, region)
+    if head.case.lips.contact:
+        return MeshedTissue(region, level, findings)
+    return MeshedTissue(region, level, findings, tissue_mesh(head.case, level, head.anatomy))
+
+
+def _tissue(
+    head: Head,
+    stages: Stages,
+    bones: PlannedBones,
+    options: KindOptions,
+    meshed: "Future[MeshedTissue]",
+) -> Tissue:
     case, anatomy = head.case, head.anatomy
     stages.begin("finding the soft tissue")
-    region = region_of(head.case, head.anatomy, head.skull)
-    level, noticed = tissue_level(head.anatomy, region)
-    stages.add(noticed)
-
     arches = seam = None
     if options.sliding or case.lips.contact:
         arches = dental_arches(anatomy, bones.segments, head.skull)
+    contacts = None
+    if case.mesh.file is None:
+        # While the tissue is meshed.
+        edge = case.mesh.edge_length
+        contacts = made_contacts(head, stages, bones, arches, options, edge_length=edge)
+    stages.begin("filling the tissue with tets")
+    found = meshed.result()
+    stages.add(found.findings)
+    filled = found.filled
     if case.lips.contact:
         stages.begin("finding the seam between the lips")
         seam = find_seam(case, anatomy, arches, head.landmarks.get("skin", {}))
         stages.add(seam.findings)
-
-    stages.begin("filling the tissue with tets")
-    mesh, report, noticed = tissue_mesh(case, level, anatomy, seam)
+        stages.begin("filling the tissue with tets")
+    if filled is None:
+        filled = tissue_mesh(case, found.level, anatomy, seam)
+    mesh, report, noticed = filled
     stages.add(noticed)
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
-    return Tissue(region, level, mesh, report, arches, seam)
+    if contacts is None:
+        edge = mean_edge(mesh)
+        contacts = made_contacts(head, stages, bones, arches, options, edge_length=edge)
+    return Tissue(found.region, found.level, mesh, report, arches, seam, contacts)
 
 
 def _draw(model: PatientModel, folder: Path) -> list[str]:

@@ -4,6 +4,7 @@ from typing import Any
 
 from cmfsim.errors import LandmarkError, LandmarkInputError
 from cmfsim.io import Case
+from cmfsim.pipeline.building.parts import Head
 from cmfsim.pipeline.building.stages import Stages
 from cmfsim.registration.proposed import ProposedLandmarks
 from cmfsim.values.anatomy import Anatomy
@@ -12,12 +13,10 @@ from cmfsim.values.finding import Finding
 __all__ = ["found_landmarks", "landmark_summary"]
 
 
-def found_landmarks(
-    case: Case, anatomy: Anatomy, stages: Stages, *, is_read: bool
-) -> tuple[ProposedLandmarks | None, Anatomy]:
-    """The landmarks found on a head, and the head, of which the jaws may be separated by them.
+def found_landmarks(case: Case, anatomy: Anatomy, stages: Stages, *, is_read: bool) -> Head:
+    """A head with the landmarks found on it, by which its jaws may be separated.
 
-    None, with a warning, where it shows no face: what cannot do without landmarks (muscles,
+    Without any, with a warning, where it shows no face: what cannot do without landmarks (muscles,
     standard procedures) is refused where it is reached.
 
     Parameters
@@ -52,7 +51,7 @@ def found_landmarks(
                 )
             ]
         )
-        return None, anatomy
+        return Head(case, {}, anatomy)
     found = head.landmarks
     if found.impossible_jaw and case.image is not None:
         raise LandmarkInputError(
@@ -65,7 +64,7 @@ def found_landmarks(
         stages.drop({BY_SHAPE})
     stages.add(head.findings)
     stages.add(found.findings)
-    return found, head.anatomy
+    return Head(case, found.points, head.anatomy, found, head.skin)
 
 
 def landmark_summary(found: ProposedLandmarks) -> dict[str, Any]:

@@ -1,21 +1,69 @@
 """The muscles of a patient: a template carried to the skull, and its share in each tet."""
 
 import time
-from collections.abc import Mapping
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
 
 from cmfsim._core import TetMesh
 from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
 from cmfsim.muscles.equivalent import equivalent_material
-from cmfsim.muscles.fitting import fit_muscles
+from cmfsim.muscles.fitting import MuscleFit, fit_muscles
 from cmfsim.muscles.mixing import MODULI_CODES
 from cmfsim.muscles.template import MuscleTemplate
+from cmfsim.muscles.template.morphing import MorphedMusculature
+from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.moduli import FatModuli
 from cmfsim.values.patient_model import PatientModel
 
-__all__ = ["with_muscles"]
+__all__ = ["PlacedMuscles", "placed_muscles", "with_muscles"]
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedMuscles:
+    """A template's muscles in a head.
+
+    Attributes
+    ----------
+    muscles : MorphedMusculature
+        Where they are used: fitted, if that helps.
+    fit : MuscleFit or None
+    seconds : mapping of str to float
+        Of each step.
+    """
+
+    muscles: MorphedMusculature
+    fit: MuscleFit | None
+    seconds: Mapping[str, float]
+
+
+def placed_muscles(
+    name: str, given: CaseMuscles, skull: Mapping[str, Floats], anatomy: Anatomy
+) -> PlacedMuscles:
+    """The muscles of a case in a head, from its skull landmarks.
+
+    Raises
+    ------
+    LandmarkError
+        (also `ValueError`) There are no skull landmarks, or they do not fit the template's.
+    CaseError
+        (also `ValueError`) There is no such template.
+    """
+    if not skull:
+        raise LandmarkInputError(
+            f"{name}: muscles are placed from skull landmarks, and the case has none: add "
+            "[landmarks] skull, or take a homogeneous model"
+        )
+    begun = time.perf_counter()
+    muscles = MuscleTemplate.load(given.template).morph(skull, smoothing=given.smoothing)
+    seconds = {"placing the muscles": time.perf_counter() - begun}
+    if not given.fit:
+        return PlacedMuscles(muscles, None, seconds)
+    fit = fit_muscles(muscles, anatomy)
+    seconds["fitting the muscles"] = fit.seconds
+    # A head in which muscles lie right already is left alone.
+    return PlacedMuscles(fit.musculature if fit.helps else muscles, fit, seconds)
 
 
 def with_muscles(
@@ -24,6 +72,7 @@ def with_muscles(
     *,
     landmarks: Mapping[str, Floats] | None = None,
     mesh: TetMesh | None = None,
+    placed: Callable[[], PlacedMuscles] | None = None,
 ) -> PatientModel:
     """The patient with a template's muscles and their equivalent material (paper 2.2, 2.3).
 
@@ -35,6 +84,9 @@ def with_muscles(
         Instead of the patient's own skull landmarks, as for a trial of their error.
     mesh : TetMesh, optional
         That of the patient's scene, where the caller has it already.
+    placed : callable, optional
+        Gives the muscles in the head, where the caller has them placed beside other work: only the
+        wait for them counts in the timings.
 
     Returns
     -------
@@ -54,21 +106,16 @@ def with_muscles(
     >>> import cmfsim
     >>> patient = cmfsim.with_muscles(patient, cmfsim.CaseMuscles())  # doctest: +SKIP
     """
-    skull = patient.landmarks.get("skull") if landmarks is None else landmarks
-    if not skull:
-        raise LandmarkInputError(
-            f"{patient.name}: muscles are placed from skull landmarks, and the case has none: add "
-            "[landmarks] skull, or take a homogeneous model"
-        )
     begun = time.perf_counter()
-    muscles = MuscleTemplate.load(given.template).morph(skull, smoothing=given.smoothing)
-    placed = time.perf_counter()
-    fit = fit_muscles(muscles, patient.anatomy) if given.fit else None
-    # A head in which muscles lie right already is left alone.
-    helps = fit is not None and fit.helps
-    if fit is not None and helps:
-        muscles = fit.musculature
-    fitted = time.perf_counter()
+    if placed is None:
+        skull = patient.landmarks.get("skull", {}) if landmarks is None else landmarks
+        found = placed_muscles(patient.name, given, skull, patient.anatomy)
+        timings = dict(found.seconds)
+    else:
+        found = placed()
+        timings = {[*found.seconds][-1]: time.perf_counter() - begun}
+    muscles, fit = found.muscles, found.fit
+    begun = time.perf_counter()
     scene = patient.scene
     mixture = equivalent_material(
         TetMesh(scene.nodes, scene.tets) if mesh is None else mesh,
@@ -79,13 +126,7 @@ def with_muscles(
         seed=given.seed,
         moduli=replace(given.moduli, fat=FatModuli.of(patient.fat)),
     )
-    timings = {
-        **patient.summary.get("timings", {}),
-        "placing the muscles": placed - begun,
-        "sampling the muscles": time.perf_counter() - fitted,
-    }
-    if fit is not None:
-        timings["fitting the muscles"] = fitted - placed
+    timings["sampling the muscles"] = time.perf_counter() - begun
     # What the doctor found already has the line of the case.
     repeated = {"template-landmarks-missing", *MODULI_CODES}
     known = {f.code for f in patient.findings} & repeated
@@ -93,10 +134,10 @@ def with_muscles(
     findings = tuple(dict.fromkeys([*patient.findings, *more]))
     summary = {
         **patient.summary,
-        "timings": timings,
+        "timings": {**patient.summary.get("timings", {}), **timings},
         "findings": [asdict(finding) for finding in findings],
         "muscles": {**asdict(given), "template": str(given.template), **mixture.summary},
-        "muscle_fit": None if fit is None else {"used": helps, **fit.summary()},
+        "muscle_fit": None if fit is None else {"used": fit.helps, **fit.summary()},
     }
     return replace(
         patient,

@@ -1,10 +1,10 @@
 """What each node of the soft tissue does, and which tets are left."""
 
 from cmfsim.meshing import report_of_part
-from cmfsim.node_kinds import KindOptions, classify_nodes, lifted_tissue
+from cmfsim.node_kinds import DentalArches, KindOptions, classify_nodes, lifted_tissue
 from cmfsim.pipeline.building.case_checks import cut_segments, untouched
 from cmfsim.pipeline.building.clefts import without_clefts
-from cmfsim.pipeline.building.contacts import CaseContacts, arch_sheets, mean_edge
+from cmfsim.pipeline.building.contacts import CaseContacts, arch_sheets
 from cmfsim.pipeline.building.ends import end_findings
 from cmfsim.pipeline.building.held import held_part
 from cmfsim.pipeline.building.lips import CaseLipContact, lip_contact, separated_at_seam
@@ -13,7 +13,7 @@ from cmfsim.pipeline.building.parts import Head, Nodes, Tissue
 from cmfsim.pipeline.building.stages import Stages
 from cmfsim.pipeline.building.tissue_mesh import end_planes
 
-__all__ = ["nodes_of"]
+__all__ = ["made_contacts", "nodes_of"]
 
 
 def nodes_of(
@@ -22,7 +22,8 @@ def nodes_of(
     """What the nodes of the tissue do: joined, sliding, fixed or free, with contact and lips."""
     case, anatomy, mesh, report = head.case, head.anatomy, tissue.mesh, tissue.report
     moved = [*dict.fromkeys([*cut_segments(case), *bones.motions])]
-    contacts = _contacts(head, stages, bones, tissue, options)
+    contacts = tissue.contacts
+    stages.add(contacts.findings)
     stages.begin("classifying nodes")
     classified = classify_nodes(
         mesh.nodes,
@@ -76,15 +77,17 @@ def nodes_of(
     return Nodes(mesh, report, kinds, contacts, tissue.level, tissue.seam, lips, lifted)
 
 
-def _contacts(
-    head: Head, stages: Stages, bones: PlannedBones, tissue: Tissue, options: KindOptions
+def made_contacts(
+    head: Head,
+    stages: Stages,
+    bones: PlannedBones,
+    arches: DentalArches | None,
+    options: KindOptions,
+    *,
+    edge_length: float,
 ) -> CaseContacts:
     """The surfaces along the dental arches that tissue slides on: none without arches."""
-    if tissue.arches is None:
+    if arches is None:
         return CaseContacts()
     stages.begin("making the contact sheets")
-    mesh = head.case.mesh
-    edge = mesh.edge_length if mesh.file is None else mean_edge(tissue.mesh)
-    contacts = arch_sheets(head.anatomy, bones.segments, tissue.arches, options, edge)
-    stages.add(contacts.findings)
-    return contacts
+    return arch_sheets(head.anatomy, bones.segments, arches, options, edge_length)

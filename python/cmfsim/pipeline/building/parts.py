@@ -13,21 +13,36 @@ from cmfsim.pipeline.building.contacts import CaseContacts
 from cmfsim.pipeline.building.lips import CaseLipContact
 from cmfsim.registration.proposed import ProposedLandmarks
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.lifted_tissue import LiftedTissue
 from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["Head", "Nodes", "Tissue"]
 
 
 @dataclass(frozen=True, eq=False)
 class Head:
-    """A case with what was read of it."""
+    """A case with what was read of it.
+
+    Attributes
+    ----------
+    case : Case
+    landmarks : mapping of str to mapping of str to (3,) float64, mm
+        "skull" and "skin".
+    anatomy : Anatomy
+    proposed : ProposedLandmarks or None
+        The landmarks, where they were found automatically.
+    skin : SurfaceData or None
+        The skin in full detail, where finding them has made it.
+    """
 
     case: Case
     landmarks: Mapping[str, Mapping[str, Floats]]
     anatomy: Anatomy
     proposed: ProposedLandmarks | None = None
+    skin: SurfaceData | None = None
 
     @property
     def skull(self) -> Mapping[str, Floats]:
@@ -36,8 +51,28 @@ class Head:
 
 
 @dataclass(frozen=True, eq=False)
+class MeshedTissue:
+    """The soft tissue of a head before its bones are known to be cut.
+
+    Attributes
+    ----------
+    region : TissueRegion
+    level : ImageData
+    findings : tuple of Finding
+    filled : tuple or None
+        The tets that fill it, their report and the findings on them; None where they have to
+        follow the seam between the lips.
+    """
+
+    region: TissueRegion
+    level: ImageData
+    findings: tuple[Finding, ...]
+    filled: tuple[TetMesh, MeshReport, tuple[Finding, ...]] | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Tissue:
-    """The soft tissue of a head, and the tets that fill it."""
+    """The soft tissue of a head, the tets that fill it, and what it slides on."""
 
     region: TissueRegion
     level: ImageData
@@ -45,6 +80,7 @@ class Tissue:
     report: MeshReport
     arches: DentalArches | None
     seam: LipSeam | None
+    contacts: CaseContacts
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from cmfsim.registration.proposed.skull_sites import FRONT_REACH, find_skull_sit
 from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Detected", "biases", "detect", "is_lower", "joined"]
+__all__ = ["Detected", "HeadSurfaces", "biases", "detect", "is_lower", "joined"]
 
 # Points on a surface per mm² for depth maps: some four in a cell.
 DENSITY = 6.0
@@ -32,6 +33,37 @@ class Detected:
     skin: Mapping[str, Floats]
 
 
+@dataclass(frozen=True, eq=False)
+class HeadSurfaces:
+    """The surfaces of a head, with points that lie densely on each, (n, 3) mm, made once.
+
+    Attributes
+    ----------
+    upper : SurfaceData
+        The bones without the mandible.
+    lower, skin : SurfaceData or None
+    """
+
+    upper: SurfaceData
+    lower: SurfaceData | None
+    skin: SurfaceData | None = None
+
+    @cached_property
+    def upper_points(self) -> Floats:
+        """Points on the upper bones."""
+        return _points(self.upper)
+
+    @cached_property
+    def lower_points(self) -> Floats:
+        """Points on the mandible; none without one."""
+        return np.zeros((0, 3)) if self.lower is None else _points(self.lower)
+
+    @cached_property
+    def skin_points(self) -> Floats:
+        """Points on the skin; none without it."""
+        return np.zeros((0, 3)) if self.skin is None else _points(self.skin)
+
+
 def joined(surfaces: list[SurfaceData]) -> SurfaceData:
     """Several surfaces as one."""
     starts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])[:-1]
@@ -46,15 +78,16 @@ def joined(surfaces: list[SurfaceData]) -> SurfaceData:
     )
 
 
-def detect(
-    upper: SurfaceData, lower: SurfaceData | None, skin: SurfaceData | None, pose: Pose
-) -> Detected:
-    """The sites of a head that lies in a known pose: of cranium, mandible and skin."""
-    jaw = np.zeros((0, 3)) if lower is None else _points(lower, pose)
-    skull = find_skull_sites(skull_views(_points(upper, pose), jaw))
-    if skin is None:
+def detect(head: HeadSurfaces, pose: Pose, *, skin: bool = True) -> Detected:
+    """The sites of a head that lies in a known pose: of cranium, mandible and, if asked, skin."""
+
+    def placed(points: Floats) -> Floats:
+        return pose.into(points) / pose.size
+
+    skull = find_skull_sites(skull_views(placed(head.upper_points), placed(head.lower_points)))
+    if head.skin is None or not skin:
         return Detected(skull, {})
-    front = depth_map(_points(skin, pose), (0, 2, 1), 1.0, FRONT_REACH)
+    front = depth_map(placed(head.skin_points), (0, 2, 1), 1.0, FRONT_REACH)
     return Detected(skull, find_skin_sites(front, skull))
 
 
@@ -64,21 +97,20 @@ def is_lower(name: str) -> bool:
     return any(word in words for word in ("mandible", "lower", "ramus", "chin"))
 
 
-def _points(surface: SurfaceData, pose: Pose) -> Floats:
+def _points(surface: SurfaceData) -> Floats:
     area = Surface(surface.vertices, surface.triangles).area
     count = min(MOST_POINTS, int(DENSITY * float(area)))
-    points, _ = surface_samples(surface, max(count, 1000))
-    return pose.into(points) / pose.size
+    return surface_samples(surface, max(count, 1000))[0]
 
 
 def biases(
-    template: TemplateHead, upper: SurfaceData, lower: SurfaceData | None, pose: Pose
+    template: TemplateHead, head: HeadSurfaces, pose: Pose
 ) -> tuple[dict[str, Floats], dict[str, Floats]]:
     """How far the landmarks of a template lie from where its sites are found, (3,) each.
 
     Of skull and skin, in the frame and size of the average head.
     """
-    found = detect(upper, lower, template.skin, pose)
+    found = detect(head, pose)
     pairs = ((found.skull, template.skull), (found.skin, template.skin_landmarks))
     skull, skin = (
         {

@@ -48,18 +48,20 @@ TO_FOLD, TO_CHIN = 18.0, 27.0
 STRANGE, IMPOSSIBLE = 9.5, 15.0
 
 
-# Sites of the skin that are found from those of the skull, and are gone with them.
-SUPPORT: Mapping[str, str] = MappingProxyType(
+# Sites of the skin that are found from those of the skull, and are gone with any of them.
+SUPPORT: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
-        "pogonion": "pogonion",
-        "nasion": "nasion",
+        "pogonion": ("pogonion",),
+        "nasion": ("nasion",),
         **{
-            f"{corner}canthion_{letter}": f"supraorbital_{letter}"
+            f"{corner}canthion_{letter}": (f"supraorbital_{letter}", f"suborbital_{letter}")
             for corner in ("endo", "exo")
             for letter in "LR"
         },
     }
 )
+# Those that are looked for between nose and chin: they are wrong where the chin is.
+ABOVE_CHIN = ("subnasale", "labiale_superius", "labiale_inferius", "alare", "cheilion")
 
 
 @dataclass(frozen=True)
@@ -109,8 +111,10 @@ def missing_sites(
             lost[name] = "the skin around it was not recognised"
         elif (cut := _cut_at(skin[name], cuts, AT_CUT)) is not None:
             lost[name] = f"the image ends there ({cut.name} border)"
-        elif SUPPORT.get(name) in gone:
-            lost[name] = gone[SUPPORT[name]]
+        elif (support := next((n for n in SUPPORT.get(name, ()) if n in gone), None)) is not None:
+            lost[name] = gone[support]
+        elif name.startswith(ABOVE_CHIN) and off["skull"].get("pogonion", 0.0) > IMPOSSIBLE:
+            lost[name] = gone["pogonion"]
     _impossible(off["skin"], lost)
     strange = {name: size for name, size in off["skull"].items() if size > IMPOSSIBLE}
     return MissingSites(gone, lost, strange)

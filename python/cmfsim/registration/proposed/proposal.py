@@ -1,7 +1,6 @@
 """Proposed landmarks of a head: found by definition, corrected by templates, judged one by one."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -9,7 +8,14 @@ import numpy as np
 from cmfsim._core import Surface
 from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
-from cmfsim.registration.proposed.detection import Detected, biases, detect, is_lower, joined
+from cmfsim.registration.proposed.detection import (
+    Detected,
+    HeadSurfaces,
+    biases,
+    detect,
+    is_lower,
+    joined,
+)
 from cmfsim.registration.proposed.groups import JAW_SITES
 from cmfsim.registration.proposed.jaw_evidence import (
     JawEvidence,
@@ -31,7 +37,7 @@ from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["landmarks_from"]
+__all__ = ["landmarks_from", "measured_biases"]
 
 # Distance of a head from a template at which the template's bias counts half, average-head mm.
 LIKENESS = 0.8
@@ -41,14 +47,6 @@ MIRRORED = 0.3
 LEVEL_ROUNDS = 2
 # Sites of the cranium without which what was found is no head.
 LEAST_SITES = 12
-
-
-@dataclass(frozen=True, eq=False)
-class _Bones:
-    """The bones of a head as two surfaces; without a mandible the skull is one."""
-
-    upper: SurfaceData
-    lower: SurfaceData | None
 
 
 def landmarks_from(
@@ -86,12 +84,12 @@ def landmarks_from(
             f"{len(bones)} bones and {len(templates)} template heads are given: landmarks are "
             "found on at least one bone with at least one template"
         )
-    parts = _parts(bones)
+    parts = _surfaces(bones, skin)
     average = templates[0]
     pose = find_pose(parts.upper, average.bones["cranium"])
     for _ in range(LEVEL_ROUNDS):
-        pose = levelled(pose, detect(parts.upper, parts.lower, None, pose).skull, average.skull)
-    found = detect(parts.upper, parts.lower, skin, pose)
+        pose = levelled(pose, detect(parts, pose, skin=False).skull, average.skull)
+    found = detect(parts, pose)
     likeness = [_likeness(template, parts.upper, pose, templates) for template in templates]
     found = _corrected(found, templates, likeness)
     skull = _evened({name: p for name, p in found.skull.items() if not name.startswith("_")})
@@ -122,14 +120,14 @@ def landmarks_from(
     )
 
 
-def _parts(bones: Mapping[str, SurfaceData]) -> _Bones:
+def _surfaces(bones: Mapping[str, SurfaceData], skin: SurfaceData | None = None) -> HeadSurfaces:
     upper = [bone for name, bone in bones.items() if not is_lower(name)]
     lower = [bone for name, bone in bones.items() if is_lower(name)]
     if not upper:
         raise LandmarkInputError(
             f"the bones are {', '.join(bones)}: landmarks are found from the cranium, add it"
         )
-    return _Bones(joined(upper), joined(lower) if lower else None)
+    return HeadSurfaces(joined(upper), joined(lower) if lower else None, skin)
 
 
 def _check_head(skull: Mapping[str, Floats]) -> None:
@@ -151,30 +149,38 @@ def _likeness(
     else:
         other = _template_pose(template, templates[0])
         points, normals = surface_samples(upper, 2000)
-        shape = _parts(template.bones).upper
+        shape = _template_surfaces(template).upper
         moved = SurfaceData(other.into(shape.vertices) / other.size, shape.triangles)
         distance = distance_from(pose.into(points) / pose.size, normals @ pose.axes.T, moved)
     return 1.0 / (1.0 + (distance / LIKENESS) ** 2)
 
 
+@lru_cache(maxsize=2)
+def _template_surfaces(template: TemplateHead) -> HeadSurfaces:
+    return _surfaces(template.bones, template.skin)
+
+
 @lru_cache(maxsize=8)
 def _template_pose(template: TemplateHead, average: TemplateHead) -> Pose:
-    parts = _parts(template.bones)
+    parts = _template_surfaces(template)
     if template is average:
         pose = Pose(np.zeros(3), np.eye(3), 1.0, 0.0)
     else:
         pose = find_pose(parts.upper, average.bones["cranium"])
     for _ in range(LEVEL_ROUNDS):
-        pose = levelled(pose, detect(parts.upper, parts.lower, None, pose).skull, average.skull)
+        pose = levelled(pose, detect(parts, pose, skin=False).skull, average.skull)
     return pose
 
 
 @lru_cache(maxsize=8)
-def _template_biases(
+def measured_biases(
     template: TemplateHead, average: TemplateHead
-) -> tuple[dict[str, Floats], dict[str, Floats]]:
-    parts = _parts(template.bones)
-    return biases(template, parts.upper, parts.lower, _template_pose(template, average))
+) -> tuple[Mapping[str, Floats], Mapping[str, Floats]]:
+    """How far the landmarks of a template lie from where its sites are found: skull and skin.
+
+    In the frame and size of the average head, (3,) each.
+    """
+    return biases(template, _template_surfaces(template), _template_pose(template, average))
 
 
 def _corrected(
@@ -184,7 +190,7 @@ def _corrected(
     results: list[dict[str, Floats]] = [dict(found.skull), dict(found.skin)]
     total = max(1.0, float(sum(likeness)))
     for template, weight in zip(templates, likeness, strict=True):
-        shares = _template_biases(template, templates[0])
+        shares = template.biases or measured_biases(template, templates[0])
         for sites, bias in zip(results, shares, strict=True):
             for name in sites.keys() & bias.keys():
                 sites[name] = sites[name] + weight / total * bias[name]

@@ -59,8 +59,9 @@ FACE_AT, FACE_SLOPE, HOLLOW = -87.0, 0.45, 9.0
 ORBIT_X, ORBIT_Z = (12.0, 54.0), (-16.0, 52.0)
 # Area of an orbit at least, mm².
 LEAST_ORBIT = 300.0
-# The lateral rim slopes back: the hollow ends before it, and its middle is so far out, mm.
-LATERAL_RIM = 0.5
+# The lateral rim slopes back: the hollow ends before it, and its middle is so far out, mm. In the
+# middle between two real heads, in which 3 mm and none fit best.
+LATERAL_RIM = 2.0
 
 
 def find_orbit(view: SideView) -> Orbit | None:
@@ -94,7 +95,7 @@ def find_orbit(view: SideView) -> Orbit | None:
 # lower border of the cheekbone, mm.
 TO_FOREHEAD, TO_MALAR = 32.5, 18.5
 # That border is looked for so far out, as a factor on the orbit's middle.
-MALAR_OUT = 1.065
+MALAR_OUT = 1.02
 # The cheekbone beside the orbit lies so far behind and above its lower rim, mm.
 LATERAL_BEHIND, LATERAL_ABOVE = 12.0, 4.5
 # Rims are the farthest points in these directions: forwards, and so much down or up.

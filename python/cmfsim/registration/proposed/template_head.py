@@ -25,6 +25,9 @@ class TemplateHead(Frozen):
         Its skull landmarks by label.
     skin : SurfaceData or None
     skin_landmarks : mapping of str to (3,) float64, mm
+    biases : tuple of two mappings of str to (3,) float64, mm, or None
+        How far the landmarks of skull and skin lie from where their definitions put them on this
+        head, in its own frame; None where that has to be measured.
 
     Raises
     ------
@@ -37,6 +40,7 @@ class TemplateHead(Frozen):
     skull: Mapping[str, Floats]
     skin: SurfaceData | None = None
     skin_landmarks: Mapping[str, Floats] = field(default_factory=dict)
+    biases: tuple[Mapping[str, Floats], Mapping[str, Floats]] | None = None
 
     def __post_init__(self) -> None:
         as_text("name of the template head", self.name)

@@ -1,0 +1,26 @@
+"""Surfaces of levels: closed, of the right size, without vertices that belong to nothing."""
+
+import numpy as np
+import pytest
+
+import cmfsim
+from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
+
+pytest.importorskip("skimage")
+pytest.importorskip("scipy")
+
+
+def test_a_voxel_that_is_hardly_inside_leaves_no_vertex():
+    """All vertices of its surface fall together: smoothing divided them by no neighbour."""
+    values = np.full((24, 24, 24), -1.0, dtype=np.float32)
+    x, y, z = np.indices(values.shape)
+    values = np.clip(6.0 - np.sqrt((x - 9.0) ** 2 + (y - 9.0) ** 2 + (z - 9.0) ** 2), -1.0, 1.0)
+    values[20, 20, 20] = 1e-30
+    level = cmfsim.ImageData(values.astype(np.float32), (1.0, 1.0, 1.0))
+    for smoothing in (0, 6):
+        surface = surface_of_level("ball", level, SurfaceOptions(smoothing=smoothing))
+        assert np.isfinite(surface.vertices).all()
+        np.testing.assert_array_equal(
+            np.unique(surface.triangles), np.arange(len(surface.vertices))
+        )
+        assert np.abs(np.linalg.norm(surface.vertices - 9.0, axis=1) - 6.0).max() < 0.2
