@@ -15,7 +15,7 @@ NASION_BELOW = 1.0
 # The wing of the nose is widest so far behind its tip, mm.
 WING_BEHIND = 21.5
 # The corners of the eye lie at these shares of the distance of the orbit's middle from the midline.
-INNER_CORNER, OUTER_CORNER = 0.54, 1.53
+INNER_CORNER, OUTER_CORNER = 0.54, 1.46
 # The slit of the eye lies so far below the middle of the orbit, mm.
 EYE_BELOW = 2.5
 # The corners of the mouth lie so far from its middle, mm.
