@@ -1,7 +1,7 @@
 """Values that tests of several files need, made once in a run of the suite, whatever process asks.
 
 They are pickled in the folder of temporary files that the processes of pytest-xdist share, which
-every run makes anew: no value outlives the code that made it.
+every run creates for itself: no value outlives the code that made it.
 """
 
 import contextlib

@@ -221,17 +221,19 @@ def _without_slits(
     _, first, back = np.unique(points[centred], axis=0, return_index=True, return_inverse=True)
     same = np.arange(len(points))
     same[centred] = centred[first[back.reshape(-1)]]
-    own = same == np.arange(len(points))
-    joined = (np.cumsum(own) - 1)[same][triangles]
+    joined = same[triangles]
     kept = (
         (joined[:, 0] != joined[:, 1])
         & (joined[:, 1] != joined[:, 2])
         & (joined[:, 2] != joined[:, 0])
     )
-    left, places = joined[kept], points[own]
-    used = np.zeros(len(places), dtype=bool)
-    used[left] = True
-    return (np.cumsum(used) - 1)[left], places[used]
+    return _used(points, joined[kept])
+
+
+def _used(points: Floats, triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], Floats]:
+    """The triangles and the points that they use, in their order, renumbered."""
+    used, numbers = np.unique(triangles, return_inverse=True)
+    return numbers.reshape(triangles.shape), points[used]
 
 
 def _smoothed(points: Floats, triangles: NDArray[np.int64], rounds: int) -> Floats:
@@ -281,10 +283,10 @@ def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> S
     if len(triangles) <= max_triangles:
         return surface
     points, corners = _simplified(name, surface.vertices, triangles, max_triangles)
-    used, numbers = np.unique(corners, return_inverse=True)
-    if not len(used):
+    if not len(corners):
         raise CaseInputError(f"nothing is left of {name!r} at {max_triangles} triangles")
-    return SurfaceData(points[used], numbers.reshape(corners.shape))
+    left, used = _used(points, corners)
+    return SurfaceData(used, left)
 
 
 def _simplified(

@@ -47,8 +47,8 @@ mandible = "mandible.ply"
 """
 # Tissue of the phantom's CT at 2 mm and this edge, as the build found it, mm³.
 ORDINARY = 1.2056e6
-# How each is made harder, the finding that says so, the part of the ordinary volume of tissue that
-# is left (a head cut off has less of it), and how near the face is to that of the reference: median
+# How each is made harder, the finding that reports it, the part of the ordinary volume of tissue
+# that is left (a head cut off has less of it), how near the face is to the reference: median
 # and 95th percentile of distances, mm, and least Dice of the mandible; None: not measured.
 HARD = {
     "metal": (variants.with_metal, {"metal"}, (0.9, 1.1), (0.4, 3.0, 0.75)),

@@ -12,8 +12,7 @@ pytest.importorskip("scipy")
 
 def test_a_voxel_that_is_hardly_inside_leaves_no_vertex():
     """All vertices of its surface fall together: smoothing divided them by no neighbour."""
-    values = np.full((24, 24, 24), -1.0, dtype=np.float32)
-    x, y, z = np.indices(values.shape)
+    x, y, z = np.indices((24, 24, 24))
     values = np.clip(6.0 - np.sqrt((x - 9.0) ** 2 + (y - 9.0) ** 2 + (z - 9.0) ** 2), -1.0, 1.0)
     values[20, 20, 20] = 1e-30
     level = cmfsim.ImageData(values.astype(np.float32), (1.0, 1.0, 1.0))
