@@ -10,7 +10,7 @@ from cmfsim.pictures.anatomy import (
     segment_colours,
 )
 from cmfsim.pictures.bands import band_picture, picture_band
-from cmfsim.pictures.beside import Painter, PictureJob
+from cmfsim.pictures.beside import Painter, Picture
 from cmfsim.pictures.charts import MODEL_COLOURS, chart_errors
 from cmfsim.pictures.distances import (
     DISTANCE_LIMIT,
@@ -35,7 +35,7 @@ __all__ = [
     "SEGMENT_COLOURS",
     "SKIN_COLOUR",
     "Painter",
-    "PictureJob",
+    "Picture",
     "ViewPart",
     "band_picture",
     "chart_errors",

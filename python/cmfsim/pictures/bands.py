@@ -1,13 +1,13 @@
 """The band of a prediction painted on its skin."""
 
 import os
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from cmfsim.errors import CaseInputError
-from cmfsim.pictures.beside import PictureJob
+from cmfsim.pictures.beside import Picture
 from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.distances import NOT_EVALUATED
 from cmfsim.pictures.skin_ends import skin_ends, trimmed
@@ -48,14 +48,14 @@ def picture_band(
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_band("band.png", prediction)  # doctest: +SKIP
     """
-    band_picture(prediction, size=size).draw(Path(path))
+    band_picture(prediction, size=size)(path)
 
 
-def band_picture(prediction: Prediction, *, size: tuple[int, int] = SIZE) -> PictureJob:
+def band_picture(prediction: Prediction, *, size: tuple[int, int] = SIZE) -> Picture:
     """The picture that `picture_band` writes, to be drawn later."""
     if prediction.band is None:
         raise CaseInputError("the prediction has no band: use predict_with_band")
-    return PictureJob(picture_half_width, skin=prediction.skin, band=prediction.band, size=size)
+    return partial(picture_half_width, skin=prediction.skin, band=prediction.band, size=size)
 
 
 def picture_half_width(

@@ -8,29 +8,21 @@ import base64
 import contextlib
 import pickle
 import sys
-from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from cmfsim.errors import CaseError, CaseInputError
 from cmfsim.io.parallel import Worker
 from cmfsim.pictures.canvas import NO_OPENGL, pyvista_module, without_probe
 
-__all__ = ["Painter", "PictureJob", "draw_packed", "load"]
+__all__ = ["Painter", "Picture", "draw_packed", "load"]
 
-
-class PictureJob:
-    """A function of this package that draws a picture, and what it takes beside the path."""
-
-    def __init__(self, function: Callable[..., None], /, **given: Any) -> None:
-        self.function = function
-        self.given: Mapping[str, Any] = given
-
-    def draw(self, path: Path) -> None:
-        """Draws it in this process."""
-        self.function(path, **self.given)
+# What draws a picture at a path: a function of this package with all else that it takes, which can
+# be pickled.
+Picture = partial[None]
 
 
 class Painter:
@@ -59,14 +51,14 @@ class Painter:
             self._worker.end()
         self._queue.shutdown(cancel_futures=True)
 
-    def begin(self, job: PictureJob, path: Path) -> "Future[None]":
-        """The picture to come; its result raises what `draw` does.
+    def begin(self, picture: Picture, path: Path) -> "Future[None]":
+        """The picture to come; its result raises what drawing it here would.
 
         What the picture shows is taken now: it may not change afterwards.
         """
         if self._worker is None:
-            return self._queue.submit(job.draw, path)
-        return self._queue.submit(self._draw, self._worker, job, path)
+            return self._queue.submit(picture, path)
+        return self._queue.submit(self._draw, self._worker, picture, path)
 
     @staticmethod
     def _load(worker: Worker) -> None:
@@ -75,8 +67,8 @@ class Painter:
             worker.answer("cmfsim.pictures.beside:load", {})
 
     @staticmethod
-    def _draw(worker: Worker, job: PictureJob, path: Path) -> None:
-        packed = base64.b64encode(pickle.dumps((job.function, dict(job.given)))).decode()
+    def _draw(worker: Worker, picture: Picture, path: Path) -> None:
+        packed = base64.b64encode(pickle.dumps(picture)).decode()
         try:
             worker.answer(
                 "cmfsim.pictures.beside:draw_packed",
@@ -97,6 +89,6 @@ def load() -> None:
 
 def draw_packed(path: str, packed: str) -> None:
     """Draws a picture of `Painter`, in its process."""
-    function, given = pickle.loads(base64.b64decode(packed))  # noqa: S301 (of the own parent)
+    picture: Picture = pickle.loads(base64.b64decode(packed))  # noqa: S301 (of the own parent)
     with without_probe():
-        function(Path(path), **given)
+        picture(Path(path))

@@ -2,13 +2,13 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
-from cmfsim.pictures.beside import PictureJob
+from cmfsim.pictures.beside import Picture
 from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.skin_ends import SkinEnds, skin_ends, trimmed
 from cmfsim.values.clinical_motion import plan_lines
@@ -61,12 +61,12 @@ def picture_prediction(
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_prediction("prediction.png", prediction)  # doctest: +SKIP
     """
-    prediction_picture(prediction, size=size).draw(Path(path))
+    prediction_picture(prediction, size=size)(path)
 
 
-def prediction_picture(prediction: Prediction, *, size: tuple[int, int] = TWO_ROWS) -> PictureJob:
+def prediction_picture(prediction: Prediction, *, size: tuple[int, int] = TWO_ROWS) -> Picture:
     """The picture that `picture_prediction` writes, to be drawn later."""
-    return PictureJob(
+    return partial(
         picture_faces,
         before=prediction.face_before,
         after=prediction.face,
@@ -146,14 +146,14 @@ def picture_plan(
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_plan("plan.png", prediction)  # doctest: +SKIP
     """
-    plan_picture(prediction, size=size).draw(Path(path))
+    plan_picture(prediction, size=size)(path)
 
 
-def plan_picture(prediction: Prediction, *, size: tuple[int, int] = SIZE) -> PictureJob:
+def plan_picture(prediction: Prediction, *, size: tuple[int, int] = SIZE) -> Picture:
     """The picture that `picture_plan` writes, to be drawn later."""
     after = prediction.bones
     plan = {name: m["clinical"] for name, m in prediction.summary.get("plan", {}).items()}
-    return PictureJob(
+    return partial(
         picture_motions,
         before={s.name: s.surface for s in prediction.patient.segments},
         after={

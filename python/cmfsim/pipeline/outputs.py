@@ -41,7 +41,7 @@ from cmfsim.io.summaries import write_summary
 from cmfsim.muscles.template import joined_surface
 from cmfsim.pictures import (
     Painter,
-    PictureJob,
+    Picture,
     band_picture,
     chart_errors,
     picture_distances,
@@ -192,8 +192,8 @@ def write_results(
             (fresh / place).mkdir(exist_ok=True)
             begun = {}
             if pictures(prediction.model):
-                for name, job in _pictures_of(prediction):
-                    begun[name] = painter.begin(job, fresh / place / name)
+                for name, picture in _pictures_of(prediction):
+                    begun[name] = painter.begin(picture, fresh / place / name)
             more = partial(_more_files, prediction, begun, clock, slicer=slicer)
             clock.begin(place, prediction.summary["timings"])
             with clock.timed("writing the files"):
@@ -298,12 +298,12 @@ def _drawn(begun: Mapping[str, "Future[None]"]) -> list[str]:
     return names
 
 
-def _pictures_of(prediction: Prediction) -> Iterator[tuple[str, PictureJob]]:
+def _pictures_of(prediction: Prediction) -> Iterator[tuple[str, Picture]]:
     if prediction.muscles is not None:
         segments = prediction.patient.segments
         yield (
             "muscles.png",
-            PictureJob(
+            partial(
                 picture_muscles,
                 musculature=Musculature(prediction.muscles.muscles),
                 skull=joined_surface([segment.surface for segment in segments]),
