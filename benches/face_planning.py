@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 import cmfsim
 from cmfsim.phantom.demo import write_demo_case
+from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
 from marked import publish
 
@@ -100,7 +101,7 @@ def search_again(
     off = stated(planning, found.plan, names) - stated(planning, plan, names)
     variance, axes = np.linalg.eigh(found.covariance)
     deviations = np.sqrt(np.diagonal(found.covariance))
-    sure = np.sqrt(variance) <= DETERMINED
+    sure = np.sqrt(variance.clip(min=0.0)) <= DETERMINED
     return Found(np.abs(off), np.abs(off) <= 2.0 * deviations, np.abs(axes.T @ off)[sure], seconds)
 
 
@@ -110,7 +111,9 @@ def table(planning: cmfsim.PlanningModel, plans: int) -> str:
         HEAD,
         "| ---: | ---: | --- |" + " ---: |" * 8,
     ]
-    for count, noise, prior in ((120, 0.0, True), (120, 0.0, False), (30, NOISE, False)):
+    default = f"{cmfsim.FaceSearch().prior_shift:g}"
+    rows = ((120, 0.0, True), (120, 0.0, False), (30, NOISE, True), (30, NOISE, False))
+    for count, noise, prior in rows:
         found = [search_again(planning, count, noise, seed, prior=prior) for seed in range(plans)]
         errors = np.concatenate([one.errors for one in found])
         sure = np.concatenate([one.determined for one in found])
@@ -118,7 +121,7 @@ def table(planning: cmfsim.PlanningModel, plans: int) -> str:
         seconds = [one.seconds for one in found]
         noisy = noise > 0.0
         lines.append(
-            f"| {count} | {noise:g} | {'20' if prior else 'none'} | {len(found)} "
+            f"| {count} | {noise:g} | {default if prior else 'none'} | {len(found)} "
             f"| {errors.max():.2g} | {np.percentile(errors, 95):.2g} "
             f"| {f'{len(sure)} of {len(errors)}' if noisy else '-'} "
             f"| {f'{np.percentile(sure, 95):.2g}' if noisy else '-'} "
@@ -136,7 +139,7 @@ def truth_table(folders: Sequence[Path]) -> str:
         "| --- | --- | --- |" + " ---: |" * 6,
     ]
     for folder in folders:
-        patient = build_patient(folder / "case.toml", ("M+S",), check=False)
+        patient = build_patient(folder / "case.toml", ("M+S",), BuildOptions(check=False))
         operated = dict(patient.scene.plan)
         still = {name: np.eye(4) for name in operated}
         planning = cmfsim.planning_model(patient, "M+S", reference=still)
@@ -182,7 +185,7 @@ def main(words: Sequence[str] | None = None) -> int:
     made = write_demo_case(options.folder, edge_length=options.edge_length)
     text = made.case.file.read_text(encoding="utf-8")
     made.case.file.write_text(text + GENIOPLASTY, encoding="utf-8")
-    patient = build_patient(made.case.file, (options.model,), check=False)
+    patient = build_patient(made.case.file, (options.model,), BuildOptions(check=False))
     planning = cmfsim.planning_model(
         patient, options.model, reference={name: np.eye(4) for name in patient.scene.plan}
     )

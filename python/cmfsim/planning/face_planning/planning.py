@@ -28,7 +28,7 @@ NUMBERS = ("forwards", "up", "left", "pitch", "yaw", "roll")
 AT_BOUND = 1e-6
 # Standard deviation of an undetermined number, mm or degrees; and the share of the prior's standard
 # deviation above which a number counts as open.
-OPEN, OPEN_SHARE = 1e3, 0.5
+OPEN, OPEN_SHARE = 1e3, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,15 +59,15 @@ class FaceSearch:
     >>> import cmfsim
     >>> search = cmfsim.FaceSearch(follows={"mandible_body": "maxilla"}, shift=10.0)
     >>> search.prior_turn
-    20.0
+    40.0
     """
 
     segments: Sequence[str] | None = None
     follows: Mapping[str, str] = field(default_factory=dict)
     shift: float = 15.0
     turn: float = 15.0
-    prior_shift: float | None = 20.0
-    prior_turn: float | None = 20.0
+    prior_shift: float | None = 40.0
+    prior_turn: float | None = 40.0
     steps: int = 50
 
     def __post_init__(self) -> None:
@@ -94,8 +94,8 @@ class FacePlan:
     covariance : (6 s, 6 s) float64
         Of the numbers of the free segments, one after the other; 0 where a number is at a bound.
     undetermined : tuple of str
-        Numbers that the targets leave open: their standard deviation is more than half that of the
-        prior, or there is no prior and nothing else determines the number.
+        Numbers that the targets leave open: their standard deviation is more than a quarter of
+        that of the prior, or there is no prior and nothing else determines the number.
     at_bounds : tuple of str
         Numbers that are at a bound.
     residuals : tuple of (m,) float64

@@ -21,6 +21,9 @@ FIRST_DAMPING, HARDER, SOFTER = 1e-3, 10.0, 0.1
 MOST_DAMPING = 1e12
 # A step below this, mm or degrees, ends the search.
 STILL = 1e-7
+# So does one that would lower the sum of squares by less than this share, along a valley that
+# residuals do not determine.
+FLAT = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +37,7 @@ class Minimum:
     jacobian : (m, n) float64
     steps : int
     converged : bool
-        Whether the last step was too small to matter, before the steps ran out.
+        Whether the next step is too small to matter, before the steps ran out.
     """
 
     x: Floats
@@ -76,9 +79,11 @@ def bounded_least_squares(
             step = np.zeros_like(x)
             step[free] = -np.linalg.solve(normal + damping * np.diag(scale), gradient[free])
             there = np.clip(x + step, low, high)
-            moved = float(np.abs(there - x).max())
-            if moved <= STILL or damping > MOST_DAMPING:
-                return Minimum(x, r, jacobian, taken, converged=moved <= STILL)
+            change = jacobian @ step
+            still = float(np.abs(there - x).max()) <= STILL
+            still |= float(-2.0 * (r @ change) - change @ change) <= FLAT * float(r @ r)
+            if still or damping > MOST_DAMPING:
+                return Minimum(x, r, jacobian, taken, converged=still)
             found = residuals(there)
             if found @ found < r @ r:
                 break
