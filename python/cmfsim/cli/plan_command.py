@@ -27,6 +27,7 @@ from cmfsim.pipeline.preparation import prepare
 from cmfsim.planning.face_planning import FacePlan, FaceSearch, plan_for_face
 from cmfsim.planning.page import PAGE_FILE, PageContent, page_content, write_planning_page
 from cmfsim.planning.replanning import (
+    USUAL,
     ExpectedError,
     PlanCorrection,
     PlanningModel,
@@ -177,9 +178,10 @@ def _error_text(errors: ExpectedError) -> str:
 
 def _correction_text(correction: PlanCorrection) -> str:
     before, after = float(correction.before.max()), float(correction.left_out.max())
+    usual = float(np.percentile(correction.left_out, USUAL))
     return (
         f"corrected by {len(correction.plans)} other plans: {before:.2f} mm at most before, "
-        f"{after:.2f} mm where each was left out"
+        f"{after:.2f} mm where each was left out (nine of ten: {usual:.2f} mm)"
     )
 
 

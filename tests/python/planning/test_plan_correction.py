@@ -52,7 +52,8 @@ def fitted(numbers):
     rng = np.random.default_rng(0)
     plans = [near(rng) for _ in range(120)]
     places = np.array([numbers.of(plan) for plan in plans])
-    return fitted_correction(numbers, places, np.array([curved(numbers, p) for p in plans]))
+    errors = np.array([curved(numbers, p) for p in plans])
+    return fitted_correction(numbers, places, np.ones(len(plans)), errors)
 
 
 def test_numbers_are_shifts_and_turns_of_the_middle(numbers):
@@ -112,7 +113,7 @@ def test_far_from_every_plan_the_operator_is_left_alone(fitted):
 def test_errors_without_order_are_not_corrected(numbers):
     rng = np.random.default_rng(4)
     places = np.array([numbers.of(near(rng)) for _ in range(60)])
-    _, pays = fitted_correction(numbers, places, rng.normal(size=(60, NODES, 3)))
+    _, pays = fitted_correction(numbers, places, np.ones(60), rng.normal(size=(60, NODES, 3)))
     assert not pays
 
 
@@ -126,12 +127,15 @@ def test_what_is_left_out_is_what_a_fit_to_the_others_leaves(numbers):
         patch.setattr("cmfsim.planning.replanning.correction.LENGTHS", (10.0,))
         patch.setattr("cmfsim.planning.replanning.correction.NOISES", (1e-8,))
         patch.setattr("cmfsim.planning.replanning.correction.KEPT_ENERGY", 1.0 - 1e-12)
-        whole, _ = fitted_correction(numbers, places, errors)
+        whole, _ = fitted_correction(numbers, places, np.ones(len(places)), errors)
         for out in (0, 17):
             others = np.arange(len(plans)) != out
-            part, _ = fitted_correction(numbers, places[others], errors[others])
+            part, _ = fitted_correction(
+                numbers, places[others], np.ones(others.sum()), errors[others]
+            )
             away = np.linalg.norm(errors[out] - part.displacements(plans[out]), axis=1)
             assert whole.left_out[out] == pytest.approx(away.max(), rel=1e-3, abs=1e-5)
+            assert whole.left_out_mean[out] == pytest.approx(away.mean(), rel=1e-3, abs=1e-5)
 
 
 def test_some_of_the_nodes_are_corrected_as_all_of_them(fitted):

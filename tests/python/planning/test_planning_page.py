@@ -143,7 +143,9 @@ def test_the_command_corrects_the_page_and_states_it(folder, planning, capsys):
     correction = planning.correction
     text = _correction_text(correction)
     assert f"by {len(correction.plans)} other plans: {correction.before.max():.2f} mm" in text
-    assert f"{correction.left_out.max():.2f} mm where each was left out" in text
+    usual = np.percentile(correction.left_out, 90)
+    left_out = correction.left_out.max()
+    assert f"{left_out:.2f} mm where each was left out (nine of ten: {usual:.2f}" in text
 
 
 def test_corrections_are_the_same_each_time(bare, planning):
@@ -217,6 +219,22 @@ def test_the_expected_error_is_that_of_the_trials(planning, errors):
     assert largest >= trial.largest * (1 - 1e-12)
     assert errors.at(0.0) == (0.0, 0.0)
     assert errors.at(1.01 * errors.reach) is None
+    assert errors.usual(1.01 * errors.reach) is None
+    # Plans of the correction count as well, each as the others predict it.
+    correction = planning.correction
+    ratios = np.concatenate(
+        [
+            [t.largest / t.distance for t in errors.trials],
+            correction.left_out / correction.distances,
+        ]
+    )
+    assert largest == pytest.approx(trial.distance * ratios.max())
+    assert errors.usual(trial.distance) == pytest.approx(
+        trial.distance * np.percentile(ratios, 90.0)
+    )
+    assert errors.usual(trial.distance) < largest
+    drawn = again_plans(planning, len(correction.distances))
+    assert correction.distances[0] == pytest.approx(plan_distance(planning, drawn[0]))
     # Trials differ from the reference, by no more than what was asked for.
     assert 1.0 < trial.distance < 5.0 * 3**0.5 + 15.0
 
@@ -589,8 +607,12 @@ def test_the_error_is_stated_and_warned_of_beyond_what_was_tried(opened, errors,
     type_number(opened, "forwards", -4.5)
     until(opened, "document.getElementById('error-state').textContent.startsWith('Expected')")
     plan = motions_of(opened, planning)
-    mean, largest = errors.at(plan_distance(planning, plan))
-    assert f"{mean:.2f} mm on average, {largest:.2f} mm at most" in state.inner_text()
+    distance = plan_distance(planning, plan)
+    mean, largest = errors.at(distance)
+    assert (
+        f"{mean:.2f} mm on average; at most {errors.usual(distance):.2f} mm in nine of ten plans "
+        f"as far away, {largest:.2f} mm in the worst"
+    ) in state.inner_text()
     type_number(opened, "forwards", -28)
     until(opened, "document.querySelector('#error-state.warning')")
     assert "farther than any plan that was tried" in state.inner_text()

@@ -3,6 +3,7 @@
 from cmfsim.planning.replanning.corrected import CORRECTIONS, corrected_planning
 from cmfsim.planning.replanning.correction import PlanCorrection
 from cmfsim.planning.replanning.expected_error import (
+    USUAL,
     ExpectedError,
     PlanTrial,
     expected_error,
@@ -14,6 +15,7 @@ from cmfsim.planning.replanning.plan_band import PlanBand, plan_band
 
 __all__ = [
     "CORRECTIONS",
+    "USUAL",
     "ExpectedError",
     "Motions",
     "PlanBand",

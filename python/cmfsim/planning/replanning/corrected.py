@@ -10,7 +10,12 @@ import numpy as np
 from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, ContactError, SolverError
 from cmfsim.planning.replanning.correction import PlanNumbers, fitted_correction
-from cmfsim.planning.replanning.expected_error import moving_segments, plan_near, segment_boxes
+from cmfsim.planning.replanning.expected_error import (
+    moving_segments,
+    plan_distance,
+    plan_near,
+    segment_boxes,
+)
 from cmfsim.planning.replanning.model import Motions, PlanningModel
 
 __all__ = ["CORRECTIONS", "corrected_planning"]
@@ -79,16 +84,19 @@ def corrected_planning(
     # A stream of its own, so that no plan is one of those by which the error is measured.
     rng = np.random.default_rng((seed, 1))
     drawn = [plan_near(bare, rng, shift, turn) for _ in range(plans)]
-    places, errors = [], []
+    places, distances, errors = [], [], []
     for number, exact in enumerate(_solved(bare, drawn)):
         if progress is not None:
             progress(f"solving plans nearby to correct the operator ({number + 1} of {plans})")
         if exact is not None:
             places.append(numbers.of(drawn[number]))
+            distances.append(plan_distance(bare, drawn[number]))
             errors.append(exact - bare.displacements(drawn[number]))
     if len(places) < LEAST_PLANS:
         return bare
-    correction, pays = fitted_correction(numbers, np.array(places), np.array(errors))
+    correction, pays = fitted_correction(
+        numbers, np.array(places), np.array(distances), np.array(errors)
+    )
     return replace(bare, correction=correction) if pays else bare
 
 

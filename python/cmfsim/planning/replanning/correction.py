@@ -99,6 +99,10 @@ class PlanCorrection:
     before, left_out : (n,) float64, mm
         The largest error at each plan, without the correction and with the one fitted to all other
         plans.
+    left_out_mean : (n,) float64, mm
+        The mean error at each plan with the correction fitted to all other plans.
+    distances : (n,) float64, mm
+        Of each plan from the reference, as `plan_distance`.
     """
 
     numbers: PlanNumbers
@@ -108,6 +112,8 @@ class PlanCorrection:
     shapes: Floats
     before: Floats
     left_out: Floats
+    left_out_mean: Floats
+    distances: Floats
 
     def amounts(self, plan: Mapping[str, ArrayLike]) -> Floats:
         """The amount of each shape under a plan, (m,)."""
@@ -124,7 +130,7 @@ class PlanCorrection:
 
 
 def fitted_correction(
-    numbers: PlanNumbers, plans: Floats, errors: Floats
+    numbers: PlanNumbers, plans: Floats, distances: Floats, errors: Floats
 ) -> tuple[PlanCorrection, bool]:
     """The correction that interpolates errors of the operator, and whether it pays.
 
@@ -133,6 +139,8 @@ def fitted_correction(
     numbers : PlanNumbers
     plans : (n, s, 6) float64, mm
         Their values at plans that were solved exactly; at least two.
+    distances : (n,) float64, mm
+        Of these plans from the reference.
     errors : (n, k, 3) float64, mm
         Exact displacements minus the operator's.
 
@@ -152,7 +160,7 @@ def fitted_correction(
     inverse = _inverse(plans, length, noise)
     # Each plan's error with the interpolation of all others (Rasmussen and Williams 2006, 5.12).
     apart = inverse / np.diagonal(inverse)[:, None]
-    left_out = np.linalg.norm((apart @ rows).reshape(errors.shape), axis=2).max(axis=1)
+    left_out = np.linalg.norm((apart @ rows).reshape(errors.shape), axis=2)
     before = np.linalg.norm(errors, axis=2).max(axis=1)
     energy, vectors = np.linalg.eigh(gram)
     energy, vectors = energy[::-1].clip(min=0.0), vectors[:, ::-1]
@@ -168,9 +176,11 @@ def fitted_correction(
         inverse @ vectors * largest,
         (shapes / largest).reshape(nodes, 3, -1),
         before,
-        left_out,
+        left_out.max(axis=1),
+        left_out.mean(axis=1),
+        distances,
     )
-    pays = float((left_out**2).sum()) < PAYS**2 * float((before**2).sum())
+    pays = float((correction.left_out**2).sum()) < PAYS**2 * float((before**2).sum())
     return correction, pays
 
 

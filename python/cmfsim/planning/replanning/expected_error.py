@@ -14,6 +14,7 @@ from cmfsim.progress import Progress
 from cmfsim.values.motion import rigid_motion
 
 __all__ = [
+    "USUAL",
     "ExpectedError",
     "PlanTrial",
     "expected_error",
@@ -25,6 +26,8 @@ __all__ = [
 
 # Plans are tried at these shares of the range, one after the other.
 SHARES = (1.0, 0.5)
+# The usual error is the one that this percentage of the plans stays within.
+USUAL = 90.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,33 +67,50 @@ class ExpectedError:
         The range: along each axis, and about any axis.
     slides : bool
         Whether tissue slides; if not, the product is exact.
+    left_out : (n, 3) float64, mm
+        Distance, mean and largest error of the plans that correct the operator, each with the
+        correction fitted to all others; none where nothing is corrected.
     """
 
     trials: tuple[PlanTrial, ...]
     shift: float
     turn: float
     slides: bool
+    left_out: Floats
 
     @property
     def reach(self) -> float:
         """The largest distance from the reference at which a plan was solved, mm."""
-        return max((t.distance for t in self.trials if not t.failed), default=0.0)
+        return float(self._measured()[:, 0].max(initial=0.0))
 
     def at(self, distance: float) -> tuple[float, float] | None:
         """Mean and largest error to expect at a distance from the reference, mm.
 
-        The largest measured ratio of error to distance, times the distance. The error grows faster
-        than the distance, so this overestimates near the reference. None beyond `reach`, where no
-        plan was tried.
+        The largest measured ratio of error to distance, times the distance, over all trials and
+        all plans that were left out of the correction. The error grows faster than the distance,
+        so this overestimates near the reference. None beyond `reach`, where no plan was tried.
         """
-        if not self.slides:
-            return 0.0, 0.0
-        if distance > self.reach:
+        if distance > self.reach and self.slides:
             return None
-        solved = [t for t in self.trials if t.mean is not None and t.largest is not None]
-        means = [t.mean / t.distance for t in solved if t.mean is not None]
-        worst = [t.largest / t.distance for t in solved if t.largest is not None]
-        return distance * max(means, default=0.0), distance * max(worst, default=0.0)
+        mean, largest = self._ratios().max(axis=0, initial=0.0)
+        return distance * float(mean), distance * float(largest)
+
+    def usual(self, distance: float) -> float | None:
+        """The largest error that nine of ten plans stay within at a distance, mm, as `at`."""
+        if distance > self.reach and self.slides:
+            return None
+        ratios = self._ratios()[:, 1]
+        return distance * float(np.percentile(ratios, USUAL)) if len(ratios) else 0.0
+
+    def _measured(self) -> Floats:
+        """Distance, mean and largest error of each plan that was solved, (n, 3) mm."""
+        rows = [(t.distance, t.mean, t.largest) for t in self.trials if not t.failed]
+        return np.concatenate([np.array(rows, dtype=np.float64).reshape(-1, 3), self.left_out])
+
+    def _ratios(self) -> Floats:
+        """Mean and largest error over the distance, (n, 2); none where the product is exact."""
+        found = self._measured() if self.slides else np.zeros((0, 3))
+        return np.asarray(found[:, 1:] / found[:, :1])
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
@@ -109,6 +129,10 @@ class ExpectedError:
                     "seconds": t.seconds,
                 }
                 for t in self.trials
+            ],
+            "left_out": [
+                {"distance_mm": distance, "mean_mm": mean, "largest_mm": largest}
+                for distance, mean, largest in self.left_out.tolist()
             ],
         }
 
@@ -183,8 +207,8 @@ def expected_error(
     --------
     >>> import cmfsim
     >>> found = cmfsim.expected_error(planning)  # doctest: +SKIP
-    >>> found.at(3.0)  # doctest: +SKIP
-    (0.012, 0.19)
+    >>> found.at(3.0), found.usual(3.0)  # doctest: +SKIP
+    ((0.012, 0.39), 0.11)
     """
     shift, turn = as_positive("shift", shift), as_positive("turn", turn)
     if isinstance(trials, bool) or not isinstance(trials, int) or trials < 1:
@@ -197,7 +221,13 @@ def expected_error(
         share = SHARES[number % len(SHARES)]
         plan = plan_near(planning, rng, share * shift, share * turn)
         found.append(_trial(planning, plan))
-    return ExpectedError(tuple(found), shift, turn, planning.slides)
+    correction = planning.correction
+    left_out = np.zeros((0, 3))
+    if correction is not None:
+        left_out = np.stack(
+            [correction.distances, correction.left_out_mean, correction.left_out], axis=1
+        )
+    return ExpectedError(tuple(found), shift, turn, planning.slides, left_out)
 
 
 def moving_segments(planning: PlanningModel) -> tuple[str, ...]:

@@ -248,7 +248,7 @@ class App {
 
   showError() {
     const box = document.getElementById("error-state");
-    const { slides, reach_mm: reach, trials } = this.page.expected_error;
+    const { slides, reach_mm: reach, trials, left_out: leftOut } = this.page.expected_error;
     const distance = this.face.distance(this.motions);
     const found = this.face.expectedError(this.motions);
     let warned = false;
@@ -264,11 +264,10 @@ class App {
     } else {
       const count = trials.filter((t) => !t.failed).length;
       const failed = trials.length - count;
-      const { correction } = this.page;
-      const corrected = correction ? ` that are not among the ${correction.plans} used to correct the operator` : "";
-      box.textContent = `Expected error of the face: ${found.mean.toFixed(2)} mm on average, ${found.largest.toFixed(2)} mm at most (an estimate from ${count} exact solutions${corrected}; this plan is ${distance.toFixed(1)} mm from the case's own, where contact was solved).`;
+      const corrected = leftOut.length ? ` and ${leftOut.length} left out of the correction in turn` : "";
+      box.textContent = `Expected error of the face: ${found.mean.toFixed(2)} mm on average; at most ${found.usual.toFixed(2)} mm in nine of ten plans as far away, ${found.largest.toFixed(2)} mm in the worst (an estimate from exact solutions of ${count} other plans${corrected}; this plan is ${distance.toFixed(1)} mm from the case's own, where contact was solved).`;
       if (failed) box.textContent += ` ${failed} more could not be solved.`;
-      warned = found.largest > WARNED_ERROR;
+      warned = found.usual > WARNED_ERROR;
     }
     if (this.solver.state) box.textContent += ` ${this.solver.state}`;
     box.classList.toggle("warning", warned);

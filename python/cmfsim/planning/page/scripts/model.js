@@ -8,6 +8,8 @@ import { moved } from "./rigid.js";
 
 // Points of the profile further apart than this, mm, before, have skin between them that is left out.
 const GAP = 15;
+// Share of the plans that the usual error is not exceeded at.
+const USUAL = 0.9;
 
 export class PatientFace {
   /** page: the values of the page; arrays: its unpacked numbers. */
@@ -133,15 +135,17 @@ export class PatientFace {
     return worst;
   }
 
-  /** Mean and largest error to expect of the operator, mm; null beyond what was tried. */
+  /** Errors to expect of the operator, mm: mean, largest at nine of ten plans and at the worst; null beyond what was tried. */
   expectedError(motions) {
-    const { slides, reach_mm: reach, trials } = this.page.expected_error;
-    if (!slides) return { mean: 0, largest: 0 };
+    const { slides, reach_mm: reach, trials, left_out: leftOut } = this.page.expected_error;
+    if (!slides) return { mean: 0, usual: 0, largest: 0 };
     const distance = this.distance(motions);
     if (distance > reach) return null;
-    const solved = trials.filter((t) => !t.failed);
-    const ratio = (key) => Math.max(0, ...solved.map((t) => t[key] / t.distance_mm));
-    return { mean: distance * ratio("mean_mm"), largest: distance * ratio("largest_mm") };
+    const solved = [...trials.filter((t) => !t.failed), ...leftOut];
+    const ratios = (key) => solved.map((t) => t[key] / t.distance_mm).sort((a, b) => a - b);
+    const [means, largest] = [ratios("mean_mm"), ratios("largest_mm")];
+    const at = (values, share) => distance * quantile(values, share);
+    return { mean: at(means, 1), usual: at(largest, USUAL), largest: at(largest, 1) };
   }
 
   /** How deep the lower teeth reach into the upper ones, mm; 0 where they do not. */
@@ -159,6 +163,15 @@ export class PatientFace {
     }
     return worst;
   }
+}
+
+/** The value of a sorted list at a share of its length, between its values as numpy.percentile. */
+function quantile(values, share) {
+  if (!values.length) return 0;
+  const place = share * (values.length - 1);
+  const low = Math.floor(place);
+  const high = Math.min(low + 1, values.length - 1);
+  return values[low] + (place - low) * (values[high] - values[low]);
 }
 
 const sameMotions = (a, b) => a === b || a.every((m, s) => m.every((v, i) => v === b[s][i]));
