@@ -25,6 +25,7 @@ PULLED = (-7, -4)
 
 def main(page_file: Path, out: Path) -> None:
     """Plans and chooses as a planner would, with a still after each part."""
+    out.mkdir(parents=True, exist_ok=True)
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
     with sync_playwright() as driver:
         chromium = driver.chromium.launch(executable_path=browser, args=["--no-sandbox"])

@@ -106,7 +106,7 @@ pub use mechanics::strain_energy::{EnergyState, StrainEnergy, TangentKind};
 pub use mechanics::tensors::{EdgeTensors, MassTensors, tet_tensor};
 pub use mechanics::tissue::{TetMaterial, Tissue};
 pub use mesh::{MeshQuality, TetMesh};
-pub use meshing::crack::part;
+pub use meshing::crack::{Parted, part};
 pub use meshing::signed_distance::signed_distance;
 pub use meshing::stuffing::distance::squared_distance;
 pub use meshing::stuffing::level::{Grid, LevelImage};

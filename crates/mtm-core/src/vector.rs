@@ -22,7 +22,12 @@ pub(crate) fn between(a: &[[f64; 3]], b: &[[f64; 3]], share: f64) -> Vec<[f64; 3
     if share == 1.0 {
         return b.to_vec();
     }
-    a.iter().zip(b).map(|(a, b)| add(*a, scaled(sub(*b, *a), share))).collect()
+    a.iter().zip(b).map(|(a, b)| towards(*a, *b, share)).collect()
+}
+
+/// The point at `share` of the way from `a` to `b`.
+pub(crate) fn towards(a: [f64; 3], b: [f64; 3], share: f64) -> [f64; 3] {
+    add(a, scaled(sub(b, a), share))
 }
 
 pub(crate) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {

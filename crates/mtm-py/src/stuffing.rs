@@ -6,7 +6,7 @@ use mtm_core::{
     ErrorKind, Grid, Halvings, LevelImage, Stuffed, StuffingOptions, part, signed_distance,
     squared_distance, stuff,
 };
-use numpy::PyArray3;
+use numpy::{PyArray2, PyArray3};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -110,14 +110,15 @@ pub fn signed_distance_image<'py>(
     arrays::volume(py, shape, level.into_values())
 }
 
-/// The mesh split along an open surface, and the number of duplicated nodes; tuple of mesh and count.
+/// The mesh split along an open surface, and for each new node the ends of the edge on which it lies, or twice
+/// the node that it is a copy of; tuple of mesh and (k, 2) uint32.
 #[pyfunction]
-pub fn part_mesh(
-    py: Python<'_>,
-    mesh: &Bound<'_, PyTetMesh>,
-    surface: &Bound<'_, PySurface>,
-) -> PyResult<(PyTetMesh, usize)> {
+pub fn part_mesh<'py>(
+    py: Python<'py>,
+    mesh: &Bound<'py, PyTetMesh>,
+    surface: &Bound<'py, PySurface>,
+) -> PyResult<(PyTetMesh, Bound<'py, PyArray2<u32>>)> {
     let (mesh, surface) = (mesh.get().core.clone(), surface.get().core.clone());
     let parted = interruptible(py, move |_| part(&mesh, &surface))?;
-    Ok((PyTetMesh::wrap(Arc::new(parted.mesh)), parted.doubled))
+    Ok((PyTetMesh::wrap(Arc::new(parted.mesh)), arrays::table(py, parted.parents)))
 }

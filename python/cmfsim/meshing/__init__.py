@@ -2,12 +2,12 @@
 
 from cmfsim.meshing.levels import anatomy_from_surfaces, signed_level
 from cmfsim.meshing.quality import MeshReport, mesh_findings, mesh_report, report_of_part
+from cmfsim.meshing.separation import SeparatedMesh, part_mesh, separated_mesh
 from cmfsim.meshing.stuffing import (
     MeshOptions,
     TissueMesh,
     mesh_from_labels,
     mesh_from_level,
-    part_mesh,
 )
 from cmfsim.meshing.tetwild import mesh_with_tetwild
 from cmfsim.meshing.tissue import TissueRegion, near_skin, tissue_level
@@ -15,6 +15,7 @@ from cmfsim.meshing.tissue import TissueRegion, near_skin, tissue_level
 __all__ = [
     "MeshOptions",
     "MeshReport",
+    "SeparatedMesh",
     "TissueMesh",
     "TissueRegion",
     "anatomy_from_surfaces",
@@ -26,6 +27,7 @@ __all__ = [
     "near_skin",
     "part_mesh",
     "report_of_part",
+    "separated_mesh",
     "signed_level",
     "tissue_level",
 ]

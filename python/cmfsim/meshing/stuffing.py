@@ -1,4 +1,4 @@
-"""Isosurface stuffing of labels and levels (Labelle & Shewchuk 2007), and the parting of a mesh."""
+"""Isosurface stuffing of labels and levels (Labelle & Shewchuk 2007)."""
 
 from dataclasses import dataclass
 
@@ -6,15 +6,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim import _core
-from cmfsim._core import Surface, TetMesh
+from cmfsim._core import TetMesh
 from cmfsim.checks import as_number, as_point, as_positive
 from cmfsim.errors import MeshInputError
 from cmfsim.meshing.quality import MeshReport, mesh_findings, mesh_report
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
-from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["MeshOptions", "TissueMesh", "mesh_from_labels", "mesh_from_level", "part_mesh"]
+__all__ = ["MeshOptions", "TissueMesh", "mesh_from_labels", "mesh_from_level"]
 
 MAX_REFINEMENTS = 3
 
@@ -175,38 +174,6 @@ def mesh_from_level(
     )
     report = mesh_report(mesh, making)
     return TissueMesh(mesh, report, mesh_findings(report))
-
-
-def part_mesh(mesh: TetMesh, surface: SurfaceData) -> TetMesh:
-    """The mesh parted along an open surface, as lips that an image shows as one.
-
-    Parameters
-    ----------
-    mesh : TetMesh
-    surface : SurfaceData
-        Open; the parting ends at its rim, and at the boundary of the mesh where it reaches beyond.
-
-    Returns
-    -------
-    TetMesh
-        Its nodes keep their numbers; copies of those on the crack follow them.
-
-    Raises
-    ------
-    MeshError
-        (also `ValueError`) The surface runs through no tissue.
-
-    Examples
-    --------
-    >>> import cmfsim, numpy as np
-    >>> mesh = cmfsim.mesh_from_labels(np.ones((12, 12, 12)) > 0, spacing=1.0)
-    >>> corners = [[-9, -9, 5.6], [6, -9, 5.6], [6, 20, 5.6], [-9, 20, 5.6]]
-    >>> sheet = cmfsim.SurfaceData(corners, [[0, 1, 2], [0, 2, 3]])
-    >>> cmfsim.part_mesh(mesh, sheet).n_nodes > mesh.n_nodes
-    True
-    """
-    parted, _ = _core.part_mesh(mesh, Surface(surface.vertices, surface.triangles))
-    return parted
 
 
 def _stuffed(

@@ -1,7 +1,7 @@
 //! Isosurface stuffing: shapes, volume, boundary, thin parts, determinism, bad input.
 
 use mtm_core::{
-    Grid, Halvings, LevelImage, MtmError, Stuffed, StuffingOptions, Surface, TetMesh, part,
+    Grid, Halvings, LevelImage, MtmError, Parted, Stuffed, StuffingOptions, Surface, TetMesh, part,
     signed_distance, stuff,
 };
 use proptest::prelude::*;
@@ -267,35 +267,55 @@ fn the_signed_distance_of_a_surface_is_that_of_brute_force() {
 
 #[test]
 fn a_parting_surface_parts_the_mesh_and_leaves_its_rim_joined() {
-    let grid = Grid::new([20, 20, 20], [1.0; 3], [0.0; 3]).expect("a grid");
-    let level = LevelImage::from_labels(grid, &[true; 8000]).expect("a level");
-    let mesh = stuff(&level, &options(3.0, 0), &Halvings::default()).expect("a mesh").mesh;
-    let sheet = |to: f64| {
-        let corners = vec![[-5.0, -5.0, 9.3], [to, -5.0, 9.3], [to, 25.0, 9.3], [-5.0, 25.0, 9.3]];
-        Surface::new(corners, vec![[0, 1, 2], [0, 2, 3]]).expect("a sheet")
-    };
-    let half = part(&mesh, &sheet(10.0)).expect("parted");
-    assert!(half.doubled > 10);
-    assert_eq!(half.mesh.n_nodes(), mesh.n_nodes() + half.doubled);
-    assert!((volume(&half.mesh) / volume(&mesh) - 1.0).abs() < 1e-2);
-    assert!(least_dihedral(&half.mesh) >= 10.0);
-    assert_conforming(&half.mesh);
-    assert_eq!(n_bodies(&half.mesh), 1);
-    let whole = part(&mesh, &sheet(25.0)).expect("parted");
-    assert_eq!(n_bodies(&whole.mesh), 2);
-    // The crack lies on the sheet: doubled nodes are pairs in one place, near z = 9.3.
-    let copies = &whole.mesh.nodes()[mesh.n_nodes()..];
-    assert!(copies.iter().all(|x| (x[2] - 9.3).abs() < 1.5));
+    let mesh = block();
+    for z in [7.7, 8.8, 9.3, 9.9, 10.1] {
+        let sheet = |to: f64| {
+            let corners = vec![[-5.0, -5.0, z], [to, -5.0, z], [to, 25.0, z], [-5.0, 25.0, z]];
+            Surface::new(corners, vec![[0, 1, 2], [0, 2, 3]]).expect("a sheet")
+        };
+        for (to, bodies) in [(10.0, 1), (25.0, 2)] {
+            let split = part(&mesh, &sheet(to)).expect("parted");
+            assert!(split.parents.len() > 10);
+            assert_eq!(split.mesh.n_nodes(), mesh.n_nodes() + split.parents.len());
+            assert!((volume(&split.mesh) / volume(&mesh) - 1.0).abs() < 1e-4);
+            assert!(least_dihedral(&split.mesh) >= 15.0, "at {z}: {}", least_dihedral(&split.mesh));
+            assert_conforming(&split.mesh);
+            assert_eq!(n_bodies(&split.mesh), bodies);
+            assert_new_nodes_lie_between_their_parents(&mesh, &split);
+            // The crack is as flat as the sheet.
+            let new = &split.mesh.nodes()[mesh.n_nodes()..];
+            assert!(new.iter().all(|x| (x[2] - z).abs() < 1e-12));
+            let on_sheet = |t: &&[u32; 3]| {
+                t.iter().all(|&j| (split.mesh.nodes()[j as usize][2] - z).abs() < 1e-12)
+            };
+            let boundary = split.mesh.boundary_triangles();
+            assert!(boundary.iter().filter(on_sheet).count() > 50);
+        }
+    }
     let far =
         Surface::new(vec![[0.0, 0.0, 90.0], [9.0, 0.0, 90.0], [0.0, 9.0, 90.0]], vec![[0, 1, 2]]);
     assert!(matches!(part(&mesh, &far.expect("a sheet")), Err(MtmError::OutOfRange { .. })));
 }
 
+/// A node on an edge lies between its parents, but for the distance by which they moved; a copy where its
+/// original does.
+fn assert_new_nodes_lie_between_their_parents(mesh: &TetMesh, split: &Parted) {
+    let places = split.mesh.nodes();
+    for (k, &[a, b]) in split.parents.iter().enumerate() {
+        let x = places[mesh.n_nodes() + k];
+        let [p, q] = [a, b].map(|j| places[j as usize]);
+        if a == b {
+            assert_eq!(x, p);
+        } else {
+            let detour = radius(x, p) + radius(x, q) - radius(p, q);
+            assert!(detour < 1e-12, "node {k}: {detour}");
+        }
+    }
+}
+
 #[test]
 fn a_bent_parting_surface_leaves_no_bridge_along_its_bends() {
-    let grid = Grid::new([20, 20, 20], [1.0; 3], [0.0; 3]).expect("a grid");
-    let level = LevelImage::from_labels(grid, &[true; 8000]).expect("a level");
-    let mesh = stuff(&level, &options(3.0, 0), &Halvings::default()).expect("a mesh").mesh;
+    let mesh = block();
     // A roof and its mirror image, a gutter: slopes of 30° on either side of the bend.
     for (edge, bend) in [(5.0, 13.7), (14.0, 5.3)] {
         let row = |x: f64, z: f64| [[x, -5.0, z], [x, 25.0, z]];
@@ -305,7 +325,39 @@ fn a_bent_parting_surface_leaves_no_bridge_along_its_bends() {
         let whole = part(&mesh, &roof).expect("parted");
         assert_eq!(n_bodies(&whole.mesh), 2, "bend at {bend}");
         assert_conforming(&whole.mesh);
+        assert!(least_dihedral(&whole.mesh) >= 5.0, "{}", least_dihedral(&whole.mesh));
+        assert!((volume(&whole.mesh) / volume(&mesh) - 1.0).abs() < 1e-2);
     }
+}
+
+#[test]
+fn a_curved_parting_surface_makes_a_crack_that_is_as_smooth() {
+    let mesh = block();
+    // A quarter of a cylinder's wall of radius 14 about the y axis, in facets of 3 degrees.
+    let row = |k: u32| {
+        let angle = (f64::from(k) * 3.0 - 60.0).to_radians();
+        let (x, z) = (10.0 + 14.0 * angle.sin(), -4.0 + 14.0 * angle.cos());
+        [[x, -5.0, z], [x, 25.0, z]]
+    };
+    let corners: Vec<[f64; 3]> = (0..41).flat_map(row).collect();
+    let quads = (0..40).map(|k| 2 * k);
+    let triangles = quads.flat_map(|v| [[v, v + 2, v + 1], [v + 1, v + 2, v + 3]]).collect();
+    let wall = Surface::new(corners, triangles).expect("a wall");
+    let split = part(&mesh, &wall).expect("parted");
+    assert_eq!(n_bodies(&split.mesh), 2);
+    assert_conforming(&split.mesh);
+    assert!(least_dihedral(&split.mesh) >= 5.0, "{}", least_dihedral(&split.mesh));
+    let from_axis = |x: &[f64; 3]| (x[0] - 10.0).hypot(x[2] + 4.0);
+    let new = &split.mesh.nodes()[mesh.n_nodes()..];
+    // The sagitta of a facet is 0.005, and that of an edge of the mesh at most 0.1.
+    assert!(new.iter().all(|x| (from_axis(x) - 14.0).abs() < 0.1));
+}
+
+/// A block of 20 voxels along each axis in tets of 3 mm.
+fn block() -> TetMesh {
+    let grid = Grid::new([20, 20, 20], [1.0; 3], [0.0; 3]).expect("a grid");
+    let level = LevelImage::from_labels(grid, &[true; 8000]).expect("a level");
+    stuff(&level, &options(3.0, 0), &Halvings::default()).expect("a mesh").mesh
 }
 
 fn n_bodies(mesh: &TetMesh) -> usize {

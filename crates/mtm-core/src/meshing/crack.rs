@@ -1,31 +1,33 @@
 //! A mesh split along an open surface: lips that are fused in an image become separate.
 //!
-//! Nodes near the surface move onto it if no tet degenerates; tets are sorted by side; every node on the faces
-//! between the two sides is duplicated, one copy for each part of the tets around it. The rim of the surface
-//! stays connected, so that the cut ends where the surface ends.
+//! Nodes near the surface move onto it where their tets keep their shape, as in isosurface stuffing (Labelle &
+//! Shewchuk 2007); edges that still cross it are cut, and their tets with them, so that the two new faces are as
+//! smooth as the surface. Every node on these faces is then duplicated, one copy for each part of the tets
+//! around it. The rim of the surface stays connected, so that the crack ends where the surface ends.
+
+mod clipping;
+mod snapping;
 
 use std::collections::HashMap;
 
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::surface::Surface;
 use crate::mesh::TetMesh;
-use crate::meshing::stuffing::cut::shape;
 use crate::vector::{add, dot, norm, scaled, sub};
 
-/// A node moves onto the surface from a distance of up to this share of its shortest edge.
-const REACH: f64 = 0.4;
-/// Smallest dihedral angle that a move may leave, radians.
-const LEAST_DIHEDRAL: f64 = 10.0 * std::f64::consts::PI / 180.0;
+use clipping::Clipped;
+
 /// Sine of the angle between the normal and the direction to the rim, above which a point lies outside the rim.
 const BESIDE: f64 = 0.2;
 
 /// A split mesh.
 #[derive(Debug, Clone)]
 pub struct Parted {
-    /// The mesh; existing nodes keep their numbers, copies follow.
+    /// The mesh; existing nodes keep their numbers, new ones follow.
     pub mesh: TetMesh,
-    /// Number of copies.
-    pub doubled: usize,
+    /// The two nodes of the unsplit mesh on whose edge each new node lies, or twice the one that it is a copy
+    /// of.
+    pub parents: Vec<[u32; 2]>,
 }
 
 /// `mesh` with a crack along `surface`.
@@ -34,11 +36,18 @@ pub struct Parted {
 /// [`MtmError::OutOfRange`] if the surface runs between no two tets.
 pub fn part(mesh: &TetMesh, surface: &Surface) -> Result<Parted> {
     let mut nodes = mesh.nodes().to_vec();
-    snap(mesh, surface, &mut nodes);
-    let sides = sides(mesh, surface, &nodes);
-    let mut tets = mesh.tets().to_vec();
-    let doubled = double(mesh, &sides, &mut nodes, &mut tets);
-    if doubled == 0 {
+    let heights = snapping::snap(mesh, surface, &mut nodes);
+    let Clipped { tets, parents: cut } = clipping::clip(mesh.tets(), &heights, &mut nodes);
+    let n_on_edges = cut.len();
+    let on_surface = |j: u32| {
+        let height = heights.get(j as usize).copied();
+        height.is_none_or(|h| h == Some(0.0))
+    };
+    let clipped = TetMesh::new(nodes.clone(), tets.clone())?;
+    let sides = sides(&clipped, surface, &heights);
+    let (mut tets, mut copied) = (tets, Vec::new());
+    double(&clipped, (&sides, &on_surface), &mut tets, &mut copied);
+    if copied.is_empty() {
         return Err(MtmError::OutOfRange {
             what: "nodes doubled by the parting surface".into(),
             index: 0,
@@ -47,7 +56,14 @@ pub fn part(mesh: &TetMesh, surface: &Surface) -> Result<Parted> {
             kind: ErrorKind::Mesh,
         });
     }
-    Ok(Parted { mesh: TetMesh::new(nodes, tets)?, doubled })
+    let first_cut = mesh.n_nodes();
+    let mut parents = cut;
+    for &j in &copied {
+        nodes.push(nodes[j as usize]);
+        let on_edge = (j as usize).checked_sub(first_cut).filter(|k| *k < n_on_edges);
+        parents.push(on_edge.map_or([j, j], |k| parents[k]));
+    }
+    Ok(Parted { mesh: TetMesh::new(nodes, tets)?, parents })
 }
 
 /// Signed distance from the surface; none outside its rim, where "above" and "below" are undefined.
@@ -61,65 +77,61 @@ fn height(surface: &Surface, x: [f64; 3]) -> Option<f64> {
     (!closest.on_border || aside <= BESIDE * length).then_some(closest.signed_distance)
 }
 
-fn snap(mesh: &TetMesh, surface: &Surface, nodes: &mut [[f64; 3]]) {
-    for node in 0..nodes.len() {
-        let x = nodes[node];
-        let star = mesh.tets_of_node(node);
-        let shortest = star
-            .iter()
-            .flat_map(|&t| mesh.tets()[t as usize])
-            .filter(|&v| v as usize != node)
-            .map(|v| norm(sub(nodes[v as usize], x)))
-            .fold(f64::INFINITY, f64::min);
-        let near = height(surface, x).filter(|h| h.abs() < REACH * shortest);
-        if near.is_none() {
-            continue;
-        }
-        let target = surface.closest_one(x).point;
-        let worst = |place: [f64; 3]| {
-            star.iter()
-                .map(|&t| {
-                    shape(
-                        mesh.tets()[t as usize]
-                            .map(|v| if v as usize == node { place } else { nodes[v as usize] }),
-                    )
-                })
-                .fold(f64::INFINITY, f64::min)
-        };
-        if worst(target) >= LEAST_DIHEDRAL.min(worst(x)) {
-            nodes[node] = target;
-        }
-    }
-}
-
-/// +1 or −1 for tets next to the surface, 0 for all others.
-fn sides(mesh: &TetMesh, surface: &Surface, nodes: &[[f64; 3]]) -> Vec<i8> {
-    mesh.tets()
-        .iter()
-        .map(|tet| {
-            let x = tet.map(|v| nodes[v as usize]);
-            let centroid = scaled(x.iter().fold([0.0; 3], |sum, &p| add(sum, p)), 0.25);
-            let longest =
-                x.iter().flat_map(|&p| x.iter().map(move |&q| norm(sub(p, q)))).fold(0.0, f64::max);
-            match height(surface, centroid) {
-                Some(h) if h.abs() < longest => {
-                    if h > 0.0 {
-                        1
-                    } else {
-                        -1
-                    }
+/// +1 or −1 for tets next to the surface, 0 for all others. No tet has nodes on either side.
+///
+/// `heights`: of the nodes of the unsplit mesh; all others lie on the surface.
+fn sides(mesh: &TetMesh, surface: &Surface, heights: &[Option<f64>]) -> Vec<i8> {
+    let side = |tet: &[u32; 4]| {
+        let known = tet.iter().filter_map(|&j| heights.get(j as usize).copied().flatten());
+        let sum: i8 = known
+            .map(|h| {
+                if h > 0.0 {
+                    1
+                } else if h < 0.0 {
+                    -1
+                } else {
+                    0
                 }
-                _ => 0,
+            })
+            .sum();
+        if sum != 0 {
+            return sum.signum();
+        }
+        // All nodes on the surface, or beyond its rim.
+        let x = tet.map(|j| mesh.nodes()[j as usize]);
+        let centroid = scaled(x.iter().fold([0.0; 3], |sum, &p| add(sum, p)), 0.25);
+        let apart = x.iter().flat_map(|&p| x.iter().map(move |&q| norm(sub(p, q))));
+        let longest = apart.fold(0.0, f64::max);
+        match height(surface, centroid) {
+            Some(h) if h.abs() < longest => {
+                if h > 0.0 {
+                    1
+                } else {
+                    -1
+                }
             }
-        })
-        .collect()
+            _ => 0,
+        }
+    };
+    mesh.tets().iter().map(side).collect()
 }
 
-/// Gives each part of the tets around a node of the crack its own copy; returns the number of copies.
-fn double(mesh: &TetMesh, sides: &[i8], nodes: &mut Vec<[f64; 3]>, tets: &mut [[u32; 4]]) -> usize {
-    let before = nodes.len();
-    let cracked = |s: u32, t: u32| sides[s as usize] * sides[t as usize] < 0;
-    for node in 0..before {
+/// Gives each part of the tets around a node of the crack its own copy. `copied`: the node that each copy is of.
+///
+/// The crack runs between tets on either side through faces whose nodes all lie on the surface.
+fn double(
+    mesh: &TetMesh,
+    (sides, on_surface): (&[i8], &impl Fn(u32) -> bool),
+    tets: &mut [[u32; 4]],
+    copied: &mut Vec<u32>,
+) {
+    let lies_on = |s: u32, t: u32| {
+        let other = mesh.tets()[t as usize];
+        let shared = mesh.tets()[s as usize].into_iter().filter(|j| other.contains(j));
+        shared.into_iter().all(on_surface)
+    };
+    let cracked = |s: u32, t: u32| sides[s as usize] * sides[t as usize] < 0 && lies_on(s, t);
+    for node in (0..mesh.n_nodes()).filter(|&j| on_surface(j as u32)) {
         let star = mesh.tets_of_node(node);
         if !(star.iter().any(|&t| sides[t as usize] > 0)
             && star.iter().any(|&t| sides[t as usize] < 0))
@@ -149,8 +161,8 @@ fn double(mesh: &TetMesh, sides: &[i8], nodes: &mut Vec<[f64; 3]>, tets: &mut [[
         }
         // If the star was already disconnected, at a hinge of the mesh, those parts stay as they were.
         for p in 1..parts {
-            let copy = nodes.len() as u32;
-            nodes.push(nodes[node]);
+            let copy = (mesh.n_nodes() + copied.len()) as u32;
+            copied.push(node as u32);
             for (i, &t) in star.iter().enumerate().filter(|(i, _)| part[*i] == p) {
                 debug_assert_eq!(star[i], t);
                 for v in tets[t as usize].iter_mut().filter(|v| **v as usize == node) {
@@ -159,5 +171,4 @@ fn double(mesh: &TetMesh, sides: &[i8], nodes: &mut Vec<[f64; 3]>, tets: &mut [[
             }
         }
     }
-    nodes.len() - before
 }

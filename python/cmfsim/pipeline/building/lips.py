@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import Surface, TetMesh
-from cmfsim.checks import Floats
+from cmfsim.checks import Floats, Indices
 from cmfsim.errors import MeshError
 from cmfsim.io import Case, read_surface
 from cmfsim.lips import LipSeam, lip_regions, lip_seam
-from cmfsim.meshing import part_mesh
+from cmfsim.meshing import separated_mesh
 from cmfsim.node_kinds import DentalArches
 from cmfsim.pipeline.building.contacts import CaseContacts
 from cmfsim.pipeline.building.held import held_part
@@ -84,7 +84,7 @@ def _upwards(surface: SurfaceData) -> SurfaceData:
 def separated_at_seam(
     mesh: TetMesh, kinds: NodeKinds, seam: LipSeam
 ) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
-    """The mesh separated at the seam, where copies of nodes have the kinds of their originals.
+    """The mesh separated at the seam; new nodes have the kinds of those that they lie between.
 
     Kinds are found before: the faces of the lips along the edges of teeth look at these without
     being attached to them.
@@ -97,7 +97,7 @@ def separated_at_seam(
     if seam.surface is None:
         return mesh, kinds, ()
     try:
-        separated = part_mesh(mesh, seam.surface)
+        separated = separated_mesh(mesh, seam.surface)
     except MeshError:
         if seam.source != "gap":
             raise
@@ -109,13 +109,32 @@ def separated_at_seam(
             fix="none is needed",
         )
         return mesh, kinds, (finding,)
-    _, place = np.unique(separated.nodes, axis=0, return_inverse=True)
-    place = place.reshape(-1)
-    first = np.full(place.max() + 1, -1)
-    first[place[: mesh.n_nodes]] = np.arange(mesh.n_nodes)
-    origin = first[place]
-    copied = NodeKinds(kinds.kind[origin], kinds.segment[origin], kinds.segments)
-    return held_part(separated, copied)
+    return held_part(separated.mesh, _with_new_nodes(mesh, kinds, separated.parents))
+
+
+def _with_new_nodes(mesh: TetMesh, kinds: NodeKinds, parents: Indices) -> NodeKinds:
+    """The kinds of a mesh, and those of new nodes by the nodes that they lie between.
+
+    A copy has the kind of its original. A node on an edge of the boundary has the kind of both its
+    ends, or slides where one end does and the other is joined to the same bone; all others are
+    free.
+    """
+    kind, segment = kinds.kind[parents], kinds.segment[parents]
+    free, joined, sliding = (NODE_KINDS.index(k) for k in ("free", "joined", "sliding"))
+    edges = edges_of(mesh.boundary_triangles().astype(np.int64)).ends
+    key = np.array([mesh.n_nodes, 1])
+    on_boundary = np.isin(np.sort(parents, axis=1) @ key, edges @ key)
+    is_copy = parents[:, 0] == parents[:, 1]
+    attached = np.isin(kind, [joined, sliding]).all(axis=1)
+    alike = ((kind[:, 0] == kind[:, 1]) | attached) & (segment[:, 0] == segment[:, 1])
+    kept = is_copy | (on_boundary & alike)
+    new_kind = np.where(kept, kind.max(axis=1), free)
+    new_segment = np.where(kept, segment[:, 0], -1)
+    return NodeKinds(
+        np.concatenate([kinds.kind, new_kind.astype(kinds.kind.dtype)]),
+        np.concatenate([kinds.segment, new_segment.astype(kinds.segment.dtype)]),
+        kinds.segments,
+    )
 
 
 def lip_contact(

@@ -18,6 +18,7 @@ from cmfsim.meshing import (
     mesh_from_level,
     mesh_report,
     part_mesh,
+    report_of_part,
 )
 from cmfsim.pipeline.building.refinement import (
     GAP_REFINEMENTS,
@@ -110,5 +111,5 @@ def tissue_mesh(
     if case.surfaces is not None:
         units, frame = case.surfaces.units, case.surfaces.frame
     parted = part_mesh(made.mesh, read_surface(case.mesh.parting, units=units, frame=frame))
-    # A crack parts tets and changes none: what was said of the whole holds.
-    return parted, replace(made.report, n_nodes=parted.n_nodes), made.findings
+    report = report_of_part(parted, made.report)
+    return parted, report, mesh_findings(report)
