@@ -154,3 +154,43 @@ def with_tube(
     values[outside & (nearest < radius)] = hu
     values[outside & (nearest < radius - 2.5)] = -1000
     return image.with_values(values)
+
+
+def with_pad(
+    image: ImageData,
+    place: tuple[float, float, float],
+    width: float,
+    thickness: float,
+    hu: float = 40.0,
+) -> ImageData:
+    """A round pad that follows the skin nearest to a place (mm), without a gap.
+
+    `width` is its diameter, and `thickness` how far it stands out, mm.
+    """
+    values = np.asarray(image.values).astype(np.float32)
+    step, origin = np.asarray(image.spacing), np.asarray(image.origin)
+    reach = width + thickness + 20.0
+    low = np.maximum(((np.array(place) - reach - origin) / step).astype(int), 0)
+    high = np.minimum(((np.array(place) + reach - origin) / step).astype(int), values.shape)
+    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    part = values[box]
+    labels, count = ndimage.label(part > -300.0)
+    sizes = ndimage.sum_labels(part > -300.0, labels, range(1, count + 1))
+    inside = labels == 1 + np.argmax(sizes)
+    out = ndimage.distance_transform_edt(~inside, sampling=step)
+    index = np.stack(np.meshgrid(*map(np.arange, part.shape), indexing="ij"), axis=-1)
+    points = origin + step * (low + index)
+    skin = np.argwhere((out > 0.0) & (out <= step.max()))
+    at = skin[np.argmin(np.linalg.norm(points[tuple(skin.T)] - place, axis=1))]
+    smooth = ndimage.gaussian_filter(inside.astype(np.float32), 6.0 / step)
+    normal = -np.array([d[tuple(at)] for d in np.gradient(smooth, *step)])
+    normal /= np.linalg.norm(normal)
+    away = points - points[tuple(at)]
+    up = away @ normal
+    aside = np.sqrt(np.maximum((away**2).sum(axis=-1) - up**2, 0.0))
+    # Voxels at its border are filled in part.
+    thin = np.clip(0.5 + (thickness + 0.5 * step.mean() - out) / step.mean(), 0.0, 1.0)
+    share = thin * np.clip(0.5 + (0.5 * width - aside) / step.mean(), 0.0, 1.0)
+    share[inside | (np.abs(up) > width + thickness)] = 0.0
+    values[box] += share * np.maximum(hu - part, 0.0)
+    return image.with_values(np.round(values).astype(np.int16))
