@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 from skimage.transform import iradon, radon
 
 from cmfsim import ImageData
@@ -154,3 +155,64 @@ def with_tube(
     values[outside & (nearest < radius)] = hu
     values[outside & (nearest < radius - 2.5)] = -1000
     return image.with_values(values)
+
+
+def with_pad(
+    image: ImageData,
+    place: tuple[float, float, float],
+    width: float,
+    thickness: float,
+    hu: float = 40.0,
+) -> ImageData:
+    """A round pad that follows the skin nearest to a place (mm), without a gap.
+
+    `width` is its diameter, and `thickness` how far it stands out, mm.
+    """
+    values = np.asarray(image.values).astype(np.float32)
+    step, origin = np.asarray(image.spacing), np.asarray(image.origin)
+    reach = width + thickness + 20.0
+    low = np.maximum(((np.array(place) - reach - origin) / step).astype(int), 0)
+    high = np.minimum(((np.array(place) + reach - origin) / step).astype(int), values.shape)
+    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    part = values[box]
+    labels, count = ndimage.label(part > -300.0)
+    sizes = ndimage.sum_labels(part > -300.0, labels, range(1, count + 1))
+    inside = labels == 1 + np.argmax(sizes)
+    out = ndimage.distance_transform_edt(~inside, sampling=step)
+    index = np.stack(np.meshgrid(*map(np.arange, part.shape), indexing="ij"), axis=-1)
+    points = origin + step * (low + index)
+    skin = np.argwhere((out > 0.0) & (out <= step.max()))
+    at = skin[np.argmin(np.linalg.norm(points[tuple(skin.T)] - place, axis=1))]
+    smooth = ndimage.gaussian_filter(inside.astype(np.float32), 6.0 / step)
+    normal = -np.array([d[tuple(at)] for d in np.gradient(smooth, *step)])
+    normal /= np.linalg.norm(normal)
+    away = points - points[tuple(at)]
+    up = away @ normal
+    aside = np.sqrt(np.maximum((away**2).sum(axis=-1) - up**2, 0.0))
+    # Voxels at its border are filled in part.
+    thin = np.clip(0.5 + (thickness + 0.5 * step.mean() - out) / step.mean(), 0.0, 1.0)
+    share = thin * np.clip(0.5 + (0.5 * width - aside) / step.mean(), 0.0, 1.0)
+    share[inside | (np.abs(up) > width + thickness)] = 0.0
+    values[box] += share * np.maximum(hu - part, 0.0)
+    return image.with_values(np.round(values).astype(np.int16))
+
+
+def turned(image: ImageData, angles: tuple[float, float, float]) -> tuple[ImageData, np.ndarray]:
+    """The head turned about x, y and z (degrees; x: nodding forwards), in voxels of 1.5 mm.
+
+    With the (4, 4) motion that places of the head make.
+    """
+    values = np.asarray(image.values, dtype=np.float32)
+    own, origin = np.asarray(image.spacing), np.asarray(image.origin)
+    turn = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+    middle = origin + 0.5 * own * (np.array(values.shape) - 1)
+    step = np.full(3, 1.5)
+    size = (1.05 * np.array(values.shape) * own / step).astype(int)
+    low = middle - 0.5 * step * (size - 1)
+    axes = [low[a] + step[a] * np.arange(size[a]) for a in range(3)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    back = ((places - middle) @ turn + middle - origin) / own
+    seen = ndimage.map_coordinates(values, back.T, order=1, cval=-1000.0).reshape(size)
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turn, middle - turn @ middle
+    return ImageData(seen, step, low), matrix

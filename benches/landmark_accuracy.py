@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial.transform import Rotation
 
 import cmfsim
+import ct_variants as variants
 from cmfsim.imaging import segment_head
 from cmfsim.io.images import read_image_file
 from cmfsim.pipeline.proposing import head_surfaces, read_template_head
@@ -121,8 +121,8 @@ def _variants(image: ImageData, skull: Points) -> Iterator[tuple[str, ImageData,
     yield "cut at the chin", _cropped(image, low=skull["supramentale"][2]), still
     yield "cut at the forehead", _cropped(image, high=skull["glabella"][2] + 12.0), still
     yield "voxels of 3 mm", _coarse(image, 3.0), still
-    yield "turned by 12°, −8° and 10°", *_turned(image, (12.0, -8.0, 10.0))
-    yield "nodding by 15°", *_turned(image, (15.0, 0.0, 0.0))
+    yield "turned by 12°, −8° and 10°", *variants.turned(image, (12.0, -8.0, 10.0))
+    yield "nodding by 15°", *variants.turned(image, (15.0, 0.0, 0.0))
 
 
 def _cropped(image: ImageData, low: float = -np.inf, high: float = np.inf) -> ImageData:
@@ -140,23 +140,6 @@ def _coarse(image: ImageData, spacing: float) -> ImageData:
     fewer = ndimage.zoom(blurred, own / spacing, order=1)
     step = own * (np.array(values.shape) - 1) / (np.array(fewer.shape) - 1)
     return ImageData(fewer, step, image.origin)
-
-
-def _turned(image: ImageData, angles: tuple[float, float, float]) -> tuple[ImageData, np.ndarray]:
-    values = np.asarray(image.values, dtype=np.float32)
-    own, origin = np.asarray(image.spacing), np.asarray(image.origin)
-    turn = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
-    middle = origin + 0.5 * own * (np.array(values.shape) - 1)
-    step = np.full(3, 1.5)
-    size = (1.05 * np.array(values.shape) * own / step).astype(int)
-    low = middle - 0.5 * step * (size - 1)
-    axes = [low[a] + step[a] * np.arange(size[a]) for a in range(3)]
-    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    back = ((places - middle) @ turn + middle - origin) / own
-    seen = ndimage.map_coordinates(values, back.T, order=1, cval=-1000.0).reshape(size)
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = turn, middle - turn @ middle
-    return ImageData(seen, step, low), matrix
 
 
 def page(real: Sequence[Row], synthetic: Sequence[Row]) -> str:

@@ -2,9 +2,11 @@
 
 Whatever protrudes from the head and is thin is checked: it belongs to the face if it has a mirror
 image on the other side, as ears, nose and lips have, is less dense than plastic and protrudes no
-further than a nose.
+further than a nose. What lies flat on the face has a step all round (`find_plates`).
 """
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,8 @@ from cmfsim.imaging.morphology import (
     reached,
     simplex,
 )
+from cmfsim.imaging.plates import STEP as PLATE_STEP
+from cmfsim.imaging.plates import find_plates
 from cmfsim.imaging.skin import Skin
 from cmfsim.imaging.working import Working, coarse_of
 from cmfsim.values.finding import Finding
@@ -57,44 +61,124 @@ LEAST_LENGTH = 18.0
 # The face lies in front of this part of the head's depth: ears, folded or not, lie behind.
 FACE_PART = 0.45
 ONE_SIDED_TEXT = "with no counterpart on the other side"
+FLAT_TEXT = "flat, with a step all round as no part of a face has"
+# A flat thing whose middle lies within the box of another one, wider by this, is the same, mm.
+SAME = 10.0
+# A nose stands out farther than this from what larger balls, of the second radius, sweep in the
+# head; a pad does not, mm.
+FLAT, BROAD = 13.0, 20.0
 # Points of the face that its plane of symmetry is fitted to.
 SAMPLES = 4000
 
 
+@dataclass(frozen=True, eq=False)
+class _Head:
+    """The inside of the head in voxels of about `STEP`.
+
+    Attributes
+    ----------
+    mask : (nx, ny, nz) bool
+    spacing, origin : (3,) float64, mm
+    """
+
+    mask: Mask
+    spacing: NDArray[np.float64]
+    origin: NDArray[np.float64]
+
+    @cached_property
+    def core(self) -> Mask:
+        """What balls can sweep in the head with its airway."""
+        return opened(self.mask | _airway(self.mask, self.spacing), WIDEST, self.spacing)
+
+    @cached_property
+    def away(self) -> Volume:
+        """The distance from that, mm; negative in it."""
+        return -depth(self.core, self.spacing)
+
+    @cached_property
+    def away_broadly(self) -> Volume:
+        """The distance from what larger balls can sweep, mm; negative in it."""
+        return -depth(opened(self.mask, BROAD, self.spacing), self.spacing)
+
+
+@dataclass(frozen=True, eq=False)
+class _Thing:
+    """What is on the face.
+
+    Attributes
+    ----------
+    middle, size : (3,) float64, mm
+    volume : float, mm³
+        Not known of what lies flat: 0.
+    kind : str
+    """
+
+    middle: NDArray[np.float64]
+    size: NDArray[np.float64]
+    volume: float
+    kind: str
+
+
 def attached_findings(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
-    """A finding for each thing on the face that is one-sided or with the density of plastic."""
+    """A finding for each thing on the face: one-sided, dense as plastic, or flat with a rim."""
     inside, spacing, shift = coarse_of(skin.mask.astype(np.float32), work.spacing, STEP)
-    mask: Mask = np.asfortranarray(inside > 0.5)
+    head = _Head(np.asfortranarray(inside > 0.5), spacing, work.origin + shift)
+    things = _protruding(head, work, bone)
+    for flat in _flat(head, work, skin):
+        near = [np.abs(flat.middle - thing.middle) < 0.5 * thing.size + SAME for thing in things]
+        if not any(inside.all() for inside in near):
+            things.append(flat)
+    return [_finding(thing) for thing in things]
+
+
+def _flat(head: _Head, work: Working, skin: Skin) -> list[_Thing]:
+    """What lies flat on the face."""
+    level, spacing, shift = coarse_of(skin.level, work.spacing, PLATE_STEP)
+    things = []
+    for voxels in find_plates(level, spacing, _behind(box_of(level > 0.0)[1])):
+        places = work.origin + shift + voxels * spacing
+        index = np.rint((places - head.origin) / head.spacing).astype(np.intp)
+        index = np.clip(index, 0, np.array(head.mask.shape) - 1)
+        if head.away_broadly[tuple(index.T)].max() <= FLAT:
+            size = (np.ptp(voxels, axis=0) + 1) * spacing
+            things.append(_Thing(places.mean(axis=0), size, 0.0, FLAT_TEXT))
+    return things
+
+
+def _behind(rows: slice) -> int:
+    """The first layer along y behind the face, of those that hold the head."""
+    return int(rows.start + int(FACE_PART * (rows.stop - rows.start)))
+
+
+def _protruding(head: _Head, work: Working, bone: Bone) -> list[_Thing]:
+    """What protrudes, and is one-sided, has the density of plastic, or reaches too far."""
+    spacing = head.spacing
     hu = coarse_of(work.hu, work.spacing, STEP)[0]
     own = coarse_of(bone.solid.astype(np.float32), work.spacing, STEP)[0] > 0.25
-    box = box_of(mask)
-    rows = box[1]
-    behind = rows.start + int(FACE_PART * (rows.stop - rows.start))
-    around = depth(mask, spacing)
-    core = opened(mask | _airway(mask, spacing), WIDEST, spacing)
-    out = mask & ~core
+    behind = _behind(box_of(head.mask)[1])
+    around = depth(head.mask, spacing)
+    out = head.mask & ~head.core
     out[:, behind:] = False
-    away = -depth(core, spacing)
-    far = reached(out & (away > STANDING_OUT), away > FARTHEST)
+    far = reached(out & (head.away > STANDING_OUT), head.away > FARTHEST)
     dense = out & (hu > PLASTIC) & (around < WIDEST)
     dense &= depth(np.asfortranarray(own), spacing) < -OWN_BONE
     mirrored = _mirrored(around, spacing, behind, out)
     alone = reached(out & (mirrored < -NEARLY_ONE_SIDED), mirrored < -ONE_SIDED)
     found: Mask = dense | alone | far
     labels, count = label(found, corners=True)
-    findings = []
+    things = []
     for piece in range(1, count + 1):
         voxels = np.argwhere(labels == piece)
         volume = len(voxels) * float(np.prod(spacing))
         size = (np.ptp(voxels, axis=0) + 1) * spacing
         if volume < LEAST_VOLUME or float(np.linalg.norm(size)) < LEAST_LENGTH:
             continue
-        middle = work.origin + shift + voxels.mean(axis=0) * spacing
+        middle = head.origin + voxels.mean(axis=0) * spacing
         kinds = ((far, "further out than a nose"), (dense, "with the density of plastic"))
         here = labels == piece
         kind = next((text for which, text in kinds if which[here].mean() > 0.5), ONE_SIDED_TEXT)
-        findings.append(_finding(middle, size, volume, kind))
-    return findings
+        things.append(_Thing(middle, size, volume, kind))
+    return things
 
 
 def _airway(mask: Mask, spacing: NDArray[np.float64]) -> Mask:
@@ -136,16 +220,16 @@ def _thick(mask: Mask, spacing: NDArray[np.float64]) -> Mask:
     return thick
 
 
-def _finding(
-    middle: NDArray[np.float64], size: NDArray[np.float64], volume: float, kind: str
-) -> Finding:
+def _finding(thing: _Thing) -> Finding:
+    size = " × ".join(f"{length:.0f}" for length in thing.size)
+    volume = f", {thing.volume / 1000.0:.1f} cm³" if thing.volume else ""
+    x, y, z = thing.middle
     return Finding.warning(
         "skin-attachment",
-        f"something protrudes from the face, {kind}: {size[0]:.0f} × {size[1]:.0f} × {size[2]:.0f} "
-        f"mm, {volume / 1000.0:.1f} cm³",
-        where=f"skin at ({middle[0]:.0f}, {middle[1]:.0f}, {middle[2]:.0f}) mm",
-        why="a tube, a holder or tape on the face is taken for skin, and is moved and compared as "
-        "skin",
+        f"something protrudes from the face, {thing.kind}: {size} mm{volume}",
+        where=f"skin at ({x:.0f}, {y:.0f}, {z:.0f}) mm",
+        why="a tube, a holder, a pad or tape on the face is taken for skin, and is moved and "
+        "compared as skin",
         fix="look at it in the image; erase it there (air, −1000 HU), or leave that part of the "
         "face out of the evaluation",
     )

@@ -152,16 +152,15 @@ def _bearers(
     Behind its teeth the lower jaw goes on as ramus, which a sagittal split makes a segment of its
     own; what lies behind the upper teeth are the pterygoid processes, from which muscles arise.
     """
-    bearers = {}
-    for jaw, arch in arches.items():
-        places = np.array([arch.tip, arch.left, arch.right])
-        distances = []
-        for segment in segments:
-            surface = Surface(segment.surface.vertices, segment.surface.triangles)
-            closest, _, _ = surface.closest(places)
-            distances.append(np.linalg.norm(closest - places, axis=1))
-        bearers[jaw] = set(np.argmin(distances, axis=0).tolist())
-    owners = [_bone_of(anatomy, segment) for segment in segments]
+    places = np.array([p for arch in arches.values() for p in (arch.tip, arch.left, arch.right)])
+    distances = []
+    for segment in segments:
+        closest, _, _ = Surface(segment.surface.vertices, segment.surface.triangles).closest(places)
+        distances.append(np.linalg.norm(closest - places, axis=1))
+    nearest = np.argmin(distances, axis=0).reshape(len(arches), 3)
+    bearers = {jaw: set(near.tolist()) for jaw, near in zip(arches, nearest, strict=True)}
+    bones = {name: bone.values > 0.0 for name, bone in anatomy.bones.items()}
+    owners = [_bone_of(bones, segment) for segment in segments]
     mine = {owners[i] for i in bearers["lower"]} - {None}
     theirs = {owners[i] for i in bearers["upper"]}
     for number, owner in enumerate(owners):
@@ -170,13 +169,13 @@ def _bearers(
     return {jaw: frozenset(numbers) for jaw, numbers in bearers.items()}
 
 
-def _bone_of(anatomy: Anatomy, segment: BoneSegment) -> str | None:
-    """The bone of the anatomy that a segment is a piece of."""
+def _bone_of(bones: Mapping[str, NDArray[np.bool_]], segment: BoneSegment) -> str | None:
+    """The bone that a segment is a piece of, of those whose inside is given."""
     inside = segment.level.values > 0.0
     shared = {
-        name: int(np.count_nonzero(inside & (bone.values > 0.0)))
-        for name, bone in anatomy.bones.items()
-        if bone.values.shape == inside.shape
+        name: int(np.count_nonzero(inside & bone))
+        for name, bone in bones.items()
+        if bone.shape == inside.shape
     }
     name = max(shared, key=shared.__getitem__, default=None)
     return name if name is not None and shared[name] else None

@@ -158,7 +158,8 @@ def proposed_head(
 
     Where a CT's jaws were separated by shape and the lower one is doubtful, the landmarks that do
     not rest on that separate them once more, and all are found again: a site that this moves is
-    doubtful. If the second jaw is worse, the first one stays.
+    doubtful. If the second jaw is worse, the first one stays. Where the first jaw shows no teeth,
+    as in a head that nods far forwards, an average head's separate it, and then the patient's own.
 
     Parameters
     ----------
@@ -178,15 +179,32 @@ def proposed_head(
     is_doubtful = bool(found.doubtful_jaw or found.impossible_jaw)
     if case.image is None or not (is_read and by_shape and is_doubtful and found.separation):
         return first
-    stage("separating the jaws by the landmarks found")
-    again, _ = read_anatomy(case, found.separation, stage)
-    stage("finding the landmarks again")
-    second = _proposed(again, heads)
-    if "mandible" not in again.bones or _is_worse(second.landmarks, found):
+    second = _separated_by(first, case, stage, heads)
+    if second is None:
         return replace(first, findings=(_not_separated_again(),))
-    apart = _apart(found.skull, second.landmarks.skull)
+    if found.is_rough:
+        # Teeth are known now, and separate the jaws less roughly.
+        third = _separated_by(second, case, stage, heads)
+        first, second = (first, second) if third is None else (second, third)
+    apart = _apart(first.landmarks.skull, second.landmarks.skull)
     moved = replace(second.landmarks, skull=_with_moves(second.landmarks.skull, apart))
     return replace(second, landmarks=moved, findings=(_separated_again(apart),))
+
+
+def _separated_by(
+    first: ProposedHead,
+    case: Case,
+    stage: Callable[[str], None],
+    heads: Sequence[TemplateHead],
+) -> ProposedHead | None:
+    """The head with its jaws separated by its landmarks; None where that makes them worse."""
+    stage("separating the jaws by the landmarks found")
+    again, _ = read_anatomy(case, first.landmarks.separation, stage)
+    stage("finding the landmarks again")
+    second = _proposed(again, heads)
+    if "mandible" not in again.bones or _is_worse(second.landmarks, first.landmarks):
+        return None
+    return second
 
 
 def _proposed(anatomy: Anatomy, heads: Sequence[TemplateHead]) -> ProposedHead:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import cmfsim
+import ct_variants as variants
+import real_heads
 from cmfsim.phantom.average_head import average_head
 from cmfsim.pipeline.building.inputs import read_anatomy
 from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head
@@ -79,14 +81,36 @@ def test_a_jaw_that_cannot_be_one_is_named_so(change, why):
     assert [f.severity for f in found.findings if f.code == "jaw-impossible"] == ["warning"]
 
 
-def test_a_build_stops_where_the_maxilla_was_taken_for_the_mandible(tmp_path):
+@pytest.fixture
+def child(tmp_path):
+    """A child with an open mouth in coarse voxels: its maxilla is taken for the mandible."""
     pytest.importorskip("SimpleITK")
     pytest.importorskip("skimage")
-    child = cmfsim.make_head(cmfsim.HeadParameters(scale=0.85, lip_gap=8.0, bite_gap=6.0))
-    cmfsim.write_image(child.ct(3.0), tmp_path / "ct.nrrd")
+    head = cmfsim.make_head(cmfsim.HeadParameters(scale=0.85, lip_gap=8.0, bite_gap=6.0))
+    cmfsim.write_image(head.ct(3.0), tmp_path / "ct.nrrd")
     (tmp_path / "case.toml").write_text(CASE, encoding="utf-8")
+    return head, cmfsim.Case.load(tmp_path)
+
+
+def test_a_build_stops_where_the_maxilla_is_taken_for_the_mandible(child, monkeypatch):
+    """Where the second separation does not help either."""
+    monkeypatch.setattr("cmfsim.pipeline.proposing._separated_by", lambda *_: None)
     with pytest.raises(cmfsim.LandmarkError, match=r"mandible is not one.*by hand"):
-        cmfsim.build_case(tmp_path / "case.toml")
+        cmfsim.build_case(child[1])
+
+
+def test_the_jaws_of_an_open_mouth_are_separated_by_an_average_heads_teeth(child):
+    head, case = child
+    anatomy, _ = read_anatomy(case, {}, lambda _: None)
+    found = proposed_head(case, anatomy, lambda _: None)
+    assert [f.code for f in found.findings] == ["jaws-separated-again"]
+    errors = {
+        name: np.linalg.norm(site.point - head.skull_landmarks[name])
+        for name, site in found.landmarks.skull.items()
+    }
+    assert len(errors) == 32
+    assert np.mean([*errors.values()]) < 1.6
+    assert max(errors.values()) < 5.0
 
 
 def test_doubtful_jaws_are_separated_again_by_the_landmarks_found(tmp_path, monkeypatch):
@@ -111,3 +135,24 @@ def test_doubtful_jaws_are_separated_again_by_the_landmarks_found(tmp_path, monk
         assert np.linalg.norm(site.point - head.skull_landmarks[name]) < 5.0, name
     kept = proposed_head(case, anatomy, lambda _: None, is_read=False)
     assert kept.anatomy is anatomy
+
+
+def test_a_head_that_nods_far_forwards_has_its_landmarks(tmp_path):
+    """By 20°: shape alone takes 148 cm³ for the mandible, and no tooth is found."""
+    pytest.importorskip("SimpleITK")
+    pytest.importorskip("skimage")
+    folder = real_heads.data_folder() / "ct_phantom"
+    image, motion = variants.turned(cmfsim.read_image(folder / "ct.nii.gz"), (20.0, 0.0, 0.0))
+    cmfsim.write_image(image, tmp_path / "ct.nrrd")
+    (tmp_path / "case.toml").write_text(CASE, encoding="utf-8")
+    case = cmfsim.Case.load(tmp_path)
+    anatomy, _ = read_anatomy(case, {}, lambda _: None)
+    found = proposed_head(case, anatomy, lambda _: None)
+    assert [f.code for f in found.findings] == ["jaws-separated-again"]
+    assert not found.landmarks.doubtful_jaw
+    for kind, sites in (("skull", found.landmarks.skull), ("skin", found.landmarks.skin)):
+        true = real_heads.landmarks("ct_phantom", kind)
+        places = {n: motion[:3, :3] @ p + motion[:3, 3] for n, p in true.items()}
+        errors = [np.linalg.norm(site.point - places[name]) for name, site in sites.items()]
+        assert len(errors) == len(true)
+        assert np.mean(errors) < 3.0

@@ -37,6 +37,8 @@ VOLUMES, POSSIBLE_VOLUMES = (33.0, 100.0), (15.0, 140.0)
 WEAK_ERROR, WEAK_FRONT_ERROR = 10.0, 5.0
 BACK_SITES = ("sub_m2", "supra_m2", "occlusal_line", "gonion")
 FRONT_SITES = ("infradentale", "supradentale", "mid_philtrum", "supramentale", "pogonion", "menton")
+# Sites of the average head that separate jaws whose own sites are not known.
+USUAL_SITES = ("supradentale", "infradentale", "occlusal_line_L", "occlusal_line_R", "menton")
 # The end of the tooth rows beside and behind the incisors, average-head mm.
 ROW_SIDE, ROW_BACK = 50.0, 52.0
 
@@ -173,15 +175,29 @@ def weakened(
     return result
 
 
-def separation_points(sites: Mapping[str, ProposedSite], pose: Pose) -> dict[str, Floats]:
+def separation_points(
+    sites: Mapping[str, ProposedSite], pose: Pose, average: Mapping[str, Floats]
+) -> dict[str, Floats]:
     """What jaws can be separated by again: sites that do not rest on how they were the first time.
 
     Sites of cranium, incisors and chin, and the ends of the tooth rows where the cranium's pose and
-    the incisors put them. Empty where the incisors are not known.
+    the incisors put them. Where the incisors are not known, nothing of the jaws is trusted: teeth
+    and chin are then those of the average head in the cranium's pose, which is rough.
+
+    Parameters
+    ----------
+    sites : mapping of str to ProposedSite
+        Of the skull.
+    pose : Pose
+    average : mapping of str to (3,) float64
+        Sites of the average head, in its frame.
     """
     points = {n: s.point for n, s in sites.items() if not n.startswith(BACK_SITES)}
     if not {"supradentale", "infradentale"} <= points.keys():
-        return {}
+        points = {n: p for n, p in points.items() if not n.startswith(FRONT_SITES)}
+        usual = {name: average[name] for name in USUAL_SITES}
+        placed = pose.out(pose.size * np.array([*usual.values()]))
+        return points | dict(zip(usual, placed, strict=True))
     middle = 0.5 * (points["supradentale"] + points["infradentale"])
     across, back, height = pose.into(middle[None])[0] / pose.size
     rise = ROW_BACK * float(np.tan(np.radians(USUAL_RISE)))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from cmfsim.checks import Floats
 from cmfsim.registration.proposed.depth_maps import STEP, DepthMap
 
-__all__ = ["farthest_from_chord", "local_midline", "smoothed", "upper_end"]
+__all__ = ["farthest_from_chord", "local_midline", "most_outside", "smoothed", "upper_end"]
 
 # How far from the plane of symmetry the midline of a jaw is looked for, mm.
 LEAN = 9.0
@@ -18,6 +18,8 @@ HALF_WIDTH, CORE = 26.0, 1.5
 MOST_DIFFERENCE = 4.0
 # Weight of the distance from the plane of symmetry, mm of difference per mm².
 PULL = 0.004
+# A bulge is flat: its middle is that of what lies within this of its farthest point, mm.
+BULGE = 0.4
 
 
 def smoothed(values: Floats, sigma: float) -> Floats:
@@ -75,6 +77,21 @@ def farthest_from_chord(
     """
     inside, gaps = _from_chord(heights, depths, ends)
     return None if not len(inside) else int(inside[np.argmax(outwards * gaps)])
+
+
+def most_outside(
+    heights: Floats, depths: Floats, ends: Sequence[float], reach: tuple[float, float]
+) -> float | None:
+    """The height of the middle of a bulge: what lies farthest in front of the chord between two.
+
+    Looked for within `reach` alone. None where an end or all between them is missing.
+    """
+    inside, gaps = _from_chord(heights, depths, ends)
+    near = (heights[inside] >= reach[0]) & (heights[inside] <= reach[1])
+    if not near.any():
+        return None
+    bulge = near & (gaps >= gaps[near].max() - BULGE)
+    return float(heights[inside[bulge]].mean())
 
 
 def upper_end(

@@ -116,7 +116,7 @@ def landmarks_from(
         gone.skin if skin is not None else dict.fromkeys(SKIN_LANDMARKS, "no skin is given"),
         evidence.impossible,
         evidence.reason,
-        separation_points(sites, pose),
+        separation_points(sites, pose, average.skull),
     )
 
 

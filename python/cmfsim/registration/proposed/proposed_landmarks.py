@@ -45,7 +45,7 @@ class ProposedLandmarks:
     doubtful_jaw : str
         All that speaks against it, doubts included; empty where nothing does.
     separation : mapping of str to (3,) float64, mm
-        What the jaws of an image can be separated by again; empty where that is not known.
+        What the jaws of an image can be separated by again.
     """
 
     skull: Mapping[str, ProposedSite]
@@ -55,6 +55,11 @@ class ProposedLandmarks:
     impossible_jaw: str = ""
     doubtful_jaw: str = ""
     separation: Mapping[str, Floats] = field(default_factory=dict)
+
+    @property
+    def is_rough(self) -> bool:
+        """Whether jaws can be separated again only by where an average head has its teeth."""
+        return not {"supradentale", "infradentale"} <= self.skull.keys()
 
     def __post_init__(self) -> None:
         for name in ("skull", "skin", "missing_skull", "missing_skin", "separation"):

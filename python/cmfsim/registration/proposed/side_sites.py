@@ -7,7 +7,7 @@ import numpy as np
 from cmfsim.checks import Floats
 from cmfsim.extras import third_party
 from cmfsim.registration.proposed.depth_maps import STEP, DepthMap
-from cmfsim.registration.proposed.profile import smoothed
+from cmfsim.registration.proposed.profile import most_outside, smoothed
 
 __all__ = ["Orbit", "SideView", "Sites", "find_orbit", "find_side_sites"]
 
@@ -91,9 +91,16 @@ def find_orbit(view: SideView) -> Orbit | None:
     return Orbit(middle, float(zs.mean()), float(height[near].min()), float(height[near].max()))
 
 
-# From the ridge over the orbit up to the bulge of the forehead, and from the lower rim down to the
-# lower border of the cheekbone, mm.
-TO_FOREHEAD, TO_MALAR = 32.5, 18.5
+# The bulge of the forehead is where its profile lies farthest in front of a chord of this length
+# that begins at the ridge over the orbit, between these heights above the ridge, mm. A bulge is
+# flat, so that its middle is pulled by the share below towards its usual height above the ridge,
+# which is taken alone where the forehead is cut off below the end of the chord, mm.
+FOREHEAD_CHORD, FOREHEAD_REACH, TO_FOREHEAD = 60.0, (18.0, 50.0), 32.5
+FOREHEAD_PULL = 1.0 / 3.0
+# The forehead's profile is the median of a strip this wide to either side, smoothed over this, mm.
+FOREHEAD_HALF, FOREHEAD_SIGMA = 4.0, 2.0
+# From the lower rim of the orbit down to the lower border of the cheekbone, mm.
+TO_MALAR = 18.5
 # That border is looked for so far out, as a factor on the orbit's middle.
 MALAR_OUT = 1.02
 # The cheekbone beside the orbit lies so far behind and above its lower rim, mm.
@@ -124,8 +131,7 @@ def _about_orbit(view: SideView, orbit: Orbit, found: Sites) -> None:
     if len(above):
         upper = above[np.argmax(-line[above] - RIM_DOWN * z[above])]
         view.put(found, "supraorbital", np.array([orbit.x, line[upper], z[upper]]))
-        bulge = int(np.argmin(np.abs(z - z[upper] - TO_FOREHEAD)))
-        view.put(found, "frontal_eminence", np.array([orbit.x, line[bulge], z[bulge]]))
+        _forehead(view, orbit, float(z[upper]), found)
     below = np.flatnonzero((z <= orbit.low + 1.0) & (z >= orbit.low - 10.0) & np.isfinite(line))
     if len(below):
         lower = below[np.argmax(-line[below] + RIM_UP * z[below])]
@@ -135,6 +141,19 @@ def _about_orbit(view: SideView, orbit: Orbit, found: Sites) -> None:
         view.put(found, "inferior_malar", np.array([out, depth, malar]))
         y, up = float(line[lower]) + LATERAL_BEHIND, float(z[lower]) + LATERAL_ABOVE
         view.put(found, "lateral_orbit", np.array([-view.outer.at(y, up), y, up]))
+
+
+def _forehead(view: SideView, orbit: Orbit, ridge: float, found: Sites) -> None:
+    """The frontal eminence, from the height of the ridge over the orbit."""
+    z = view.front.columns
+    line = smoothed(view.front.column(view.side * orbit.x, FOREHEAD_HALF), FOREHEAD_SIGMA)
+    reach = (ridge + FOREHEAD_REACH[0], ridge + FOREHEAD_REACH[1])
+    found_at = most_outside(z, line, (ridge, ridge + FOREHEAD_CHORD), reach)
+    height = usual = ridge + TO_FOREHEAD
+    if found_at is not None:
+        height = FOREHEAD_PULL * usual + (1.0 - FOREHEAD_PULL) * found_at
+    bulge = int(np.argmin(np.abs(z - height)))
+    view.put(found, "frontal_eminence", np.array([orbit.x, line[bulge], z[bulge]]))
 
 
 # Where the condyle of a levelled head can lie, mm, how high its top must reach there, and how many
