@@ -12,8 +12,8 @@ from cmfsim._core import Surface, TetMesh
 from cmfsim.checks import Floats
 from cmfsim.errors import MeshError
 from cmfsim.io import Case, read_surface
-from cmfsim.lips import LipSeam, lip_regions, lip_seam
 from cmfsim.meshing import part_mesh
+from cmfsim.meshing.lips import LipSeam, lip_regions, lip_seam
 from cmfsim.node_kinds import DentalArches
 from cmfsim.pipeline.building.contacts import CaseContacts
 from cmfsim.pipeline.building.held import held_part
