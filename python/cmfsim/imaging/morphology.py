@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim import _core
-from cmfsim.errors import ImageError
-from cmfsim.extras import third_party
+from cmfsim.errors import ImageError, third_party
 
 __all__ = [
     "Block",

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface
 from cmfsim.checks import Floats
-from cmfsim.extras import third_party
+from cmfsim.errors import third_party
 from cmfsim.node_kinds.arches import DentalArches
 from cmfsim.node_kinds.options import KindOptions
 from cmfsim.values.anatomy import Anatomy, BoneSegment

@@ -5,7 +5,7 @@ import os
 from importlib.resources import files
 from pathlib import Path
 
-from cmfsim.extras import third_party
+from cmfsim.errors import third_party
 from cmfsim.io.files import replacing
 from cmfsim.report.document import Document, Figure, Note, Table
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from cmfsim import _core
 from cmfsim.checks import Floats, Indices, as_number, as_positive
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData

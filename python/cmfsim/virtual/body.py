@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.checks import Floats, as_index_rows, as_rows
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.virtual.hyperelastic import HyperelasticTissue, cofactor
 
 __all__ = ["HyperelasticBody"]

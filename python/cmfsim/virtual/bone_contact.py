@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.checks import Floats, as_positive
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.image_data import ImageData
 
 __all__ = ["BoneContact", "SmoothDistance"]

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import Floats, as_index_rows, as_number, as_rows
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["carried", "scanned"]

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.checks import Floats
-from cmfsim.errors import CaseInputError, SolverError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, SolverError, third_party
 from cmfsim.virtual.body import HyperelasticBody
 
 __all__ = ["Contact", "Equilibrium", "EquilibriumOptions", "NoContact", "find_equilibrium"]

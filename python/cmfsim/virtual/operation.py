@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface, signed_distance_image
 from cmfsim.checks import Floats
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import decompose_motion, rigid_motion

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface, TetMesh
 from cmfsim.checks import Floats, as_positive
-from cmfsim.errors import CaseInputError
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.evaluation.unmoved import thickened as moved_outward
-from cmfsim.extras import third_party
 from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
 from cmfsim.pipeline.building import build_model

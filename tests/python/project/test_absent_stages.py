@@ -12,8 +12,7 @@ import pytest
 import cmfsim
 import meshes
 from cmfsim.deferred import PUBLIC
-from cmfsim.errors import MeshInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import MeshInputError, third_party
 from head_case import HeadCase
 
 PACKAGE = Path(cmfsim.__file__).parent

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.checks import Floats
-from cmfsim.extras import third_party
+from cmfsim.errors import third_party
 
 __all__ = ["STEP", "DepthMap", "depth_map"]
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from cmfsim._core import ThinPlateSpline
 from cmfsim.checks import Floats
-from cmfsim.errors import CaseInputError
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.evaluation import SKIN_LANDMARKS
-from cmfsim.extras import third_party
 from cmfsim.study.benchmark.patients import BenchmarkPatient
 
 __all__ = ["LEAST_TRAINED", "LearnedFace", "PartialLeastSquares", "learn_face"]
