@@ -51,10 +51,10 @@ from cmfsim.pictures import (
 )
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.planning.page import PAGE_FILE, page_state
-from cmfsim.progress import Progress
 from cmfsim.report import Document, Figure, case_document, write_page
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.prediction import MODELS, Prediction
+from cmfsim.values.progress import Progress
 
 __all__ = [
     "WrittenPrediction",

@@ -10,7 +10,6 @@ from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.pipeline.building import Postoperative, case_key, input_hashes, plan_key
 from cmfsim.pipeline.building.case_model import model_of
 from cmfsim.pipeline.building.stages import BuildOptions
-from cmfsim.progress import Progress
 from cmfsim.solving.models import predict_patient
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.band_options import BandOptions
@@ -18,6 +17,7 @@ from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
+from cmfsim.values.progress import Progress
 
 __all__ = [
     "build_patient",

@@ -14,13 +14,13 @@ from cmfsim.evaluation.unmoved import thickened as moved_outward
 from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
 from cmfsim.pipeline.building import build_model
-from cmfsim.progress import Progress, no_progress
 from cmfsim.surfaces.depth import tissue_depth
 from cmfsim.surfaces.topology import tet_bodies
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.body import HyperelasticBody
 from cmfsim.virtual.carried_skin import carried

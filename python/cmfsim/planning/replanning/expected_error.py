@@ -10,8 +10,8 @@ import numpy as np
 from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, ContactError, SolverError
 from cmfsim.planning.replanning.model import Motions, PlanningModel
-from cmfsim.progress import Progress
 from cmfsim.values.motion import rigid_motion
+from cmfsim.values.progress import Progress
 
 __all__ = [
     "USUAL",

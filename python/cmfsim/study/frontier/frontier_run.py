@@ -17,7 +17,6 @@ from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.io import Case
 from cmfsim.io.archives import member_of, read_archive
 from cmfsim.pipeline.building import input_hashes
-from cmfsim.progress import Progress, no_progress
 from cmfsim.study.frontier.choice import Choice, case_choice
 from cmfsim.study.frontier.machine import machine
 from cmfsim.study.frontier.measure import STOPPED, Answer, kept, run_job
@@ -25,6 +24,7 @@ from cmfsim.study.frontier.rows import Frontier, FrontierRow, Spread, with_front
 from cmfsim.study.frontier.skin_points import WHOLE, read_points, skin_errors
 from cmfsim.study.frontier.sweep import reference_choice, sweep_choices
 from cmfsim.study.frontier.worker import MOVED_FORMAT
+from cmfsim.values.progress import Progress, no_progress
 
 __all__ = ["content_key", "frontier"]
 
