@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import cmfsim
-from cmfsim.phantom.average_head import drawn_head
 from cmfsim.pictures import picture_landmarks
+from make_average_head import drawn_head
 
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "docs" / "figures"

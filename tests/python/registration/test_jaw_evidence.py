@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.phantom.average_head import average_head
 from cmfsim.pipeline.building.inputs import read_anatomy
 from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head
+from cmfsim.registration.proposed.average_head import average_head
 
 pytest.importorskip("scipy")
 

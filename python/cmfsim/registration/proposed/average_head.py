@@ -1,4 +1,4 @@
-"""The ordinary synthetic head as surfaces with landmarks, ready to compare other heads with."""
+"""The ordinary synthetic head, as stored: what the landmarks of other heads are proposed from."""
 
 from collections.abc import Mapping
 from functools import lru_cache
@@ -9,19 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.checks import Floats
-from cmfsim.phantom.model import PhantomHead, make_head
-from cmfsim.registration.proposed import TemplateHead, measured_biases
-from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
+from cmfsim.registration.proposed.proposal import measured_biases
+from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["average_head", "drawn_head", "write_average_head"]
+__all__ = ["average_head", "write_average_head"]
 
 FILE = "average_head.npz"
 # Coordinates are rounded to this, mm: they pack into 16 bits.
 GRAIN = 1.0 / 100.0
-# Voxels that the surfaces are taken from, mm, and how many triangles each has at most.
-SPACING, MOST_TRIANGLES = 1.5, 16_000
 BONES = ("cranium", "mandible")
 PARTS = (*BONES, "skin")
 KINDS = {"skull": SKULL_LANDMARKS, "skin": SKIN_LANDMARKS}
@@ -38,20 +35,9 @@ def average_head() -> TemplateHead:
         return _unpacked(stored)
 
 
-def drawn_head(head: PhantomHead, name: str) -> TemplateHead:
-    """A synthetic head with surfaces like those of `average_head`; it takes seconds."""
-    anatomy = head.anatomy(SPACING)
-    options = SurfaceOptions(max_triangles=MOST_TRIANGLES)
-    levels = {**anatomy.bones, "skin": anatomy.skin}
-    parts = {part: surface_of_level(part, levels[part], options) for part in PARTS}
-    bones = {bone: parts[bone] for bone in BONES}
-    return TemplateHead(name, bones, head.skull_landmarks, parts["skin"], head.skin_landmarks)
-
-
-def write_average_head(path: Path) -> None:
-    """Writes the ordinary synthetic head: its surfaces packed, its landmarks with every digit."""
-    template = drawn_head(make_head(), "synthetic head")
-    surfaces = {**template.bones, "skin": template.skin}
+def write_average_head(path: Path, head: TemplateHead) -> None:
+    """Writes the head that `average_head` reads: surfaces packed, landmarks with every digit."""
+    surfaces = {**head.bones, "skin": head.skin}
     packed: dict[str, NDArray[np.generic]] = {}
     for name in PARTS:
         surface = surfaces[name]
@@ -59,8 +45,8 @@ def write_average_head(path: Path) -> None:
             raise AssertionError(name)
         packed[f"{name}_vertices"] = np.round(surface.vertices / GRAIN).astype(np.int16)
         packed[f"{name}_triangles"] = surface.triangles.astype(np.uint16)
-    packed["skull_landmarks"] = np.array([template.skull[name] for name in SKULL_LANDMARKS])
-    packed["skin_landmarks"] = np.array([template.skin_landmarks[name] for name in SKIN_LANDMARKS])
+    packed["skull_landmarks"] = np.array([head.skull[name] for name in SKULL_LANDMARKS])
+    packed["skin_landmarks"] = np.array([head.skin_landmarks[name] for name in SKIN_LANDMARKS])
     # Of the head as it is read: rounded.
     rounded = _unpacked(packed)
     for (kind, names), biases in zip(KINDS.items(), measured_biases(rounded, rounded), strict=True):
