@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from cmfsim._core import Surface, TetMesh
 from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, third_party
-from cmfsim.evaluation.unmoved import thickened as moved_outward
 from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
 from cmfsim.pipeline.building import build_model
-from cmfsim.surfaces.depth import tissue_depth
+from cmfsim.surfaces.depth import moved_outward, tissue_depth
 from cmfsim.surfaces.topology import tet_bodies
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.image_data import ImageData
