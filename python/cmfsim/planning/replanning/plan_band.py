@@ -22,11 +22,11 @@ from cmfsim.planning.replanning.model import Motions, PlanningModel
 from cmfsim.solving.models import model_scene
 from cmfsim.solving.rates import ACCURACY, scene_parts, tissue_load
 from cmfsim.solving.simulation import scene_plan
-from cmfsim.solving.uncertainty import TISSUE, Source
 from cmfsim.values.calibration import BandFactor
 from cmfsim.values.motion import decompose_motion
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import SkinBand
+from cmfsim.values.uncertainty import TISSUE, Source
 
 __all__ = ["PlanBand", "plan_band"]
 

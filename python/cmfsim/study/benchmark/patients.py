@@ -17,7 +17,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.evaluation import skin_regions
 from cmfsim.io import Case, read_landmarks, read_surface
 from cmfsim.io.populations import MADE, Population
-from cmfsim.solving.uncertainty import ADDED, PLAN, Source
+from cmfsim.values.uncertainty import ADDED, PLAN, Source
 
 __all__ = ["LIPS", "BenchmarkPatient", "far_from_models", "patients_of"]
 
