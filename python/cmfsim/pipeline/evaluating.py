@@ -24,7 +24,8 @@ from cmfsim.evaluation import (
 )
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.io.metrics import EVALUATION_FILE
-from cmfsim.pipeline.building import Postoperative, case_key, read_postoperative
+from cmfsim.pipeline.building.inputs import case_key
+from cmfsim.pipeline.building.postoperative import Postoperative, read_postoperative
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.face_regions import face_landmarks
 from cmfsim.pipeline.predicting import named_models, predictions_of

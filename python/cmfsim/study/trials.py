@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from cmfsim.checks import Floats, as_positive, as_rows
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io import CaseOrPath, as_case
-from cmfsim.pipeline.building import with_muscles
+from cmfsim.pipeline.building.muscles import with_muscles
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.solving.models import predict_patient

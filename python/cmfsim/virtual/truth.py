@@ -12,7 +12,7 @@ from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
-from cmfsim.pipeline.building import build_model
+from cmfsim.pipeline.building.case_model import build_model
 from cmfsim.surfaces.depth import moved_outward, tissue_depth
 from cmfsim.surfaces.topology import tet_bodies
 from cmfsim.values.anatomy import Anatomy, BoneSegment

@@ -16,7 +16,7 @@ from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.io import Case
 from cmfsim.io.archives import member_of, read_archive
-from cmfsim.pipeline.building import input_hashes
+from cmfsim.pipeline.building.inputs import input_hashes
 from cmfsim.study.frontier.choice import Choice, case_choice
 from cmfsim.study.frontier.machine import machine
 from cmfsim.study.frontier.measure import STOPPED, Answer, kept, run_job

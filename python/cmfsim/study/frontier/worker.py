@@ -15,7 +15,7 @@ from typing import Any
 from cmfsim.errors import CmfsimError
 from cmfsim.io import Case, read_scene, replacing, write_scene
 from cmfsim.io.archives import member_of, read_archive, write_archive
-from cmfsim.pipeline.building import build_model
+from cmfsim.pipeline.building.case_model import build_model
 from cmfsim.solving.models import model_scene
 from cmfsim.solving.simulation import solve_scene
 from cmfsim.study.frontier.choice import Choice
