@@ -19,6 +19,7 @@ from cmfsim.checks import Floats
 from cmfsim.errors import BoundaryInputError, RegistrationError, third_party
 from cmfsim.surfaces.checks import duplicate_triangles, has_three_corners, thin_triangles
 from cmfsim.surfaces.topology import connected_labels, edges_of
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = [
@@ -393,10 +394,6 @@ def _areas(vertices: Floats, triangles: Integers) -> Floats:
 
 def _part(motion: MovedSurface, triangles: Integers) -> MovedSurface:
     """The motion of some of its triangles, and of their vertices only."""
-    used, renumbered = np.unique(triangles, return_inverse=True)
-    surface = SurfaceData(
-        motion.surface.vertices[used],
-        renumbered.reshape(-1, 3),
-        motion.surface.crease_angle,
-    )
+    used, corners = used_nodes(triangles)
+    surface = SurfaceData(motion.surface.vertices[used], corners, motion.surface.crease_angle)
     return MovedSurface(surface, motion.moved_vertices[used])

@@ -15,6 +15,7 @@ from cmfsim.checks import Floats, Indices, as_number, as_positive
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
@@ -226,13 +227,8 @@ def _without_slits(
         & (joined[:, 1] != joined[:, 2])
         & (joined[:, 2] != joined[:, 0])
     )
-    return _used(points, joined[kept])
-
-
-def _used(points: Floats, triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], Floats]:
-    """The triangles and the points that they use, in their order, renumbered."""
-    used, numbers = np.unique(triangles, return_inverse=True)
-    return numbers.reshape(triangles.shape), points[used]
+    used, left = used_nodes(joined[kept])
+    return left, points[used]
 
 
 def _smoothed(points: Floats, triangles: NDArray[np.int64], rounds: int) -> Floats:
@@ -284,8 +280,8 @@ def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> S
     points, corners = _simplified(name, surface.vertices, triangles, max_triangles)
     if not len(corners):
         raise CaseInputError(f"nothing is left of {name!r} at {max_triangles} triangles")
-    left, used = _used(points, corners)
-    return SurfaceData(used, left)
+    used, left = used_nodes(corners)
+    return SurfaceData(points[used], left)
 
 
 def _simplified(

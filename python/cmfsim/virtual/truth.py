@@ -20,6 +20,7 @@ from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.progress import Progress, no_progress
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.body import HyperelasticBody
 from cmfsim.virtual.carried_skin import carried
@@ -379,14 +380,11 @@ def _opened(
     bared = np.zeros(len(nodes), dtype=bool)
     bared[tets[~kept]] = True
     tets = tets[kept]
-    tets = tets[largest_body(tets)]
-    used = np.zeros(len(nodes), dtype=bool)
-    used[tets] = True
-    number = np.cumsum(used) - 1
+    used, left = used_nodes(tets[largest_body(tets)])
     return _Opened(
         nodes[used],
-        number[tets].astype(np.uint32),
-        NodeKinds(kinds.kind[used], kinds.segment[used], kinds.segments),
+        left.astype(np.uint32),
+        kinds.of_nodes(used),
         np.flatnonzero(bared[used]),
     )
 

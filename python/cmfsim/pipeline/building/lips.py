@@ -23,6 +23,7 @@ from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.finding import Finding
 from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.touching import ObstacleData, TouchingData
 
@@ -114,8 +115,7 @@ def separated_at_seam(
     first = np.full(place.max() + 1, -1)
     first[place[: mesh.n_nodes]] = np.arange(mesh.n_nodes)
     origin = first[place]
-    copied = NodeKinds(kinds.kind[origin], kinds.segment[origin], kinds.segments)
-    return held_part(separated, copied)
+    return held_part(separated, kinds.of_nodes(origin))
 
 
 def lip_contact(
@@ -231,8 +231,8 @@ def _on_teeth(sheet: SurfaceData, bones: Sequence[Surface]) -> SurfaceData | Non
         return None
     label = connected_labels(edges_of(kept.astype(np.int64)).pairs, len(kept))
     kept = kept[label == np.argmax(np.bincount(label))]
-    used, corners = np.unique(kept, return_inverse=True)
-    return SurfaceData(vertices[used], corners.reshape(-1, 3), sheet.crease_angle)
+    used, corners = used_nodes(kept)
+    return SurfaceData(vertices[used], corners, sheet.crease_angle)
 
 
 def _distances(points: Floats, surface: Surface) -> Floats:
