@@ -38,7 +38,6 @@ from cmfsim.io.predictions import (
 from cmfsim.io.skin_errors import skin_errors_file, write_skin_errors
 from cmfsim.io.slicer_output import SLICER_FILE, write_slicer_bundle
 from cmfsim.io.summaries import write_summary
-from cmfsim.muscles.template import joined_surface
 from cmfsim.pictures import (
     Painter,
     Picture,
@@ -55,6 +54,7 @@ from cmfsim.report import Document, Figure, case_document, write_page
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import Progress
+from cmfsim.values.surface_data import joined_surface
 
 __all__ = [
     "WrittenPrediction",
