@@ -69,7 +69,7 @@ def predict(options: argparse.Namespace) -> int:
         written = write_results(
             case.output,
             _timed(_at_least_one(predictions, failed), before),
-            len(models),
+            models,
             stage=progress.stage,
             with_report=not options.no_report,
             slicer=options.slicer,
@@ -132,7 +132,7 @@ def evaluate(options: argparse.Namespace) -> int:
         written = write_results(
             case.output,
             found.predictions,
-            len(models),
+            models,
             stage=progress.stage,
             evaluation=lambda: found,
             with_report=not options.no_report,

@@ -28,15 +28,12 @@ Picture = partial[None]
 class Painter:
     """A process that draws pictures one after the other, while the caller goes on.
 
-    It loads its libraries as soon as it is made. Used in a `with` statement, it ends with that.
+    It starts with the first picture, or with `load`. Used in a `with` statement, it ends with that.
     """
 
     def __init__(self) -> None:
         self._queue = ThreadPoolExecutor(1)
-        # Where this Python cannot start another, pictures are drawn in turn.
-        self._worker = Worker() if sys.executable else None
-        if self._worker is not None:
-            self._queue.submit(self._load, self._worker)
+        self._worker: Worker | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -51,11 +48,19 @@ class Painter:
             self._worker.end()
         self._queue.shutdown(cancel_futures=True)
 
+    def load(self) -> None:
+        """Starts the process, which loads its libraries: ahead of a picture that is to come."""
+        # Where this Python cannot start another, pictures are drawn in turn.
+        if self._worker is None and sys.executable:
+            self._worker = Worker()
+            self._queue.submit(self._load, self._worker)
+
     def begin(self, picture: Picture, path: Path) -> "Future[None]":
         """The picture to come; its result raises what drawing it here would.
 
         What the picture shows is taken now: it may not change afterwards.
         """
+        self.load()
         if self._worker is None:
             return self._queue.submit(picture, path)
         return self._queue.submit(self._draw, self._worker, picture, path)

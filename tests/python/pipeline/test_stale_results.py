@@ -82,7 +82,7 @@ def write(folder, *predictions, evaluation=None):
     return write_results(
         folder,
         predictions,
-        len(predictions),
+        [prediction.model for prediction in predictions],
         stage=lambda _: None,
         evaluation=None if evaluation is None else lambda: evaluation,
     )
@@ -452,7 +452,7 @@ def test_an_output_folder_that_leads_elsewhere_is_refused(tmp_path, case, predic
 def test_no_stage_is_named_twice(tmp_path, prediction, evaluation):
     stages = []
     write_results(
-        Path(tmp_path), [prediction], 1, stage=stages.append, evaluation=lambda: evaluation
+        Path(tmp_path), [prediction], ["H"], stage=stages.append, evaluation=lambda: evaluation
     )
     assert stages == ["writing H", "writing the comparison", "writing the report"]
 
