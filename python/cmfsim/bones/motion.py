@@ -288,7 +288,7 @@ def missing_patches(
     """
     here = segment.vertices
     triangles = segment.triangles.astype(np.int64)
-    moved = here @ np.asarray(matrix)[:3, :3].T + np.asarray(matrix)[:3, 3]
+    moved = here @ matrix[:3, :3].T + matrix[:3, 3]
     off = np.linalg.norm(bone.closest(moved)[0] - moved, axis=1)
     far = np.flatnonzero((off > REMOVED_RIM) & (off < shown))
     gone = np.zeros(len(here), dtype=bool)
@@ -340,9 +340,11 @@ def _rest_of(here: Floats, there: Floats) -> tuple[Floats, Callable[[Floats], Fl
         return None
 
     def back(points: Floats) -> Floats:
-        return np.asarray(np.linalg.solve(linear.T, (points - coefficients[3]).T).T + middle)
+        moved: Floats = np.linalg.solve(linear.T, (points - coefficients[3]).T).T + middle
+        return moved
 
-    return np.asarray(columns @ coefficients), back
+    moved: Floats = columns @ coefficients
+    return moved, back
 
 
 def _averaged(points: Floats, values: Floats) -> Floats:

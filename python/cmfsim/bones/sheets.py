@@ -367,7 +367,8 @@ def _closed_slice(mask: Mask, radius: float) -> Mask:
     wide = np.pad(mask, rim)
     grown = ndimage.distance_transform_edt(~wide) * SPACING <= radius
     kept = ndimage.distance_transform_edt(grown) * SPACING > radius
-    return np.asarray(kept[rim:-rim, rim:-rim] | mask)
+    filled: Mask = kept[rim:-rim, rim:-rim] | mask
+    return filled
 
 
 def _signed_slice(mask: Mask) -> Floats:
@@ -378,7 +379,8 @@ def _signed_slice(mask: Mask) -> Floats:
     outside = ndimage.distance_transform_edt(~mask)
     inside = ndimage.distance_transform_edt(mask)
     half = 0.5
-    return np.asarray(np.where(mask, half - inside, outside - half) * SPACING)
+    level: Floats = np.where(mask, half - inside, outside - half) * SPACING
+    return level
 
 
 def _depth(solid: Mask, near: Floats) -> NDArray[np.float32]:

@@ -270,7 +270,7 @@ def _carried(
     first, second = landmarks
     motion = SurfaceMotion(skin, moved)
     if isinstance(first, Mapping):
-        places = np.array([np.asarray(p, dtype=np.float64) for p in first.values()])
+        places = np.array(list(first.values()), dtype=np.float64)
         there = places + motion.displacement(places)
         return dict(zip(first, there, strict=True)), second
     places = as_rows("landmarks", first, 3)

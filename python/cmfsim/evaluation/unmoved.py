@@ -91,7 +91,7 @@ def compare_unmoved(
     RegistrationError
         (also `ValueError`) None of them has a partner: the scan after ends below the forehead.
     """
-    still = np.asarray(moved) < STILL
+    still = moved < STILL
     parts: dict[str, NDArray[np.bool_]] = {n: np.asarray(p) & still for n, p in regions.items()}
     parts = {name: part for name, part in parts.items() if part.any()}
     if sum(int(part.sum()) for part in parts.values()) < LEAST_VERTICES:

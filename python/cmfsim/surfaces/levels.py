@@ -111,7 +111,7 @@ def surface_of_level(
         the surface has to be decimated, is missing.
     """
     options = options or SurfaceOptions()
-    values = np.asarray(level.values, dtype=np.float32)
+    values = level.single
     low, high = block_of(values > 0.0)
     if not (high > low).all():
         raise CaseInputError(f"{name!r} has no voxel inside: its surface would be empty")
@@ -201,7 +201,7 @@ def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> 
 def block_of(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The first and the past-the-last voxel of the mask along each axis; equal if it is empty."""
     low, high = np.zeros(3, dtype=np.intp), np.zeros(3, dtype=np.intp)
-    columns, sheet = np.asarray(mask.any(axis=2)), np.asarray(mask.any(axis=0))
+    columns, sheet = np.any(mask, axis=2), np.any(mask, axis=0)
     for axis, line in enumerate((columns.any(axis=1), columns.any(axis=0), sheet.any(axis=0))):
         found = np.flatnonzero(line)
         if len(found):

@@ -331,7 +331,8 @@ def _departure(patient: VirtualPatient, head: PhantomHead, segment: str) -> Floa
 def _nearest(points: Floats, places: Floats) -> NDArray[np.intp]:
     """Index of the nearest place to each point."""
     spatial = third_party("scipy.spatial", "virtual patients are made", "study")
-    return np.asarray(spatial.cKDTree(places).query(points)[1])
+    nearest: NDArray[np.intp] = spatial.cKDTree(places).query(points)[1]
+    return nearest
 
 
 def _outward(
@@ -399,7 +400,8 @@ def largest_body(tets: NDArray[Any]) -> NDArray[np.bool_]:
     tets : (m, 4)
     """
     body = tet_bodies(tets)
-    return np.asarray(body == np.argmax(np.bincount(body)))
+    largest: NDArray[np.bool_] = body == np.argmax(np.bincount(body))
+    return largest
 
 
 def _moved_sites(

@@ -71,7 +71,8 @@ class SkinProfiles:
             [np.interp(h, self.heights, self.ahead[k]) for k, h in zip(row, heights, strict=True)]
             for row in (low, low + 1)
         ]
-        return np.asarray((1.0 - part) * np.array(ends[0]) + part * np.array(ends[1]))
+        point: Floats = (1.0 - part) * np.array(ends[0]) + part * np.array(ends[1])
+        return point
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +142,8 @@ def _first_inside(level: Floats, rays: Floats) -> Floats:
     there = np.take_along_axis(level, before[..., None], axis=2)[..., 0]
     part = np.where(here > there, here / np.where(here > there, here - there, 1.0), 0.0)
     ahead = rays[first] + part * (rays[before] - rays[first])
-    return np.asarray(np.where(hit, ahead, rays[-1]))
+    places: Floats = np.where(hit, ahead, rays[-1])
+    return places
 
 
 def _chord_depth(ahead: Floats) -> Floats:
@@ -241,7 +243,7 @@ def smoothed(values: Floats, weight: Floats, length: float) -> Floats:
         return values.copy()
     second = np.diff(np.eye(n), 2, axis=0)
     stiff = (0.5 * length) ** 4 * second.T @ second
-    kept = np.asarray(weight, dtype=np.float64) / max(float(np.max(weight)), 1e-9)
+    kept = weight / max(float(np.max(weight)), 1e-9)
     kept = np.maximum(kept, 1e-6)
     smooth: Floats = values
     trust = np.ones(n)

@@ -114,7 +114,8 @@ def _without_scraps(triangles: Indices) -> Indices:
     edges = edges_of(triangles.astype(np.int64))
     label = connected_labels(edges.pairs, len(triangles))
     size = np.bincount(label)
-    return np.asarray(triangles[size[label] >= LEAST_PATCH * size.max()])
+    large: Indices = triangles[size[label] >= LEAST_PATCH * size.max()]
+    return large
 
 
 def _region(mine: Indices, other: Indices, kinds: NodeKinds, held: NDArray[np.bool_]) -> LipRegion:

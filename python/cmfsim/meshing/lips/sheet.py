@@ -141,7 +141,8 @@ def _bone_met(
 def _widened(values: Floats, reach: int) -> Floats:
     """The largest value within a number of positions on either side."""
     padded = np.pad(values, reach, mode="edge")
-    return np.asarray(np.max([padded[k : k + len(values)] for k in range(2 * reach + 1)], axis=0))
+    highest: Floats = np.max([padded[k : k + len(values)] for k in range(2 * reach + 1)], axis=0)
+    return highest
 
 
 def _in_front(profiles: SkinProfiles, line: MouthLine) -> Floats:
@@ -193,7 +194,10 @@ def _heights(
 def _first_closed(bounded: NDArray[np.bool_], away: Floats) -> NDArray[np.intp]:
     """The first row, from the mouth's line on backwards, at which no gap is left in a column."""
     closed = ~bounded & (away >= 0.0)
-    return np.asarray(np.where(closed.any(axis=1), np.argmax(closed, axis=1), bounded.shape[1]))
+    first: NDArray[np.intp] = np.where(
+        closed.any(axis=1), np.argmax(closed, axis=1), bounded.shape[1]
+    )
+    return first
 
 
 def _air_about(level: Floats, fine: Floats) -> tuple[Floats, Floats]:

@@ -116,11 +116,13 @@ def _least_at_corners(
     near = np.flatnonzero(((nodes >= low) & (nodes <= high)).all(axis=1))
     distance = np.full(len(nodes), np.inf)
     distance[near] = _distances(nodes[near], surface)
-    return np.asarray(distance[tets].min(axis=1))
+    nearest: Floats = distance[tets].min(axis=1)
+    return nearest
 
 
 def _distances(points: Floats, surface: Surface) -> Floats:
     if not len(points):
         return np.zeros(0)
     closest, _, _ = surface.closest(points)
-    return np.asarray(np.linalg.norm(closest - points, axis=1))
+    distances: Floats = np.linalg.norm(closest - points, axis=1)
+    return distances

@@ -237,7 +237,8 @@ def _on_teeth(sheet: SurfaceData, bones: Sequence[Surface]) -> SurfaceData | Non
 
 def _distances(points: Floats, surface: Surface) -> Floats:
     closest, _, _ = surface.closest(points)
-    return np.asarray(np.linalg.norm(closest - points, axis=1))
+    distances: Floats = np.linalg.norm(closest - points, axis=1)
+    return distances
 
 
 def lip_summary(seam: LipSeam, lips: CaseLipContact) -> dict[str, Any]:

@@ -284,18 +284,19 @@ def _surface_wish(planning: PlanningModel, target: SurfaceTarget) -> Wish:
 
     def rows(places: Floats, _: Motions) -> Floats:
         closest, normals, _triangles = surface.closest(places)
-        return np.asarray(((places - closest) * normals).sum(axis=1) / target.std)
+        rows: Floats = ((places - closest) * normals).sum(axis=1) / target.std
+        return rows
 
     return Wish(kept, rows)
 
 
 def _has_partner(surface: Surface, rim: Floats, points: Floats) -> NDArray[np.bool_]:
     closest, _, _ = surface.closest(points)
-    near = np.linalg.norm(closest - points, axis=1) <= MOST_APART
+    near: NDArray[np.bool_] = np.linalg.norm(closest - points, axis=1) <= MOST_APART
     if len(rim):
         from_rim = [float(np.linalg.norm(rim - place, axis=1).min()) for place in closest]
         near &= np.array(from_rim) > BORDER
-    return np.asarray(near)
+    return near
 
 
 def _border_points(surface: SurfaceData) -> Floats:

@@ -69,7 +69,8 @@ class PlanBand:
     def sd(self, plan: Motions) -> Floats:
         """The standard deviation at each vertex of the mesh's skin, (k,) mm."""
         shift = self.shift + self.rates @ self.numbers(plan)
-        return np.asarray(np.sqrt(self.still + (shift**2).sum(axis=0)))
+        total: Floats = np.sqrt(self.still + (shift**2).sum(axis=0))
+        return total
 
     def numbers(self, plan: Motions) -> Floats:
         """Six numbers of each segment, (6 s,): shift of its centre, mm, and turn, radians."""

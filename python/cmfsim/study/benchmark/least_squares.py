@@ -118,7 +118,8 @@ class LearnedFace:
         weights = 1.0 / np.maximum(away, 1e-3)
         weights /= weights.sum(axis=1, keepdims=True)
         share = np.clip((FADED - away[:, 0]) / (FADED - FOLLOWS), 0.0, 1.0)
-        return np.asarray(share[:, None] * np.einsum("vk,vki->vi", weights, moves[near]))
+        moved: Floats = share[:, None] * np.einsum("vk,vki->vi", weights, moves[near])
+        return moved
 
 
 def learn_face(patients: Sequence[BenchmarkPatient]) -> LearnedFace:
@@ -174,7 +175,8 @@ def _landmarks(patient: BenchmarkPatient) -> Floats:
 def _partners(patient: BenchmarkPatient, landmarks: Floats, points: Floats) -> NDArray[np.intp]:
     """The vertex of a patient's skin that answers to each point of another's."""
     spline = ThinPlateSpline(landmarks, _landmarks(patient))
-    return np.asarray(_tree(patient.skin).query(np.asarray(spline(points)))[1])
+    nearest: NDArray[np.intp] = _tree(patient.skin).query(spline(points))[1]
+    return nearest
 
 
 def _tree(points: Floats):  # type: ignore[no-untyped-def]
