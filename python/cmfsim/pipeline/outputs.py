@@ -18,7 +18,7 @@ import numpy as np
 
 from cmfsim.errors import CmfsimError
 from cmfsim.evaluation import error_table
-from cmfsim.io import replacing_files
+from cmfsim.io import replacing, replacing_files
 from cmfsim.io.metrics import (
     EVALUATION_FILE,
     REPORT_FILE,
@@ -50,7 +50,7 @@ from cmfsim.pictures import (
 )
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.planning.page import PAGE_FILE, page_state
-from cmfsim.report import Document, Figure, case_document, write_page
+from cmfsim.report import Document, Figure, case_document, render_page
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import Progress
@@ -469,8 +469,10 @@ def _error_caption(model: str) -> str:
 def write_report_page(folder: Path, document: Document) -> str | None:
     """The name of the page that a report was written to; none, with a warning, without Jinja2."""
     try:
-        write_page(folder / REPORT_FILE, document)
+        page = render_page(document)
     except CmfsimError as error:
         _log.warning("no report: %s", error)
         return None
+    with replacing(folder / REPORT_FILE) as file:
+        file.write(page.encode())
     return REPORT_FILE
