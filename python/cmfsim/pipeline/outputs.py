@@ -39,7 +39,6 @@ from cmfsim.io.skin_errors import skin_errors_file, write_skin_errors
 from cmfsim.io.slicer_output import SLICER_FILE, write_slicer_bundle
 from cmfsim.io.summaries import write_summary
 from cmfsim.pictures import (
-    Painter,
     Picture,
     band_picture,
     chart_errors,
@@ -49,6 +48,7 @@ from cmfsim.pictures import (
     prediction_picture,
 )
 from cmfsim.pipeline.evaluating import CaseEvaluation
+from cmfsim.pipeline.painting import Painter
 from cmfsim.planning.page import PAGE_FILE, page_state
 from cmfsim.report import Document, Figure, case_document, render_page
 from cmfsim.values.musculature import Musculature

@@ -9,20 +9,15 @@ import contextlib
 import pickle
 import sys
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from cmfsim.errors import CaseError, CaseInputError
 from cmfsim.io.parallel import Worker
-from cmfsim.pictures.canvas import NO_OPENGL, pyvista_module, without_probe
+from cmfsim.pictures.canvas import NO_OPENGL, Picture, pyvista_module, without_probe
 
-__all__ = ["Painter", "Picture", "draw_packed", "load"]
-
-# What draws a picture at a path: a function of this package with all else that it takes, which can
-# be pickled.
-Picture = partial[None]
+__all__ = ["Painter", "draw_packed", "load"]
 
 
 class Painter:
@@ -69,14 +64,14 @@ class Painter:
     def _load(worker: Worker) -> None:
         # What is wrong is raised for the first picture.
         with contextlib.suppress(CaseError):
-            worker.answer("cmfsim.pictures.beside:load", {})
+            worker.answer("cmfsim.pipeline.painting:load", {})
 
     @staticmethod
     def _draw(worker: Worker, picture: Picture, path: Path) -> None:
         packed = base64.b64encode(pickle.dumps(picture)).decode()
         try:
             worker.answer(
-                "cmfsim.pictures.beside:draw_packed",
+                "cmfsim.pipeline.painting:draw_packed",
                 {"path": str(path.absolute()), "packed": packed},
             )
         except CaseError as error:
