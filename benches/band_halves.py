@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 import cmfsim
-from cmfsim.benchmark.bands import COVERAGE, calibrated_band
-from cmfsim.benchmark.markdown import table
-from cmfsim.benchmark.patients import far_from_models, patients_of
 from cmfsim.io.populations import PARTS
+from cmfsim.study.benchmark.bands import COVERAGE, calibrated_band
+from cmfsim.study.benchmark.markdown import table
+from cmfsim.study.benchmark.patients import far_from_models, patients_of
 
 # Quantiles of the coverage over splits that are printed.
 ENDS = (0.05, 0.95)

@@ -114,6 +114,10 @@ class Jaws:
         return True
 
 
+def _stays(motion: Floats | cmfsim.MovedSurface) -> bool:
+    return not isinstance(motion, cmfsim.MovedSurface) and np.allclose(motion, np.eye(4))
+
+
 def draw(
     model: cmfsim.PatientModel, count: int, reach: tuple[float, float], overlap: float, seed: int
 ) -> list[Plan]:
@@ -122,7 +126,7 @@ def draw(
     jaws = Jaws(model, overlap)
     nodes = np.asarray(model.scene.nodes)
     segments = model.scene.segments
-    movable = [n for n, m in model.scene.plan.items() if not np.allclose(m, np.eye(4))]
+    movable = [n for n, m in model.scene.plan.items() if not _stays(m)]
     centres = {
         n: nodes[np.concatenate([segments[n].joined, segments[n].sliding])].mean(axis=0)
         for n in movable
@@ -174,7 +178,7 @@ def run_nearby(
     before = None
     for plan in plans:
         here = solver.solve(plan)
-        name = str(rng.choice([n for n, m in plan.items() if not np.allclose(m, np.eye(4))]))
+        name = str(rng.choice([n for n, m in plan.items() if not _stays(m)]))
         way = rng.normal(size=3)
         more = cmfsim.rigid_motion(tuple(NEARBY * way / np.linalg.norm(way))) @ plan[name]
         tally.nearby.append(_apart(here, solver.solve({**plan, name: more}), skin))

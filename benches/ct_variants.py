@@ -70,7 +70,13 @@ def with_metal(
     return image.with_values(np.round(values).clip(-1024, 3071).astype(np.int16))
 
 
-def _streaks(slice_hu, metal, image, least_transmission, rng):
+def _streaks(
+    slice_hu: np.ndarray,
+    metal: np.ndarray,
+    image: ImageData,
+    least_transmission: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
     # Water attenuates 0.02 per mm at 70 keV, fillings some 20 times as much.
     size = max(slice_hu.shape)
     wide = np.full((size, size), -1000.0)
@@ -86,7 +92,8 @@ def _streaks(slice_hu, metal, image, least_transmission, rng):
     measured = np.where(bad, least_transmission + rng.normal(0.0, 0.6, lines.shape), lines)
     error = iradon(measured - lines, angles, circle=False, output_size=size)
     error[filled] = 0.0
-    return (1000.0 * error / (0.02 * step))[: slice_hu.shape[0], : slice_hu.shape[1]]
+    streaks: np.ndarray = 1000.0 * error / (0.02 * step)
+    return streaks[: slice_hu.shape[0], : slice_hu.shape[1]]
 
 
 def with_pillow(image: ImageData, hu: float = -200.0) -> ImageData:

@@ -16,9 +16,10 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
 from marked import publish
 
+Motions = Mapping[str, NDArray[np.float64] | cmfsim.MovedSurface]
 NUMBERS = ("forwards", "up", "left", "pitch", "yaw", "roll")
 SEGMENTS = ("maxilla", "mandible_body", "chin")
 SIZE = 5.0
@@ -44,7 +46,7 @@ HEAD = (
     "| points | noise, mm | prior | plans | worst number | 95 % of numbers "
     "| determined directions | their 95 % | within two deviations | processor s: median | worst |"
 )
-FREE = {"prior_shift": None, "prior_turn": None, "shift": 60.0, "turn": 60.0}
+FREE: dict[str, Any] = {"prior_shift": None, "prior_turn": None, "shift": 60.0, "turn": 60.0}
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,9 @@ class Found:
     seconds: float
 
 
-def stated(planning: cmfsim.PlanningModel, plan: dict, names: Sequence[str]) -> NDArray[np.float64]:
+def stated(
+    planning: cmfsim.PlanningModel, plan: Motions, names: Sequence[str]
+) -> NDArray[np.float64]:
     """The six numbers of each of these segments under a plan, one after the other."""
     skull = planning.patient.landmarks["skull"]
     surfaces = {s.name: np.asarray(s.surface.vertices) for s in planning.patient.segments}
@@ -70,12 +74,13 @@ def stated(planning: cmfsim.PlanningModel, plan: dict, names: Sequence[str]) -> 
 
 def random_plan(
     planning: cmfsim.PlanningModel, names: Sequence[str], rng: np.random.Generator
-) -> dict:
+) -> dict[str, NDArray[np.float64]]:
     """±5 mm and ±5° of each number of these segments; all others stay."""
     skull = planning.patient.landmarks["skull"]
     plan = {name: np.eye(4) for name in planning.segments}
     for name in names:
         point = cmfsim.clinical_motion(name, np.eye(4), landmarks=skull).point
+        assert point is not None  # noqa: S101 (rotations are about a landmark)
         plan[name] = cmfsim.planned_motion(
             point, shift=rng.uniform(-SIZE, SIZE, 3), turn=rng.uniform(-SIZE, SIZE, 3)
         )
@@ -143,14 +148,18 @@ def truth_table(folders: Sequence[Path]) -> str:
         operated = dict(patient.scene.plan)
         still = {name: np.eye(4) for name in operated}
         planning = cmfsim.planning_model(patient, "M+S", reference=still)
-        names = [n for n, m in operated.items() if not np.array_equal(m, np.eye(4))]
+        names = [
+            name
+            for name, motion in operated.items()
+            if isinstance(motion, cmfsim.MovedSurface) or not np.array_equal(motion, np.eye(4))
+        ]
         before = cmfsim.read_surface(folder / "truth/skin_before.ply")
         exact = cmfsim.read_surface(folder / "truth/skin_exact.ply")
         scanned = cmfsim.read_surface(folder / "truth/skin.ply")
         points, goals = np.asarray(before.vertices), np.asarray(exact.vertices)
         far = np.linalg.norm(goals - points, axis=1) > 0.5
         chosen = np.flatnonzero(far)[:: max(1, int(far.sum()) // 200)]
-        wishes = {
+        wishes: dict[str, cmfsim.PointTarget | cmfsim.SurfaceTarget] = {
             f"{len(chosen)} true points": cmfsim.PointTarget(points[chosen], goals[chosen]),
             "the scanned surface": cmfsim.SurfaceTarget(scanned),
         }

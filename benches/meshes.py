@@ -1,6 +1,7 @@
 """Procedural meshes, materials and integrals of tests and benches, all seeded: no data files."""
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +16,17 @@ VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 def oriented(nodes: Floats, tets: NDArray[np.integer]) -> Indices:
     """The tets with two nodes swapped where their volume is negative."""
-    tets = np.array(tets, dtype=np.uint32)
-    negative = volumes(nodes, tets) < 0.0
-    tets[negative] = tets[negative][:, [0, 2, 1, 3]]
-    return tets
+    turned = tets.astype(np.uint32)
+    negative = volumes(nodes, turned) < 0.0
+    turned[negative] = turned[negative][:, [0, 2, 1, 3]]
+    return turned
 
 
 def volumes(nodes: Floats, tets: NDArray[np.integer]) -> Floats:
     """Signed volumes: det(b − a, c − a, d − a) / 6."""
     a, b, c, d = (nodes[tets[:, i]] for i in range(4))
-    return np.einsum("ij,ij->i", b - a, np.cross(c - a, d - a)) / 6.0
+    found: Floats = np.einsum("ij,ij->i", b - a, np.cross(c - a, d - a)) / 6.0
+    return found
 
 
 def box(
@@ -43,7 +45,7 @@ def box(
     _, ny, nz = cells
     axes = [np.arange(n + 1, dtype=np.float64) for n in cells]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    inner = ((grid > 0) & (grid < np.array(cells))).all(axis=1)
+    inner = np.all((grid > 0) & (grid < np.array(cells)), axis=1)
     shift = np.random.default_rng(seed).uniform(-jitter, jitter, grid.shape)
     if keep_layers:
         shift[:, 0] = 0.0
@@ -134,7 +136,7 @@ def plane(half_width: float, cells: int = 1, *, seed: int | None = None) -> tupl
     axis = np.linspace(-half_width, half_width, cells + 1)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     if seed is not None:
-        inner = (np.abs(grid) < half_width * (1.0 - 1e-9)).all(axis=1)
+        inner = np.all(np.abs(grid) < half_width * (1.0 - 1e-9), axis=1)
         shift = np.random.default_rng(seed).uniform(-0.4, 0.4, grid.shape)
         grid = grid + inner[:, None] * shift * (2.0 * half_width / cells)
     triangles = Delaunay(grid).simplices
@@ -163,13 +165,15 @@ def rotation(axis: tuple[float, float, float], degrees: float) -> Floats:
     k = np.array(axis) / np.linalg.norm(axis)
     cross = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
     angle = np.radians(degrees)
-    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+    turn: Floats = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+    return turn
 
 
 def unit_vectors(count: int, seed: int = 0) -> Floats:
     """Random directions."""
     v = np.random.default_rng(seed).normal(size=(count, 3))
-    return v / np.linalg.norm(v, axis=1, keepdims=True)
+    units: Floats = v / np.linalg.norm(v, axis=1, keepdims=True)
+    return units
 
 
 # Elasticity by engineering constants and fourth-order tensors, independent of the core's formulas.
@@ -180,11 +184,12 @@ def isotropic_tensor(young: float, poisson: float) -> Floats:
     lame = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
     mu = young / (2 * (1 + poisson))
     d = np.eye(3)
-    return (
+    c: Floats = (
         lame * np.einsum("ij,kl->ijkl", d, d)
         + mu * np.einsum("ik,jl->ijkl", d, d)
         + mu * np.einsum("il,jk->ijkl", d, d)
     )
+    return c
 
 
 def fibre_tensor(along: float, across: float, poisson: float, fibre: Floats) -> Floats:
@@ -202,12 +207,13 @@ def fibre_tensor(along: float, across: float, poisson: float, fibre: Floats) -> 
     s[1, 2] = s[2, 1] = -poisson / across
     s[3, 3] = 2 * (1 + poisson) / across
     s[4, 4] = s[5, 5] = 1 / along + 1 / across + 2 * nu_lt / along
-    c = voigt_to_tensor(np.linalg.inv(s))
+    c = voigt_to_tensor(np.linalg.inv(s).astype(np.float64))
     a = np.asarray(fibre, dtype=np.float64)
     b = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
     b /= np.linalg.norm(b)
     frame = np.stack([a, b, np.cross(a, b)], axis=1)
-    return np.einsum("ip,jq,kr,ls,pqrs->ijkl", frame, frame, frame, frame, c)
+    turned: Floats = np.einsum("ip,jq,kr,ls,pqrs->ijkl", frame, frame, frame, frame, c)
+    return turned
 
 
 def voigt_to_tensor(c: Floats) -> Floats:
@@ -239,7 +245,7 @@ def quadrature(order: int = 4) -> tuple[Floats, Floats]:
     return np.column_stack([1 - points.sum(axis=1), points]), weights
 
 
-def body_loads(nodes: Floats, tets: Indices, density) -> Floats:
+def body_loads(nodes: Floats, tets: Indices, density: Callable[[Floats], Floats]) -> Floats:
     """Consistent nodal forces ∫ N_j b dV of a body force b(points), N/mm³."""
     barycentric, weights = quadrature()
     x = np.einsum("qa,mai->mqi", barycentric, nodes[tets])
@@ -250,7 +256,7 @@ def body_loads(nodes: Floats, tets: Indices, density) -> Floats:
     return loads
 
 
-def l2_error(nodes: Floats, tets: Indices, u: Floats, exact) -> float:
+def l2_error(nodes: Floats, tets: Indices, u: Floats, exact: Callable[[Floats], Floats]) -> float:
     """‖u_h − u‖ / ‖u‖ in L2 over the mesh."""
     barycentric, weights = quadrature()
     x = np.einsum("qa,mai->mqi", barycentric, nodes[tets])
@@ -272,4 +278,4 @@ def surface_loads(nodes: Floats, triangles: Indices, traction: Floats) -> Floats
 
 def matched(points: Floats, others: Floats) -> NDArray[np.intp]:
     """Index of the nearest of `others` for each point."""
-    return cKDTree(others).query(points)[1]
+    return np.asarray(cKDTree(others).query(points)[1])

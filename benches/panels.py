@@ -46,4 +46,5 @@ def far_side_loads(
             edges = ((a, b), (a, c), (b, c))
             ends = [middles[edge] for edge in edges] if middles else [a, b, c]
             loads[ends, 1] += np.linalg.norm(np.cross(*sides)) / 6
-    return loads * (load / loads.sum())
+    scaled: Floats = loads * (load / loads.sum())
+    return scaled

@@ -32,7 +32,8 @@ def cuboid(half: float, squares: int) -> tuple[Floats, Floats]:
     i, j = (a.ravel() for a in np.meshgrid(*[np.arange(squares)] * 2, indexing="ij"))
     corner = [(i + a) * (squares + 1) + j + b for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
     face = np.concatenate([np.stack(corner[:3], 1), np.stack([corner[0], *corner[2:]], 1)])
-    vertices, triangles = [], []
+    vertices: list[Floats] = []
+    triangles: list[Floats] = []
     for axis in range(3):
         for side in (-half, half):
             points = np.roll(np.stack([np.full(u.size, side), u.ravel(), v.ravel()], 1), axis, 1)
@@ -58,7 +59,8 @@ def positive_part(values: Floats) -> Floats:
 def random_points(nodes: Floats, tets: Floats, samples: int, rng: np.random.Generator) -> Floats:
     """Points uniform in each tet, (m, samples, 3)."""
     weights = rng.dirichlet(np.ones(4), (len(tets), samples))
-    return np.einsum("mak,mac->mck", nodes[tets], weights.transpose(0, 2, 1))
+    points: Floats = np.einsum("mak,mac->mck", nodes[tets], weights.transpose(0, 2, 1))
+    return points
 
 
 def by_winding(surface: cmfsim.Surface, points: Floats) -> Floats:
@@ -69,7 +71,8 @@ def by_winding(surface: cmfsim.Surface, points: Floats) -> Floats:
 def by_normal(surface: cmfsim.Surface, points: Floats) -> Floats:
     """The paper's test: the closest normal points away from the point."""
     closest, normals, _ = surface.closest(points)
-    return np.einsum("na,na->n", closest - points, normals) > 0.0
+    inside: Floats = np.einsum("na,na->n", closest - points, normals) > 0.0
+    return inside
 
 
 def measure(repeat: int) -> list[dict[str, float | str]]:

@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -75,19 +76,20 @@ class Variant:
         low, high = np.maximum(FACE[0], self.low), np.minimum(FACE[1], self.high)
         inside = ((points > low + BORDER) & (points < high - BORDER)).all(axis=1)
         away = np.hypot(points[:, 0] - MIDDLE[0], points[:, 1] - MIDDLE[1])
-        return inside & (away < self.radius - BORDER)
+        seen: np.ndarray = inside & (away < self.radius - BORDER)
+        return seen
 
 
 def _shifted(by: float) -> Callable[[ImageData], ImageData]:
     return lambda image: image.with_values((image.values.astype(np.int32) + int(by)).astype("i2"))
 
 
-def _filled(image: ImageData, **options: float) -> ImageData:
+def _filled(image: ImageData, **options: Any) -> ImageData:
     pieces = effects.fillings(image, variants.FILLINGS)
     return effects.with_metal_scanned(image, [pieces], **options)
 
 
-def _braced(image: ImageData, **options: float) -> ImageData:
+def _braced(image: ImageData, **options: Any) -> ImageData:
     rows = [(x, z) for x in np.arange(-21.0, 22.0, 7.0) for z in (379.0, 364.0)]
     pieces = [
         effects.on_bone(image, "steel", rows, (3.5, 2.5, 3.0)),
@@ -142,7 +144,7 @@ def _coarse(image: ImageData) -> ImageData:
     return ImageData(np.round(values).astype(np.int16), step, image.origin)
 
 
-def _cone(**options: float) -> Callable[[ImageData], ImageData]:
+def _cone(**options: Any) -> Callable[[ImageData], ImageData]:
     return lambda image: effects.cone_beam(image, effects.ConeBeam(middle=MIDDLE, **options))
 
 
@@ -223,11 +225,14 @@ def compared(found: cmfsim.Anatomy, clean: cmfsim.Anatomy, variant: Variant) -> 
     return result
 
 
-def _apart(points, surface, variant: Variant) -> np.ndarray:
+def _apart(
+    points: tuple[np.ndarray, np.ndarray], surface: tuple[np.ndarray, np.ndarray], variant: Variant
+) -> np.ndarray:
     seen = points[0][variant.sees(points[0])]
     seen = seen[np.random.default_rng(0).permutation(len(seen))[:SAMPLES]]
     closest = cmfsim.Surface(*surface).closest(seen)[0]
-    return np.linalg.norm(seen - closest, axis=1)
+    apart: np.ndarray = np.linalg.norm(seen - closest, axis=1)
+    return apart
 
 
 def _tissue(anatomy: cmfsim.Anatomy, variant: Variant) -> float:
@@ -240,7 +245,7 @@ def _tissue(anatomy: cmfsim.Anatomy, variant: Variant) -> float:
     return float(np.count_nonzero(variant.sees(places)) * np.prod(anatomy.skin.spacing))
 
 
-def measured(folder: Path) -> list[dict]:
+def measured(folder: Path) -> list[dict[str, Any]]:
     """A row for each variant of a folder, by the cmfsim that this process has."""
     rows = []
     points = None
@@ -252,7 +257,7 @@ def measured(folder: Path) -> list[dict]:
         with np.load(path) as stored:
             image = ImageData(stored["values"], stored["spacing"], stored["origin"])
             name = str(stored["name"])
-        row: dict = {"name": name, "codes": [], "error": ""}
+        row: dict[str, Any] = {"name": name, "codes": [], "error": ""}
         begun = time.process_time()
         try:
             found = cmfsim.segment_head(image, landmarks=points)
@@ -271,7 +276,7 @@ def measured(folder: Path) -> list[dict]:
     return rows
 
 
-def verdict(row: Mapping) -> str:
+def verdict(row: Mapping[str, Any]) -> str:
     """Whether a variant is within the tolerances, reported, refused or silent."""
     if VARIANTS[row["name"]].refused:
         return "refused, rightly" if row["error"] else "**taken for a CT**"
@@ -284,7 +289,7 @@ def verdict(row: Mapping) -> str:
     return f"reported: {codes}" if codes else f"**silent**: {', '.join(beyond)}"
 
 
-def _cells(row: Mapping) -> str:
+def _cells(row: Mapping[str, Any]) -> str:
     if row["error"]:
         return "– | – | –"
     skin, bone = (
@@ -294,7 +299,7 @@ def _cells(row: Mapping) -> str:
     return f"{skin} | {bone} | {100.0 * row['tissue']:+.1f}"
 
 
-def page(runs: Mapping[str, list[dict]]) -> str:
+def page(runs: Mapping[str, list[dict[str, Any]]]) -> str:
     """The table in Markdown."""
     commit = _git("rev-parse", "--short", "HEAD").decode().strip()
     made = (
@@ -319,14 +324,14 @@ def _git(*arguments: str) -> bytes:
     return subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout  # noqa: S603
 
 
-def _run(folder: Path, package: Path) -> list[dict]:
+def _run(folder: Path, package: Path) -> list[dict[str, Any]]:
     """The rows of another state of the package, measured by a process of its own."""
     command = [sys.executable, __file__, "--measure", str(folder)]
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(package), str(ROOT / "benches")])
     }
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True)  # noqa: S603
-    rows: list[dict] = json.loads(done.stdout)
+    rows: list[dict[str, Any]] = json.loads(done.stdout)
     return rows
 
 

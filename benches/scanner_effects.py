@@ -61,7 +61,12 @@ def with_metal_scanned(
     return image.with_values(np.round(values).clip(-1024, top).astype(kind))
 
 
-def _difference(hu, metals, step, rng):
+def _difference(
+    hu: np.ndarray,
+    metals: Sequence[tuple[np.ndarray, np.ndarray]],
+    step: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
     """What metal changes in one slice, HU."""
     size = max(hu.shape)
     square = [(0, size - n) for n in hu.shape]
@@ -82,14 +87,18 @@ def _difference(hu, metals, step, rng):
     touched = np.abs(loaded - clean).max(axis=-1) > 1e-6
     error = np.where(touched, measured - expected, 0.0)
     change = iradon(error, ANGLES, circle=False, output_size=size, filter_name="hann")
-    return (1000.0 * change / (effective * step))[: hu.shape[0], : hu.shape[1]]
+    found: np.ndarray = 1000.0 * change / (effective * step)
+    return found[: hu.shape[0], : hu.shape[1]]
 
 
-def _lines(part):
-    return radon(part, ANGLES, circle=False)
+def _lines(part: np.ndarray) -> np.ndarray:
+    lines: np.ndarray = radon(part, ANGLES, circle=False)
+    return lines
 
 
-def fillings(image: ImageData, places, radius: float = 4.0) -> Pieces:
+def fillings(
+    image: ImageData, places: Sequence[tuple[float, float, float]], radius: float = 4.0
+) -> Pieces:
     """Balls of amalgam."""
     filled = np.zeros(image.values.shape)
     for a, b, c in places:
@@ -171,7 +180,7 @@ def cone_beam(image: ImageData, scanner: ConeBeam) -> ImageData:
     return image.with_values(grey.clip(min(low, 0.0), scanner.top).astype(np.int16))
 
 
-def _reconstructed_noise(shape, seed):
+def _reconstructed_noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
     """Noise with the spectrum of filtered back projection in each slice, of variance 1."""
     noise = np.random.default_rng(seed).standard_normal(shape)
     fx, fy = np.fft.fftfreq(shape[0])[:, None], np.fft.fftfreq(shape[1])[None]
@@ -179,7 +188,8 @@ def _reconstructed_noise(shape, seed):
     # A ramp under a Hann window gives the noise a power spectrum like its product.
     window = np.sqrt(radius) * 0.5 * (1.0 + np.cos(np.pi * np.clip(2.0 * radius, 0.0, 1.0)))
     shaped = np.fft.ifft2(np.fft.fft2(noise, axes=(0, 1)) * window[..., None], axes=(0, 1)).real
-    return shaped / shaped.std()
+    scaled: np.ndarray = shaped / shaped.std()
+    return scaled
 
 
 def as_magnetic_resonance(image: ImageData, seed: int = 0) -> ImageData:

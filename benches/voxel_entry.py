@@ -36,17 +36,20 @@ def predicted(folder: Path, voxel: float) -> cmfsim.SkinPrediction:
     skin = cmfsim.read_surface(folder / "skin.ply")
     vertices = np.asarray(skin.vertices)
     nodes, cells = _grid(patient, cmfsim.Surface(skin.vertices, skin.triangles), voxel)
-    moved, at = _held(patient, nodes, voxel)
-    u = _solved(nodes, cells, moved, at)
-    distance, nearest = scipy.spatial.cKDTree(nodes).query(vertices, k=NEIGHBOURS)
+    motion, at = _held(patient, nodes, voxel)
+    u = _solved(nodes, cells, motion, at)
+    found = scipy.spatial.cKDTree(nodes).query(vertices, k=NEIGHBOURS)
+    distance, nearest = np.asarray(found[0]), np.asarray(found[1])
     weights = 1.0 / np.maximum(distance, 1e-6) ** 2
     weights /= weights.sum(axis=1, keepdims=True)
     share = np.clip(2.0 * (1.0 - distance[:, 0] / (NEAR * voxel)), 0.0, 1.0)
-    found = share[:, None] * np.einsum("vk,vki->vi", weights, u[nearest])
-    return cmfsim.SkinPrediction(vertices, found)
+    moved = share[:, None] * np.einsum("vk,vki->vi", weights, u[nearest])
+    return cmfsim.SkinPrediction(vertices, moved)
 
 
-def _grid(patient, skin: cmfsim.Surface, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+def _grid(
+    patient: cmfsim.PatientModel, skin: cmfsim.Surface, voxel: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Nodes and hexahedra of the voxels that are soft tissue or touch it."""
     mesh = np.asarray(patient.scene.nodes)
     low, high = mesh.min(axis=0) - voxel, mesh.max(axis=0) + voxel
@@ -66,10 +69,13 @@ def _depth(surface: cmfsim.Surface, points: np.ndarray) -> np.ndarray:
     """How deep points lie in bone, mm; negative outside."""
     closest, _, _ = surface.closest(points)
     away = np.linalg.norm(points - closest, axis=1)
-    return np.where(surface.winding_number(points) > 0.5, away, -away)
+    depth: np.ndarray = np.where(surface.winding_number(points) > 0.5, away, -away)
+    return depth
 
 
-def _held(patient, nodes: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+def _held(
+    patient: cmfsim.PatientModel, nodes: np.ndarray, voxel: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Nodes in or at bone, and where the grid is cut at its back and below, with their motions."""
     low, high = nodes.min(axis=0), nodes.max(axis=0)
     cut = (nodes[:, 1] > high[1] - 0.1 * voxel) | (nodes[:, 2] < low[2] + 0.1 * voxel)
@@ -103,7 +109,8 @@ def _solved(
     u[free], failed = scipy.sparse.linalg.cg(reduced, right, rtol=TOLERANCE, maxiter=5000, M=scale)
     if failed:
         raise RuntimeError(f"conjugate gradients have not converged after {failed} iterations")
-    return u[dofs].T
+    displacements: np.ndarray = u[dofs].T
+    return displacements
 
 
 def main() -> None:

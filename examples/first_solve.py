@@ -7,11 +7,14 @@ stays. Run it with `python examples/first_solve.py`.
 import itertools
 
 import numpy as np
+from numpy.typing import NDArray
 
 import cmfsim
 
 
-def block(cells: tuple[int, int, int], size: tuple[float, float, float]):
+def block(
+    cells: tuple[int, int, int], size: tuple[float, float, float]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Nodes (mm) and tets of a box, each cell cut into six."""
     grid = np.stack(np.meshgrid(*(np.arange(n + 1) for n in cells), indexing="ij"), axis=-1)
     nodes = grid.reshape(-1, 3) * np.array(size) / np.array(cells)

@@ -47,20 +47,22 @@ PYTHON: tuple[frozenset[str], ...] = tuple(
     frozenset(row.split())
     for row in (
         "_core",
-        "errors deferred progress",
-        "checks extras",
+        "errors deferred",
+        "checks",
         "values",
         "io registration surfaces",
         "phantom",
         # The stages: none knows another.
-        "bones evaluation imaging lips meshing muscles node_kinds solving",
+        "bones evaluation imaging meshing muscles node_kinds solving",
         "doctor pictures planning report",
         "pipeline",
-        "bench benchmark study virtual",
+        "study virtual",
         "cli",
         "__init__ __main__",
     )
 )
+# Entries at the top of python/cmfsim, with `__init__.py` and `__main__.py`.
+MOST_PYTHON_ENTRIES = 25
 # Outside packages that a module may import at its top: `import cmfsim` needs numpy alone.
 PYTHON_PACKAGES = frozenset({"numpy"})
 # A file is called after its subject.
@@ -195,11 +197,13 @@ def check_python(root: Path) -> Iterator[str]:
     package = root / "python/cmfsim"
     level = {name: number for number, row in enumerate(PYTHON) for name in row}
     files: dict[str, set[str]] = {}
+    entries: set[str] = set()
     # Packages that load their modules when these are asked for say them in the stub beside.
     for path in sorted([*package.rglob("*.py"), *package.rglob("__init__.pyi")]):
         place = path.relative_to(root)
         inside = path.relative_to(package).with_suffix("")
         name = inside.parts[0]
+        entries.add(name)
         if name not in level:
             yield f"{place}: add {name} to PYTHON in scripts/check_imports.py"
             continue
@@ -215,6 +219,8 @@ def check_python(root: Path) -> Iterator[str]:
         for line, module in _top_imports(tree):
             if module not in PYTHON_PACKAGES | {"cmfsim"} | sys.stdlib_module_names:
                 yield f"{place}:{line}: import {module} inside the function that needs it"
+    if len(entries) > MOST_PYTHON_ENTRIES:
+        yield f"python/cmfsim: {len(entries)} entries, at most {MOST_PYTHON_ENTRIES}"
     # A folder's own `__init__` gives names of its files to others, and is left out.
     graph = {f: {g for g in found if not f.startswith(f"{g}/")} for f, found in files.items()}
     for circle in _circles(graph):

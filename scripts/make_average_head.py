@@ -1,18 +1,33 @@
-"""Makes python/cmfsim/phantom/average_head.npz, the head that proposed landmarks are compared with.
+"""Makes the head that proposed landmarks are compared with, average_head.npz of the package.
 
 Run it after a change of the shapes in cmfsim.phantom: python scripts/make_average_head.py
 """
 
 from pathlib import Path
 
-from cmfsim.phantom import average_head
+import cmfsim
+from cmfsim.registration.proposed import TemplateHead, average_head
+from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
+
+# Voxels that the surfaces are taken from, mm, and how many triangles each has at most.
+SPACING, MOST_TRIANGLES = 1.5, 16_000
 
 
 def main() -> None:
     """Writes the file and prints its size."""
     path = Path(average_head.__file__).with_name(average_head.FILE)
-    average_head.write_average_head(path)
+    average_head.write_average_head(path, drawn_head(cmfsim.make_head(), "synthetic head"))
     print(f"{path.name}: {path.stat().st_size / 1024:.0f} kB")
+
+
+def drawn_head(head: cmfsim.PhantomHead, name: str) -> TemplateHead:
+    """A synthetic head with surfaces like those of `average_head`; it takes seconds."""
+    anatomy = head.anatomy(SPACING)
+    options = SurfaceOptions(max_triangles=MOST_TRIANGLES)
+    levels = {**anatomy.bones, "skin": anatomy.skin}
+    parts = {part: surface_of_level(part, levels[part], options) for part in average_head.PARTS}
+    bones = {bone: parts[bone] for bone in average_head.BONES}
+    return TemplateHead(name, bones, head.skull_landmarks, parts["skin"], head.skin_landmarks)
 
 
 if __name__ == "__main__":

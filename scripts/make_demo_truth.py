@@ -15,9 +15,11 @@ import sys
 import tempfile
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyvista
+from numpy.typing import NDArray
 
 from cmfsim import Case, SurfaceData, __version__, make_head, write_landmarks
 from cmfsim.io.files import replacing
@@ -85,7 +87,7 @@ def _face(truth: PostoperativeTruth, head: PhantomHead) -> SurfaceData:
     last = float(head.skull_landmarks["supraglenoid_L"][1]) + BEHIND
     top = float(head.skull_landmarks["nasion"][2]) + ABOVE
     inside = (rest[:, 1] < last) & (rest[:, 2] < top)
-    triangles = np.asarray(truth.skin.triangles, dtype=np.int64)
+    triangles: NDArray[Any] = truth.skin.triangles.astype(np.int64)
     triangles = triangles[inside[triangles].all(axis=1)]
     mesh = pyvista.PolyData.from_regular_faces(np.asarray(truth.skin.vertices), triangles).clean()
     small = mesh.decimate(max(0.0, 1.0 - TRIANGLES / mesh.n_cells))

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import cmfsim
-from cmfsim.phantom.average_head import drawn_head
 from cmfsim.pictures import picture_landmarks
+from make_average_head import drawn_head
 
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "docs" / "figures"
@@ -58,7 +58,9 @@ def write(
     picture_landmarks(path, bones, skin, points, views=views, size=size)
     drawn = Image.open(path).convert("RGB")
     page = drawn.resize((PAGE, round(drawn.height * PAGE / drawn.width)), Image.Resampling.LANCZOS)
-    page.quantize(method=Image.Quantize.MAXCOVERAGE, dither=0).save(path, optimize=True)
+    page.quantize(method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        path, optimize=True
+    )
     print(f"{path}: {path.stat().st_size / 1024:.0f} kB")
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import time
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -261,8 +261,8 @@ def _refused(case: Case, row: Row, error: cmfsim.CmfsimError, text: str) -> Row:
 class _Held:
     """Sliding nodes that walls hold, where these are, and their normals."""
 
-    nodes: Indices
-    points: Floats
+    nodes: list[int] = field(default_factory=list)
+    points: list[Floats] = field(default_factory=list)
     normals: list[Floats] = field(default_factory=list)
 
 
@@ -276,7 +276,7 @@ def _compared(case: Case, row: Row, result: cmfsim.Solution) -> Row:
     force_of = dict(zip(result.contact_nodes.tolist(), result.contact_forces, strict=True))
     gap_of = dict(zip(result.contact_nodes.tolist(), result.contact_gaps, strict=True))
     largest = max(map(abs, force_of.values()), default=0.0)
-    distances, held = [], _Held([], [], [])
+    distances, held = [], _Held()
     for name, ids in s.sliding.items():
         vertices, triangles = s.walls[name]
         matrix = s.moves[name]
@@ -304,7 +304,7 @@ def _compared(case: Case, row: Row, result: cmfsim.Solution) -> Row:
     found, condition, residual = _equilibrium(case, held, u)
     # On a wall that bends, what nodes feel is near its facets, not on them.
     is_exact = p.exact is not None and s.bend == 0.0
-    exact = p.exact if is_exact else found
+    exact = p.exact if is_exact and p.exact is not None else found
     size = float(np.linalg.norm(exact, axis=1).max())
     error = float(np.linalg.norm(u - exact, axis=1).max()) / size
     tangential = _tangential(case, held, u)
@@ -364,7 +364,7 @@ def _equilibrium(case: Case, held: _Held, start: Floats) -> tuple[Floats, float,
         else:
             bases.append(np.eye(3))
         columns[node] = bases[-1].shape[1]
-    z = sp.block_diag(bases, format="csr")
+    z: Any = sp.block_diag(bases, format="csr")
     u = motion + Twofold(offsets)
     matrix = sp.csc_matrix(z.T @ model(case).matrix @ z)
     scale = 1.0 / np.sqrt(matrix.diagonal())

@@ -131,7 +131,8 @@ def slope(angle: float, sign: float) -> Callable[[Floats, Floats], Floats]:
     steep = sign * np.tan(np.radians(angle))
 
     def height(x: Floats, _: Floats) -> Floats:
-        return steep * np.abs(x - 30.0)
+        heights: Floats = steep * np.abs(x - 30.0)
+        return heights
 
     return height
 

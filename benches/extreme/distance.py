@@ -77,4 +77,5 @@ def _feet(p: Floats, corners: Floats, normals: Floats) -> Floats:
         length = np.linalg.norm(p - foot, axis=1)
         nearer = length < shortest
         side_feet[nearer], shortest[nearer] = foot[nearer], length[nearer]
-    return np.where(inside[:, None], best, side_feet)
+    feet: Floats = np.where(inside[:, None], best, side_feet)
+    return feet

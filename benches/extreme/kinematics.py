@@ -159,9 +159,9 @@ def judge(case: Case, method: str) -> Row:
         with patience(PATIENCE):
             solver = cmfsim.StaticSolver(tensors, boundary, "cholesky", kinematics=kind)
             result = solver.solve(p.plan)
-    except cmfsim.SolverError as error:
-        passed = bool(case.refusal) and all(word in str(error) for word in case.refusal)
-        verdict = f"{'' if passed else 'WRONG: '}refused: SolverError: {error}"
+    except cmfsim.SolverError as refusal:
+        passed = bool(case.refusal) and all(word in str(refusal) for word in case.refusal)
+        verdict = f"{'' if passed else 'WRONG: '}refused: SolverError: {refusal}"
         return replace(row, verdict=verdict, passed=passed, seconds=time.perf_counter() - begin)
     except TimeoutError:
         return replace(row, verdict=f"WRONG: no answer in {PATIENCE} s")

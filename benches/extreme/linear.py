@@ -240,7 +240,8 @@ def _cases() -> Iterator[Case]:
 @functools.cache
 def problem(case: Case) -> Problem:
     """The built case."""
-    return case.build()
+    built: Problem = case.build()
+    return built
 
 
 @functools.cache

@@ -1,8 +1,11 @@
-"""The exception family, and how Python code of the package raises it.
+"""The exception family, how Python code of the package raises it, and missing optional packages.
 
 The classes are defined by the extension, so that an error means the same wherever it is found.
 Where the input is at fault the error is a `ValueError` too.
 """
+
+from importlib import import_module
+from typing import Any
 
 from cmfsim._core import (
     BoundaryError,
@@ -37,6 +40,8 @@ __all__ = [
     "RegistrationInputError",
     "SolverError",
     "UnpairedError",
+    "error_text",
+    "third_party",
 ]
 
 
@@ -81,3 +86,34 @@ def error_text(error: BaseException) -> str:
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
     return str(error) or type(error).__name__
+
+
+def third_party(
+    module: str, purpose: str, extra: str, error: type[CmfsimError] = CaseInputError
+) -> Any:
+    """A module of an optional dependency; where it is missing, the pip line that installs it.
+
+    Parameters
+    ----------
+    module : str
+        As `import` takes it: "scipy.ndimage".
+    purpose : str
+        What needs it, as the beginning of a sentence: "bones are cut".
+    extra : str
+        The extra of cmfsim that brings it.
+    error : type of CmfsimError
+        What to raise.
+
+    Raises
+    ------
+    CmfsimError
+        (of type `error`) The module cannot be imported.
+    """
+    try:
+        return import_module(module)
+    except ImportError as reason:
+        package = module.partition(".")[0]
+        raise error(
+            f"{purpose} with {package}, which cannot be imported ({reason}): "
+            f"pip install 'cmfsim[{extra}]'"
+        ) from reason

@@ -12,8 +12,7 @@ from cmfsim.bones.planes import Cut, Procedure
 from cmfsim.bones.procedures import PROCEDURES, place_procedure
 from cmfsim.bones.segment_checks import check_segments
 from cmfsim.checks import as_number, check_instance
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.surfaces.levels import SurfaceOptions, block_of, surface_of_level
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.finding import Finding
@@ -138,16 +137,13 @@ def cut_bones(
         check_instance(f"bone {name!r}", level, ImageData)
         first = next(iter(bones.values()))
         same = level.values.shape == first.values.shape and all(
-            np.array_equal(np.asarray(getattr(level, n)), np.asarray(getattr(first, n)))
-            for n in ("spacing", "origin")
+            np.array_equal(getattr(level, n), getattr(first, n)) for n in ("spacing", "origin")
         )
         if not same:
             raise CaseInputError(f"bone {name!r} lies on another grid than {next(iter(bones))!r}")
     placed = _placed(procedures, landmarks or {})
     findings = [f for p in placed for f in p.findings]
-    pieces: dict[str, Levels] = {
-        name: np.asarray(level.values, dtype=np.float32) for name, level in bones.items()
-    }
+    pieces: dict[str, Levels] = {name: level.single for name, level in bones.items()}
     grid = next(iter(bones.values()))
     for procedure in placed:
         for cut in procedure.cuts:

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface, SurfaceMotion, rigid_fit
 from cmfsim.checks import Floats
-from cmfsim.errors import BoundaryInputError, RegistrationError
-from cmfsim.extras import third_party
+from cmfsim.errors import BoundaryInputError, RegistrationError, third_party
 from cmfsim.surfaces.checks import duplicate_triangles, has_three_corners, thin_triangles
 from cmfsim.surfaces.topology import connected_labels, edges_of
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = [
@@ -288,7 +288,7 @@ def missing_patches(
     """
     here = segment.vertices
     triangles = segment.triangles.astype(np.int64)
-    moved = here @ np.asarray(matrix)[:3, :3].T + np.asarray(matrix)[:3, 3]
+    moved = here @ matrix[:3, :3].T + matrix[:3, 3]
     off = np.linalg.norm(bone.closest(moved)[0] - moved, axis=1)
     far = np.flatnonzero((off > REMOVED_RIM) & (off < shown))
     gone = np.zeros(len(here), dtype=bool)
@@ -340,9 +340,11 @@ def _rest_of(here: Floats, there: Floats) -> tuple[Floats, Callable[[Floats], Fl
         return None
 
     def back(points: Floats) -> Floats:
-        return np.asarray(np.linalg.solve(linear.T, (points - coefficients[3]).T).T + middle)
+        moved: Floats = np.linalg.solve(linear.T, (points - coefficients[3]).T).T + middle
+        return moved
 
-    return np.asarray(columns @ coefficients), back
+    moved: Floats = columns @ coefficients
+    return moved, back
 
 
 def _averaged(points: Floats, values: Floats) -> Floats:
@@ -394,10 +396,6 @@ def _areas(vertices: Floats, triangles: Integers) -> Floats:
 
 def _part(motion: MovedSurface, triangles: Integers) -> MovedSurface:
     """The motion of some of its triangles, and of their vertices only."""
-    used, renumbered = np.unique(triangles, return_inverse=True)
-    surface = SurfaceData(
-        motion.surface.vertices[used],
-        renumbered.reshape(-1, 3),
-        motion.surface.crease_angle,
-    )
+    used, corners = used_nodes(triangles)
+    surface = SurfaceData(motion.surface.vertices[used], corners, motion.surface.crease_angle)
     return MovedSurface(surface, motion.moved_vertices[used])

@@ -46,7 +46,7 @@ def part_segment(
         (also `ValueError`) No piece holds as much.
     """
     level = segment.level
-    values = np.asarray(level.values, dtype=np.float32)
+    values = level.single
     limit = max(float(values.max()), -float(values.min()))
     surfaces = [Surface(s.vertices, s.triangles) for s in pieces.values()]
     low = np.min([s.vertices.min(axis=0) for s in surfaces[1:]] or [level.highest], axis=0)

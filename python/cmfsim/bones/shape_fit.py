@@ -80,7 +80,7 @@ class OpenDirection(Frozen):
     def axis(self) -> Floats:
         """Unit vector of the turn's axis, or of the shift."""
         main = self.turn if self.is_turn else self.shift
-        return np.asarray(main / np.linalg.norm(main))
+        return main / np.linalg.norm(main)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as JSON holds them."""
@@ -206,7 +206,6 @@ def fit_shape(
     few = whole.some(np.random.default_rng(0).permutation(len(points))[:most_points])
     radius = float(np.sqrt((few.arms**2).sum(axis=1).mean()))
     facing = np.cos(np.radians(max_angle))
-    start = np.asarray(start)
     pose = _Pose(start[:3, :3], start[:3, :3] @ middle + start[:3, 3], 1.0)
     for _ in range(MOST_STEPS):
         step = _Equations(few, bone, pose, radius, facing).step()
@@ -336,7 +335,8 @@ class _Equations:
         rows = self.rows[keep] @ self.basis
         weighted = (rows * self.weight[keep, None]).T
         solved = np.linalg.lstsq(weighted @ rows, -weighted @ rest[keep], rcond=None)[0]
-        return np.asarray(self.basis @ solved)
+        solution: Floats = self.basis @ solved
+        return solution
 
 
 def _rows(arms: Floats, normals: Floats, radius: float) -> Floats:

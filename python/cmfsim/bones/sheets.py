@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim import _core
 from cmfsim.checks import Floats, as_positive, as_rows
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.dental_arch import SHEET_DEPTH, DentalArch
 from cmfsim.values.image_data import ImageData
@@ -368,7 +367,8 @@ def _closed_slice(mask: Mask, radius: float) -> Mask:
     wide = np.pad(mask, rim)
     grown = ndimage.distance_transform_edt(~wide) * SPACING <= radius
     kept = ndimage.distance_transform_edt(grown) * SPACING > radius
-    return np.asarray(kept[rim:-rim, rim:-rim] | mask)
+    filled: Mask = kept[rim:-rim, rim:-rim] | mask
+    return filled
 
 
 def _signed_slice(mask: Mask) -> Floats:
@@ -379,7 +379,8 @@ def _signed_slice(mask: Mask) -> Floats:
     outside = ndimage.distance_transform_edt(~mask)
     inside = ndimage.distance_transform_edt(mask)
     half = 0.5
-    return np.asarray(np.where(mask, half - inside, outside - half) * SPACING)
+    level: Floats = np.where(mask, half - inside, outside - half) * SPACING
+    return level
 
 
 def _depth(solid: Mask, near: Floats) -> NDArray[np.float32]:

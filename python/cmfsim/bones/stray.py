@@ -101,7 +101,7 @@ def stray_patches(
     """
     here = segment.vertices
     triangles = segment.triangles.astype(np.int64)
-    turn, shift = np.asarray(matrix)[:3, :3], np.asarray(matrix)[:3, 3]
+    turn, shift = matrix[:3, :3], matrix[:3, 3]
     moved = here @ turn.T + shift
     closest, facing, _ = bone.closest(moved)
     off: Floats = np.linalg.norm(closest - moved, axis=1)

@@ -6,7 +6,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from cmfsim.bench import (
+from cmfsim.cli.exit_codes import DONE
+from cmfsim.cli.terminal import StageProgress, escaped
+from cmfsim.io import Case
+from cmfsim.phantom import make_head
+from cmfsim.phantom.case_files import write_phantom_case
+from cmfsim.study.frontier import (
     FACTORS,
     WHOLE,
     Choice,
@@ -15,14 +20,9 @@ from cmfsim.bench import (
     reference_choice,
     sweep_choices,
 )
-from cmfsim.bench import frontier as run_frontier
-from cmfsim.bench.files import write_frontier
-from cmfsim.bench.table import GRID, base_verdict
-from cmfsim.cli.exit_codes import DONE
-from cmfsim.cli.terminal import StageProgress, escaped
-from cmfsim.io import Case
-from cmfsim.phantom import make_head
-from cmfsim.phantom.case_files import write_phantom_case
+from cmfsim.study.frontier import frontier as run_frontier
+from cmfsim.study.frontier.files import write_frontier
+from cmfsim.study.frontier.table import GRID, base_verdict
 
 __all__ = ["FRONTIER_FOLDER", "frontier"]
 

@@ -3,8 +3,8 @@
 import argparse
 import sys
 
-from cmfsim.benchmark import run_benchmark
 from cmfsim.cli.exit_codes import DONE
+from cmfsim.study.benchmark import run_benchmark
 
 __all__ = ["benchmark"]
 

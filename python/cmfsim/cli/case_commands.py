@@ -20,7 +20,7 @@ from cmfsim.cli.terminal import StageProgress, columns, escaped, in_colour
 from cmfsim.doctor import Examination, examine, findings_text
 from cmfsim.io import Case
 from cmfsim.io.models import is_model_file
-from cmfsim.pipeline.building import plan_key
+from cmfsim.pipeline.building.inputs import plan_key
 from cmfsim.pipeline.predicting import case_for_models
 from cmfsim.pipeline.preparation import prepare
 from cmfsim.values.clinical_motion import plan_lines
@@ -67,7 +67,7 @@ def build(options: argparse.Namespace) -> int:
     findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
     seconds = time.perf_counter() - begun
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
-        build_case = import_module("cmfsim.pipeline.building").build_case
+        build_case = import_module("cmfsim.pipeline.building.case_model").build_case
         built = build_case(
             case, progress=progress.stage, check=False, findings=findings, on_findings=notices.add
         )

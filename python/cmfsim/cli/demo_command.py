@@ -90,7 +90,7 @@ def _work(
     return write_results(
         case.output,
         predictions,
-        len(models),
+        models,
         stage=progress.stage,
         evaluation=None if found is None else lambda: found,
         # The report shows the pictures of the last model alone.

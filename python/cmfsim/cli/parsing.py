@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim._core import ELEMENTS, KINEMATICS, METHODS, __version__
-from cmfsim.bench import EDGES, FACTORS
 from cmfsim.cli import (
     bench_command,
     case_commands,
@@ -24,6 +23,7 @@ from cmfsim.cli.population_parsing import add_population_commands
 from cmfsim.io import result_suffixes
 from cmfsim.muscles.template import WHERE
 from cmfsim.planning.replanning import CORRECTIONS
+from cmfsim.study.frontier import EDGES, FACTORS
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import CONTACTS
 

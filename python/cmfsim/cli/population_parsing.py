@@ -4,9 +4,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from cmfsim.benchmark.entries import ENTRIES, ON_REQUEST
 from cmfsim.cli import benchmark_command, virtual_patients_command
 from cmfsim.io.populations import PARTS, TEST
+from cmfsim.study.benchmark.entries import ENTRIES, ON_REQUEST
 from cmfsim.values.model_names import MODELS
 
 __all__ = ["add_population_commands"]

@@ -27,8 +27,9 @@ from cmfsim.pipeline.outputs import (
 )
 from cmfsim.pipeline.predicting import predict_models
 from cmfsim.pipeline.preparation import prepare
-from cmfsim.study import CaseOutcome, StudyReport, run_study, write_study_report
-from cmfsim.study import sensitivity as landmark_sensitivity
+from cmfsim.study.cohort import CaseOutcome, StudyReport, run_study
+from cmfsim.study.outputs import write_study_report
+from cmfsim.study.trials import sensitivity as landmark_sensitivity
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import MODELS, Prediction
 
@@ -68,7 +69,7 @@ def predict(options: argparse.Namespace) -> int:
         written = write_results(
             case.output,
             _timed(_at_least_one(predictions, failed), before),
-            len(models),
+            models,
             stage=progress.stage,
             with_report=not options.no_report,
             slicer=options.slicer,
@@ -131,7 +132,7 @@ def evaluate(options: argparse.Namespace) -> int:
         written = write_results(
             case.output,
             found.predictions,
-            len(models),
+            models,
             stage=progress.stage,
             evaluation=lambda: found,
             with_report=not options.no_report,

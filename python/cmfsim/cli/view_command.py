@@ -13,9 +13,8 @@ from cmfsim.cli.exit_codes import DONE
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_parts, read_result, read_scene, read_surface
 from cmfsim.io.predictions import predictions_of
-from cmfsim.muscles.template import joined_surface
 from cmfsim.pictures import KIND_COLOURS, SKIN_COLOUR, ViewPart, segment_colours, view_parts
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, joined_surface
 
 __all__ = ["parts_of", "view"]
 

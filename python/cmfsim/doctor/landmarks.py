@@ -107,7 +107,7 @@ def nearest_of_level(
         low = np.floor((point - REACH - image.lowest) / spacing).astype(int).clip(0)
         high = np.ceil((point + REACH - image.lowest) / spacing).astype(int) + 1
         box = tuple(slice(a, max(b, a)) for a, b in zip(low, high, strict=True))
-        block = np.asarray(values[box], dtype=np.float64) - level
+        block = values[box].astype(np.float64) - level
         for axis in range(3):
             ahead = np.moveaxis(block, axis, 0)
             one, other = ahead[:-1], ahead[1:]
@@ -129,7 +129,8 @@ def nearest_of_level(
 
     def nearest(points: Floats) -> Floats:
         index = tree.query(points, distance_upper_bound=REACH)[1]
-        return np.asarray(crossings[index], dtype=np.float64)
+        closest: Floats = crossings[index]
+        return closest
 
     return nearest
 

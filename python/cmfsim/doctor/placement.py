@@ -245,7 +245,8 @@ def _check_within_image(
         beyond = (places < image.lowest - LANDMARK_WARNING) | (
             places > image.highest + LANDMARK_WARNING
         )
-        return np.asarray(beyond.any(axis=1), dtype=np.bool_)
+        outside: NDArray[np.bool_] = np.any(beyond, axis=1)
+        return outside
 
     wrong = outside(points)
     if not wrong.any():
@@ -403,7 +404,7 @@ def _check_bone_directions(evidence: Evidence) -> Iterator[Finding]:
     cranium, mandible = evidence.bones.get("cranium"), evidence.bones.get("mandible")
     if cranium is None or mandible is None:
         return
-    lowest, highest = (np.asarray(getattr(cranium.report, n)) for n in ("lowest", "highest"))
+    lowest, highest = cranium.report.lowest, cranium.report.highest
     middle = 0.5 * (lowest + highest)
     jaw = 0.5 * (mandible.report.lowest + mandible.report.highest)
     away = jaw - middle

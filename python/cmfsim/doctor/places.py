@@ -1,7 +1,8 @@
 """Places, directions and shifts as findings write them."""
 
 import numpy as np
-from numpy.typing import ArrayLike
+
+from cmfsim.checks import Floats
 
 __all__ = ["direction_text", "place_text", "shift_text"]
 
@@ -22,23 +23,21 @@ SHIFTS = (
 )
 
 
-def place_text(point: ArrayLike) -> str:
+def place_text(point: Floats) -> str:
     """A point as (L, P, S) with a tenth of a mm."""
-    return "(" + ", ".join(f"{x:.1f}" for x in np.asarray(point, dtype=float).tolist()) + ")"
+    return "(" + ", ".join(f"{x:.1f}" for x in point) + ")"
 
 
-def direction_text(offset: ArrayLike) -> str:
+def direction_text(offset: Floats) -> str:
     """Where a thing lies that is off by an LPS vector, in words: "above", "behind and below"."""
-    vector = np.asarray(offset, dtype=float)
-    sizes = np.abs(vector)
+    sizes = np.abs(offset)
     order = np.argsort(-sizes, kind="stable")[:2]
     named = [a for a in order if sizes[a] > 0.0 and sizes[a] >= NAMED_SHARE * sizes[order[0]]]
-    return " and ".join(DIRECTIONS[a][int(vector[a] > 0.0)] for a in named) or "on"
+    return " and ".join(DIRECTIONS[a][int(offset[a] > 0.0)] for a in named) or "on"
 
 
-def shift_text(offset: ArrayLike) -> str:
+def shift_text(offset: Floats) -> str:
     """An LPS vector in words: "5.0 mm too high and 2.0 mm too far back"."""
-    vector = np.asarray(offset, dtype=float)
-    sizes = np.abs(vector)
+    sizes = np.abs(offset)
     named = [a for a in np.argsort(-sizes, kind="stable") if sizes[a] >= SHIFT_SHARE * sizes.max()]
-    return " and ".join(f"{sizes[a]:.1f} mm {SHIFTS[a][int(vector[a] > 0.0)]}" for a in named)
+    return " and ".join(f"{sizes[a]:.1f} mm {SHIFTS[a][int(offset[a] > 0.0)]}" for a in named)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import as_floats, as_number
 from cmfsim.errors import CalibrationError
@@ -157,7 +157,7 @@ def region_scores(
     """
     masked: Any = np.ma.asarray(errors)
     known = ~np.ma.getmaskarray(masked)
-    values = np.asarray(np.ma.filled(masked.astype(np.float64), 0.0))
+    values: NDArray[np.float64] = np.ma.filled(masked.astype(np.float64), 0.0)
     deviation = np.asarray(sd, dtype=np.float64)
     if values.ndim != 1 or values.shape != deviation.shape:
         raise CalibrationError(

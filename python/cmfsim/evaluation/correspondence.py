@@ -9,6 +9,7 @@ from cmfsim._core import Surface, ThinPlateSpline
 from cmfsim.checks import Floats
 from cmfsim.surfaces.barycentric import barycentric
 from cmfsim.surfaces.topology import edges_of
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["Matches", "Skin", "match_skins"]
@@ -50,8 +51,8 @@ class Skin:
         kept = self.triangles[chosen[self.triangles].all(axis=1)]
         if not len(kept):
             return None
-        used, triangles = np.unique(kept, return_inverse=True)
-        return Skin(SurfaceData(self.vertices[used], triangles.reshape(-1, 3)))
+        used, triangles = used_nodes(kept)
+        return Skin(SurfaceData(self.vertices[used], triangles))
 
     def at_border(self, points: Floats, triangles: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Which points, each on the triangle named, lie on the border."""

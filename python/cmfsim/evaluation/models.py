@@ -20,7 +20,7 @@ from cmfsim.evaluation.comparison import (
 from cmfsim.evaluation.regions import SKIN_LANDMARKS, skin_regions
 from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
-from cmfsim.evaluation.unmoved import thickened
+from cmfsim.surfaces.depth import moved_outward
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["NO_CHANGE", "WHOLE", "Improvement", "ModelComparison", "compare_models"]
@@ -194,7 +194,7 @@ def compare_models(  # noqa: PLR0913 (options by name)
                 f"{len(skin.vertices)}: the same are needed, in the same order"
             )
     if thickening is not None:
-        moved = {name: thickened(skin, at, thickening) for name, at in moved.items()}
+        moved = {name: moved_outward(skin, at, thickening) for name, at in moved.items()}
     names = landmarks[0] if landmarks is not None else None
     parts: dict[str, NDArray[np.bool_]] = dict(regions or {})
     if regions is None and isinstance(names, Mapping) and all(n in names for n in SKIN_LANDMARKS):
@@ -270,7 +270,7 @@ def _carried(
     first, second = landmarks
     motion = SurfaceMotion(skin, moved)
     if isinstance(first, Mapping):
-        places = np.array([np.asarray(p, dtype=np.float64) for p in first.values()])
+        places = np.array(list(first.values()), dtype=np.float64)
         there = places + motion.displacement(places)
         return dict(zip(first, there, strict=True)), second
     places = as_rows("landmarks", first, 3)

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.checks import as_floats, check_one_of
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 
 __all__ = ["PAIRED_BY", "PairedTest", "wilcoxon_test"]
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim._core import Surface
 from cmfsim.checks import Floats, as_floats
 from cmfsim.errors import CaseInputError
 from cmfsim.evaluation.comparison import SkinComparison, compare_skins
@@ -22,7 +21,6 @@ __all__ = [
     "ThicknessChange",
     "compare_unmoved",
     "fitted_thickness",
-    "thickened",
 ]
 
 # What every model moves by less than this stays, mm: far below the noise of a scan.
@@ -93,7 +91,7 @@ def compare_unmoved(
     RegistrationError
         (also `ValueError`) None of them has a partner: the scan after ends below the forehead.
     """
-    still = np.asarray(moved) < STILL
+    still = moved < STILL
     parts: dict[str, NDArray[np.bool_]] = {n: np.asarray(p) & still for n, p in regions.items()}
     parts = {name: part for name, part in parts.items() if part.any()}
     if sum(int(part.sum()) for part in parts.values()) < LEAST_VERTICES:
@@ -146,18 +144,3 @@ def fitted_thickness(signed: ArrayLike, depth: ArrayLike) -> ThicknessChange:
         )
     before, after = float(np.abs(e).mean()), float(np.abs(e + share * d).mean())
     return ThicknessChange(share, len(e), float(d.mean()), before, after)
-
-
-def thickened(skin: Surface, vertices: Floats, outward: Floats) -> Floats:
-    """The vertices of a moved skin, each shifted outward along its normal.
-
-    Parameters
-    ----------
-    skin : Surface
-        Gives the triangles.
-    vertices : (v, 3) float64, mm
-    outward : (v,) float64, mm
-    """
-    normals = skin.moved(vertices).vertex_normals
-    shifted: Floats = vertices + np.asarray(outward)[:, None] * normals
-    return shifted

@@ -23,10 +23,10 @@ from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import Skin, find_skin
 from cmfsim.imaging.view import view_findings
 from cmfsim.imaging.working import Working, working_grid
-from cmfsim.progress import Progress
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.progress import Progress
 
 __all__ = ["segment_head"]
 

@@ -78,12 +78,14 @@ def deviations(hu: Volume, spacing: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _is_soft(plain: Volume) -> Mask:
-    return np.asarray(np.abs(plain - np.float32(1.0 + 1e-3 * SOFT)) < 1e-4)
+    soft: Mask = np.abs(plain - np.float32(1.0 + 1e-3 * SOFT)) < 1e-4
+    return soft
 
 
 def _root_mean(squares: Volume, soft: Mask) -> NDArray[np.float64]:
     counts = np.maximum(soft.sum(axis=(0, 1)), 1)
-    return np.asarray(np.sqrt(squares.sum(axis=(0, 1)) / counts))
+    deviation: NDArray[np.float64] = np.sqrt(squares.sum(axis=(0, 1)) / counts)
+    return deviation
 
 
 def _squares(hu: Volume, soft: Mask) -> Volume:
@@ -124,4 +126,4 @@ def _plain(hu: Volume, spacing: NDArray[np.float64]) -> Volume:
     smooth = ndimage().gaussian_filter(hu, flat)
     dense = np.where(smooth < bone, SOFT, np.clip(hu, bone, ENAMEL))
     plain = np.where(smooth < air, -1000.0, dense) * 1e-3 + 1.0
-    return np.asarray(plain, dtype=np.float32)
+    return plain.astype(np.float32, copy=False)

@@ -128,7 +128,8 @@ def _means(values: NDArray[Any]) -> NDArray[np.float64]:
     field = round_field(values)
     if field is not None:
         total = total[field.inside(values.shape, 2.0 * BLOCK)[np.ix_(starts[0], starts[1])]]
-    return np.asarray(total.ravel() / np.prod(edges))
+    means: NDArray[np.float64] = total.ravel() / np.prod(edges)
+    return means
 
 
 def _stated(sample: NDArray[np.float64], slope: float, intercept: float) -> Calibration:

@@ -315,7 +315,7 @@ def _balls(
     for name in names:
         if name not in landmarks:
             continue
-        place = (np.asarray(landmarks[name]) - work.origin) / work.spacing
+        place = (landmarks[name] - work.origin) / work.spacing
         low = np.maximum(np.floor(place - reach / work.spacing).astype(int), 0)
         high = np.minimum(np.ceil(place + reach / work.spacing).astype(int) + 1, domain.shape)
         if (high <= low).any():

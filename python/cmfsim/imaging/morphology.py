@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim import _core
-from cmfsim.errors import ImageError
-from cmfsim.extras import third_party
+from cmfsim.errors import ImageError, third_party
 
 __all__ = [
     "Block",
@@ -132,8 +131,7 @@ def depth(mask: Mask, spacing: NDArray[np.float64], within: float = np.inf) -> V
 def box_of(mask: Mask, margin: int = 0) -> Block:
     """The smallest block that holds the mask, and a margin of voxels where the array has them."""
     box = []
-    columns = np.asarray(mask.any(axis=0))
-    sheet = np.asarray(mask.any(axis=2))
+    columns, sheet = np.any(mask, axis=0), np.any(mask, axis=2)
     lines = (sheet.any(axis=1), columns.any(axis=1), columns.any(axis=0))
     for axis, line in enumerate(lines):
         found = np.flatnonzero(line)

@@ -73,7 +73,8 @@ class Stack:
     @property
     def heights(self) -> NDArray[np.float64]:
         """Of the slices along their normal, mm."""
-        return np.asarray(self.positions @ np.cross(*self.axes))
+        along: NDArray[np.float64] = self.positions @ np.cross(*self.axes)
+        return along
 
     def kept(self, which: Sequence[int]) -> "Stack":
         """The stack of some of the slices."""

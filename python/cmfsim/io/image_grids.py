@@ -292,8 +292,10 @@ def _from_rows(
 
 def _is_in_slice(values: NDArray[Any], u: Floats, v: Floats) -> NDArray[np.bool_]:
     rows, columns = values.shape[1:]
-    inside = (u > -SAME) & (u < columns - 1 + SAME) & (v > -SAME) & (v < rows - 1 + SAME)
-    return np.asarray(inside)
+    inside: NDArray[np.bool_] = (
+        (u > -SAME) & (u < columns - 1 + SAME) & (v > -SAME) & (v < rows - 1 + SAME)
+    )
+    return inside
 
 
 def _in_slice(values: NDArray[Any], k: NDArray[np.intp], u: Floats, v: Floats) -> Floats:

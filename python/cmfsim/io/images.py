@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.errors import ImageError, ImageInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import ImageError, ImageInputError, third_party
 from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
 from cmfsim.io.dicom import read_dicom_file, read_dicom_folder
 from cmfsim.io.files import is_there

@@ -285,7 +285,7 @@ def _write_parts(folder: Path, prediction: Prediction) -> dict[str, list[str]]:
         counts = [len(vertices) for vertices in before]
         starts = np.concatenate([[0], np.cumsum(counts)])
         triangles = [
-            np.asarray(surface.triangles, dtype=np.int64) + start
+            surface.triangles.astype(np.int64) + start
             for (surface, _), start in zip(surfaces.values(), starts, strict=False)
         ]
         moved = [after - at for (_, after), at in zip(surfaces.values(), before, strict=True)]
@@ -340,7 +340,7 @@ def _read_part_file(
     points = mesh.points
     triangles = mesh.cells_dict["triangle"]
     number = mesh.point_data.get("part", np.zeros(len(points), dtype=np.int64))
-    moved = points + np.asarray(mesh.point_data.get("displacement", 0.0))
+    moved = points + mesh.point_data.get("displacement", 0.0)
     found = {}
     for part, name in enumerate(names):
         mine = np.flatnonzero(number == part)

@@ -12,6 +12,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.archives import member_of, read_archive, write_archive
 from cmfsim.io.files import named, replacing
 from cmfsim.io.vtk import write_tets, write_triangles
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.scene import SceneResult
 
 __all__ = ["read_result", "result_suffixes", "write_result"]
@@ -135,10 +136,10 @@ def _write_vtu(file: BinaryIO, result: SceneResult) -> None:
 
 
 def _write_vtp(file: BinaryIO, result: SceneResult) -> None:
-    used, triangles = np.unique(result.skin_triangles, return_inverse=True)
+    used, triangles = used_nodes(result.skin_triangles)
     data = {name: array[used] for name, array in _point_data(result).items()}
-    data["node"] = used.astype(np.int64)
-    write_triangles(file, result.nodes[used], triangles.reshape(-1, 3), data)
+    data["node"] = used
+    write_triangles(file, result.nodes[used], triangles, data)
 
 
 def _point_data(result: SceneResult) -> dict[str, NDArray[Any]]:

@@ -59,7 +59,8 @@ class Segmentation:
 
     def mask(self, segment: Segment) -> NDArray[np.bool_]:
         """Where a segment is, (nx, ny, nz)."""
-        return np.asarray(self.labels[segment.layer] == segment.label)
+        mask: NDArray[np.bool_] = self.labels[segment.layer] == segment.label
+        return mask
 
 
 def read_segmentation(path: Path) -> Segmentation:

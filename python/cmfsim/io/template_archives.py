@@ -40,11 +40,11 @@ def write_template_archive(path: Path, template: TemplateData) -> None:
             entry.update(_counts(muscle.surface))
             entry["course"] = [len(line) for line in muscle.course]
             vertices.append(muscle.surface.vertices)
-            triangles.append(np.asarray(muscle.surface.triangles, dtype=np.int64))
+            triangles.append(muscle.surface.triangles.astype(np.int64))
             course += muscle.course
         entries.append(entry)
     vertices.append(template.skull.vertices)
-    triangles.append(np.asarray(template.skull.triangles, dtype=np.int64))
+    triangles.append(template.skull.triangles.astype(np.int64))
     header = {
         **{key: getattr(template, key) for key in ("name", "licence", "attribution", "source")},
         "landmarks": list(template.landmarks),

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 __all__ = [
     "VTK_TETRA",
@@ -48,28 +48,27 @@ def write_vtk(file: BinaryIO, kind: str, body: str) -> None:
 
 def write_tets(
     file: BinaryIO,
-    nodes: ArrayLike,
-    tets: ArrayLike,
+    nodes: NDArray[Any],
+    tets: NDArray[Any],
     point_data: Mapping[str, NDArray[Any]],
     cell_data: Mapping[str, NDArray[Any]],
 ) -> None:
     """Writes tets as a `.vtu` file with named arrays on nodes and tets."""
-    points, cells = np.asarray(nodes), np.asarray(tets)
     body = (
-        f'<Piece NumberOfPoints="{len(points)}" NumberOfCells="{len(cells)}">'
-        f"<Points>{data_array('points', points)}</Points>"
+        f'<Piece NumberOfPoints="{len(nodes)}" NumberOfCells="{len(tets)}">'
+        f"<Points>{data_array('points', nodes)}</Points>"
         f"<PointData>{_arrays(point_data)}</PointData><CellData>{_arrays(cell_data)}</CellData>"
-        f"<Cells>{data_array('connectivity', cells.reshape(-1).astype(np.int64))}"
-        f"{data_array('offsets', 4 * np.arange(1, len(cells) + 1, dtype=np.int64))}"
-        f"{data_array('types', np.full(len(cells), VTK_TETRA, dtype=np.uint8))}</Cells></Piece>"
+        f"<Cells>{data_array('connectivity', tets.reshape(-1).astype(np.int64))}"
+        f"{data_array('offsets', 4 * np.arange(1, len(tets) + 1, dtype=np.int64))}"
+        f"{data_array('types', np.full(len(tets), VTK_TETRA, dtype=np.uint8))}</Cells></Piece>"
     )
     write_vtk(file, "UnstructuredGrid", body)
 
 
 def write_triangles(
     file: BinaryIO,
-    vertices: ArrayLike,
-    triangles: ArrayLike,
+    vertices: NDArray[Any],
+    triangles: NDArray[Any],
     point_data: Mapping[str, NDArray[Any]],
     *,
     vectors: str = "",
@@ -79,7 +78,6 @@ def write_triangles(
 
     `vectors` names the array that turns with the surface; `frame` is stated as 3D Slicer does.
     """
-    points, polys = np.asarray(vertices), np.asarray(triangles)
     turning = f' Vectors="{vectors}"' if vectors else ""
     codes = " ".join(str(ord(letter)) for letter in frame)
     stated = (
@@ -89,12 +87,13 @@ def write_triangles(
         else ""
     )
     body = (
-        f'{stated}<Piece NumberOfPoints="{len(points)}" NumberOfVerts="0" NumberOfLines="0" '
-        f'NumberOfStrips="0" NumberOfPolys="{len(polys)}">'
-        f"<Points>{data_array('points', points)}</Points>"
+        f'{stated}<Piece NumberOfPoints="{len(vertices)}" NumberOfVerts="0" NumberOfLines="0" '
+        f'NumberOfStrips="0" NumberOfPolys="{len(triangles)}">'
+        f"<Points>{data_array('points', vertices)}</Points>"
         f"<PointData{turning}>{_arrays(point_data)}</PointData>"
-        f"<Polys>{data_array('connectivity', polys.reshape(-1).astype(np.int32))}"
-        f"{data_array('offsets', 3 * np.arange(1, len(polys) + 1, dtype=np.int32))}</Polys></Piece>"
+        f"<Polys>{data_array('connectivity', triangles.reshape(-1).astype(np.int32))}"
+        f"{data_array('offsets', 3 * np.arange(1, len(triangles) + 1, dtype=np.int32))}"
+        "</Polys></Piece>"
     )
     write_vtk(file, "PolyData", body)
 

@@ -168,7 +168,7 @@ def mesh_from_level(
     (True, True)
     """
     options = options or MeshOptions()
-    values = np.asarray(level.values, dtype=np.float32)
+    values = level.single
     mesh, making = _stuffed(
         values, level.spacing, level.origin, options, allowed=allowed, needed=needed
     )

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim import _core
 from cmfsim.checks import Floats, as_number, as_point, as_positive
-from cmfsim.errors import MeshInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import MeshInputError, third_party
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
@@ -134,9 +133,9 @@ def _within_region(level: Levels, grid: ImageData, region: TissueRegion) -> None
     """Bounds a level by the planes of a region: the distance into it, in the scale of a level."""
     band = BAND_IN_VOXELS * float(grid.spacing.max())
     x, y, z = grid.axes()
-    point, normal = np.asarray(region.point), np.asarray(region.normal)
     dx, dy, dz = (
-        (axis - place) * part for axis, place, part in zip((x, y, z), point, normal, strict=True)
+        (axis - place) * part
+        for axis, place, part in zip((x, y, z), region.point, region.normal, strict=True)
     )
     # In slabs: distances in double precision of the whole grid would be its largest array.
     for begin in range(0, len(level), SLAB):

@@ -141,7 +141,8 @@ def _above(places: Mapping[str, Floats]) -> Floats:
         raise CaseInputError(
             f"landmarks of the upper and lower arch lie {length:.2g} mm apart in height: misplaced"
         )
-    return np.asarray(up / length)
+    unit: Floats = up / length
+    return unit
 
 
 def _bearers(
@@ -196,7 +197,7 @@ def _places_of_teeth(anatomy: Anatomy) -> dict[str, Floats] | None:
     axes = np.stack([left, np.cross(left, -up), up])
     # LPS: ahead is −y.
     axes[1] *= -np.sign(axes[1, 1] or 1.0)
-    places = {}
+    places: dict[str, Floats] = {}
     for names, row, sign, rise in (
         (UPPER_ARCH, upper, 1.0, UPPER_MOLAR_RISE),
         (LOWER_ARCH, lower, -1.0, LOWER_MOLAR_RISE),
@@ -205,7 +206,7 @@ def _places_of_teeth(anatomy: Anatomy) -> dict[str, Floats] | None:
         front = a > a.max() - FRONT_PART
         middle = float(np.median(s[front]))
         tip = (middle, np.percentile(a[front], 98.0), _root_end(v[front], sign, FRONT_RISE))
-        places[names[0]] = np.asarray(tip @ axes)
+        places[names[0]] = tip @ axes
         for name, side in ((names[1], s > middle), (names[2], s < middle)):
             if np.count_nonzero(side) < 3:
                 return None
@@ -213,7 +214,7 @@ def _places_of_teeth(anatomy: Anatomy) -> dict[str, Floats] | None:
             back = side & (a < end + MOLAR_PART)
             outer = np.percentile(s[back] - middle, 95.0 if name == names[1] else 5.0) + middle
             molar = (outer, end + HALF_MOLAR, _root_end(v[back], sign, rise))
-            places[name] = np.asarray(molar @ axes)
+            places[name] = molar @ axes
     return places
 
 

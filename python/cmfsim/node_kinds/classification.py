@@ -20,6 +20,7 @@ from cmfsim.node_kinds.sliding import sliding_nodes
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.scene import SegmentData
 from cmfsim.values.surface_data import SurfaceData
 
@@ -242,10 +243,8 @@ class _Boundary:
     """The nodes on the boundary of a mesh, with the length of their edges and their triangles."""
 
     def __init__(self, points: Floats, triangles: Indices) -> None:
-        ids, local = np.unique(triangles, return_inverse=True)
-        self.ids: NDArray[np.intp] = ids.astype(np.intp)
+        self.ids, self.triangles = used_nodes(triangles)
         self.points: Floats = points[self.ids]
-        self.triangles = local.reshape(-1, 3)
         n = len(self.ids)
         corners = self.points[self.triangles]
         total, count = np.zeros(n), np.zeros(n)

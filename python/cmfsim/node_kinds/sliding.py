@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface
 from cmfsim.checks import Floats
-from cmfsim.extras import third_party
+from cmfsim.errors import third_party
 from cmfsim.node_kinds.arches import DentalArches
 from cmfsim.node_kinds.options import KindOptions
 from cmfsim.values.anatomy import Anatomy, BoneSegment
@@ -98,7 +98,7 @@ def _in_arch(
     normal = normal * np.sign(normal @ out)
     offset = points - arch.middle
     ahead = offset @ forwards
-    region = (
+    region: NDArray[np.bool_] = (
         ((points - a) @ normal <= 0.0)
         & (ahead >= -options.behind)
         & (np.abs(offset @ across) <= arch.half_width + options.beside)
@@ -106,12 +106,13 @@ def _in_arch(
     if alone:
         bite = 0.5 * arch.depth_molars + PAST_BITE
         region &= (ahead >= 0.0) | (-(offset @ out) <= bite)
-    return np.asarray(region)
+    return region
 
 
 def _on_sheet(points: Floats, sheet: SurfaceData) -> NDArray[np.bool_]:
     closest, _, _ = Surface(sheet.vertices, sheet.triangles).closest(points)
-    return np.asarray(np.linalg.norm(closest - points, axis=1) <= SHEET_DEPTH)
+    near: NDArray[np.bool_] = np.linalg.norm(closest - points, axis=1) <= SHEET_DEPTH
+    return near
 
 
 def _near_teeth(points: Floats, anatomy: Anatomy, options: KindOptions) -> NDArray[np.bool_]:

@@ -140,7 +140,7 @@ def level_surface(field: Field, low: Floats, high: Floats, spacing: float) -> Su
     # A surface through a grid point would give triangles without area.
     least = NEAREST * spacing
     values = np.where(np.abs(values) < least, np.copysign(least, values), values)
-    corners, triangles, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
+    corners, triangles, _, _ = marching_cubes(
         values, 0.0, spacing=(spacing,) * 3, gradient_direction="ascent"
     )
     start = np.array([axis[0] for axis in axes])

@@ -82,7 +82,8 @@ def _hits(points: Floats) -> Floats:
 
 def _extreme(points: Floats, direction: Floats) -> Floats:
     """The point that lies furthest in a direction."""
-    return np.asarray(points[int(np.argmax(points @ direction))])
+    furthest: Floats = points[int(np.argmax(points @ direction))]
+    return furthest
 
 
 def _scan(low: float, high: float) -> Floats:

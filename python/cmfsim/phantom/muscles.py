@@ -162,7 +162,8 @@ def _tangents(line: Floats) -> Floats:
     place = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rows, axis=0), axis=1))])
     slope = np.gradient(rows, place, axis=0, edge_order=2)
     tangents = slope[1:-1] if closed else slope
-    return np.asarray(tangents / np.linalg.norm(tangents, axis=1)[:, None])
+    units: Floats = tangents / np.linalg.norm(tangents, axis=1)[:, None]
+    return units
 
 
 def _closest_direction(line: Floats, points: Floats) -> tuple[Floats, Floats]:

@@ -108,7 +108,7 @@ class Egg:
             reach = float(max(*self.low, *high)) * (1.8 if self.power > 2.0 else 1.0)
             lows, highs = c - reach, c + reach
         else:
-            lows, highs = c - np.asarray(self.low), c + np.asarray(high)
+            lows, highs = np.subtract(c, self.low), np.add(c, high)
         return Box(tuple(lows.tolist()), tuple(highs.tolist()))
 
     def level(self, x: Level, y: Level, z: Level) -> Level:
@@ -428,8 +428,8 @@ class Blend:
                 box, margin = EVERYWHERE, 0.0
             else:
                 box, margin = step.shape.box, REACH
-            low.append(np.asarray(box.low) - margin)
-            high.append(np.asarray(box.high) + margin)
+            low.append(np.subtract(box.low, margin))
+            high.append(np.add(box.high, margin))
         return Reaches(np.array(low), np.array(high))
 
     def level(self, x: Level, y: Level, z: Level) -> Level:

@@ -328,8 +328,8 @@ def teeth_shape(*, upper: bool) -> Blend:
         middle, half = 0.5 * (edge + root), 0.5 * abs(edge - root)
         tooth = Egg((x, y, middle), (0.5 * width - 0.05, depth, half), power=2.8, turn=turn)
         steps.append(Step("join", tooth, 0.4))
-        low = np.minimum(low, np.asarray(tooth.box.low))
-        high = np.maximum(high, np.asarray(tooth.box.high))
+        low = np.minimum(low, tooth.box.low)
+        high = np.maximum(high, tooth.box.high)
     return Blend(tuple(steps), Box(tuple(low.tolist()), tuple(high.tolist())))
 
 

@@ -10,7 +10,7 @@ from cmfsim.pictures.anatomy import (
     segment_colours,
 )
 from cmfsim.pictures.bands import band_picture, picture_band
-from cmfsim.pictures.beside import Painter, Picture
+from cmfsim.pictures.canvas import Picture
 from cmfsim.pictures.charts import MODEL_COLOURS, chart_errors
 from cmfsim.pictures.distances import (
     DISTANCE_LIMIT,
@@ -34,7 +34,6 @@ __all__ = [
     "MODEL_COLOURS",
     "SEGMENT_COLOURS",
     "SKIN_COLOUR",
-    "Painter",
     "Picture",
     "ViewPart",
     "band_picture",

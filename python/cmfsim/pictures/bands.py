@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.errors import CaseInputError
-from cmfsim.pictures.beside import Picture
-from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
+from cmfsim.pictures.canvas import SIZE, Picture, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.distances import NOT_EVALUATED
 from cmfsim.pictures.skin_ends import skin_ends, trimmed
 from cmfsim.values.prediction import Prediction

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
@@ -31,6 +31,7 @@ __all__ = [
     "LEGEND_ROW",
     "NO_OPENGL",
     "SIZE",
+    "Picture",
     "View",
     "add_scale_bar",
     "bounds",
@@ -44,6 +45,9 @@ __all__ = [
     "write_picture",
 ]
 
+# What draws a picture at a path: a function of this package with all else that it takes, which can
+# be pickled.
+Picture = partial[None]
 SIZE = (1650, 820)
 # Where the camera stands, as a direction from the head, in LPS.
 DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType(

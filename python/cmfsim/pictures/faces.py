@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
-from cmfsim.pictures.beside import Picture
-from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
+from cmfsim.pictures.canvas import SIZE, Picture, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.skin_ends import SkinEnds, skin_ends, trimmed
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import Prediction

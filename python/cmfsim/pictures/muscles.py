@@ -125,7 +125,7 @@ def add_muscle(plotter: Any, muscle: MuscleSurface, colour: str) -> None:
 def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:
     """Fibre strokes and box edges as pairs of points, and the colour of the boxes."""
     vertices = muscle.surface.vertices
-    triangles = np.asarray(muscle.surface.triangles, dtype=np.int64)
+    triangles = muscle.surface.triangles.astype(np.int64)
     surface = Surface(vertices, triangles)
     fibres = MuscleFibres(surface, muscle.kind, muscle.boxes, muscle.course)
     every = max(1, len(triangles) // STROKES)

@@ -16,13 +16,13 @@ from cmfsim.evaluation import SKIN_LANDMARKS, calibrate, skin_regions
 from cmfsim.pipeline.face_regions import FaceLandmarks, face_landmarks
 from cmfsim.solving.models import solved_patient
 from cmfsim.solving.rates import SkinRates, skin_rates
-from cmfsim.solving.uncertainty import ADDED, NOT_COVERED, band_sources
 from cmfsim.surfaces.depth import tissue_depth
 from cmfsim.values.band_options import BandOptions
 from cmfsim.values.calibration import BandFactor, Calibration, settings_digest
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import WHOLE_FACE, SkinBand
+from cmfsim.values.uncertainty import ADDED, NOT_COVERED, band_sources
 
 __all__ = ["band_regions", "band_settings", "predict_with_band"]
 

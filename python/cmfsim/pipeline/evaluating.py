@@ -24,16 +24,17 @@ from cmfsim.evaluation import (
 )
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.io.metrics import EVALUATION_FILE
-from cmfsim.pipeline.building import Postoperative, case_key, read_postoperative
+from cmfsim.pipeline.building.inputs import case_key
+from cmfsim.pipeline.building.postoperative import Postoperative, read_postoperative
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.face_regions import face_landmarks
 from cmfsim.pipeline.predicting import named_models, predictions_of
-from cmfsim.progress import Progress
 from cmfsim.surfaces.depth import tissue_depth
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.finding_groups import grouped
 from cmfsim.values.prediction import MODELS, Prediction
+from cmfsim.values.progress import Progress
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["EVALUATION_FILE", "CaseEvaluation", "evaluate", "evaluation_key"]

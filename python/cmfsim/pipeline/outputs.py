@@ -18,7 +18,7 @@ import numpy as np
 
 from cmfsim.errors import CmfsimError
 from cmfsim.evaluation import error_table
-from cmfsim.io import replacing_files
+from cmfsim.io import replacing, replacing_files
 from cmfsim.io.metrics import (
     EVALUATION_FILE,
     REPORT_FILE,
@@ -38,9 +38,7 @@ from cmfsim.io.predictions import (
 from cmfsim.io.skin_errors import skin_errors_file, write_skin_errors
 from cmfsim.io.slicer_output import SLICER_FILE, write_slicer_bundle
 from cmfsim.io.summaries import write_summary
-from cmfsim.muscles.template import joined_surface
 from cmfsim.pictures import (
-    Painter,
     Picture,
     band_picture,
     chart_errors,
@@ -50,11 +48,13 @@ from cmfsim.pictures import (
     prediction_picture,
 )
 from cmfsim.pipeline.evaluating import CaseEvaluation
+from cmfsim.pipeline.painting import Painter
 from cmfsim.planning.page import PAGE_FILE, page_state
-from cmfsim.progress import Progress
-from cmfsim.report import Document, Figure, case_document, write_page
+from cmfsim.report import Document, Figure, case_document, render_page
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.prediction import MODELS, Prediction
+from cmfsim.values.progress import Progress
+from cmfsim.values.surface_data import joined_surface
 
 __all__ = [
     "WrittenPrediction",
@@ -149,7 +149,7 @@ class _Clock:
 def write_results(
     output: Path,
     predictions: Iterable[Prediction],
-    n_models: int,
+    models: Sequence[str],
     *,
     stage: Progress,
     evaluation: Callable[[], CaseEvaluation] | None = None,
@@ -165,8 +165,8 @@ def write_results(
         The case's output folder: predictions of several models lie in a folder for each.
     predictions : iterable of Prediction
         Written one by one, as each is solved.
-    n_models : int
-        That were asked for.
+    models : sequence of str
+        That were asked for, whether or not all could be predicted.
     stage : callable
         Called with the name of each stage as it begins.
     evaluation : callable, optional
@@ -188,7 +188,7 @@ def write_results(
     def fill(fresh: Path) -> list[str]:
         for prediction in predictions:
             stage(f"writing {prediction.model}")
-            place = "" if n_models == 1 else prediction.model
+            place = "" if len(models) == 1 else prediction.model
             (fresh / place).mkdir(exist_ok=True)
             begun = {}
             if pictures(prediction.model):
@@ -226,22 +226,29 @@ def write_results(
     def stale() -> list[str]:
         key = written.predictions[0].summary["case_key"]
         written.left_out = stale_results(output, key)
-        # Pictures of an earlier run that this one has not drawn, and a report that it has not made.
-        older = [REPORT_FILE]
-        for place in (entry.place for entry in written.predictions):
-            folder = output / place
-            if folder.is_dir() and (folder / "prediction.json").exists():
-                names = [path.name for path in folder.iterdir() if is_prediction_file(path.name)]
-                older += [f"{place}/{name}".lstrip("/") for name in names]
-        return [*written.left_out, *older]
+        return [*written.left_out, *_older(output, [entry.place for entry in written.predictions])]
 
     # A comparison lists its files; those of predictions are found by their names.
     summary = None if evaluation is None else EVALUATION_FILE
     with Painter() as painter:
+        if any(pictures(model) for model in models):
+            # While the first prediction is solved.
+            painter.load()
         names = replacing_files(output, summary, is_result_file, fill, stale)
     written.left_out = [name for name in written.left_out if name not in names]
     _warn_of_removed(output, written.left_out)
     return written
+
+
+def _older(output: Path, places: Iterable[str]) -> list[str]:
+    """Pictures of an earlier run that this one has not drawn, and a report that it has not made."""
+    older = [REPORT_FILE]
+    for place in places:
+        folder = output / place
+        if folder.is_dir() and (folder / "prediction.json").exists():
+            names = [path.name for path in folder.iterdir() if is_prediction_file(path.name)]
+            older += [f"{place}/{name}".lstrip("/") for name in names]
+    return older
 
 
 def _earlier_evaluation(output: Path, key: str) -> dict[str, Any] | None:
@@ -462,8 +469,10 @@ def _error_caption(model: str) -> str:
 def write_report_page(folder: Path, document: Document) -> str | None:
     """The name of the page that a report was written to; none, with a warning, without Jinja2."""
     try:
-        write_page(folder / REPORT_FILE, document)
+        page = render_page(document)
     except CmfsimError as error:
         _log.warning("no report: %s", error)
         return None
+    with replacing(folder / REPORT_FILE) as file:
+        file.write(page.encode())
     return REPORT_FILE

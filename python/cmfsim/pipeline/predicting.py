@@ -7,10 +7,10 @@ from dataclasses import replace
 from cmfsim.checks import check_one_of
 from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
 from cmfsim.io import Case, CaseOrPath, as_case
-from cmfsim.pipeline.building import Postoperative, case_key, input_hashes, plan_key
 from cmfsim.pipeline.building.case_model import model_of
+from cmfsim.pipeline.building.inputs import case_key, input_hashes, plan_key
+from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.stages import BuildOptions
-from cmfsim.progress import Progress
 from cmfsim.solving.models import predict_patient
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.band_options import BandOptions
@@ -18,6 +18,7 @@ from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
+from cmfsim.values.progress import Progress
 
 __all__ = [
     "build_patient",

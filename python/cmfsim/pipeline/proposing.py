@@ -11,7 +11,6 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_landmark_file, read_surface
-from cmfsim.phantom.average_head import average_head
 from cmfsim.pipeline.building.inputs import read_anatomy
 from cmfsim.registration.proposed import (
     ProposedLandmarks,
@@ -19,6 +18,7 @@ from cmfsim.registration.proposed import (
     TemplateHead,
     landmarks_from,
 )
+from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding
@@ -88,7 +88,7 @@ def propose_landmarks(
     Examples
     --------
     >>> import cmfsim
-    >>> from cmfsim.phantom.average_head import average_head
+    >>> from cmfsim.registration.proposed.average_head import average_head
     >>> head = average_head()
     >>> found = cmfsim.propose_landmarks(head.bones, head.skin)
     >>> len(found.skull), len(found.skin)

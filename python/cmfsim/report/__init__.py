@@ -2,7 +2,7 @@
 
 from cmfsim.report.case import case_document
 from cmfsim.report.document import Alert, Document, Figure, Note, Section, Table
-from cmfsim.report.page import render_page, write_page
+from cmfsim.report.page import render_page
 from cmfsim.report.study import study_document
 
 __all__ = [
@@ -15,5 +15,4 @@ __all__ = [
     "case_document",
     "render_page",
     "study_document",
-    "write_page",
 ]

@@ -1,15 +1,12 @@
 """A report as one HTML page that needs nothing beside it: for browsers and for paper."""
 
 import base64
-import os
 from importlib.resources import files
-from pathlib import Path
 
-from cmfsim.extras import third_party
-from cmfsim.io.files import replacing
+from cmfsim.errors import third_party
 from cmfsim.report.document import Document, Figure, Note, Table
 
-__all__ = ["render_page", "write_page"]
+__all__ = ["render_page"]
 
 DISCLAIMER = "Research software, not a medical device. Not for diagnosis or treatment decisions."
 
@@ -38,21 +35,6 @@ def render_page(document: Document) -> str:
     text = files("cmfsim.report").joinpath("page.html").read_text(encoding="utf-8")
     page: str = environment.from_string(text).render(document=document, disclaimer=DISCLAIMER)
     return page
-
-
-def write_page(path: str | os.PathLike[str], document: Document) -> None:
-    """Writes the page of a report, replacing an older one in one step.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Jinja2, of the extra `report`, is not installed.
-    OSError
-        The folder cannot be written to.
-    """
-    page = render_page(document)
-    with replacing(Path(path)) as file:
-        file.write(page.encode())
 
 
 def _kind(block: Note | Table | Figure) -> str:

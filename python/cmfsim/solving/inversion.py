@@ -40,7 +40,7 @@ def least_volume_ratios(tensors: MassTensors, displacements: ArrayLike) -> Float
     ratios: Floats = 1.0 + tensors.volume_change(u)
     if len(tensors.mid_edges) == 0:
         return ratios
-    tets = np.asarray(tensors.mesh.tets, dtype=np.int64)
+    tets = tensors.mesh.tets.astype(np.int64)
     rest = 6.0 * tensors.mesh.volumes
     # Of each corner the other three, in the order that keeps the tet's orientation: (m, 4, 3).
     all_others = tets[:, [(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)]]
@@ -60,7 +60,7 @@ def _middles(
 ) -> NDArray[np.int64]:
     """The nodes in the middle of the edges between corners."""
     n = tensors.mesh.n_nodes
-    pairs = np.sort(np.asarray(tensors.mid_edges, dtype=np.int64), axis=1)
+    pairs = np.sort(tensors.mid_edges.astype(np.int64), axis=1)
     keys = pairs[:, 0] * n + pairs[:, 1]
     order = np.argsort(keys)
     asked = np.minimum(starts, ends) * n + np.maximum(starts, ends)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Solution, StaticSolver, rigid_fit
-from cmfsim.checks import check_one_of
+from cmfsim.checks import Floats, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.solving.simulation import scene_solver, solved_scene, told
 from cmfsim.values.clinical_motion import clinical_motion
@@ -264,5 +264,5 @@ def _left_out(patient: PatientModel, scene: Scene, model: str) -> list[str]:
     return left
 
 
-def _stays(motion: object) -> bool:
-    return not isinstance(motion, MovedSurface) and np.array_equal(np.asarray(motion), np.eye(4))
+def _stays(motion: Floats | MovedSurface) -> bool:
+    return not isinstance(motion, MovedSurface) and np.array_equal(motion, np.eye(4))

@@ -18,10 +18,10 @@ from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.solving.simulation import scene_plan
 from cmfsim.solving.tissue_changes import TissueParts, tissue_parts
-from cmfsim.solving.uncertainty import PLAN, TISSUE, Source
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.scene import Scene
 from cmfsim.values.surface_data import MovedSurface
+from cmfsim.values.uncertainty import PLAN, TISSUE, Source
 
 __all__ = ["ACCURACY", "SkinRates", "scene_parts", "skin_rates", "tissue_load"]
 

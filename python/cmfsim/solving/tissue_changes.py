@@ -154,7 +154,7 @@ def tissue_parts(
             return TissueParts(young, poisson, none, none, none, none, straight, law)
         if fraction is None:
             return None
-        p = np.asarray(fraction, dtype=np.float64)
+        p = fraction
         along, across = (arrays[n] - (1.0 - p) * young for n in ("young_along", "young_across"))
         ratio = arrays["poisson"] - (1.0 - p) * poisson
     # Fat has no direction; any unit vector serves.

@@ -11,16 +11,16 @@ from numpy.typing import ArrayLike
 from cmfsim.checks import Floats, as_positive, as_rows
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io import CaseOrPath, as_case
-from cmfsim.pipeline.building import with_muscles
+from cmfsim.pipeline.building.muscles import with_muscles
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
-from cmfsim.progress import Progress
 from cmfsim.solving.models import predict_patient
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
+from cmfsim.values.progress import Progress
 
 __all__ = ["LandmarkTrial", "SensitivityReport", "landmark_trials", "sensitivity"]
 

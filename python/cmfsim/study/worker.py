@@ -59,7 +59,7 @@ def _evaluated(case: Case, models: Sequence[str]) -> bool:
     write_results(
         case.output,
         evaluation.predictions,
-        len(models),
+        models,
         stage=_log.info,
         evaluation=lambda: evaluation,
     )

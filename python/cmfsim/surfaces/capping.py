@@ -52,7 +52,8 @@ def cap_loop(vertices: Floats, loop: Integers) -> tuple[Integers, float]:
 
 def _loop_normal(points: Floats) -> Floats:
     """Twice the vector area of a loop (Newell)."""
-    return np.asarray(np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0), dtype=np.float64)
+    doubled: Floats = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
+    return doubled
 
 
 def _clip_ears(flat: Floats) -> Integers:

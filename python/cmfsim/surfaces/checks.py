@@ -234,7 +234,8 @@ def thin_triangles(
 def has_three_corners(triangles: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Which triangles name no vertex twice."""
     a, b, c = triangles.T
-    return np.asarray((a != b) & (b != c) & (c != a), dtype=np.bool_)
+    three: NDArray[np.bool_] = (a != b) & (b != c) & (c != a)
+    return three
 
 
 def duplicate_triangles(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -292,7 +293,7 @@ def _areas_volumes(vertices: Floats, triangles: NDArray[np.int64]) -> tuple[Floa
     middle = vertices[triangles].mean(axis=(0, 1))
     a, b, c = (vertices[triangles[:, i]] - middle for i in range(3))
     normals = np.cross(b - a, c - a)
-    volumes = np.asarray((a * np.cross(b, c)).sum(axis=1) / 6.0, dtype=np.float64)
+    volumes: Floats = (a * np.cross(b, c)).sum(axis=1) / 6.0
     return 0.5 * np.linalg.norm(normals, axis=1), volumes
 
 

@@ -144,7 +144,8 @@ def _heights(triangle: Floats, points: Floats) -> Floats:
     """Six times the signed volumes of a triangle with each of three points, (k, 3)."""
     a = triangle[:, 0]
     normal = np.cross(triangle[:, 1] - a, triangle[:, 2] - a)
-    return np.asarray(np.einsum("kij,kj->ki", points - a[:, None], normal), dtype=np.float64)
+    heights: Floats = np.einsum("kij,kj->ki", points - a[:, None], normal)
+    return heights
 
 
 def _passes(p: Floats, q: Floats, triangle: Floats) -> NDArray[np.bool_]:
@@ -154,5 +155,7 @@ def _passes(p: Floats, q: Floats, triangle: Floats) -> NDArray[np.bool_]:
     u = (np.cross(a, b) * along).sum(axis=1)
     v = (np.cross(b, c) * along).sum(axis=1)
     w = (np.cross(c, a) * along).sum(axis=1)
-    same = ((u > 0.0) & (v > 0.0) & (w > 0.0)) | ((u < 0.0) & (v < 0.0) & (w < 0.0))
-    return np.asarray(same, dtype=np.bool_)
+    same: NDArray[np.bool_] = ((u > 0.0) & (v > 0.0) & (w > 0.0)) | (
+        (u < 0.0) & (v < 0.0) & (w < 0.0)
+    )
+    return same

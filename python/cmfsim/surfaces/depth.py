@@ -1,4 +1,4 @@
-"""Depth of the soft tissue: how far the bone lies below each point of the skin."""
+"""Depth of the soft tissue below each point of the skin, and a skin moved outward."""
 
 from collections.abc import Iterable
 
@@ -10,7 +10,7 @@ from cmfsim.checks import Floats, as_rows
 from cmfsim.errors import MeshInputError
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["MOST_DEPTH", "tissue_depth"]
+__all__ = ["MOST_DEPTH", "moved_outward", "tissue_depth"]
 
 # Beyond this the closest bone is not below the skin but beside what was segmented, mm: the thickest
 # soft tissue of the face, in front of the masseter, is about 25 mm (De Greef et al. 2006).
@@ -39,3 +39,18 @@ def tissue_depth(points: ArrayLike, bones: Iterable[SurfaceData]) -> Floats:
         raise MeshInputError("the depth of the soft tissue needs at least one bone: there is none")
     capped: Floats = np.minimum(depth, MOST_DEPTH)
     return capped
+
+
+def moved_outward(skin: Surface, vertices: Floats, outward: Floats) -> Floats:
+    """The vertices of a moved skin, each shifted outward along its normal.
+
+    Parameters
+    ----------
+    skin : Surface
+        Gives the triangles.
+    vertices : (v, 3) float64, mm
+    outward : (v,) float64, mm
+    """
+    normals = skin.moved(vertices).vertex_normals
+    shifted: Floats = vertices + outward[:, None] * normals
+    return shifted

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from cmfsim import _core
 from cmfsim.checks import Floats, Indices, as_number, as_positive
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
@@ -111,7 +111,7 @@ def surface_of_level(
         the surface has to be decimated, is missing.
     """
     options = options or SurfaceOptions()
-    values = np.asarray(level.values, dtype=np.float32)
+    values = level.single
     low, high = block_of(values > 0.0)
     if not (high > low).all():
         raise CaseInputError(f"{name!r} has no voxel inside: its surface would be empty")
@@ -201,7 +201,7 @@ def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> 
 def block_of(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The first and the past-the-last voxel of the mask along each axis; equal if it is empty."""
     low, high = np.zeros(3, dtype=np.intp), np.zeros(3, dtype=np.intp)
-    columns, sheet = np.asarray(mask.any(axis=2)), np.asarray(mask.any(axis=0))
+    columns, sheet = np.any(mask, axis=2), np.any(mask, axis=0)
     for axis, line in enumerate((columns.any(axis=1), columns.any(axis=0), sheet.any(axis=0))):
         found = np.flatnonzero(line)
         if len(found):
@@ -227,13 +227,8 @@ def _without_slits(
         & (joined[:, 1] != joined[:, 2])
         & (joined[:, 2] != joined[:, 0])
     )
-    return _used(points, joined[kept])
-
-
-def _used(points: Floats, triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], Floats]:
-    """The triangles and the points that they use, in their order, renumbered."""
-    used, numbers = np.unique(triangles, return_inverse=True)
-    return numbers.reshape(triangles.shape), points[used]
+    used, left = used_nodes(joined[kept])
+    return left, points[used]
 
 
 def _smoothed(points: Floats, triangles: NDArray[np.int64], rounds: int) -> Floats:
@@ -285,8 +280,8 @@ def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> S
     points, corners = _simplified(name, surface.vertices, triangles, max_triangles)
     if not len(corners):
         raise CaseInputError(f"nothing is left of {name!r} at {max_triangles} triangles")
-    left, used = _used(points, corners)
-    return SurfaceData(used, left)
+    used, left = used_nodes(corners)
+    return SurfaceData(points[used], left)
 
 
 def _simplified(

@@ -18,6 +18,7 @@ from cmfsim.surfaces.checks import (
 )
 from cmfsim.surfaces.topology import component_labels, connected_labels, edges_of, orientation_flips
 from cmfsim.values.finding import Finding
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["RepairOptions", "clean_surface", "repair_surface"]
@@ -173,8 +174,8 @@ def _cap_finding(name: str, length: float, centre: Floats, bulge: float) -> Find
 
 
 def _compact(vertices: Floats, triangles: Integers, crease_angle: float) -> SurfaceData:
-    used, renumbered = np.unique(triangles, return_inverse=True)
-    return SurfaceData(vertices[used], renumbered.reshape(-1, 3), crease_angle)
+    used, corners = used_nodes(triangles)
+    return SurfaceData(vertices[used], corners, crease_angle)
 
 
 def _welded(

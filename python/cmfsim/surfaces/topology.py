@@ -100,7 +100,7 @@ def connected_labels(pairs: Integers, count: int) -> Integers:
             if np.array_equal(followed, root):
                 break
             root = followed
-    return np.asarray(np.unique(root, return_inverse=True)[1], dtype=np.int64).reshape(-1)
+    return np.unique(root, return_inverse=True)[1].reshape(-1)
 
 
 def orientation_flips(edges: Edges, n_triangles: int) -> tuple[NDArray[np.bool_], bool]:
@@ -141,4 +141,5 @@ def tet_bodies(tets: NDArray[Any]) -> Integers:
     ones = np.ones(pairs.shape[1], dtype=bool)
     graph = sparse.coo_matrix((ones, pairs), shape=(len(tets), len(tets)))
     _, body = import_module("scipy.sparse.csgraph").connected_components(graph, directed=False)
-    return np.asarray(body, dtype=np.int64)
+    bodies: Integers = body.astype(np.int64)
+    return bodies

@@ -74,6 +74,11 @@ class ImageData(Frozen):
         steps = np.array(self.values.shape) - 1
         return self.lowest + steps * self.spacing
 
+    @property
+    def single(self) -> NDArray[np.float32]:
+        """The values in single precision, not copied where they are."""
+        return self.values.astype(np.float32, copy=False)
+
     def with_values(self, values: NDArray[Any]) -> "ImageData":
         """Other values on the same grid."""
         if np.shape(values) != self.values.shape:

@@ -59,7 +59,7 @@ class LiftedTissue(Frozen):
         found: Indices = self.nodes[away >= 0.0]
         return found
 
-    def fixed(self, others: ArrayLike, motion: ArrayLike | MovedSurface) -> Indices:
+    def fixed(self, others: Indices, motion: ArrayLike | MovedSurface) -> Indices:
         """The fixed nodes of a scene: those that are not lifted, and what a motion presses on bone.
 
         Parameters
@@ -68,5 +68,5 @@ class LiftedTissue(Frozen):
             Fixed nodes of the scene; whether lifted ones are among them does not matter.
         motion : as for `free`
         """
-        all_of = np.union1d(np.asarray(others, dtype=np.uint32), self.nodes)
+        all_of = np.union1d(others, self.nodes)
         return np.setdiff1d(all_of, self.free(motion)).astype(np.uint32)

@@ -47,6 +47,10 @@ class NodeKinds(Frozen):
         object.__setattr__(self, "kind", frozen(kind))
         object.__setattr__(self, "segment", frozen(segment))
 
+    def of_nodes(self, nodes: NDArray[np.integer]) -> "NodeKinds":
+        """The kinds of some nodes, in their order: of the mesh that has only these."""
+        return NodeKinds(self.kind[nodes], self.segment[nodes], self.segments)
+
     def nodes(self, kind: str, segment: str | None = None) -> NDArray[np.uint32]:
         """The indices of the nodes of a kind ("free", "fixed", "joined", "sliding")."""
         check_one_of("kind", kind, NODE_KINDS)

@@ -18,6 +18,7 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.lifted_tissue import LiftedTissue
 from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.scene import Scene
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 from cmfsim.values.tissue_data import TissueData
@@ -94,13 +95,12 @@ class PatientModel(Frozen):
     @property
     def skin_nodes(self) -> NDArray[np.uint32]:
         """The nodes on the skin, (k,) uint32, ascending: vertex i of `skin` is node i of these."""
-        return np.unique(self.skin_triangles).astype(np.uint32)
+        return used_nodes(self.skin_triangles)[0].astype(np.uint32)
 
     @property
     def skin(self) -> SurfaceData:
         """The patient's skin as the mesh has it, outward."""
-        nodes = self.skin_nodes
-        triangles = np.searchsorted(nodes, self.skin_triangles)
+        nodes, triangles = used_nodes(self.skin_triangles)
         return SurfaceData(self.scene.nodes[nodes], triangles)
 
     def with_plan(self, plan: Mapping[str, ArrayLike | MovedSurface]) -> PatientModel:

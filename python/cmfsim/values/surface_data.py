@@ -1,14 +1,16 @@
-"""Triangle surfaces, and surfaces before and after a motion."""
+"""Triangle surfaces, several as one, and surfaces before and after a motion."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.checks import Floats, Indices, as_index_rows, as_number, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.values.frozen import Frozen
 
-__all__ = ["MovedSurface", "SurfaceData"]
+__all__ = ["MovedSurface", "SurfaceData", "joined_surface"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,17 @@ class SurfaceData(Frozen):
         object.__setattr__(self, "vertices", places)
         object.__setattr__(self, "triangles", corners)
         object.__setattr__(self, "crease_angle", as_number("crease_angle", crease_angle))
+
+
+def joined_surface(surfaces: Sequence[SurfaceData]) -> SurfaceData:
+    """Several surfaces as one, each a piece of its own."""
+    starts = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])[:-1]
+    triangles = [
+        surface.triangles.astype(np.int64) + start
+        for surface, start in zip(surfaces, starts, strict=True)
+    ]
+    vertices = [surface.vertices for surface in surfaces]
+    return SurfaceData(np.concatenate(vertices), np.concatenate(triangles))
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,45 +74,68 @@ class TissueData(Frozen):
     """
 
     kind: str
-    young: ArrayLike | None = None
-    poisson: ArrayLike | None = None
-    young_along: ArrayLike | None = None
-    young_across: ArrayLike | None = None
-    fibre: ArrayLike | None = None
-    stiffness: ArrayLike | None = None
-    fraction: ArrayLike | None = None
-    law: str = "spencer"
-    preset: str = "kim2010"
-    mixing: str = "moduli"
+    young: Floats | None
+    poisson: Floats | None
+    young_along: Floats | None
+    young_across: Floats | None
+    fibre: Floats | None
+    stiffness: Floats | None
+    fraction: Floats | None
+    law: str
+    preset: str
+    mixing: str
 
-    def __post_init__(self) -> None:
-        check_one_of("tissue kind", self.kind, tuple(TISSUE_ARRAYS))
+    def __init__(  # noqa: PLR0913, PLR0917 (one for each field)
+        self,
+        kind: str,
+        young: ArrayLike | None = None,
+        poisson: ArrayLike | None = None,
+        young_along: ArrayLike | None = None,
+        young_across: ArrayLike | None = None,
+        fibre: ArrayLike | None = None,
+        stiffness: ArrayLike | None = None,
+        fraction: ArrayLike | None = None,
+        law: str = "spencer",
+        preset: str = "kim2010",
+        mixing: str = "moduli",
+    ) -> None:
+        check_one_of("tissue kind", kind, tuple(TISSUE_ARRAYS))
+        given = {
+            "fibre": fibre,
+            "fraction": fraction,
+            "poisson": poisson,
+            "stiffness": stiffness,
+            "young": young,
+            "young_across": young_across,
+            "young_along": young_along,
+        }
+        object.__setattr__(self, "kind", kind)
+        for name, value in given.items():
+            object.__setattr__(self, name, self._checked(name, value))
+        for name, text in (("law", law), ("preset", preset), ("mixing", mixing)):
+            object.__setattr__(self, name, as_text(f"tissue {name}", text))
+
+    def _checked(self, name: str, value: ArrayLike | None) -> Floats | None:
+        """One of the arrays, with a row for each tet or a single one."""
         wanted = TISSUE_ARRAYS[self.kind]
-        for name in sorted({n for arrays in TISSUE_ARRAYS.values() for n in arrays}):
-            value = getattr(self, name)
-            if name not in wanted:
-                if value is not None:
-                    raise CaseInputError(f"tissue of kind {self.kind!r} takes no {name!r}")
-            elif value is not None:
-                array = as_floats(f"tissue {name}", value)
-                tail = wanted[name]
-                if array.shape == tail:
-                    array = array[np.newaxis]
-                if array.shape[1:] != tail or array.ndim != 1 + len(tail):
-                    shape = ", ".join(str(n) for n in ("m", *tail))
-                    raise CaseInputError(
-                        f"tissue {name} has shape {array.shape}: ({shape}) is needed"
-                    )
-                object.__setattr__(self, name, frozen(array))
-            elif (self.kind, name) not in TISSUE_OPTIONAL:
+        if value is None:
+            if name in wanted and (self.kind, name) not in TISSUE_OPTIONAL:
                 raise CaseInputError(f"tissue of kind {self.kind!r} lacks {name!r}")
-        for name in ("law", "preset", "mixing"):
-            as_text(f"tissue {name}", getattr(self, name))
+            return None
+        if name not in wanted:
+            raise CaseInputError(f"tissue of kind {self.kind!r} takes no {name!r}")
+        array, tail = as_floats(f"tissue {name}", value), wanted[name]
+        if array.shape == tail:
+            array = array[np.newaxis]
+        if array.shape[1:] != tail or array.ndim != 1 + len(tail):
+            shape = ", ".join(str(n) for n in ("m", *tail))
+            raise CaseInputError(f"tissue {name} has shape {array.shape}: ({shape}) is needed")
+        return frozen(array)
 
     def arrays(self) -> dict[str, Floats]:
         """The arrays of this kind of tissue, by name."""
         return {
-            name: np.asarray(getattr(self, name), dtype=np.float64)
+            name: getattr(self, name)
             for name in TISSUE_ARRAYS[self.kind]
             if getattr(self, name) is not None
         }

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.checks import Floats, as_index_rows, as_rows
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.virtual.hyperelastic import HyperelasticTissue, cofactor
 
 __all__ = ["HyperelasticBody"]
@@ -100,8 +99,8 @@ class HyperelasticBody:
     def forces(self, displacements: Floats) -> Floats:
         """The internal forces, (n, 3) N: the gradient of the energy."""
         stress = self.tissue.stress(self.deformation(displacements))
-        assembled = self._assemble(self._basis, stress=stress[..., None])
-        return np.asarray(assembled).reshape(-1, 3)
+        assembled: Floats = self._assemble(self._basis, stress=stress[..., None])
+        return assembled.reshape(-1, 3)
 
     def stiffness(
         self, displacements: Floats, added: Floats | None = None, *, convex: bool = False

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.checks import Floats, as_positive
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.image_data import ImageData
 
 __all__ = ["BoneContact", "SmoothDistance"]
@@ -43,9 +42,8 @@ class SmoothDistance:
     def __init__(self, level: ImageData, relief: float = RELIEF) -> None:
         ndimage = third_party("scipy.ndimage", "contact of virtual patients is found", "study")
         spacing = level.spacing
-        blurred = ndimage.gaussian_filter(
-            np.asarray(level.values, dtype=np.float64), as_positive("relief", relief) / spacing
-        )
+        values = level.values.astype(np.float64)
+        blurred = ndimage.gaussian_filter(values, as_positive("relief", relief) / spacing)
         self._spline = ndimage.spline_filter(-blurred, order=3, mode="mirror")
         self._origin, self._spacing = level.lowest, spacing
         self._sample = ndimage.map_coordinates
@@ -53,8 +51,8 @@ class SmoothDistance:
     def __call__(self, points: Floats) -> Floats:
         """The distances of points (k, 3), mm."""
         place = ((points - self._origin) / self._spacing).T
-        found = self._sample(self._spline, place, order=3, mode="mirror", prefilter=False)
-        return np.asarray(found)
+        found: Floats = self._sample(self._spline, place, order=3, mode="mirror", prefilter=False)
+        return found
 
     def slope(self, points: Floats) -> Floats:
         """The gradients at points, (k, 3)."""
@@ -123,7 +121,8 @@ class BoneContact:
         """The moved nodes in the frame of a bone after a fraction of its motion."""
         matrix = self.motion[name](part)
         moved = (self.points + displacements)[self.nodes]
-        return np.asarray((moved - matrix[:3, 3]) @ matrix[:3, :3])
+        back: Floats = (moved - matrix[:3, 3]) @ matrix[:3, :3]
+        return back
 
     def energy(self, displacements: Floats, part: float) -> float:
         """∫ ∫ pressure d(depth) d(area), N·mm.

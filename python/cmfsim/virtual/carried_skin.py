@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.checks import Floats, as_index_rows, as_number, as_rows
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["carried", "scanned"]
@@ -65,7 +64,8 @@ def carried(
         best[at], weights[at], home[at] = least[better], inside[better], tet[better]
     weights = np.clip(weights, 0.0, None)
     weights /= weights.sum(axis=1, keepdims=True)
-    return np.asarray(np.einsum("kc,kci->ki", weights, moves[rows[home]]))
+    moved: Floats = np.einsum("kc,kci->ki", weights, moves[rows[home]])
+    return moved
 
 
 def scanned(
@@ -118,7 +118,8 @@ def _normals(vertices: Floats, triangles: NDArray[Any]) -> Floats:
     for corner in range(3):
         np.add.at(total, triangles[:, corner], area)
     length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.asarray(total / np.maximum(length, np.finfo(np.float64).tiny))
+    normals: Floats = total / np.maximum(length, np.finfo(np.float64).tiny)
+    return normals
 
 
 def _module(name: str) -> Any:

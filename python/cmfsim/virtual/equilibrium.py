@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.checks import Floats
-from cmfsim.errors import CaseInputError, SolverError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, SolverError, third_party
 from cmfsim.virtual.body import HyperelasticBody
 
 __all__ = ["Contact", "Equilibrium", "EquilibriumOptions", "NoContact", "find_equilibrium"]
@@ -172,7 +171,7 @@ class _Search:
         options: EquilibriumOptions,
     ) -> None:
         self.body, self.path, self.contact, self.options = body, path, contact, options
-        self.held = np.asarray(held, dtype=np.int64)
+        self.held = held.astype(np.int64)
         self.free = np.setdiff1d(np.arange(len(body.nodes)), self.held)
         self.linear = _LinearSolver(body.nodes[self.free])
         self.u: Floats = np.zeros_like(body.nodes)

@@ -152,8 +152,10 @@ class HyperelasticTissue:
     @property
     def fibrous(self) -> NDArray[np.bool_]:
         """Which tets have fibres, (m,)."""
-        fibres = (self.alpha != 0.0) | (self.difference != 0.0) | (self.beta != 0.0)
-        return np.asarray(fibres)
+        fibres: NDArray[np.bool_] = (
+            (self.alpha != 0.0) | (self.difference != 0.0) | (self.beta != 0.0)
+        )
+        return fibres
 
     def of(self, tets: ArrayLike) -> "HyperelasticTissue":
         """The tissue of some of the tets."""
@@ -178,12 +180,13 @@ class HyperelasticTissue:
         _, det = cofactor(gradient)
         _, c, i4 = self._fibre_strain(gradient)
         growth = det - 1.0
-        psi = 0.5 * self.mu * ((gradient * gradient).sum(axis=(0, 1)) - 3.0) - self.mu * growth
+        psi: Floats = 0.5 * self.mu * ((gradient * gradient).sum(axis=(0, 1)) - 3.0)
+        psi -= self.mu * growth
         psi += 0.5 * (self.lambda_ + self.mu) * growth**2
         psi += self._crushing() / 3.0 * np.maximum(CRUSHED - det, 0.0) ** 3
         psi += (0.5 * self.alpha * growth + 0.125 * self.beta * i4) * i4
         psi += 0.5 * self.difference * (c * c).sum(axis=0)
-        return np.asarray(psi)
+        return psi
 
     def stress(self, gradient: Floats) -> Floats:
         """The first Piola–Kirchhoff stress P = ∂ψ/∂F, (3, 3, m) MPa.

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.checks import Floats, as_index_rows, as_positive, as_rows
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.virtual.equilibrium import Contact
 from cmfsim.virtual.open_mouth import MARGIN, MouthSlit
 
@@ -62,7 +61,7 @@ class Lip:
         By default, all nodes of the triangles may touch the other lip.
         """
         chosen = np.unique(triangles if nodes is None else nodes).astype(np.int64)
-        return cls(np.asarray(triangles, dtype=np.int64), chosen, area[chosen])
+        return cls(triangles.astype(np.int64), chosen, area[chosen])
 
     @cached_property
     def neighbours(self) -> NDArray[np.int64]:
@@ -362,7 +361,8 @@ def _outward(places: Floats, lip: Lip, triangle: NDArray[np.int64], weights: Flo
     two = neighbour >= 0
     found[on_edge[two]] += face[neighbour[two]]
     length = np.linalg.norm(found, axis=1, keepdims=True)
-    return np.asarray(found / np.maximum(length, np.finfo(np.float64).tiny))
+    normals: Floats = found / np.maximum(length, np.finfo(np.float64).tiny)
+    return normals
 
 
 def _on_border(lip: Lip, triangle: NDArray[np.int64], weights: Floats) -> NDArray[np.bool_]:
@@ -370,7 +370,8 @@ def _on_border(lip: Lip, triangle: NDArray[np.int64], weights: Floats) -> NDArra
     none = weights <= ON_EDGE
     edge = (none & (lip.neighbours[triangle] < 0)).any(axis=1)
     corner = lip.triangles[triangle, weights.argmax(axis=1)]
-    return np.asarray(edge | ((none.sum(axis=1) == 2) & np.isin(corner, lip.border_nodes)))
+    border: NDArray[np.bool_] = edge | ((none.sum(axis=1) == 2) & np.isin(corner, lip.border_nodes))
+    return border
 
 
 def _block_matrix(rows: NDArray[np.int64], columns: NDArray[np.int64], data: Floats, n: int) -> Any:

@@ -66,14 +66,15 @@ class MouthSlit:
     def _drawn(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         """Distance from the midline, front-to-back position, height in the canonical head, mm."""
         p = self.head.parameters
-        u, v, w = self.head.warp.inverse(*np.asarray(points, dtype=np.float64).T)
+        u, v, w = self.head.warp.inverse(*points.T)
         u, v, w = JawWarp(p, soft=True).inverse(np.abs(u), v, w)
         return np.asarray(u), np.asarray(v), np.asarray(w)
 
     def height(self, points: Floats) -> Floats:
         """Height of points (k, 3) above the line of the mouth, (k,) mm; negative below it."""
         u, _, w = self._drawn(points)
-        return np.asarray(self.head.parameters.scale * (w - np.interp(u, DISTANCE, LINE)))
+        height: Floats = self.head.parameters.scale * (w - np.interp(u, DISTANCE, LINE))
+        return height
 
     def level(self, points: Floats) -> Floats:
         """The level of the slit at points (k, 3), (k,) mm: positive between the lips."""
@@ -83,7 +84,8 @@ class MouthSlit:
         half = 0.5 * p.lip_gap * np.sqrt(1.0 - past**2) - np.maximum(u - CORNER, 0.0)
         level = half - np.abs(w - np.interp(u, DISTANCE, LINE))
         # It ends in the middle of the upper tooth row.
-        return np.asarray(p.scale * np.minimum(level, _arch(u) - v))
+        slit: Floats = p.scale * np.minimum(level, _arch(u) - v)
+        return slit
 
     def lips(self, points: Floats, margin: float = 0.0) -> NDArray[np.int8]:
         """The lip to which points (k, 3) belong, (k,): 1 the upper, −1 the lower, 0 none.
@@ -94,13 +96,14 @@ class MouthSlit:
         height = self.height(points)
         near = (u < LIP_SIDE - margin) & (np.abs(height) < LIP_HEIGHT - margin)
         near &= v < _arch(u) + LIP_BACK - margin
-        return np.asarray(np.where(near, np.sign(height), 0.0), dtype=np.int8)
+        return np.where(near, np.sign(height), 0.0).astype(np.int8)
 
 
 def _arch(u: Floats) -> Floats:
     """Position from front to back of the middle line of the upper tooth row, mm."""
     x, y = np.array(UPPER_ARCH).T
-    return np.asarray(np.interp(u, x, y))
+    position: Floats = np.interp(u, x, y)
+    return position
 
 
 def with_open_mouth(head: PhantomHead, anatomy: Anatomy, bite: float) -> Anatomy:

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface, signed_distance_image
 from cmfsim.checks import Floats
-from cmfsim.errors import CaseInputError
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import decompose_motion, rigid_motion
@@ -183,7 +182,8 @@ def _towards(depth: ImageData, points: Floats) -> Floats:
     steps = np.diag(depth.spacing)
     slope = np.column_stack([depth.sample(points + s) - depth.sample(points - s) for s in steps])
     length = np.linalg.norm(slope, axis=1, keepdims=True)
-    return np.asarray(slope / np.maximum(length, np.finfo(np.float64).tiny))
+    normals: Floats = slope / np.maximum(length, np.finfo(np.float64).tiny)
+    return normals
 
 
 def operate(
@@ -227,7 +227,7 @@ def operate(
         if name not in distances:
             raise CaseInputError(f"the plan moves {name!r}; segments are: {', '.join(distances)}")
     names = list(distances)
-    matrices = [np.asarray(plan.get(name, np.eye(4)), dtype=np.float64) for name in names]
+    matrices = [plan.get(name, np.eye(4)) for name in names]
     motion = {
         name: screw(matrix, centres[name]) for name, matrix in zip(names, matrices, strict=True)
     }
@@ -296,7 +296,8 @@ def _crushed(
 def _volumes(nodes: Floats, tets: NDArray[Any]) -> Floats:
     edges = nodes[tets[:, 1:]] - nodes[tets[:, :1]]
     triple = np.einsum("ti,ti->t", np.cross(edges[:, 0], edges[:, 1]), edges[:, 2])
-    return np.asarray(triple / 6.0)
+    volumes: Floats = triple / 6.0
+    return volumes
 
 
 def node_areas(nodes: Floats, triangles: NDArray[Any]) -> Floats:

@@ -20,7 +20,7 @@ from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.cohorts import COHORT_FORMAT
 from cmfsim.io.files import replacing
 from cmfsim.phantom import PhantomHead, make_head
-from cmfsim.progress import Progress, no_progress
+from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.carried_skin import scanned
 from cmfsim.virtual.equilibrium import EquilibriumOptions

@@ -12,7 +12,7 @@ import numpy as np
 from cmfsim.checks import as_number
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import HeadParameters
-from cmfsim.solving.uncertainty import ADDED, PLAN
+from cmfsim.values.uncertainty import ADDED, PLAN
 from cmfsim.virtual.people import DRAWN, Relocation, VirtualPatient
 
 __all__ = ["drawn_patient"]

@@ -9,19 +9,18 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface, TetMesh
 from cmfsim.checks import Floats, as_positive
-from cmfsim.errors import CaseInputError
-from cmfsim.evaluation.unmoved import thickened as moved_outward
-from cmfsim.extras import third_party
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
-from cmfsim.pipeline.building import build_model
-from cmfsim.progress import Progress, no_progress
-from cmfsim.surfaces.depth import tissue_depth
+from cmfsim.pipeline.building.case_model import build_model
+from cmfsim.surfaces.depth import moved_outward, tissue_depth
 from cmfsim.surfaces.topology import tet_bodies
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.progress import Progress, no_progress
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.body import HyperelasticBody
 from cmfsim.virtual.carried_skin import carried
@@ -332,7 +331,8 @@ def _departure(patient: VirtualPatient, head: PhantomHead, segment: str) -> Floa
 def _nearest(points: Floats, places: Floats) -> NDArray[np.intp]:
     """Index of the nearest place to each point."""
     spatial = third_party("scipy.spatial", "virtual patients are made", "study")
-    return np.asarray(spatial.cKDTree(places).query(points)[1])
+    nearest: NDArray[np.intp] = spatial.cKDTree(places).query(points)[1]
+    return nearest
 
 
 def _outward(
@@ -381,14 +381,11 @@ def _opened(
     bared = np.zeros(len(nodes), dtype=bool)
     bared[tets[~kept]] = True
     tets = tets[kept]
-    tets = tets[largest_body(tets)]
-    used = np.zeros(len(nodes), dtype=bool)
-    used[tets] = True
-    number = np.cumsum(used) - 1
+    used, left = used_nodes(tets[largest_body(tets)])
     return _Opened(
         nodes[used],
-        number[tets].astype(np.uint32),
-        NodeKinds(kinds.kind[used], kinds.segment[used], kinds.segments),
+        left.astype(np.uint32),
+        kinds.of_nodes(used),
         np.flatnonzero(bared[used]),
     )
 
@@ -403,7 +400,8 @@ def largest_body(tets: NDArray[Any]) -> NDArray[np.bool_]:
     tets : (m, 4)
     """
     body = tet_bodies(tets)
-    return np.asarray(body == np.argmax(np.bincount(body)))
+    largest: NDArray[np.bool_] = body == np.argmax(np.bincount(body))
+    return largest
 
 
 def _moved_sites(

@@ -14,7 +14,8 @@ import cmfsim
 import phantom_case
 from cmfsim.bones import CutOptions, check_segments
 from cmfsim.io import Case
-from cmfsim.pipeline.building import build_model, case_checks
+from cmfsim.pipeline.building import case_checks
+from cmfsim.pipeline.building.case_model import build_model
 from cmfsim.pipeline.building.motions import PlannedBones
 from cmfsim.surfaces import levels as surfaces
 from head_case import HeadCase

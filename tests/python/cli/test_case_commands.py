@@ -42,7 +42,9 @@ def built(monkeypatch):
         return types.SimpleNamespace(summary=summary)
 
     monkeypatch.setitem(
-        sys.modules, "cmfsim.pipeline.building", types.SimpleNamespace(build_case=build_case)
+        sys.modules,
+        "cmfsim.pipeline.building.case_model",
+        types.SimpleNamespace(build_case=build_case),
     )
     return cases
 

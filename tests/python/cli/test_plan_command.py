@@ -17,7 +17,7 @@ import cmfsim
 from cmfsim.cli import main
 from cmfsim.cli.case_commands import case_of
 from cmfsim.io.tables import read_tables
-from cmfsim.pipeline.building import plan_key
+from cmfsim.pipeline.building.inputs import plan_key
 from cmfsim.planning.page import page_state
 from head_case import HeadCase
 

@@ -14,8 +14,7 @@ import cmfsim
 import meshes
 import real_heads
 from cmfsim.evaluation import SKIN_LANDMARKS, compare_unmoved
-from cmfsim.evaluation.unmoved import thickened
-from cmfsim.surfaces.depth import tissue_depth
+from cmfsim.surfaces.depth import moved_outward, tissue_depth
 
 stats = pytest.importorskip("scipy.stats")
 
@@ -533,7 +532,7 @@ def test_thickening_the_real_face_is_undone_by_the_fit():
     vertices = np.asarray(skin.vertices)
     depth = tissue_depth(vertices, bones)
     core = cmfsim.Surface(vertices, skin.triangles)
-    swollen = moved(skin, thickened(core, vertices, 0.06 * depth))
+    swollen = moved(skin, moved_outward(core, vertices, 0.06 * depth))
     regions = cmfsim.unmoved_regions(vertices, marks)
     unmoved = compare_unmoved(skin, swollen, regions, np.zeros(len(vertices)))
     found = cmfsim.fitted_thickness(unmoved.signed, depth[unmoved.vertices])

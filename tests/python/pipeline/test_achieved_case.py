@@ -7,8 +7,8 @@ import pytest
 
 import cmfsim
 from cmfsim.cli.study_commands import achieved_text
-from cmfsim.pipeline.building import read_postoperative
 from cmfsim.pipeline.building.motions import planned_bones
+from cmfsim.pipeline.building.postoperative import read_postoperative
 from head_case import HeadCase, ellipsoid, icosphere
 from pebbles import slid
 

@@ -80,7 +80,7 @@ def test_without_a_calibration_every_name_says_so(plain, tmp_path):
     assert values["state"] == "uncalibrated"
     assert values["calibration"] is None
     np.testing.assert_allclose(band.half_width, 1.6448536 * band.sd, rtol=1e-6)
-    written = write_results(tmp_path, [plain], 1, stage=lambda _: None)
+    written = write_results(tmp_path, [plain], ["M+S"], stage=lambda _: None)
     vtp = (tmp_path / "prediction.vtp").read_bytes()
     for name in band.arrays():
         assert name.encode() in vtp
@@ -103,7 +103,7 @@ def test_a_calibrated_band_has_the_factor_of_its_region(patient, plain, tmp_path
     assert np.ma.getmaskarray(band.half_width)[~face].all()
     assert not any("uncalibrated" in name for name in band.arrays())
     assert np.isnan(band.arrays()["band_half_width_90_percent_mm"][~face]).all()
-    write_results(tmp_path, [prediction], 1, stage=lambda _: None)
+    write_results(tmp_path, [prediction], ["M+S"], stage=lambda _: None)
     values = read_prediction(tmp_path)["band"]
     assert values["calibration"]["file"] == "made.json"
     assert values["regions"]["chin"]["calibration"]["n"] == 19

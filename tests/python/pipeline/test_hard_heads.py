@@ -127,9 +127,10 @@ def built(folder):
     """
     out, err = io.StringIO(), io.StringIO()
     models = []
+    build = case_model.build_model
 
     def build_model(case, **options):
-        models.append(cmfsim.build_model(case, **options))
+        models.append(build(case, **options))
         return models[-1]
 
     with pytest.MonkeyPatch.context() as patch:

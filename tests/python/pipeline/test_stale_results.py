@@ -17,7 +17,7 @@ from cmfsim.cli import main
 from cmfsim.io import finish_writing, read_parts
 from cmfsim.io.metrics import read_evaluation
 from cmfsim.io.predictions import predictions_of, read_prediction
-from cmfsim.pipeline.building import case_key, input_hashes
+from cmfsim.pipeline.building.inputs import case_key, input_hashes
 from cmfsim.pipeline.outputs import write_case_report, write_results
 from head_case import HeadCase
 
@@ -82,7 +82,7 @@ def write(folder, *predictions, evaluation=None):
     return write_results(
         folder,
         predictions,
-        len(predictions),
+        [prediction.model for prediction in predictions],
         stage=lambda _: None,
         evaluation=None if evaluation is None else lambda: evaluation,
     )
@@ -190,19 +190,16 @@ def test_a_comparison_of_another_plan_is_left_out_of_a_report(
 
 def test_the_key_is_that_of_files_plan_and_options_and_not_of_the_folder(case, tmp_path):
     here = cmfsim.Case.load(case)
-    key = cmfsim.pipeline.building.case_key(here)
+    key = case_key(here)
     other = cmfsim.Case.load(write_head(tmp_path))
-    assert cmfsim.pipeline.building.case_key(other) == key
+    assert case_key(other) == key
     # What is changed in memory alone counts, but not where results go.
     mesh = dataclasses.replace(here.mesh, edge_length=15.0)
-    assert cmfsim.pipeline.building.case_key(dataclasses.replace(here, mesh=mesh)) != key
-    assert cmfsim.pipeline.building.case_key(dataclasses.replace(here, plan={})) != key
-    assert (
-        cmfsim.pipeline.building.case_key(dataclasses.replace(here, output=tmp_path / "other"))
-        == key
-    )
+    assert case_key(dataclasses.replace(here, mesh=mesh)) != key
+    assert case_key(dataclasses.replace(here, plan={})) != key
+    assert case_key(dataclasses.replace(here, output=tmp_path / "other")) == key
     (tmp_path / "skin.ply").write_bytes((tmp_path / "after.ply").read_bytes())
-    assert cmfsim.pipeline.building.case_key(other) != key
+    assert case_key(other) != key
 
 
 def test_a_file_that_changes_during_the_work_is_an_error(tmp_path, monkeypatch):
@@ -455,7 +452,7 @@ def test_an_output_folder_that_leads_elsewhere_is_refused(tmp_path, case, predic
 def test_no_stage_is_named_twice(tmp_path, prediction, evaluation):
     stages = []
     write_results(
-        Path(tmp_path), [prediction], 1, stage=stages.append, evaluation=lambda: evaluation
+        Path(tmp_path), [prediction], ["H"], stage=stages.append, evaluation=lambda: evaluation
     )
     assert stages == ["writing H", "writing the comparison", "writing the report"]
 

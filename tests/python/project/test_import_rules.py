@@ -119,6 +119,18 @@ def test_a_circle_of_files_is_named(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "io/c" not in printed
 
 
+def test_too_many_entries_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A reader holds so many files and folders in mind, and no more."""
+    package = tmp_path / "python/cmfsim"
+    package.mkdir(parents=True)
+    for number in range(check_imports.MOST_PYTHON_ENTRIES + 1):
+        (package / f"entry{number}.py").touch()
+    assert check_imports.main(tmp_path) == 1
+    printed = capsys.readouterr().out
+    most = check_imports.MOST_PYTHON_ENTRIES
+    assert f"python/cmfsim: {most + 1} entries, at most {most}" in printed
+
+
 def test_the_core_runs_downhill() -> None:
     """No file can reach itself through the files that it may import."""
     table = check_imports.CORE

@@ -8,9 +8,9 @@ import pytest
 import cmfsim
 import ct_variants as variants
 import real_heads
-from cmfsim.phantom.average_head import average_head
 from cmfsim.pipeline.building.inputs import read_anatomy
 from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head
+from cmfsim.registration.proposed.average_head import average_head
 
 pytest.importorskip("scipy")
 

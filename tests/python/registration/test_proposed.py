@@ -7,9 +7,9 @@ import pytest
 
 import cmfsim
 import real_heads
-from cmfsim.phantom.average_head import average_head
 from cmfsim.pipeline.proposing import read_template_head
 from cmfsim.registration.proposed import measured_biases
+from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.proposed.groups import JAW_SITES
 from cmfsim.registration.proposed.judgement import missing_sites
 from cmfsim.registration.proposed.pose import Pose, find_pose

@@ -13,7 +13,7 @@ import pytest
 import cmfsim
 from cmfsim.cli import main
 from cmfsim.errors import CaseInputError, SolverError
-from cmfsim.solving.uncertainty import PLAN
+from cmfsim.values.uncertainty import PLAN
 from cmfsim.virtual import population_folder
 from cmfsim.virtual.population import CHIN_FORWARDS, OPERATIONS
 

@@ -174,7 +174,8 @@ def fit_muscles(morphed: MorphedMusculature, anatomy: Anatomy) -> MuscleFit:
     found, stretches, stiffness = _bounded(problem, watched)
 
     def moved(points: Floats) -> Floats:
-        return np.asarray(points + lattice.basis(points) @ found)
+        moved: Floats = points + lattice.basis(points) @ found
+        return moved
 
     after = vertices + basis @ found
     muscles = tuple(
@@ -254,7 +255,8 @@ def _samples(index: int, muscle: MuscleSurface) -> Floats:
     places = corners + np.random.default_rng(index).random(corners.shape)
     points = low + places * (high - low) / cells
     inside = np.abs(surface.winding_number(points)) > 0.5
-    return np.asarray(points[inside])
+    inner: Floats = points[inside]
+    return inner
 
 
 def _targets(morphed: MorphedMusculature, begins: Sequence[int]) -> Targets:
@@ -281,7 +283,7 @@ def _targets(morphed: MorphedMusculature, begins: Sequence[int]) -> Targets:
 def _spread(surface: SurfaceData) -> tuple[NDArray[np.intp], Floats]:
     """Vertices spread evenly over a surface, and the area that each represents."""
     vertices = surface.vertices
-    triangles = np.asarray(surface.triangles, dtype=np.intp)
+    triangles = surface.triangles.astype(np.intp)
     cross = np.cross(
         vertices[triangles[:, 1]] - vertices[triangles[:, 0]],
         vertices[triangles[:, 2]] - vertices[triangles[:, 0]],
@@ -302,7 +304,7 @@ def _spread(surface: SurfaceData) -> tuple[NDArray[np.intp], Floats]:
 
 def _stretches(lattice: Lattice, found: Floats, points: Floats) -> tuple[float, float]:
     """Smallest and largest principal stretch of space at points; negative where it folds."""
-    slopes = [np.asarray(lattice.basis(points, axis) @ found) for axis in range(3)]
+    slopes: list[Floats] = [lattice.basis(points, axis) @ found for axis in range(3)]
     gradient = np.stack(slopes, axis=2)
     whole = gradient + np.eye(3)
     sizes = np.linalg.svd(whole, compute_uv=False)

@@ -74,7 +74,8 @@ class Room:
     def known(self, points: Floats) -> NDArray[np.bool_]:
         """Which points lie in the part of the head that the data show."""
         inside = (points >= self.low) & (points <= self.high)
-        return np.asarray(inside.all(axis=1), dtype=bool)
+        within: NDArray[np.bool_] = np.all(inside, axis=1)
+        return within
 
 
 def known_part(skin: ImageData) -> tuple[Floats, Floats]:
@@ -114,7 +115,7 @@ def _resampled(level: ImageData, axes: list[Floats]) -> NDArray[np.float32]:
         part = part.reshape([-1 if a == axis else 1 for a in range(3)])
         low, high = np.take(values, before, axis), np.take(values, after, axis)
         values = low * (1 - part) + high * part
-    return np.asarray(values, dtype=np.float32)
+    return values.astype(np.float32, copy=False)
 
 
 def _distance(level: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -139,4 +140,4 @@ def _distance(level: NDArray[np.float32]) -> NDArray[np.float32]:
     # The level alone tells the side.
     wrong = (distance > 0.0) == closed
     distance[wrong] = np.where(closed[wrong], -0.05, 0.05) * SPACING
-    return np.asarray(distance, dtype=np.float32)
+    return distance.astype(np.float32, copy=False)

@@ -228,7 +228,7 @@ def _least(rows: Any, volume_rows: Any, energy: Any, right: Floats, start: Float
         ahead = scale * residual
         before, slope = slope, _dot(residual, ahead)
         along = ahead + (slope / before) * along
-    return np.asarray(x, dtype=float).reshape(start.shape)
+    return x.reshape(start.shape)
 
 
 def _dot(a: Floats, b: Floats) -> float:

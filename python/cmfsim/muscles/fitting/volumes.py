@@ -34,7 +34,7 @@ class Volumes:
     def of(cls, surfaces: Sequence[SurfaceData]) -> Self:
         """The volumes of surfaces whose vertices are concatenated in this order."""
         begins = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
-        triangles = [np.asarray(s.triangles, dtype=np.intp) for s in surfaces]
+        triangles = [s.triangles.astype(np.intp) for s in surfaces]
         return cls(tuple(triangles), tuple(map(_is_closed, triangles)), tuple(begins.tolist()))
 
     def part(self, values: Floats, surface: int) -> Floats:

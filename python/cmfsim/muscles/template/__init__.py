@@ -6,7 +6,6 @@ from cmfsim.muscles.template.checking import check_template
 from cmfsim.muscles.template.from_phantom import phantom_muscle, phantom_template
 from cmfsim.muscles.template.morphing import MorphedMusculature
 from cmfsim.muscles.template.muscle_template import MuscleTemplate
-from cmfsim.muscles.template.skull_reference import joined_surface
 
 __all__ = [
     "WHERE",
@@ -14,7 +13,6 @@ __all__ = [
     "MuscleTemplate",
     "check_template",
     "import_bodyparts3d",
-    "joined_surface",
     "phantom_muscle",
     "phantom_template",
     "template_names",

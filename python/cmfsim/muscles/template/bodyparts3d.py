@@ -27,15 +27,14 @@ from cmfsim.muscles.template.bodyparts3d_parts import (
     MusclePair,
 )
 from cmfsim.muscles.template.muscle_template import MuscleTemplate
-from cmfsim.muscles.template.skull_reference import joined_surface
-from cmfsim.progress import Progress, no_progress
 from cmfsim.registration import side_vectors
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
 from cmfsim.surfaces.repair import RepairOptions, clean_surface, repair_surface
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.progress import Progress, no_progress
+from cmfsim.values.surface_data import SurfaceData, joined_surface
 from cmfsim.values.template import as_landmarks
 
 __all__ = ["WHERE", "import_bodyparts3d"]

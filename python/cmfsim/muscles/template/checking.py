@@ -95,7 +95,8 @@ def _searchable(surface: object) -> Surface | None:
 
 def _distances(surface: Surface, points: Floats) -> Floats:
     closest = surface.closest(points)[0]
-    return np.asarray(np.linalg.norm(closest - points, axis=1))
+    distances: Floats = np.linalg.norm(closest - points, axis=1)
+    return distances
 
 
 def _listed(names: list[str]) -> str:

@@ -122,7 +122,8 @@ class _View:
 
     def flat(self, points: Floats) -> Floats:
         """Where points lie in the plane, (n, 2)."""
-        return np.asarray(points @ self.axes.T, dtype=np.float64)
+        flat: Floats = points @ self.axes.T
+        return flat
 
     def lifted(self, places: Floats) -> Floats:
         """The middle of the muscle over the longest run of places that lie on it, (n, 3)."""

@@ -5,13 +5,12 @@ import numpy as np
 from cmfsim.checks import Floats
 from cmfsim.io.template_archives import mirrored_muscle
 from cmfsim.muscles.template.muscle_template import MuscleTemplate
-from cmfsim.muscles.template.skull_reference import joined_surface
 from cmfsim.phantom import Muscle, PhantomHead, make_head
-from cmfsim.progress import Progress, no_progress
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.progress import Progress, no_progress
+from cmfsim.values.surface_data import SurfaceData, joined_surface
 
 __all__ = ["phantom_muscle", "phantom_template"]
 

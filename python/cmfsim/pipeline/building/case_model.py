@@ -37,10 +37,10 @@ from cmfsim.pipeline.building.parts import Head, MeshedTissue, Tissue
 from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.stages import BuildOptions, Stages
 from cmfsim.pipeline.building.tissue_mesh import region_of, tissue_mesh
-from cmfsim.progress import Progress, no_progress
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.progress import Progress, no_progress
 
 __all__ = ["build_case", "build_model", "model_of"]
 

@@ -10,6 +10,7 @@ from cmfsim.checks import Floats
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.renumbering import used_nodes
 
 __all__ = ["cleft_tets", "without_clefts"]
 
@@ -38,11 +39,8 @@ def without_clefts(
     inside = cleft_tets(nodes, tets, kinds, segments, moved=moved, width=width)
     if not inside.any():
         return mesh, kinds, ()
-    kept = tets[~inside]
-    used = np.zeros(len(nodes), dtype=bool)
-    used[kept] = True
-    number = np.cumsum(used) - 1
-    left = TetMesh(nodes[used], number[kept])
+    used, kept = used_nodes(tets[~inside])
+    left = TetMesh(nodes[used], kept)
     volume = float(mesh.volumes[inside].sum())
     finding = Finding.note(
         "clefts-left-out",
@@ -53,7 +51,7 @@ def without_clefts(
         "tets stretched across would be inverted and hold the bones back",
         fix="set cleft in [mesh] to another width, or to 0 to keep all tissue",
     )
-    return left, NodeKinds(kinds.kind[used], kinds.segment[used], kinds.segments), (finding,)
+    return left, kinds.of_nodes(used), (finding,)
 
 
 def cleft_tets(
@@ -118,11 +116,13 @@ def _least_at_corners(
     near = np.flatnonzero(((nodes >= low) & (nodes <= high)).all(axis=1))
     distance = np.full(len(nodes), np.inf)
     distance[near] = _distances(nodes[near], surface)
-    return np.asarray(distance[tets].min(axis=1))
+    nearest: Floats = distance[tets].min(axis=1)
+    return nearest
 
 
 def _distances(points: Floats, surface: Surface) -> Floats:
     if not len(points):
         return np.zeros(0)
     closest, _, _ = surface.closest(points)
-    return np.asarray(np.linalg.norm(closest - points, axis=1))
+    distances: Floats = np.linalg.norm(closest - points, axis=1)
+    return distances

@@ -7,6 +7,7 @@ from cmfsim.errors import MeshInputError
 from cmfsim.surfaces.topology import tet_bodies
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.renumbering import used_nodes
 
 __all__ = ["held_part"]
 
@@ -43,10 +44,8 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
             "bone; check that bones and skin are in one frame, and the posterior plane"
         )
     dropped = loose[body]
-    keep_node = np.zeros(mesh.n_nodes, dtype=bool)
-    keep_node[tets[~dropped]] = True
-    number = np.cumsum(keep_node) - 1
-    kept = TetMesh(mesh.nodes[keep_node], number[tets[~dropped]])
+    used, left = used_nodes(tets[~dropped])
+    kept = TetMesh(mesh.nodes[used], left)
     volume = float(mesh.volumes[dropped].sum())
     place = mesh.nodes[tets[dropped]].reshape(-1, 3).mean(axis=0)
     speck = volume < SPECKS
@@ -63,5 +62,4 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
         else "check skin and bone near there; a larger bone threshold or closing may have cut "
         "them off",
     )
-    left = NodeKinds(kinds.kind[keep_node], kinds.segment[keep_node], kinds.segments)
-    return kept, left, (finding,)
+    return kept, kinds.of_nodes(used), (finding,)

@@ -26,11 +26,11 @@ from cmfsim.io.images import read_image_file
 from cmfsim.io.models import is_model_file
 from cmfsim.io.transforms import read_transform_file
 from cmfsim.meshing import anatomy_from_surfaces
-from cmfsim.progress import Progress
 from cmfsim.surfaces.repair import repair_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMesh, CaseMotion
 from cmfsim.values.finding import Finding
+from cmfsim.values.progress import Progress
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:

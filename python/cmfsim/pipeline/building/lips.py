@@ -12,8 +12,8 @@ from cmfsim._core import Surface, TetMesh
 from cmfsim.checks import Floats, Indices
 from cmfsim.errors import MeshError
 from cmfsim.io import Case, read_surface
-from cmfsim.lips import LipSeam, lip_regions, lip_seam
 from cmfsim.meshing import separated_mesh
+from cmfsim.meshing.lips import LipSeam, lip_regions, lip_seam
 from cmfsim.node_kinds import DentalArches
 from cmfsim.pipeline.building.contacts import CaseContacts
 from cmfsim.pipeline.building.held import held_part
@@ -23,6 +23,7 @@ from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.finding import Finding
 from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.touching import ObstacleData, TouchingData
 
@@ -250,13 +251,14 @@ def _on_teeth(sheet: SurfaceData, bones: Sequence[Surface]) -> SurfaceData | Non
         return None
     label = connected_labels(edges_of(kept.astype(np.int64)).pairs, len(kept))
     kept = kept[label == np.argmax(np.bincount(label))]
-    used, corners = np.unique(kept, return_inverse=True)
-    return SurfaceData(vertices[used], corners.reshape(-1, 3), sheet.crease_angle)
+    used, corners = used_nodes(kept)
+    return SurfaceData(vertices[used], corners, sheet.crease_angle)
 
 
 def _distances(points: Floats, surface: Surface) -> Floats:
     closest, _, _ = surface.closest(points)
-    return np.asarray(np.linalg.norm(closest - points, axis=1))
+    distances: Floats = np.linalg.norm(closest - points, axis=1)
+    return distances
 
 
 def lip_summary(seam: LipSeam, lips: CaseLipContact) -> dict[str, Any]:

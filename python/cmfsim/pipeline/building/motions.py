@@ -25,7 +25,7 @@ from cmfsim.surfaces.repair import clean_surface
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import frozen_mapping
-from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.surface_data import MovedSurface, SurfaceData, joined_surface
 
 if TYPE_CHECKING:
     from cmfsim.bones.achieved import AchievedMotion, AchievedPlan
@@ -228,7 +228,7 @@ def _achieved_bones(
     achieved = AchievedPlan(measured, np.eye(4), None)
     if searched:
         bones = {name: clean_surface(surface) for name, surface in after.bones.items()}
-        whole = _joined(list(bones.values()))
+        whole = joined_surface(list(bones.values()))
         achieved = achieved_plan(
             {s.name: s for s in (*still, *(s for s in searched if s not in still))},
             {s.name: bones.get(s.name, whole) for s in searched},
@@ -284,20 +284,6 @@ def _paired(case: Case, name: str, moved: MovedSurface) -> list[Finding]:
         if finding.severity == "error":
             raise CaseInputError(f"{finding.where}: {finding.what}; {finding.fix}")
     return found
-
-
-def _joined(surfaces: list[SurfaceData]) -> SurfaceData:
-    """Several surfaces as one."""
-    starts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
-    return SurfaceData(
-        np.concatenate([s.vertices for s in surfaces]),
-        np.concatenate(
-            [
-                s.triangles.astype(np.int64) + start
-                for s, start in zip(surfaces, starts[:-1], strict=True)
-            ]
-        ),
-    )
 
 
 def _parted(

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from cmfsim._core import TetMesh
 from cmfsim.checks import Floats
 from cmfsim.io import Case
-from cmfsim.lips import LipSeam
 from cmfsim.meshing import MeshReport, TissueRegion
+from cmfsim.meshing.lips import LipSeam
 from cmfsim.node_kinds import DentalArches
 from cmfsim.pipeline.building.contacts import CaseContacts
 from cmfsim.pipeline.building.lips import CaseLipContact

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, distance_image
-from cmfsim.lips import LipSeam
 from cmfsim.meshing import near_skin
+from cmfsim.meshing.lips import LipSeam
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.image_data import ImageData
 

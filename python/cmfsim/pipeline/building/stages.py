@@ -5,9 +5,9 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 from cmfsim.pipeline.building.postoperative import Postoperative
-from cmfsim.progress import Progress, no_progress
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding, OnFindings
+from cmfsim.values.progress import Progress, no_progress
 
 __all__ = ["BuildOptions", "Stages"]
 

@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim._core import TetMesh
 from cmfsim.checks import Floats
 from cmfsim.io import Case, read_surface, read_tet_mesh
-from cmfsim.lips import LipSeam
 from cmfsim.meshing import (
     MeshOptions,
     MeshReport,
@@ -20,6 +19,7 @@ from cmfsim.meshing import (
     part_mesh,
     report_of_part,
 )
+from cmfsim.meshing.lips import LipSeam
 from cmfsim.pipeline.building.refinement import (
     GAP_REFINEMENTS,
     allowed_halvings,

@@ -86,7 +86,8 @@ class SurfaceFind:
     @property
     def extent(self) -> Floats:
         """Its length along each axis, in its file's unit, (3,)."""
-        return np.asarray(np.ptp(self.surface.vertices, axis=0), dtype=np.float64)
+        extent: Floats = np.ptp(self.surface.vertices, axis=0)
+        return extent
 
     @property
     def is_moved(self) -> bool:
@@ -254,7 +255,7 @@ def surface_find(path: Path, label: str) -> SurfaceFind:
 
 def is_closed(surface: SurfaceData) -> bool:
     """Whether a surface has no border."""
-    triangles = np.asarray(surface.triangles, dtype=np.int64)
+    triangles = surface.triangles.astype(np.int64)
     distinct = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
     return not len(edges_of(triangles[distinct]).border)
 

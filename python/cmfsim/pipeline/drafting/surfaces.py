@@ -359,7 +359,8 @@ def _shown_frame(
 
 
 def _middle(find: SurfaceFind) -> Floats:
-    return np.asarray(find.surface.vertices.mean(axis=0), dtype=np.float64)
+    centre: Floats = find.surface.vertices.mean(axis=0)
+    return centre
 
 
 def _choose_after(anatomy: Anatomy, found: Sequence[SurfaceFind]) -> None:

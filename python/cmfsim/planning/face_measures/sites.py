@@ -193,7 +193,8 @@ def _glabella(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     part = profile[(above >= GLABELLA[0]) & (above <= GLABELLA[1])]
     if not len(part):
         raise LandmarkInputError("the skin ends too close above nasion")
-    return np.asarray(part[np.argmin(part[:, 1])])
+    foremost: Floats = part[np.argmin(part[:, 1])]
+    return foremost
 
 
 def _columella(profile: Floats, known: Mapping[str, Floats]) -> Floats:
@@ -221,12 +222,14 @@ def _deepest(part: Floats) -> int:
 
 def _stomion_superius(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     upper, _ = _lips(profile, known)
-    return np.asarray(upper[np.argmin(upper[:, 2] + LIP_DEPTH * upper[:, 1])])
+    lowest: Floats = upper[np.argmin(upper[:, 2] + LIP_DEPTH * upper[:, 1])]
+    return lowest
 
 
 def _stomion_inferius(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     _, lower = _lips(profile, known)
-    return np.asarray(lower[np.argmax(lower[:, 2] - LIP_DEPTH * lower[:, 1])])
+    highest: Floats = lower[np.argmax(lower[:, 2] - LIP_DEPTH * lower[:, 1])]
+    return highest
 
 
 def _open(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]:
@@ -251,7 +254,8 @@ def _sublabiale(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     deepest = _deepest(part)
     if not 0 < deepest < len(part) - 1:
         raise LandmarkInputError("the profile has no fold between lower lip and chin")
-    return np.asarray(part[deepest])
+    fold: Floats = part[deepest]
+    return fold
 
 
 def _below_pogonion(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, int]:
@@ -268,7 +272,8 @@ def _below_pogonion(profile: Floats, known: Mapping[str, Floats]) -> tuple[Float
 
 def _menton(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     part, lowest = _below_pogonion(profile, known)
-    return np.asarray(part[lowest])
+    menton: Floats = part[lowest]
+    return menton
 
 
 def _cervical_point(profile: Floats, known: Mapping[str, Floats]) -> Floats:
@@ -283,7 +288,8 @@ def _cervical_point(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     corner = _deepest(throat)
     if not 0 < corner < len(throat) - 1:
         raise LandmarkInputError("chin and neck have no angle between them")
-    return np.asarray(throat[corner])
+    angle: Floats = throat[corner]
+    return angle
 
 
 _FINDERS: Mapping[str, Callable[[Floats, Mapping[str, Floats]], Floats]] = {
@@ -318,7 +324,7 @@ def _upper_incisor(patient: PatientModel) -> BoneSite:
         raise LandmarkInputError(
             f"the surface of {bearer.name} shows no incisor below supradentale"
         )
-    return BoneSite(np.asarray(near[np.argmin(near[:, 2])]), bearer.name)
+    return BoneSite(near[np.argmin(near[:, 2])], bearer.name)
 
 
 def _upper_bearer(segments: tuple[BoneSegment, ...]) -> BoneSegment:

@@ -13,6 +13,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, measure_sites
 from cmfsim.planning.replanning import Motions, PlanningModel
 from cmfsim.values.prediction import carried_share
+from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
@@ -207,11 +208,10 @@ class CarriedPoints:
         skin = Surface(before.vertices, before.triangles)
         closest, _, triangles = skin.closest(points)
         self.share = carried_share(skin, np.linalg.norm(closest - points, axis=1))
-        corners = before.triangles[np.unique(triangles)]
-        nodes, numbers = np.unique(corners, return_inverse=True)
+        nodes, corners = used_nodes(before.triangles[np.unique(triangles)])
         self.points = points
         self._places = before.vertices[nodes]
-        self._surface = Surface(self._places, numbers.reshape(corners.shape))
+        self._surface = Surface(self._places, corners)
         columns = planning.columns
         self._columns = columns
         self._matrix = columns.matrix[nodes].reshape(3 * len(nodes), -1)
@@ -284,18 +284,19 @@ def _surface_wish(planning: PlanningModel, target: SurfaceTarget) -> Wish:
 
     def rows(places: Floats, _: Motions) -> Floats:
         closest, normals, _triangles = surface.closest(places)
-        return np.asarray(((places - closest) * normals).sum(axis=1) / target.std)
+        rows: Floats = ((places - closest) * normals).sum(axis=1) / target.std
+        return rows
 
     return Wish(kept, rows)
 
 
 def _has_partner(surface: Surface, rim: Floats, points: Floats) -> NDArray[np.bool_]:
     closest, _, _ = surface.closest(points)
-    near = np.linalg.norm(closest - points, axis=1) <= MOST_APART
+    near: NDArray[np.bool_] = np.linalg.norm(closest - points, axis=1) <= MOST_APART
     if len(rim):
         from_rim = [float(np.linalg.norm(rim - place, axis=1).min()) for place in closest]
         near &= np.array(from_rim) > BORDER
-    return np.asarray(near)
+    return near
 
 
 def _border_points(surface: SurfaceData) -> Floats:

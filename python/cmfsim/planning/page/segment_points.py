@@ -105,7 +105,7 @@ def _canines(landmarks: Mapping[str, Floats]) -> dict[str, Floats]:
     for name, arch in ARCHES.items():
         if not all(site in landmarks for site in arch):
             continue
-        tip, left, right = (np.asarray(landmarks[site], dtype=np.float64) for site in arch)
+        tip, left, right = (landmarks[site] for site in arch)
         middle, half = 0.5 * (left + right), 0.5 * (left - right)
         back = (middle - tip) * CANINE_SHARE**2
         found[f"{name}_L"] = tip + back + CANINE_SHARE * half

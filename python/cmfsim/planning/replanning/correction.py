@@ -118,7 +118,8 @@ class PlanCorrection:
     def amounts(self, plan: Mapping[str, ArrayLike]) -> Floats:
         """The amount of each shape under a plan, (m,)."""
         here = self.numbers.of(plan)[None]
-        return np.asarray((_covariance(here, self.plans, self.length) @ self.weights)[0])
+        left: Floats = (_covariance(here, self.plans, self.length) @ self.weights)[0]
+        return left
 
     def displacements(self, plan: Mapping[str, ArrayLike]) -> Floats:
         """What is added to the operator's displacements under a plan, (k, 3) mm."""

@@ -10,8 +10,8 @@ import numpy as np
 from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, ContactError, SolverError
 from cmfsim.planning.replanning.model import Motions, PlanningModel
-from cmfsim.progress import Progress
 from cmfsim.values.motion import rigid_motion
+from cmfsim.values.progress import Progress
 
 __all__ = [
     "USUAL",
@@ -110,7 +110,7 @@ class ExpectedError:
     def _ratios(self) -> Floats:
         """Mean and largest error over the distance, (n, 2); none where the product is exact."""
         found = self._measured() if self.slides else np.zeros((0, 3))
-        return np.asarray(found[:, 1:] / found[:, :1])
+        return found[:, 1:] / found[:, :1]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""

@@ -22,11 +22,11 @@ from cmfsim.planning.replanning.model import Motions, PlanningModel
 from cmfsim.solving.models import model_scene
 from cmfsim.solving.rates import ACCURACY, scene_parts, tissue_load
 from cmfsim.solving.simulation import scene_plan
-from cmfsim.solving.uncertainty import TISSUE, Source
 from cmfsim.values.calibration import BandFactor
 from cmfsim.values.motion import decompose_motion
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import SkinBand
+from cmfsim.values.uncertainty import TISSUE, Source
 
 __all__ = ["PlanBand", "plan_band"]
 
@@ -69,7 +69,8 @@ class PlanBand:
     def sd(self, plan: Motions) -> Floats:
         """The standard deviation at each vertex of the mesh's skin, (k,) mm."""
         shift = self.shift + self.rates @ self.numbers(plan)
-        return np.asarray(np.sqrt(self.still + (shift**2).sum(axis=0)))
+        total: Floats = np.sqrt(self.still + (shift**2).sum(axis=0))
+        return total
 
     def numbers(self, plan: Motions) -> Floats:
         """Six numbers of each segment, (6 s,): shift of its centre, mm, and turn, radians."""

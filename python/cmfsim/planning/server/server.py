@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.errors import CmfsimError
-from cmfsim.extras import third_party
+from cmfsim.errors import CmfsimError, third_party
 from cmfsim.planning.page import PageContent, page_text
 from cmfsim.planning.replanning import PlanningModel
 from cmfsim.planning.server.requests import (

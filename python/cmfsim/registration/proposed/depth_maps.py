@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.checks import Floats
-from cmfsim.extras import third_party
+from cmfsim.errors import third_party
 
 __all__ = ["STEP", "DepthMap", "depth_map"]
 
@@ -34,12 +34,14 @@ class DepthMap:
     @property
     def rows(self) -> Floats:
         """The first coordinate of the cells, (n,) mm."""
-        return np.asarray(self.low[0] + STEP * np.arange(self.values.shape[0]))
+        rows: Floats = self.low[0] + STEP * np.arange(self.values.shape[0])
+        return rows
 
     @property
     def columns(self) -> Floats:
         """The second coordinate of the cells, (k,) mm."""
-        return np.asarray(self.low[1] + STEP * np.arange(self.values.shape[1]))
+        columns: Floats = self.low[1] + STEP * np.arange(self.values.shape[1])
+        return columns
 
     def at(self, u: float, v: float) -> float:
         """The value of the cell at a place; NaN outside."""
@@ -105,5 +107,4 @@ def _filled(values: Floats) -> Floats:
     # A closing of one cell: pits of single cells are gaps between points.
     eroded = ndimage.grey_opening(values, size=(3, 3))
     known: NDArray[np.bool_] = np.isfinite(eroded)
-    found = np.where(known, eroded, np.nan)
-    return np.asarray(found, dtype=np.float64)
+    return np.where(known, eroded, np.nan)

@@ -15,7 +15,7 @@ from cmfsim.registration.proposed.skull_sites import FRONT_REACH, find_skull_sit
 from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Detected", "HeadSurfaces", "biases", "detect", "is_lower", "joined"]
+__all__ = ["Detected", "HeadSurfaces", "biases", "detect", "is_lower"]
 
 # Points on a surface per mm² for depth maps: some four in a cell.
 DENSITY = 6.0
@@ -62,20 +62,6 @@ class HeadSurfaces:
     def skin_points(self) -> Floats:
         """Points on the skin; none without it."""
         return np.zeros((0, 3)) if self.skin is None else _points(self.skin)
-
-
-def joined(surfaces: list[SurfaceData]) -> SurfaceData:
-    """Several surfaces as one."""
-    starts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])[:-1]
-    return SurfaceData(
-        np.concatenate([s.vertices for s in surfaces]),
-        np.concatenate(
-            [
-                s.triangles.astype(np.int64) + start
-                for s, start in zip(surfaces, starts, strict=True)
-            ]
-        ),
-    )
 
 
 def detect(head: HeadSurfaces, pose: Pose, *, skin: bool = True) -> Detected:

@@ -338,7 +338,8 @@ def _similarity(
 def _face_normals(surface: Surface) -> Floats:
     corners = surface.vertices[surface.triangles.astype(np.int64)]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None])
+    units: Floats = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
+    return units
 
 
 def _step_to_planes(points: Floats, near: Floats, normals: Floats) -> tuple[Floats, Floats]:

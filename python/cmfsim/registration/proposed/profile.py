@@ -64,7 +64,8 @@ def _rows(front: DepthMap, strip: Floats, places: Floats) -> Floats:
     where = (places - front.low[0]) / STEP
     low = np.clip(np.floor(where).astype(np.int64), 0, len(strip) - 2)
     share = (where - low)[:, None]
-    return np.asarray((1.0 - share) * strip[low] + share * strip[low + 1])
+    heights: Floats = (1.0 - share) * strip[low] + share * strip[low + 1]
+    return heights
 
 
 def farthest_from_chord(
@@ -117,4 +118,5 @@ def _from_chord(
     if z[0] > low + 3.0 or z[-1] < high - 3.0:
         return inside[:0], heights[:0]
     chord = y[0] + (y[-1] - y[0]) * (z - z[0]) / (z[-1] - z[0])
-    return inside, np.asarray(chord - y)
+    gaps: Floats = chord - y
+    return inside, gaps

@@ -14,7 +14,6 @@ from cmfsim.registration.proposed.detection import (
     biases,
     detect,
     is_lower,
-    joined,
 )
 from cmfsim.registration.proposed.groups import JAW_SITES
 from cmfsim.registration.proposed.jaw_evidence import (
@@ -35,7 +34,7 @@ from cmfsim.registration.proposed.pose import (
 from cmfsim.registration.proposed.proposed_landmarks import ProposedLandmarks
 from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, joined_surface
 
 __all__ = ["landmarks_from", "measured_biases"]
 
@@ -127,7 +126,7 @@ def _surfaces(bones: Mapping[str, SurfaceData], skin: SurfaceData | None = None)
         raise LandmarkInputError(
             f"the bones are {', '.join(bones)}: landmarks are found from the cranium, add it"
         )
-    return HeadSurfaces(joined(upper), joined(lower) if lower else None, skin)
+    return HeadSurfaces(joined_surface(upper), joined_surface(lower) if lower else None, skin)
 
 
 def _check_head(skull: Mapping[str, Floats]) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmfsim.checks import Floats
-from cmfsim.extras import third_party
+from cmfsim.errors import third_party
 from cmfsim.registration.proposed.depth_maps import STEP, DepthMap
 from cmfsim.registration.proposed.profile import most_outside, smoothed
 

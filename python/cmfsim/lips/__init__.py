@@ -1,6 +1,0 @@
-"""The lips: the seam between them, and the part of a mesh's boundary that belongs to each."""
-
-from cmfsim.lips.regions import lip_regions, seam_faces
-from cmfsim.lips.seam import LIP_LANDMARKS, LipSeam, lip_seam
-
-__all__ = ["LIP_LANDMARKS", "LipSeam", "lip_regions", "lip_seam", "seam_faces"]

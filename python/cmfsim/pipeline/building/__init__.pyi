@@ -1,9 +1,0 @@
-from cmfsim.pipeline.building.case_model import build_case as build_case
-from cmfsim.pipeline.building.case_model import build_model as build_model
-from cmfsim.pipeline.building.inputs import case_key as case_key
-from cmfsim.pipeline.building.inputs import check_output as check_output
-from cmfsim.pipeline.building.inputs import input_hashes as input_hashes
-from cmfsim.pipeline.building.inputs import plan_key as plan_key
-from cmfsim.pipeline.building.muscles import with_muscles as with_muscles
-from cmfsim.pipeline.building.postoperative import Postoperative as Postoperative
-from cmfsim.pipeline.building.postoperative import read_postoperative as read_postoperative

@@ -1,0 +1,94 @@
+"""Pictures drawn in a process of their own, beside the work that they are not needed for.
+
+VTK takes seconds to load and to draw, on one core. Where it crashes for want of OpenGL, it takes
+that process along and no other.
+"""
+
+import base64
+import contextlib
+import pickle
+import sys
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from cmfsim.errors import CaseError, CaseInputError
+from cmfsim.io.parallel import Worker
+from cmfsim.pictures.canvas import NO_OPENGL, Picture, pyvista_module, without_probe
+
+__all__ = ["Painter", "draw_packed", "load"]
+
+
+class Painter:
+    """A process that draws pictures one after the other, while the caller goes on.
+
+    It starts with the first picture, or with `load`. Used in a `with` statement, it ends with that.
+    """
+
+    def __init__(self) -> None:
+        self._queue = ThreadPoolExecutor(1)
+        self._worker: Worker | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._worker is not None:
+            self._worker.end()
+        self._queue.shutdown(cancel_futures=True)
+
+    def load(self) -> None:
+        """Starts the process, which loads its libraries: ahead of a picture that is to come."""
+        # Where this Python cannot start another, pictures are drawn in turn.
+        if self._worker is None and sys.executable:
+            self._worker = Worker()
+            self._queue.submit(self._load, self._worker)
+
+    def begin(self, picture: Picture, path: Path) -> "Future[None]":
+        """The picture to come; its result raises what drawing it here would.
+
+        What the picture shows is taken now: it may not change afterwards.
+        """
+        self.load()
+        if self._worker is None:
+            return self._queue.submit(picture, path)
+        return self._queue.submit(self._draw, self._worker, picture, path)
+
+    @staticmethod
+    def _load(worker: Worker) -> None:
+        # What is wrong is raised for the first picture.
+        with contextlib.suppress(CaseError):
+            worker.answer("cmfsim.pipeline.painting:load", {})
+
+    @staticmethod
+    def _draw(worker: Worker, picture: Picture, path: Path) -> None:
+        packed = base64.b64encode(pickle.dumps(picture)).decode()
+        try:
+            worker.answer(
+                "cmfsim.pipeline.painting:draw_packed",
+                {"path": str(path.absolute()), "packed": packed},
+            )
+        except CaseError as error:
+            if not worker.has_ended:
+                raise
+            raise CaseInputError(
+                f"{path.name}: the picture cannot be drawn (OpenGL does not work); {NO_OPENGL}"
+            ) from error
+
+
+def load() -> None:
+    """Loads the libraries that draw."""
+    pyvista_module().Plotter  # noqa: B018 (loaded when it is first asked for)
+
+
+def draw_packed(path: str, packed: str) -> None:
+    """Draws a picture of `Painter`, in its process."""
+    picture: Picture = pickle.loads(base64.b64decode(packed))  # noqa: S301 (of the own parent)
+    with without_probe():
+        picture(Path(path))

@@ -1,9 +1,0 @@
-from cmfsim.study.cohort import CaseOutcome as CaseOutcome
-from cmfsim.study.cohort import StudyReport as StudyReport
-from cmfsim.study.cohort import run_study as run_study
-from cmfsim.study.outputs import study_table as study_table
-from cmfsim.study.outputs import write_study_report as write_study_report
-from cmfsim.study.trials import LandmarkTrial as LandmarkTrial
-from cmfsim.study.trials import SensitivityReport as SensitivityReport
-from cmfsim.study.trials import landmark_trials as landmark_trials
-from cmfsim.study.trials import sensitivity as sensitivity

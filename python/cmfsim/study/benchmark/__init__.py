@@ -1,0 +1,18 @@
+"""The open benchmark: displacements of the skin, by any method, scored on virtual patients."""
+
+from cmfsim.study.benchmark.running import Benchmark, run_benchmark
+from cmfsim.study.benchmark.skin_predictions import (
+    SkinPrediction,
+    read_skin_prediction,
+    write_skin_prediction,
+)
+from cmfsim.study.benchmark.table import BenchmarkTable
+
+__all__ = [
+    "Benchmark",
+    "BenchmarkTable",
+    "SkinPrediction",
+    "read_skin_prediction",
+    "run_benchmark",
+    "write_skin_prediction",
+]
