@@ -11,7 +11,6 @@ import sys
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import Self
 
 from cmfsim.errors import CaseError, CaseInputError
 from cmfsim.io.parallel import Worker
@@ -30,7 +29,7 @@ class Painter:
         self._queue = ThreadPoolExecutor(1)
         self._worker: Worker | None = None
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Painter":
         return self
 
     def __exit__(

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ class Lattice:
     number: NDArray[np.intp]
 
     @classmethod
-    def round(cls, points: Floats, spacing: float) -> Self:
+    def round(cls, points: Floats, spacing: float) -> "Lattice":
         """The lattice that determines the displacement at the given points.
 
         Parameters

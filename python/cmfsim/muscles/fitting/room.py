@@ -1,7 +1,6 @@
 """The room that bones, skin and air leave to muscles: distances to what a muscle cannot enter."""
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +44,7 @@ class Room:
     high: Floats
 
     @classmethod
-    def of(cls, anatomy: Anatomy, points: Floats) -> Self:
+    def of(cls, anatomy: Anatomy, points: Floats) -> "Room":
         """The room round some points of a head.
 
         Parameters

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +30,7 @@ class Volumes:
     begins: tuple[int, ...]
 
     @classmethod
-    def of(cls, surfaces: Sequence[SurfaceData]) -> Self:
+    def of(cls, surfaces: Sequence[SurfaceData]) -> "Volumes":
         """The volumes of surfaces whose vertices are concatenated in this order."""
         begins = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
         triangles = [s.triangles.astype(np.intp) for s in surfaces]
