@@ -5,6 +5,7 @@ Where the input is at fault the error is a `ValueError` too.
 """
 
 from importlib import import_module
+from threading import RLock
 from typing import Any
 
 from cmfsim._core import (
@@ -88,6 +89,11 @@ def error_text(error: BaseException) -> str:
     return str(error) or type(error).__name__
 
 
+# Python breaks a deadlock between threads that import parts of one package, such as scipy.ndimage
+# and scipy.spatial, by handing out a module that is half imported.
+_IMPORTING = RLock()
+
+
 def third_party(
     module: str, purpose: str, extra: str, error: type[CmfsimError] = CaseInputError
 ) -> Any:
@@ -110,7 +116,8 @@ def third_party(
         (of type `error`) The module cannot be imported.
     """
     try:
-        return import_module(module)
+        with _IMPORTING:
+            return import_module(module)
     except ImportError as reason:
         package = module.partition(".")[0]
         raise error(

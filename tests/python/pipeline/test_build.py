@@ -638,7 +638,7 @@ def test_poor_tets_from_elsewhere_are_a_finding(ellipsoids, small_model):
 
 
 def test_a_surface_parts_the_mesh(ellipsoids, small_model):
-    """`[mesh] parting`: more nodes, the same tets, and the report of the whole."""
+    """`[mesh] parting`: more nodes, tets cut along the sheet, and the report of the whole."""
     x, y, z = 0.0, -185.0, 1480.0
     corners = [[x - 60, y - 40, z], [x + 60, y - 40, z], [x + 60, y + 10, z], [x - 60, y + 10, z]]
     sheet = cmfsim.SurfaceData(corners, [[0, 1, 2], [0, 2, 3]])
@@ -650,7 +650,7 @@ def test_a_surface_parts_the_mesh(ellipsoids, small_model):
     ellipsoids.write_text(text, encoding="utf-8")
     model = cmfsim.build_model(cmfsim.Case.load(ellipsoids), check=False)
     whole, parted = small_model.summary["mesh"], model.summary["mesh"]
-    assert parted["n_tets"] == whole["n_tets"]
+    assert whole["n_tets"] < parted["n_tets"] < 1.05 * whole["n_tets"]
     assert parted["n_nodes"] > whole["n_nodes"]
     assert parted["boundary_error_mean"] == whole["boundary_error_mean"]
 
