@@ -14,7 +14,7 @@ pub const DEGENERATE_RELATIVE_VOLUME: f64 = 1e-12;
 const SHORTEST_EDGE: f64 = 1e-9;
 
 /// The four faces of a tet, outward when the tet is positively oriented.
-const FACES: [[usize; 3]; 4] = [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]];
+pub(crate) const FACES: [[usize; 3]; 4] = [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]];
 /// The six edges of a tet with the two vertices opposite each.
 const EDGES: [[usize; 4]; 6] =
     [[0, 1, 2, 3], [0, 2, 1, 3], [0, 3, 1, 2], [1, 2, 0, 3], [1, 3, 0, 2], [2, 3, 0, 1]];

@@ -2,10 +2,11 @@
 
 use std::collections::HashMap;
 
+use crate::mesh::FACES;
+use crate::meshing::stuffing::cut::pairs;
 use crate::vector::{cross, dot, sub, towards};
 
-/// Corners of each face of a tet.
-const FACES: [[usize; 3]; 4] = [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]];
+use super::ascending;
 
 /// Tets divided where they cross a surface.
 pub struct Clipped {
@@ -41,7 +42,7 @@ pub fn clip(tets: &[[u32; 4]], heights: &[Option<f64>], nodes: &mut Vec<[f64; 3]
             out.push(tet);
             continue;
         }
-        for [a, b] in edges().filter(|&[a, b]| signs[a] * signs[b] < 0) {
+        for [a, b] in pairs().filter(|&[a, b]| signs[a] * signs[b] < 0) {
             let ends = ascending(tet[a], tet[b]);
             on_edges.entry(ends).or_insert_with(|| {
                 let [h, other] = ends.map(|j| heights[j as usize].unwrap_or(0.0));
@@ -99,7 +100,7 @@ impl Corners<'_> {
             let corners = [(*p, *r), (*q, *r), (*q, *s), (*p, *s)];
             return corners.into_iter().filter_map(|(a, b)| self.crossing(a, b)).collect();
         }
-        let on_edges = edges().filter_map(|[a, b]| self.crossing(a, b));
+        let on_edges = pairs().filter_map(|[a, b]| self.crossing(a, b));
         with(0).map(|c| self.tet[c]).chain(on_edges).collect()
     }
 
@@ -110,15 +111,6 @@ impl Corners<'_> {
         }
         self.on_edges.get(&ascending(self.tet[a], self.tet[b])).copied()
     }
-}
-
-/// The edges of a tet, by corner.
-fn edges() -> impl Iterator<Item = [usize; 2]> {
-    (0..4).flat_map(|a| (a + 1..4).map(move |b| [a, b]))
-}
-
-fn ascending(a: u32, b: u32) -> [u32; 2] {
-    [a.min(b), a.max(b)]
 }
 
 /// The tet with two corners exchanged if its volume is negative.

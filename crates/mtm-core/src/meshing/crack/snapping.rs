@@ -4,10 +4,10 @@ use rayon::prelude::*;
 
 use crate::geometry::surface::Surface;
 use crate::mesh::TetMesh;
-use crate::meshing::stuffing::cut::shape;
+use crate::meshing::stuffing::cut::{pairs, shape};
 use crate::vector::{norm, sub, towards};
 
-use super::height;
+use super::{ascending, height};
 
 /// Two passes: a node moves onto the surface if an edge at it crosses the surface within a share of its length,
 /// and no dihedral angle becomes smaller than so many degrees. Cutting an edge next to its end would leave worse
@@ -99,7 +99,7 @@ fn forget_around_rim(mesh: &TetMesh, heights: &mut [Option<f64>]) {
         .with_min_len(1024)
         .flat_map_iter(|tet| {
             let heights = &*heights;
-            pairs(*tet).filter(move |[a, b]| {
+            pairs().map(|[a, b]| [tet[a], tet[b]]).filter(move |[a, b]| {
                 let [h, other] = [a, b].map(|j| heights[*j as usize].unwrap_or(0.0));
                 let [x, y] = [a, b].map(|j| mesh.nodes()[*j as usize]);
                 h * other < 0.0 && h.abs() + other.abs() > (1.0 + ROUNDING) * norm(sub(y, x))
@@ -110,11 +110,6 @@ fn forget_around_rim(mesh: &TetMesh, heights: &mut [Option<f64>]) {
     for j in around {
         heights[j as usize] = None;
     }
-}
-
-/// The edges of a tet.
-fn pairs(tet: [u32; 4]) -> impl Iterator<Item = [u32; 2]> {
-    (0..4).flat_map(move |a| (a + 1..4).map(move |b| [tet[a], tet[b]]))
 }
 
 /// The nodes that share an edge with a node, ascending.
@@ -132,7 +127,6 @@ struct BoundaryEdges(Vec<[u32; 2]>);
 
 impl BoundaryEdges {
     fn new(mesh: &TetMesh) -> Self {
-        let ascending = |a: u32, b: u32| [a.min(b), a.max(b)];
         let triangles = mesh.boundary_triangles();
         let mut edges: Vec<[u32; 2]> = triangles
             .iter()
@@ -144,6 +138,6 @@ impl BoundaryEdges {
     }
 
     fn contains(&self, a: u32, b: u32) -> bool {
-        self.0.binary_search(&[a.min(b), a.max(b)]).is_ok()
+        self.0.binary_search(&ascending(a, b)).is_ok()
     }
 }

@@ -296,7 +296,8 @@ fn prism([[a, a1], [b, b1], [c, c1]]: [[u32; 2]; 3]) -> [[u32; 4]; 3] {
     [[a, b, c, c1], [a, b, b1, c1], [a, a1, b1, c1]]
 }
 
-fn pairs() -> impl Iterator<Item = [usize; 2]> {
+/// The edges of a tet, by corner.
+pub fn pairs() -> impl Iterator<Item = [usize; 2]> {
     [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]].into_iter()
 }
 
