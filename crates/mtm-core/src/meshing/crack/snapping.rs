@@ -7,7 +7,8 @@ use crate::mesh::TetMesh;
 use crate::meshing::stuffing::cut::{pairs, shape};
 use crate::vector::{norm, sub, towards};
 
-use super::{ascending, height};
+use super::ascending;
+use super::height;
 
 /// Two passes: a node moves onto the surface if an edge at it crosses the surface within a share of its length,
 /// and no dihedral angle becomes smaller than so many degrees. Cutting an edge next to its end would leave worse
