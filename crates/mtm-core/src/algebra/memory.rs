@@ -4,8 +4,14 @@
 //! streamed. With pages of 4 KiB the first access to that memory cost more than the arithmetic on it: the
 //! numeric factorisation of 300 000 tets took three times as long. If transparent huge pages are set to
 //! `madvise` (Debian, Ubuntu) or `always`, one call per buffer avoids this; elsewhere it has no effect.
+//!
+//! A page that the kernel clears for the first time can cost ten times as much as one in use, above all in a
+//! virtual machine. Up to [`KEPT_BYTES`] of freed buffers are therefore kept for the next requests: the set-up of a
+//! multigrid hierarchy frees a third of what it allocates.
 
 use std::alloc::{GlobalAlloc, Layout, System};
+#[cfg(target_os = "linux")]
+use std::sync::Mutex;
 
 /// Size of a huge page on x86-64 and most arm64 systems, bytes.
 #[cfg(target_os = "linux")]
@@ -14,20 +20,27 @@ const HUGE_PAGE: usize = 2 << 20;
 #[cfg(target_os = "linux")]
 const LARGE: usize = HUGE_PAGE;
 
+/// Freed buffers that are kept at most, bytes.
+pub const KEPT_BYTES: usize = 64 << 20;
+/// Number of freed buffers that are kept at most.
+#[cfg(target_os = "linux")]
+const KEPT_COUNT: usize = 16;
+
 /// The system's allocator, with huge pages for large buffers on Linux.
 ///
 /// A binary opts in: `#[global_allocator] static MEMORY: HugePages = HugePages;`
 pub struct HugePages;
 
-// SAFETY: small requests are passed to the system allocator. Large ones are private anonymous mappings, zeroed
-// by the kernel, of at least the requested size and aligned to a huge page (more than any layout requests below
-// that); they are unmapped with the same size, computed from the same layout.
+// SAFETY: small requests are passed to the system allocator. Large ones are private anonymous mappings of the
+// requested size in whole huge pages, aligned to a huge page (more than any layout requests below that). Their
+// length follows from the layout, so that they are kept or unmapped as a whole.
 #[allow(unsafe_code)]
 unsafe impl GlobalAlloc for HugePages {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         #[cfg(target_os = "linux")]
         if is_large(layout) {
-            return unsafe { map(layout.size()) };
+            let length = rounded(layout.size());
+            return take_kept(length).unwrap_or_else(|| unsafe { map(length) });
         }
         unsafe { System.alloc(layout) }
     }
@@ -35,7 +48,14 @@ unsafe impl GlobalAlloc for HugePages {
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         #[cfg(target_os = "linux")]
         if is_large(layout) {
-            return unsafe { map(layout.size()) };
+            let length = rounded(layout.size());
+            if let Some(pointer) = take_kept(length) {
+                // SAFETY: the buffer has this length, and is nobody else's.
+                unsafe { pointer.write_bytes(0, layout.size()) };
+                return pointer;
+            }
+            // The kernel clears new pages.
+            return unsafe { map(length) };
         }
         unsafe { System.alloc_zeroed(layout) }
     }
@@ -43,8 +63,7 @@ unsafe impl GlobalAlloc for HugePages {
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
         #[cfg(target_os = "linux")]
         if is_large(layout) {
-            // SAFETY: the mapping was made by `map` with this size.
-            unsafe { libc::munmap(pointer.cast(), rounded(layout.size())) };
+            keep(Buffer { start: pointer, length: rounded(layout.size()) });
             return;
         }
         unsafe { System.dealloc(pointer, layout) }
@@ -82,11 +101,89 @@ fn rounded(size: usize) -> usize {
     size.div_ceil(HUGE_PAGE) * HUGE_PAGE
 }
 
-/// A zeroed mapping of `size` bytes in whole huge pages, or null.
+/// A freed buffer in whole huge pages.
+#[cfg(target_os = "linux")]
+#[derive(Clone, Copy)]
+struct Buffer {
+    start: *mut u8,
+    length: usize,
+}
+
+// SAFETY: a freed buffer belongs to whoever holds it.
 #[cfg(target_os = "linux")]
 #[allow(unsafe_code)]
-unsafe fn map(size: usize) -> *mut u8 {
-    let length = rounded(size);
+unsafe impl Send for Buffer {}
+
+#[cfg(target_os = "linux")]
+impl Buffer {
+    const NONE: Self = Self { start: std::ptr::null_mut(), length: 0 };
+
+    /// Returns the pages from `offset` on to the system.
+    #[allow(unsafe_code)]
+    fn unmap_from(self, offset: usize) {
+        if offset < self.length {
+            // SAFETY: the pages belong to this buffer, which is freed.
+            unsafe { libc::munmap(self.start.add(offset).cast(), self.length - offset) };
+        }
+    }
+}
+
+/// The kept buffers, the oldest first; places without one have length 0.
+#[cfg(target_os = "linux")]
+static KEPT: Mutex<[Buffer; KEPT_COUNT]> = Mutex::new([Buffer::NONE; KEPT_COUNT]);
+
+/// What `work` makes of the kept buffers; none while another thread uses them.
+#[cfg(target_os = "linux")]
+fn with_kept<T>(work: impl FnOnce(&mut [Buffer; KEPT_COUNT]) -> T) -> Option<T> {
+    KEPT.try_lock().ok().map(|mut kept| work(&mut kept))
+}
+
+/// The smallest kept buffer of at least `length` bytes, cut to that length.
+#[cfg(target_os = "linux")]
+fn take_kept(length: usize) -> Option<*mut u8> {
+    let found = with_kept(|kept| {
+        let fits = |b: &(usize, &Buffer)| b.1.length >= length;
+        let (place, _) = kept.iter().enumerate().filter(fits).min_by_key(|b| b.1.length)?;
+        let found = kept[place];
+        kept[place..].rotate_left(1);
+        kept[KEPT_COUNT - 1] = Buffer::NONE;
+        Some(found)
+    });
+    let found = found.flatten()?;
+    found.unmap_from(length);
+    Some(found.start)
+}
+
+/// Keeps `freed` for a later request, and returns what is then too much to the system.
+#[cfg(target_os = "linux")]
+fn keep(freed: Buffer) {
+    if freed.length > KEPT_BYTES {
+        return freed.unmap_from(0);
+    }
+    let kept = with_kept(|kept| {
+        let mut excess = freed.length + kept.iter().map(|b| b.length).sum::<usize>();
+        // The first place is freed at least.
+        let full = kept[KEPT_COUNT - 1].length > 0;
+        let mut dropped = 0;
+        while excess > KEPT_BYTES || (full && dropped == 0) {
+            excess -= kept[dropped].length;
+            kept[dropped].unmap_from(0);
+            kept[dropped] = Buffer::NONE;
+            dropped += 1;
+        }
+        kept.rotate_left(dropped);
+        let free = kept.iter().position(|b| b.length == 0).unwrap_or(KEPT_COUNT - 1);
+        kept[free] = freed;
+    });
+    if kept.is_none() {
+        freed.unmap_from(0);
+    }
+}
+
+/// A zeroed mapping of `length` bytes, whole huge pages, or null.
+#[cfg(target_os = "linux")]
+#[allow(unsafe_code)]
+unsafe fn map(length: usize) -> *mut u8 {
     let Some(reserved) = length.checked_add(HUGE_PAGE) else { return std::ptr::null_mut() };
     // SAFETY: an anonymous mapping at an address chosen by the kernel, one huge page longer than needed, so
     // that it contains an aligned run of the length; the parts before and after that run are given back.
@@ -115,5 +212,58 @@ unsafe fn map(size: usize) -> *mut u8 {
         // If the kernel refuses, ordinary pages are used, which are only slower.
         libc::madvise(pointer.cast(), length, libc::MADV_HUGEPAGE);
         pointer
+    }
+}
+
+#[cfg(all(test, target_os = "linux"))]
+mod tests {
+    use super::*;
+
+    const MB: usize = 1 << 20;
+
+    fn layout(size: usize) -> Layout {
+        Layout::from_size_align(size, 8).expect("a valid layout")
+    }
+
+    /// Other tests of this process use the system's allocator, so that the kept buffers are those of this one.
+    #[test]
+    #[allow(unsafe_code)]
+    fn freed_buffers_are_used_again_and_cleared() {
+        let total = || {
+            with_kept(|kept| kept.iter().map(|b| b.length).sum::<usize>()).expect("no other user")
+        };
+        unsafe {
+            let first = HugePages.alloc(layout(9 * MB));
+            first.write_bytes(7, 9 * MB);
+            HugePages.dealloc(first, layout(9 * MB));
+            assert_eq!(total(), 10 * MB);
+            let second = HugePages.alloc_zeroed(layout(5 * MB));
+            assert_eq!(second, first);
+            assert_eq!(total(), 0, "the rest is returned");
+            assert!(std::slice::from_raw_parts(second, 5 * MB).iter().all(|&byte| byte == 0));
+            HugePages.dealloc(second, layout(5 * MB));
+
+            // Neither more bytes nor more buffers than the limits; the newest stay.
+            let many: Vec<_> =
+                (0..3 * KEPT_COUNT).map(|_| HugePages.alloc(layout(8 * MB))).collect();
+            for &buffer in &many {
+                buffer.write_bytes(1, 8 * MB);
+                HugePages.dealloc(buffer, layout(8 * MB));
+                assert!(total() <= KEPT_BYTES);
+            }
+            assert_eq!(total(), KEPT_BYTES);
+            let again = HugePages.alloc(layout(8 * MB));
+            assert!(many[many.len() - 8..].contains(&again));
+            HugePages.dealloc(again, layout(8 * MB));
+            let small: Vec<_> = (0..3 * KEPT_COUNT).map(|_| map(2 * MB)).collect();
+            for buffer in small {
+                HugePages.dealloc(buffer, layout(2 * MB));
+            }
+            assert_eq!(total(), 2 * MB * KEPT_COUNT);
+
+            let large = HugePages.alloc(layout(KEPT_BYTES + 1));
+            HugePages.dealloc(large, layout(KEPT_BYTES + 1));
+            assert_eq!(total(), 2 * MB * KEPT_COUNT);
+        }
     }
 }
