@@ -23,8 +23,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use mtm_core::{
-    BlockMatrix, MassTensors, Multigrid, MultigridOptions, Preconditioner, SetUpPart, Symbolic,
-    tet_tensor,
+    BlockMatrix, CyclePrecision, MassTensors, Multigrid, MultigridOptions, Preconditioner,
+    SetUpPart, Symbolic, tet_tensor,
 };
 use rayon::prelude::*;
 use shell::Shell;
@@ -187,19 +187,27 @@ fn kernels(n_tets: usize) -> Vec<Line> {
     line("block product", traffic, seconds);
 
     let right = product.clone();
-    let mut cycle = |degree: usize| {
-        let options = MultigridOptions { smoother_degree: degree, ..MultigridOptions::default() };
+    let mut cycle = |degree: usize, precision: CyclePrecision| {
+        let options =
+            MultigridOptions { smoother_degree: degree, precision, ..MultigridOptions::default() };
         let multigrid = Multigrid::new(&matrix, &positions, &[], &options).expect("a held body");
         let seconds = median(|| multigrid.apply(black_box(&right), &mut product));
         (multigrid.traffic_bytes(), seconds)
     };
     let degree = MultigridOptions::default().smoother_degree;
-    let ((bytes, seconds), (more_bytes, more_seconds)) = (cycle(degree), cycle(degree + 1));
-    let sweep = (0.5 * (more_seconds - seconds)).max(0.0);
-    line("smoother sweep, all levels", (more_bytes - bytes) / 2, sweep);
-    line("multigrid cycle", bytes, seconds);
+    for (name, precision) in
+        [("double", CyclePrecision::Double), ("single", CyclePrecision::Single)]
+    {
+        let (bytes, seconds) = cycle(degree, precision);
+        let (more_bytes, more_seconds) = cycle(degree + 1, precision);
+        let sweep = (0.5 * (more_seconds - seconds)).max(0.0);
+        let kernel = format!("smoother sweep, all levels, {name} precision");
+        line(&kernel, (more_bytes - bytes) / 2, sweep);
+        line(&format!("multigrid cycle, {name} precision"), bytes, seconds);
+    }
 
-    let options = MultigridOptions::default();
+    let options =
+        MultigridOptions { precision: CyclePrecision::Single, ..MultigridOptions::default() };
     lines.extend(set_up_lines(|| {
         Multigrid::new(&matrix, &positions, &[], &options).expect("a held body")
     }));

@@ -3,8 +3,8 @@
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use mtm_core::{
-    BlockJacobi, MtmError, Multigrid, MultigridOptions, PcgOptions, PcgOutcome, Preconditioner,
-    Result, pcg,
+    BlockJacobi, CyclePrecision, MtmError, Multigrid, MultigridOptions, PcgOptions, PcgOutcome,
+    Preconditioner, Result, pcg,
 };
 use nalgebra::Matrix3;
 
@@ -125,12 +125,16 @@ fn caller_can_stop_it() {
 }
 
 /// Small enough that even the test boxes get three levels.
-fn deep() -> MultigridOptions {
-    MultigridOptions { coarsest_rows: 6, ..MultigridOptions::default() }
+fn deep(precision: CyclePrecision) -> MultigridOptions {
+    MultigridOptions { coarsest_rows: 6, precision, ..MultigridOptions::default() }
 }
 
 fn solve_by_multigrid(s: &System, relative: f64) -> PcgOutcome {
-    let mg = Multigrid::new(&s.a, &s.nodes, &s.normals, &deep()).unwrap();
+    solve_in(CyclePrecision::Double, s, relative)
+}
+
+fn solve_in(precision: CyclePrecision, s: &System, relative: f64) -> PcgOutcome {
+    let mg = Multigrid::new(&s.a, &s.nodes, &s.normals, &deep(precision)).unwrap();
     let size = largest_difference(&dense_solution(&s.a, &s.b), &vec![[0.0; 3]; s.b.len()]);
     let options = PcgOptions { tolerance: relative * size, ..PcgOptions::default() };
     pcg(&s.a, &s.b, &vec![[0.0; 3]; s.b.len()], &mg, &options, &|| false).unwrap()
@@ -152,16 +156,46 @@ fn true_error_stays_below_the_bound_at_every_contrast() {
             // Linear tets lock towards nu = 0.5, and slow the cycle as they do.
             let most = if nu > 0.49 { 250 } else { 60 };
             assert!(out.iterations < most, "{contrast} {nu}: {} iterations", out.iterations);
+            if contrast <= 1e4 && nu < 0.49 {
+                let single = solve_in(CyclePrecision::Single, &s, 1e-6);
+                let error = largest_difference(&single.solution, &exact);
+                assert!(error <= single.error_estimate_mm + round_off, "{contrast}: {error:e}");
+                assert!(single.iterations <= out.iterations + 1, "{contrast} {nu}");
+            }
         }
     }
 }
 
 #[test]
+fn a_cycle_in_single_precision_takes_forces_in_any_unit() {
+    let s = elastic_box(BoxCase { contrast: 263.0, ..BoxCase::default() });
+    let mg = Multigrid::new(&s.a, &s.nodes, &s.normals, &deep(CyclePrecision::Single)).unwrap();
+    let n = s.b.len();
+    let r = scattered(n, 3);
+    let mut plain = vec![[0.0; 3]; n];
+    mg.apply(&r, &mut plain);
+    // Powers of two scale every number exactly.
+    for exponent in [-900, -100, 100, 900] {
+        let factor = 2.0_f64.powi(exponent);
+        let scaled: Vec<_> = r.iter().map(|row| row.map(|v| factor * v)).collect();
+        let mut z = vec![[0.0; 3]; n];
+        mg.apply(&scaled, &mut z);
+        assert!(z.as_flattened().iter().zip(plain.as_flattened()).all(|(z, p)| *z == factor * p));
+    }
+    let mut z = vec![[1.0; 3]; n];
+    mg.apply(&vec![[0.0; 3]; n], &mut z);
+    assert!(z.as_flattened().iter().all(|v| *v == 0.0));
+}
+
+#[test]
 fn cycle_is_symmetric_and_positive() {
-    for contrast in [263.0, 1e8] {
+    use CyclePrecision::{Double, Single};
+    for (contrast, precision, rounding) in
+        [(263.0, Double, 1e-12), (1e8, Double, 1e-12), (263.0, Single, 1e-5), (1e4, Single, 1e-5)]
+    {
         let case = BoxCase { contrast, sliding: true, ..BoxCase::default() };
         let s = elastic_box(case);
-        let mg = Multigrid::new(&s.a, &s.nodes, &s.normals, &deep()).unwrap();
+        let mg = Multigrid::new(&s.a, &s.nodes, &s.normals, &deep(precision)).unwrap();
         assert!(mg.level_rows().len() >= 3, "{:?}", mg.level_rows());
         let n = s.b.len();
         let (mut mr, mut ms) = (vec![[0.0; 3]; n], vec![[0.0; 3]; n]);
@@ -172,7 +206,7 @@ fn cycle_is_symmetric_and_positive() {
             let (left, right) = (dot(&mr, &t), dot(&r, &ms));
             let scale = (dot(&mr, &r) * dot(&ms, &t)).sqrt();
             assert!(dot(&mr, &r) > 0.0);
-            assert!((left - right).abs() <= 1e-12 * scale, "{left:e} {right:e}");
+            assert!((left - right).abs() <= rounding * scale, "{left:e} {right:e}");
         }
     }
 }
@@ -180,17 +214,19 @@ fn cycle_is_symmetric_and_positive() {
 #[test]
 fn bits_do_not_depend_on_threads() {
     let s = elastic_box(BoxCase { cells: [14, 14, 14], sliding: true, ..BoxCase::default() });
-    let run = |threads: usize| {
+    let run = |threads: usize, precision: CyclePrecision| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
-            let mg = Multigrid::new(&s.a, &s.nodes, &s.normals, &deep()).unwrap();
+            let mg = Multigrid::new(&s.a, &s.nodes, &s.normals, &deep(precision)).unwrap();
             let options = PcgOptions { tolerance: 1e-6, ..PcgOptions::default() };
             pcg(&s.a, &s.b, &vec![[0.0; 3]; s.b.len()], &mg, &options, &|| false).unwrap()
         })
     };
-    let one = run(1);
-    assert_eq!(one, run(2));
-    assert_eq!(one, run(5));
+    for precision in [CyclePrecision::Double, CyclePrecision::Single] {
+        let one = run(1, precision);
+        assert_eq!(one, run(2, precision));
+        assert_eq!(one, run(5, precision));
+    }
 }
 
 #[test]

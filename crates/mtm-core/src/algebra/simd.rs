@@ -30,14 +30,6 @@ pub(crate) fn widest<K: Kernel>(kernel: K) -> K::Output {
     Arch::new().dispatch(Chosen(kernel))
 }
 
-/// `sum += a x`, lane by lane.
-#[inline(always)]
-pub(crate) fn add_scaled(sum: &mut [f64; LANES], a: [f64; LANES], x: f64) {
-    for lane in 0..LANES {
-        sum[lane] += a[lane] * x;
-    }
-}
-
 /// `sum += a b`, lane by lane.
 #[inline(always)]
 pub(crate) fn add_products(sum: &mut [f64; LANES], a: [f64; LANES], b: [f64; LANES]) {
@@ -58,7 +50,7 @@ mod tests {
         fn run(self) -> [f64; LANES] {
             let mut sum = [0.0; LANES];
             for &row in self.0 {
-                add_scaled(&mut sum, row, self.1);
+                add_products(&mut sum, row, [self.1; LANES]);
                 add_products(&mut sum, row, row);
             }
             sum

@@ -11,7 +11,7 @@ use crate::algebra::krylov::{
     Enough, Operator, PcgOptions, PcgOutcome, Preconditioner, Problem, Reached, Spectrum, Trial,
     pcg_near,
 };
-use crate::algebra::multigrid::{Multigrid, MultigridOptions};
+use crate::algebra::multigrid::{CyclePrecision, Multigrid, MultigridOptions};
 use crate::algebra::relaxation::{RelaxationOptions, relax};
 use crate::contact::links::Link;
 use crate::error::{MtmError, Result, Shortfall};
@@ -31,6 +31,8 @@ const MAX_SWEEPS: usize = 200_000;
 const MEASURED_SHARE: f64 = 0.1;
 /// λ/μ above which a stronger smoother pays: at ν = 0.499 it takes 113 iterations instead of 186. ν = 0.48.
 const NEARLY_INCOMPRESSIBLE: f64 = 24.0;
+/// Ratio of the stiffest to the softest tissue up to which sixteen bits describe both.
+const SINGLE_CONTRAST: f64 = 1e4;
 
 /// Results kept between the solves of one plan, whose constraints differ only a little.
 #[derive(Default)]
@@ -385,7 +387,7 @@ pub(crate) fn hierarchy(
     normals: &[(usize, [f64; 3])],
     tissue: Extremes,
 ) -> Result<Multigrid> {
-    Multigrid::new(matrix, positions, normals, &multigrid_options(tissue.lame_ratio))
+    Multigrid::new(matrix, positions, normals, &multigrid_options(tissue))
 }
 
 /// Extreme material ratios of a tissue.
@@ -397,13 +399,19 @@ pub(crate) struct Extremes {
     pub contrast: f64,
 }
 
-/// Options of the cycle for tissue with the given largest λ/μ.
-fn multigrid_options(lame_ratio: f64) -> MultigridOptions {
+/// Options of the cycle for such a tissue.
+fn multigrid_options(tissue: Extremes) -> MultigridOptions {
     let defaults = MultigridOptions::default();
-    if lame_ratio < NEARLY_INCOMPRESSIBLE {
-        return defaults;
+    let compressible = tissue.lame_ratio < NEARLY_INCOMPRESSIBLE;
+    MultigridOptions {
+        smoother_degree: if compressible { 1 } else { 2 } * defaults.smoother_degree,
+        precision: if compressible && tissue.contrast <= SINGLE_CONTRAST {
+            CyclePrecision::Single
+        } else {
+            CyclePrecision::Double
+        },
+        ..defaults
     }
-    MultigridOptions { smoother_degree: 2 * defaults.smoother_degree, ..defaults }
 }
 
 /// Remedy reported if sweeps do not converge.

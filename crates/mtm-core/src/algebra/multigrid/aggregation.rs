@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use super::block_rows::{row_index, running_sum, split_rows};
+use super::precision::Stored;
 use super::scaled_matrix::ScaledMatrix;
 
 /// No aggregate.
@@ -20,7 +21,7 @@ pub(super) struct Aggregates {
 impl Aggregates {
     /// The aggregates over connections stronger than `strength`: the norm of a scaled block over that
     /// of a diagonal one.
-    pub(super) fn new<const N: usize>(a: &ScaledMatrix<N>, strength: f64) -> Self {
+    pub(super) fn new<const N: usize, T: Stored>(a: &ScaledMatrix<N, T>, strength: f64) -> Self {
         // Scaled diagonal blocks are identities of norm √N.
         let threshold = (strength * strength * N as f64) as f32;
         let mut weights = vec![0.0_f32; a.columns.len()];
@@ -31,7 +32,8 @@ impl Aggregates {
                     if a.columns[k] as usize == i {
                         continue;
                     }
-                    let square: f32 = a.blocks[k].iter().flatten().map(|v| v * v).sum();
+                    let square: f64 = a.block(k).as_flattened().iter().map(|v| v * v).sum();
+                    let square = square as f32;
                     if square > threshold {
                         part.data[k - first] = square;
                     }

@@ -2,6 +2,7 @@
 
 use super::block_rows::SystemRows;
 use super::galerkin::CoarseMatrix;
+use super::precision::Real;
 use super::rigid_modes::MODES;
 use super::scaling::{PIVOT_TOLERANCE, Scaling, scaled_block};
 
@@ -47,10 +48,9 @@ impl DenseCholesky {
         Self { size, factor: l }
     }
 
-    pub(super) fn solve(&self, r: &[[f64; MODES]], x: &mut [[f64; MODES]]) {
+    pub(super) fn solve<F: Real>(&self, r: &[[F; MODES]], x: &mut [[F; MODES]]) {
         let n = self.size;
-        let y = x.as_flattened_mut();
-        y.copy_from_slice(r.as_flattened());
+        let mut y: Vec<f64> = r.as_flattened().iter().map(|r| r.wide()).collect();
         for i in 0..n {
             let row = &self.factor[i * n..i * n + n];
             y[i] = (y[i] - short_dot(&row[..i], &y[..i])) / row[i];
@@ -62,6 +62,9 @@ impl DenseCholesky {
             for (y, l) in y[..i].iter_mut().zip(row) {
                 *y -= l * value;
             }
+        }
+        for (x, y) in x.as_flattened_mut().iter_mut().zip(y) {
+            *x = F::of(y);
         }
     }
 }

@@ -6,6 +6,7 @@ use crate::algebra::simd::{Kernel, widest};
 
 use super::aggregation::{Aggregates, UNASSIGNED};
 use super::block_rows::{RowsPart, row_index, running_sum, split_rows};
+use super::precision::Stored;
 use super::rigid_modes::MODES;
 use super::scaled_matrix::ScaledMatrix;
 use super::scaling::Scaling;
@@ -23,8 +24,8 @@ pub(super) struct Prolongator<const N: usize> {
 impl<const N: usize> Prolongator<N> {
     /// P' = Sᵀ P with P = (I − ω Ã) P₀, one row of blocks per fine row; Ã is `a`, P₀ `tentative`, ω `damping` and
     /// S `scaling`: from coarse unknowns to those that are not scaled.
-    pub(super) fn smoothed(
-        a: &ScaledMatrix<N>,
+    pub(super) fn smoothed<T: Stored>(
+        a: &ScaledMatrix<N, T>,
         aggregates: &Aggregates,
         tentative: &[[[f64; MODES]; N]],
         damping: f64,
@@ -96,8 +97,8 @@ impl<const N: usize> Prolongator<N> {
 }
 
 /// A range of rows of [`Prolongator::smoothed`], which begins at `row_start`.
-struct SmoothedRows<'a, const N: usize> {
-    a: &'a ScaledMatrix<N>,
+struct SmoothedRows<'a, const N: usize, T> {
+    a: &'a ScaledMatrix<N, T>,
     of: &'a [u32],
     tentative: &'a [[[f64; MODES]; N]],
     damping: f64,
@@ -107,7 +108,7 @@ struct SmoothedRows<'a, const N: usize> {
     blocks: RowsPart<'a, [[f64; MODES]; N]>,
 }
 
-impl<const N: usize> Kernel for SmoothedRows<'_, N> {
+impl<const N: usize, T: Stored> Kernel for SmoothedRows<'_, N, T> {
     type Output = ();
     #[inline(always)]
     fn run(self) {
@@ -130,7 +131,7 @@ impl<const N: usize> Kernel for SmoothedRows<'_, N> {
                     used - 1
                 });
                 // Blocks of Ã are stored by columns.
-                let step = a.blocks[k].map(|column| column.map(|v| -damping * f64::from(v)));
+                let step = a.block(k).map(|column| column.map(|v| -damping * v));
                 add_transposed_product(&mut blocks[slot], &step, &tentative[j]);
                 if i == j {
                     for (out, row) in

@@ -1,4 +1,4 @@
-//! A scaled matrix in single precision: its products and its largest eigenvalue.
+//! A scaled matrix in short numbers: its products and its largest eigenvalue.
 
 use rayon::prelude::*;
 
@@ -7,6 +7,7 @@ use crate::algebra::row_sums::dot;
 use crate::algebra::simd::{Kernel, widest};
 
 use super::block_rows::{ENTRIES_PER_TASK, RowsPart, SystemRows, split_rows};
+use super::precision::{Real, Stored};
 use super::scaling::{Scaling, scaled_block};
 use super::small_blocks::block_row_product;
 
@@ -17,23 +18,24 @@ const LANCZOS_BREAKDOWN: f64 = 1e-10;
 /// Margin on that eigenvalue: Lanczos approaches it from below.
 const EIGENVALUE_SAFETY: f64 = 1.05;
 
-/// S A Sᵀ in single precision, blocks by columns.
+/// S A Sᵀ in short numbers, blocks by columns. No entry is above 1: the matrix is positive definite, and its
+/// diagonal blocks are identities (Cauchy–Schwarz).
 #[derive(Debug)]
-pub(super) struct ScaledMatrix<const N: usize> {
+pub(super) struct ScaledMatrix<const N: usize, T> {
     pub(super) row_start: Vec<usize>,
     pub(super) columns: Vec<u32>,
-    pub(super) blocks: Vec<[[f32; N]; N]>,
+    blocks: Vec<[[T; N]; N]>,
     pub(super) largest_eigenvalue: f64,
     pub(super) rows_per_task: usize,
 }
 
-impl<const N: usize> ScaledMatrix<N> {
+impl<const N: usize, T: Stored> ScaledMatrix<N, T> {
     pub(super) fn n_rows(&self) -> usize {
         self.row_start.len() - 1
     }
 
     pub(super) fn memory_bytes(&self) -> usize {
-        self.row_start.len() * 8 + self.columns.len() * (4 + 4 * N * N)
+        self.row_start.len() * 8 + self.columns.len() * (4 + size_of::<T>() * N * N)
     }
 
     /// The system `a`, scaled; its largest eigenvalue is not known yet.
@@ -42,7 +44,7 @@ impl<const N: usize> ScaledMatrix<N> {
         let entries = a.columns().len() * N * N;
         let rows_per_task = (ENTRIES_PER_TASK * a.n_rows() / entries.max(1)).max(1);
         let columns = a.columns().to_vec();
-        let mut blocks = vec![[[0.0_f32; N]; N]; columns.len()];
+        let mut blocks = vec![[[T::default(); N]; N]; columns.len()];
         let s = &scaling.inverse_factors;
         split_rows(&mut blocks, &row_start, rows_per_task)
             .into_par_iter()
@@ -52,9 +54,15 @@ impl<const N: usize> ScaledMatrix<N> {
 
     /// Row `i` of A x.
     #[inline(always)]
-    pub(super) fn row_product(&self, i: usize, x: &[[f64; N]]) -> [f64; N] {
+    pub(super) fn row_product<F: Real>(&self, i: usize, x: &[[F; N]]) -> [F; N] {
         let range = self.row_start[i]..self.row_start[i + 1];
         block_row_product(&self.columns[range.clone()], &self.blocks[range], x)
+    }
+
+    /// Block `k`, by columns.
+    #[inline(always)]
+    pub(super) fn block(&self, k: usize) -> [[f64; N]; N] {
+        self.blocks[k].map(|column| column.map(|v| v.raw::<f64>() * (1.0 / T::ONE)))
     }
 
     /// Estimates the largest eigenvalue, with a margin.
@@ -128,13 +136,13 @@ impl<const N: usize> ScaledMatrix<N> {
 }
 
 /// A range of rows of S A Sᵀ.
-struct ScaledRows<'a, const N: usize, A: SystemRows<N>> {
+struct ScaledRows<'a, const N: usize, T, A: SystemRows<N>> {
     a: &'a A,
     s: &'a [[[f64; N]; N]],
-    part: RowsPart<'a, [[f32; N]; N]>,
+    part: RowsPart<'a, [[T; N]; N]>,
 }
 
-impl<const N: usize, A: SystemRows<N>> Kernel for ScaledRows<'_, N, A> {
+impl<const N: usize, T: Stored, A: SystemRows<N>> Kernel for ScaledRows<'_, N, T, A> {
     type Output = ();
     #[inline(always)]
     fn run(self) {
@@ -148,7 +156,7 @@ impl<const N: usize, A: SystemRows<N>> Kernel for ScaledRows<'_, N, A> {
                 let out = &mut part.data[k - first];
                 for c in 0..N {
                     for r in 0..N {
-                        out[c][r] = scaled[r][c] as f32;
+                        out[c][r] = T::nearest(scaled[r][c]);
                     }
                 }
             }
@@ -157,8 +165,8 @@ impl<const N: usize, A: SystemRows<N>> Kernel for ScaledRows<'_, N, A> {
 }
 
 /// A range of rows of A v − β v₋₁, where v₋₁ is the previous vector.
-struct LanczosRows<'a, const N: usize> {
-    a: &'a ScaledMatrix<N>,
+struct LanczosRows<'a, const N: usize, T> {
+    a: &'a ScaledMatrix<N, T>,
     first: usize,
     v: &'a [[f64; N]],
     previous: &'a [[f64; N]],
@@ -166,7 +174,7 @@ struct LanczosRows<'a, const N: usize> {
     out: &'a mut [[f64; N]],
 }
 
-impl<const N: usize> Kernel for LanczosRows<'_, N> {
+impl<const N: usize, T: Stored> Kernel for LanczosRows<'_, N, T> {
     type Output = ();
     #[inline(always)]
     fn run(self) {

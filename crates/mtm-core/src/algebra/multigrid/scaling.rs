@@ -18,10 +18,20 @@ pub(super) struct Scaling<const N: usize> {
 
 impl<const N: usize> Scaling<N> {
     pub(super) fn new(a: &impl SystemRows<N>) -> Self {
-        let pairs: Vec<_> =
-            (0..a.n_rows()).into_par_iter().map(|j| factor(&a.block(a.diagonal(j)))).collect();
-        let not_positive = pairs.iter().position(|p| p.2);
-        let (factors, inverse_factors) = pairs.into_iter().map(|p| (p.0, p.1)).unzip();
+        let n = a.n_rows();
+        let mut factors = vec![[[0.0; N]; N]; n];
+        let mut inverse_factors = factors.clone();
+        let not_positive = factors
+            .par_iter_mut()
+            .zip(&mut inverse_factors)
+            .enumerate()
+            .with_min_len(1024)
+            .filter_map(|(j, (l, s))| {
+                let dependent;
+                (*l, *s, dependent) = factor(&a.block(a.diagonal(j)));
+                dependent.then_some(j)
+            })
+            .min();
         Self { factors, inverse_factors, not_positive }
     }
 }

@@ -1,43 +1,69 @@
 //! Products of small dense blocks.
 
-use crate::algebra::simd::{LANES, add_scaled};
+use std::hint::black_box;
+
+use super::precision::{Real, Stored};
 
 /// Sum of the products of a row of blocks, stored by columns, with the corresponding rows of `x`.
+#[inline(always)]
+pub(super) fn block_row_product<T: Stored, F: Real, const C: usize, const R: usize>(
+    columns: &[u32],
+    blocks: &[[[T; R]; C]],
+    x: &[[F; C]],
+) -> [F; R] {
+    // Eight singles fill the vector register that holds four doubles.
+    if R > 4 && size_of::<F>() == 4 {
+        in_lanes::<T, F, C, R, 8>(columns, blocks, x)
+    } else {
+        in_lanes::<T, F, C, R, 4>(columns, blocks, x)
+    }
+}
+
+/// [`block_row_product`] in sums of `L` numbers.
 ///
-/// A column of R values is loaded as its first four and, if R is not four, its last four: with three rows, the
+/// A column of R values is loaded as its first L and, if R is not L, its last L: with fewer rows than lanes, the
 /// first columns also load the start of the next one, and the last column the end of the previous one.
 #[inline(always)]
-pub(super) fn block_row_product<const C: usize, const R: usize>(
+fn in_lanes<T: Stored, F: Real, const C: usize, const R: usize, const L: usize>(
     columns: &[u32],
-    blocks: &[[[f32; R]; C]],
-    x: &[[f64; C]],
-) -> [f64; R] {
+    blocks: &[[[T; R]; C]],
+    x: &[[F; C]],
+) -> [F; R] {
     // Separate sums of even and odd columns: a single sum would wait for its own last addition.
-    let (mut heads, mut tails) = ([[0.0; LANES]; 2], [[0.0; LANES]; 2]);
+    let (mut heads, mut tails) = ([[F::default(); L]; 2], [[F::default(); L]; 2]);
     for (&j, block) in columns.iter().zip(blocks) {
         let x = &x[j as usize];
         let values = block.as_flattened();
-        let four = |at: usize| [0, 1, 2, 3].map(|lane| f64::from(values[at + lane]));
         for c in 0..C {
-            if R >= LANES || c + 1 < C {
-                add_scaled(&mut heads[c % 2], four(c * R), x[c]);
+            if R >= L || c + 1 < C {
+                add_scaled(&mut heads[c % 2], &values[c * R..c * R + L], x[c]);
             }
-            if R > LANES || c + 1 == C {
-                add_scaled(&mut tails[c % 2], four(c * R + R - LANES), x[c]);
+            if R > L || c + 1 == C {
+                add_scaled(&mut tails[c % 2], &values[c * R + R - L..c * R + R], x[c]);
             }
         }
     }
-    let mut sum = [0.0; R];
+    // Lanes beyond the rows count as used: a compiler that drops them falls back to single numbers.
+    let (heads, tails) = black_box((heads, tails));
+    let mut sum = [F::default(); R];
     for r in 0..R {
-        if R <= LANES || r < LANES {
+        if R <= L || r < L {
             sum[r] += heads[0][r] + heads[1][r];
         }
-        if R <= LANES || r >= LANES {
-            let lane = r + LANES - R;
+        if R <= L || r >= L {
+            let lane = r + L - R;
             sum[r] += tails[0][lane] + tails[1][lane];
         }
     }
-    sum
+    sum.map(|value| F::of(1.0 / T::ONE) * value)
+}
+
+/// `sum += a x`, lane by lane.
+#[inline(always)]
+fn add_scaled<T: Stored, F: Real, const L: usize>(sum: &mut [F; L], a: &[T], x: F) {
+    for (sum, a) in sum.iter_mut().zip(a) {
+        *sum += a.raw::<F>() * x;
+    }
 }
 
 /// `out += a b`.

@@ -4,22 +4,23 @@ use rayon::prelude::*;
 
 use crate::algebra::simd::{Kernel, widest};
 
+use super::precision::{Real, Stored};
 use super::scaled_matrix::ScaledMatrix;
 
 /// The vectors of one level in the cycle.
 #[derive(Debug)]
-pub(super) struct Vectors<const N: usize> {
-    pub(super) x: Vec<[f64; N]>,
-    pub(super) r: Vec<[f64; N]>,
+pub(super) struct Vectors<const N: usize, F> {
+    pub(super) x: Vec<[F; N]>,
+    pub(super) r: Vec<[F; N]>,
     /// Residual of the smoother's own recurrence.
-    s: Vec<[f64; N]>,
-    pub(super) d: Vec<[f64; N]>,
-    d_next: Vec<[f64; N]>,
+    s: Vec<[F; N]>,
+    pub(super) d: Vec<[F; N]>,
+    d_next: Vec<[F; N]>,
 }
 
-impl<const N: usize> Vectors<N> {
+impl<const N: usize, F: Real> Vectors<N, F> {
     pub(super) fn new(rows: usize) -> Self {
-        let zeros = vec![[0.0; N]; rows];
+        let zeros = vec![[F::default(); N]; rows];
         Self {
             x: zeros.clone(),
             r: zeros.clone(),
@@ -71,9 +72,13 @@ impl Smoother {
     }
 
     /// Smooths from x = 0 and leaves the residual in `r`.
-    pub(super) fn smooth_first<const N: usize>(&self, a: &ScaledMatrix<N>, v: &mut Vectors<N>) {
+    pub(super) fn smooth_first<const N: usize, T: Stored, F: Real>(
+        &self,
+        a: &ScaledMatrix<N, T>,
+        v: &mut Vectors<N, F>,
+    ) {
         let Some((first, later)) = self.steps.split_first() else { return };
-        let gain = first.gain / a.largest_eigenvalue;
+        let (gain, weight) = (F::of(first.gain / a.largest_eigenvalue), F::of(first.weight));
         let rows = a.rows_per_task;
         v.x.par_chunks_mut(rows)
             .zip(v.d.par_chunks_mut(rows))
@@ -83,7 +88,7 @@ impl Smoother {
                 for ((x, d), r) in x.iter_mut().zip(d).zip(r) {
                     for c in 0..N {
                         d[c] = gain * r[c];
-                        x[c] = first.weight * d[c];
+                        x[c] = weight * d[c];
                     }
                 }
             });
@@ -98,7 +103,11 @@ impl Smoother {
     }
 
     /// Adds the coarse correction in `d`, then smooths.
-    pub(super) fn smooth_last<const N: usize>(&self, a: &ScaledMatrix<N>, v: &mut Vectors<N>) {
+    pub(super) fn smooth_last<const N: usize, T: Stored, F: Real>(
+        &self,
+        a: &ScaledMatrix<N, T>,
+        v: &mut Vectors<N, F>,
+    ) {
         let mut correction = 1.0;
         for step in &self.steps {
             step.sweep(a, correction, &v.d, [&mut v.r, &mut v.d_next, &mut v.x]);
@@ -119,12 +128,12 @@ struct SmootherStep {
 impl SmootherStep {
     /// One sweep of [r, d_next, x]: r −= A d, then the new direction from r; x also receives `correction` times
     /// the old direction.
-    fn sweep<const N: usize>(
+    fn sweep<const N: usize, T: Stored, F: Real>(
         &self,
-        a: &ScaledMatrix<N>,
+        a: &ScaledMatrix<N, T>,
         correction: f64,
-        d: &[[f64; N]],
-        [r, d_next, x]: [&mut Vec<[f64; N]>; 3],
+        d: &[[F; N]],
+        [r, d_next, x]: [&mut Vec<[F; N]>; 3],
     ) {
         let rows = a.rows_per_task;
         x.par_chunks_mut(rows)
@@ -139,14 +148,14 @@ impl SmootherStep {
 }
 
 /// A range of rows of r −= A x.
-struct Residual<'a, const N: usize> {
-    a: &'a ScaledMatrix<N>,
+struct Residual<'a, const N: usize, T, F> {
+    a: &'a ScaledMatrix<N, T>,
     first: usize,
-    x: &'a [[f64; N]],
-    r: &'a mut [[f64; N]],
+    x: &'a [[F; N]],
+    r: &'a mut [[F; N]],
 }
 
-impl<const N: usize> Kernel for Residual<'_, N> {
+impl<const N: usize, T: Stored, F: Real> Kernel for Residual<'_, N, T, F> {
     type Output = ();
     #[inline(always)]
     fn run(self) {
@@ -160,30 +169,31 @@ impl<const N: usize> Kernel for Residual<'_, N> {
 }
 
 /// A range of rows of [`SmootherStep::sweep`]; `d` is whole, the other vectors are restricted to those rows.
-struct Sweep<'a, const N: usize> {
+struct Sweep<'a, const N: usize, T, F> {
     step: SmootherStep,
-    a: &'a ScaledMatrix<N>,
+    a: &'a ScaledMatrix<N, T>,
     first: usize,
     correction: f64,
-    d: &'a [[f64; N]],
-    r: &'a mut [[f64; N]],
-    d_next: &'a mut [[f64; N]],
-    x: &'a mut [[f64; N]],
+    d: &'a [[F; N]],
+    r: &'a mut [[F; N]],
+    d_next: &'a mut [[F; N]],
+    x: &'a mut [[F; N]],
 }
 
-impl<const N: usize> Kernel for Sweep<'_, N> {
+impl<const N: usize, T: Stored, F: Real> Kernel for Sweep<'_, N, T, F> {
     type Output = ();
     #[inline(always)]
     fn run(self) {
         let Self { step, a, first, correction, d, r, d_next, x } = self;
-        let gain = step.gain / a.largest_eigenvalue;
+        let gain = F::of(step.gain / a.largest_eigenvalue);
+        let [keep, weight, correction] = [step.keep, step.weight, correction].map(F::of);
         for (offset, ((x, r), d_next)) in x.iter_mut().zip(r).zip(d_next).enumerate() {
             let i = first + offset;
             let y = a.row_product(i, d);
             for c in 0..N {
                 r[c] -= y[c];
-                d_next[c] = step.keep * d[i][c] + gain * r[c];
-                x[c] += correction * d[i][c] + step.weight * d_next[c];
+                d_next[c] = keep * d[i][c] + gain * r[c];
+                x[c] += correction * d[i][c] + weight * d_next[c];
             }
         }
     }

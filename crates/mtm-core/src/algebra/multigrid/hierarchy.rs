@@ -1,0 +1,311 @@
+//! The levels and the cycle through them.
+
+use std::sync::{Mutex, PoisonError};
+
+use rayon::prelude::*;
+
+use crate::algebra::blocks::BlockMatrix;
+
+use super::MultigridOptions;
+use super::aggregation::Aggregates;
+use super::block_rows::SystemRows;
+use super::coarsest::DenseCholesky;
+use super::galerkin::{CoarseMatrix, galerkin};
+use super::parts::Parts;
+use super::precision::{Precision, Real};
+use super::prolongator::Prolongator;
+use super::rigid_modes::{MODES, ModeBlock, orthonormalise};
+use super::scaled_matrix::ScaledMatrix;
+use super::scaling::Scaling;
+use super::small_blocks::{add_transposed_product, times, transposed_times};
+use super::smoother::{Smoother, Vectors};
+use super::transfer::Transfer;
+
+/// Share of rows that must be eliminated by a level to make the next one worthwhile.
+const STALL: f64 = 0.8;
+/// Number of rows above which the coarsest level is too large for a dense factorisation when coarsening stalls.
+const DENSE_LIMIT: usize = 400;
+/// Vectors that a pass of the smoother reads or writes: d, r twice, the next d, x twice.
+const VECTORS_PER_PASS: usize = 6;
+
+/// The levels, whose numbers are those of `P`.
+#[derive(Debug)]
+pub(super) struct Hierarchy<P: Precision> {
+    finest: Level<3, P>,
+    coarse: Vec<Level<MODES, P>>,
+    coarsest: Option<DenseCholesky>,
+    smoother: Smoother,
+    workspaces: Mutex<Vec<Workspace<P::Real>>>,
+}
+
+impl<P: Precision> Hierarchy<P> {
+    /// The levels for `a`, whose rows move by `modes` in rigid motions.
+    pub(super) fn new(
+        a: &BlockMatrix,
+        scaling: &Scaling<3>,
+        modes: Vec<[[f64; MODES]; 3]>,
+        options: &MultigridOptions,
+        parts: &mut Parts,
+    ) -> Self {
+        let direct = |rows: usize| rows <= options.coarsest_rows;
+        let mut coarse = Vec::new();
+        let mut coarsest = None;
+        let (finest, mut next) = Level::new(a, scaling, modes, (options, 0), parts);
+        while let Some(mut system) = next {
+            let depth = coarse.len() + 1;
+            let rows = system.a.n_rows();
+            if direct(rows) || depth + 1 >= options.max_levels {
+                if rows <= DENSE_LIMIT {
+                    coarsest = Some(system.factor(parts));
+                } else {
+                    coarse.push(Level::lone(&system.a, &system.scaling, parts));
+                }
+                break;
+            }
+            let modes = std::mem::take(&mut system.modes);
+            let (level, after) =
+                Level::new(&system.a, &system.scaling, modes, (options, depth), parts);
+            if after.is_none() && rows <= DENSE_LIMIT {
+                coarsest = Some(system.factor(parts));
+                break;
+            }
+            coarse.push(level);
+            next = after;
+        }
+        let smoother = Smoother::new(options.smoother_degree);
+        Self { finest, coarse, coarsest, smoother, workspaces: Mutex::new(Vec::new()) }
+    }
+
+    /// Number of rows of each level, the finest first.
+    pub(super) fn level_rows(&self) -> Vec<usize> {
+        let mut rows = vec![self.finest.matrix.n_rows()];
+        rows.extend(self.coarse.iter().map(|l| l.matrix.n_rows()));
+        rows.extend(self.coarsest.as_ref().map(|c| c.size / MODES));
+        rows
+    }
+
+    /// Bytes of the levels.
+    pub(super) fn memory_bytes(&self) -> usize {
+        self.finest.memory_bytes()
+            + self.coarse.iter().map(Level::memory_bytes).sum::<usize>()
+            + self.coarsest.as_ref().map_or(0, |c| 8 * c.size * c.size)
+    }
+
+    /// Minimum memory traffic of one cycle, bytes: every matrix and vector once per pass over it.
+    pub(super) fn traffic_bytes(&self) -> usize {
+        let passes = self.smoother.passes();
+        self.finest.traffic_bytes(passes)
+            + self.coarse.iter().map(|l| l.traffic_bytes(passes)).sum::<usize>()
+            + self.coarsest.as_ref().map_or(0, |c| 2 * 8 * c.size * c.size / 2)
+    }
+
+    /// `z = Sᵀ M⁻¹ S r` for the scaling S of the finest level and the cycle M⁻¹ of the scaled one.
+    pub(super) fn apply(&self, scaling: &[[[f64; 3]; 3]], r: &[[f64; 3]], z: &mut [[f64; 3]]) {
+        let pooled = self.workspaces.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        let mut work = pooled.unwrap_or_else(|| self.new_workspace());
+        self.cycle(scaling, (r, z), &mut work);
+        self.workspaces.lock().unwrap_or_else(PoisonError::into_inner).push(work);
+    }
+
+    fn correct_coarse(&self, depth: usize, work: &mut [Vectors<MODES, P::Real>]) {
+        let Some((vectors, rest)) = work.split_first_mut() else { return };
+        match self.coarse.get(depth) {
+            None => {
+                if let Some(direct) = &self.coarsest {
+                    direct.solve(&vectors.r, &mut vectors.x);
+                }
+            }
+            Some(level) => {
+                self.smoother.smooth_first(&level.matrix, vectors);
+                if let Some(transfer) = &level.transfer {
+                    if let Some(below) = rest.first_mut() {
+                        transfer.restrict(&vectors.r, &mut below.r);
+                    }
+                    self.correct_coarse(depth + 1, rest);
+                    if let Some(below) = rest.first_mut() {
+                        transfer.prolong(&mut below.x, &mut vectors.d);
+                    }
+                    self.smoother.smooth_last(&level.matrix, vectors);
+                }
+            }
+        }
+    }
+
+    fn cycle(
+        &self,
+        scaling: &[[[f64; 3]; 3]],
+        (r, z): (&[[f64; 3]], &mut [[f64; 3]]),
+        work: &mut Workspace<P::Real>,
+    ) {
+        let rows = self.finest.matrix.rows_per_task;
+        let unit = unit_of(r, rows);
+        let fine = &mut work.finest;
+        fine.r.par_chunks_mut(rows).zip(r.par_chunks(rows).zip(scaling.par_chunks(rows))).for_each(
+            |(out, (r, scaling))| {
+                for ((out, r), s) in out.iter_mut().zip(r).zip(scaling) {
+                    *out = times(s, r).map(|v| P::Real::of(v / unit));
+                }
+            },
+        );
+        self.smoother.smooth_first(&self.finest.matrix, fine);
+        if let Some(transfer) = &self.finest.transfer {
+            if let Some(below) = work.coarse.first_mut() {
+                transfer.restrict(&fine.r, &mut below.r);
+            }
+            self.correct_coarse(0, &mut work.coarse);
+            if let Some(below) = work.coarse.first_mut() {
+                transfer.prolong(&mut below.x, &mut fine.d);
+            }
+            self.smoother.smooth_last(&self.finest.matrix, fine);
+        }
+        z.par_chunks_mut(rows).zip(fine.x.par_chunks(rows).zip(scaling.par_chunks(rows))).for_each(
+            |(z, (x, scaling))| {
+                for ((z, x), s) in z.iter_mut().zip(x).zip(scaling) {
+                    *z = transposed_times(s, &x.map(|v| unit * v.wide()));
+                }
+            },
+        );
+    }
+
+    fn new_workspace(&self) -> Workspace<P::Real> {
+        let mut coarse: Vec<_> =
+            self.coarse.iter().map(|l| Vectors::new(l.matrix.n_rows())).collect();
+        coarse.extend(self.coarsest.as_ref().map(|c| Vectors::new(c.size / MODES)));
+        Workspace { finest: Vectors::new(self.finest.matrix.n_rows()), coarse }
+    }
+}
+
+/// The power of two next to the largest number of `r`: divided by it, forces in any unit fit into single precision.
+fn unit_of(r: &[[f64; 3]], rows: usize) -> f64 {
+    let largest = r
+        .par_chunks(rows)
+        .map(|r| r.as_flattened().iter().fold(0.0_f64, |most, v| most.max(v.abs())))
+        .reduce(|| 0.0, f64::max);
+    let exponent = largest.log2().floor();
+    if exponent.is_finite() { exponent.exp2() } else { 1.0 }
+}
+
+/// The vectors of one cycle, kept for the next.
+#[derive(Debug)]
+struct Workspace<F> {
+    finest: Vectors<3, F>,
+    coarse: Vec<Vectors<MODES, F>>,
+}
+
+/// A coarse matrix with its scaling and the rigid modes in its unknowns.
+#[derive(Debug)]
+struct CoarseSystem {
+    a: CoarseMatrix,
+    scaling: Scaling<MODES>,
+    modes: Vec<ModeBlock>,
+}
+
+impl CoarseSystem {
+    /// The dense factor of this system, as the coarsest one.
+    fn factor(&self, parts: &mut Parts) -> DenseCholesky {
+        let factor = || DenseCholesky::new(&self.a, &self.scaling);
+        parts.timed("coarsest factor", factor, |made| {
+            (8 * made.size * made.size, made.size * made.size * made.size / 3)
+        })
+    }
+}
+
+/// A level of the cycle and the transfer to the next coarser one, if there is one.
+#[derive(Debug)]
+struct Level<const N: usize, P: Precision> {
+    matrix: ScaledMatrix<N, P::Stored>,
+    transfer: Option<Transfer<N, P>>,
+}
+
+impl<const N: usize, P: Precision> Level<N, P> {
+    /// The level without a coarser one.
+    fn lone(a: &impl SystemRows<N>, scaling: &Scaling<N>, parts: &mut Parts) -> Self {
+        let read = a.columns().len() * (4 + 8 * N * N) + a.n_rows() * 8 * N * N;
+        let mut matrix = parts.timed(
+            "scaled matrix",
+            || ScaledMatrix::new(a, scaling),
+            |made| (read + made.memory_bytes(), 4 * N * N * N * made.columns.len()),
+        );
+        let cost = matrix.eigenvalue_cost();
+        parts.timed("largest eigenvalue", || matrix.find_largest_eigenvalue(), |()| cost);
+        Self { matrix, transfer: None }
+    }
+
+    /// The level and the system below it, if there is one.
+    fn new(
+        a: &impl SystemRows<N>,
+        scaling: &Scaling<N>,
+        mut modes: Vec<[[f64; MODES]; N]>,
+        (options, depth): (&MultigridOptions, usize),
+        parts: &mut Parts,
+    ) -> (Self, Option<CoarseSystem>) {
+        let mut level = Self::lone(a, scaling, parts);
+        let matrix = &level.matrix;
+        let strength = options.strength * 0.5_f64.powi(depth.try_into().unwrap_or(i32::MAX));
+        let aggregates = parts.timed(
+            "strength and aggregates",
+            || Aggregates::new(matrix, strength),
+            |_| {
+                (matrix.memory_bytes() + 8 * matrix.columns.len(), 2 * N * N * matrix.columns.len())
+            },
+        );
+        if aggregates.count == 0 || aggregates.count as f64 > STALL * matrix.n_rows() as f64 {
+            return (level, None);
+        }
+        let mode_bytes = 8 * N * MODES * modes.len();
+        let coarse_modes = parts.timed(
+            "tentative prolongator",
+            || {
+                // Modes in scaled unknowns: x̃ = Lᵀ x.
+                modes.par_iter_mut().zip(&scaling.factors).with_min_len(1024).for_each(|(m, l)| {
+                    let mut out = [[0.0; MODES]; N];
+                    add_transposed_product(&mut out, l, m);
+                    *m = out;
+                });
+                orthonormalise(&aggregates, &mut modes)
+            },
+            |_| (4 * mode_bytes, 0),
+        );
+        let damping = options.prolongator_damping / matrix.largest_eigenvalue;
+        let p = parts.timed(
+            "smoothed prolongator",
+            || Prolongator::smoothed(matrix, &aggregates, &modes, damping, scaling),
+            |p| {
+                let flops = 2 * MODES * N * N * (matrix.columns.len() + p.columns.len());
+                (matrix.memory_bytes() + mode_bytes + p.memory_bytes(), flops)
+            },
+        );
+        drop(modes);
+        let p_bytes = p.memory_bytes();
+        let transposed = parts.timed(
+            "transposed pattern",
+            || p.transposed(),
+            |t| (4 * p.columns.len() + 8 * t.positions.len(), 0),
+        );
+        let a_bytes = a.columns().len() * (4 + 8 * N * N);
+        let coarse = parts.timed(
+            "Galerkin product",
+            || galerkin(a, &p, &transposed),
+            |coarse| (a_bytes + p_bytes + coarse.columns.len() * 8 * MODES * MODES, coarse.flops),
+        );
+        let coarse_scaling = Scaling::new(&coarse);
+        level.transfer = Some(parts.timed(
+            "transfer",
+            || Transfer::new(p, transposed, scaling, &coarse_scaling, level.matrix.rows_per_task),
+            |made| (p_bytes + made.memory_bytes(), 0),
+        ));
+        let system = CoarseSystem { a: coarse, scaling: coarse_scaling, modes: coarse_modes };
+        (level, Some(system))
+    }
+
+    fn memory_bytes(&self) -> usize {
+        self.matrix.memory_bytes() + self.transfer.as_ref().map_or(0, Transfer::memory_bytes)
+    }
+
+    fn traffic_bytes(&self, passes: usize) -> usize {
+        let vector = self.matrix.n_rows() * N * size_of::<P::Real>();
+        let smoothing = passes * (self.matrix.memory_bytes() + VECTORS_PER_PASS * vector);
+        let transfer = self.transfer.as_ref().map_or(0, |t| t.memory_bytes() + 2 * vector);
+        smoothing + transfer
+    }
+}
