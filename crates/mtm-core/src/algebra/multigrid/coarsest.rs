@@ -25,7 +25,7 @@ impl DenseCholesky {
                 if j > i {
                     continue;
                 }
-                let block = scaled_block(&s[i], &a.blocks[k], &s[j], false);
+                let block = scaled_block(&s[i], &a.block(k), &s[j], false);
                 for r in 0..MODES {
                     for c in 0..MODES {
                         l[(MODES * i + r) * size + MODES * j + c] = block[r][c];

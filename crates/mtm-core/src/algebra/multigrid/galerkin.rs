@@ -15,15 +15,31 @@ const UNSEEN: u32 = u32::MAX;
 /// system's allocator maps fresh pages for each request.
 const ROWS_PER_TASK: usize = 16;
 
-/// A coarse matrix in double precision, kept only until the next level is built.
+/// A symmetric coarse matrix in double precision, of which the upper triangle is stored; kept only until the next
+/// level is built.
 #[derive(Debug)]
 pub(super) struct CoarseMatrix {
     pub(super) row_start: Vec<usize>,
     pub(super) columns: Vec<u32>,
-    pub(super) blocks: Vec<ModeBlock>,
+    places: Vec<Place>,
+    upper: Vec<UpperRows>,
     diagonal: Vec<usize>,
+}
+
+/// Where a block stands in the upper triangle.
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    task: u32,
+    offset: u32,
+    /// Whether the block is below the diagonal, and the transpose of the stored one.
+    is_below: bool,
+}
+
+impl CoarseMatrix {
     /// Operations of the product.
-    pub(super) flops: usize,
+    pub(super) fn flops(&self) -> usize {
+        self.upper.iter().map(|rows| rows.flops).sum()
+    }
 }
 
 impl SystemRows<MODES> for CoarseMatrix {
@@ -35,15 +51,16 @@ impl SystemRows<MODES> for CoarseMatrix {
     }
     #[inline(always)]
     fn block(&self, position: usize) -> ModeBlock {
-        self.blocks[position]
+        let Place { task, offset, is_below } = self.places[position];
+        let block = &self.upper[task as usize].blocks[offset as usize];
+        if is_below { transposed_block(block) } else { *block }
     }
     fn diagonal(&self, row: usize) -> usize {
         self.diagonal[row]
     }
 }
 
-/// P'ᵀ A P'. The upper triangle is summed and the lower one mirrored, so that the result is symmetric in every
-/// bit.
+/// P'ᵀ A P', of which the upper triangle is summed.
 ///
 /// Row I is summed as Σ_j V_jᵀ P'_jJ with V_j = Σ_i A_ijᵀ P'_iI: the V_j of one row fit into the caches of one
 /// thread, and A P' is never stored.
@@ -68,10 +85,11 @@ pub(super) fn galerkin<const N: usize, A: SystemRows<N>>(
             },
         )
         .collect();
-    mirror(p.n_coarse, &upper)
+    in_order(p.n_coarse, upper)
 }
 
 /// Rows of the upper triangle, columns in any order.
+#[derive(Debug)]
 struct UpperRows {
     lengths: Vec<usize>,
     columns: Vec<u32>,
@@ -168,6 +186,10 @@ impl<const N: usize, A: SystemRows<N>> Kernel for Product<'_, N, A> {
             upper.lengths.push(products.rows.len());
             upper.columns.extend_from_slice(&products.rows);
             blocks.extend_from_slice(&products.blocks);
+            if let Some(diagonal) = products.rows.iter().position(|&j| j as usize == coarse) {
+                let at = blocks.len() - products.rows.len() + diagonal;
+                make_symmetric(&mut blocks[at]);
+            }
             images.clear();
             products.clear();
         }
@@ -177,75 +199,75 @@ impl<const N: usize, A: SystemRows<N>> Kernel for Product<'_, N, A> {
     }
 }
 
-/// The full matrix, columns ascending, from its upper triangle.
-fn mirror(n: usize, upper: &[UpperRows]) -> CoarseMatrix {
-    let lengths: Vec<usize> = upper.iter().flat_map(|rows| &rows.lengths).copied().collect();
-    let upper_start = running_sum(&lengths);
-    let upper_columns: Vec<u32> = upper.iter().flat_map(|rows| &rows.columns).copied().collect();
-    let mut sizes = lengths;
-    for i in 0..n {
-        for &j in &upper_columns[upper_start[i]..upper_start[i + 1]] {
-            if j as usize != i {
-                sizes[j as usize] += 1;
-            }
+/// The whole matrix, columns ascending, from its upper triangle.
+fn in_order(n: usize, upper: Vec<UpperRows>) -> CoarseMatrix {
+    let mut sizes: Vec<usize> = upper.iter().flat_map(|rows| &rows.lengths).copied().collect();
+    for_each_block(&upper, |i, j, _| {
+        if j != i {
+            sizes[j] += 1;
         }
-    }
+    });
     let row_start = running_sum(&sizes);
-    // Column of each block and its position in the upper triangle.
-    let mut sources = vec![(0_u32, 0_u32); row_start[n]];
+    let mut entries = vec![(0_u32, Place { task: 0, offset: 0, is_below: false }); row_start[n]];
     let mut next = row_start.clone();
-    for i in 0..n {
-        for k in upper_start[i]..upper_start[i + 1] {
-            let j = upper_columns[k];
-            sources[next[i]] = (j, row_index(k));
-            next[i] += 1;
-            if j as usize != i {
-                sources[next[j as usize]] = (row_index(i), row_index(k));
-                next[j as usize] += 1;
-            }
+    for_each_block(&upper, |i, j, place| {
+        entries[next[i]] = (row_index(j), place);
+        next[i] += 1;
+        if j != i {
+            entries[next[j]] = (row_index(i), Place { is_below: true, ..place });
+            next[j] += 1;
         }
-    }
-    let mut columns = vec![0_u32; row_start[n]];
-    let mut blocks = vec![[[0.0; MODES]; MODES]; row_start[n]];
-    split_rows(&mut sources, &row_start, ROWS_PER_TASK)
-        .into_par_iter()
-        .zip(split_rows(&mut columns, &row_start, ROWS_PER_TASK))
-        .zip(split_rows(&mut blocks, &row_start, ROWS_PER_TASK))
-        .for_each(|((sources, columns), blocks)| {
-            let first = row_start[sources.rows.start];
-            for i in sources.rows.clone() {
-                let range = row_start[i] - first..row_start[i + 1] - first;
-                sources.data[range.clone()].sort_unstable_by_key(|source| source.0);
-                for k in range {
-                    let (column, position) = sources.data[k];
-                    let task = i.min(column as usize) / ROWS_PER_TASK;
-                    let offset = upper_start[task * ROWS_PER_TASK];
-                    let block = &upper[task].blocks[position as usize - offset];
-                    columns.data[k] = column;
-                    blocks.data[k] = mirrored(block, i, column as usize);
-                }
-            }
-        });
+    });
+    split_rows(&mut entries, &row_start, ROWS_PER_TASK).into_par_iter().for_each(|part| {
+        let first = row_start[part.rows.start];
+        for i in part.rows {
+            part.data[row_start[i] - first..row_start[i + 1] - first]
+                .sort_unstable_by_key(|entry| entry.0);
+        }
+    });
+    let (columns, places): (Vec<u32>, Vec<Place>) = entries.into_iter().unzip();
     let diagonal = (0..n)
         .map(|i| {
             let row = &columns[row_start[i]..row_start[i + 1]];
             row_start[i] + row.partition_point(|&j| (j as usize) < i)
         })
         .collect();
-    let flops = upper.iter().map(|rows| rows.flops).sum();
-    CoarseMatrix { row_start, columns, blocks, diagonal, flops }
+    CoarseMatrix { row_start, columns, places, upper, diagonal }
 }
 
-/// The block at row `i`, column `j`, from the one in the upper triangle: transposed below the diagonal, and on
-/// it symmetric in every bit.
-fn mirrored(upper: &ModeBlock, i: usize, j: usize) -> ModeBlock {
-    let mut block = *upper;
-    for r in 0..MODES {
-        for c in 0..MODES {
-            if j < i || (j == i && c < r) {
-                block[r][c] = upper[c][r];
+/// Calls `visit` with row, column and place of every block of the upper triangle.
+fn for_each_block(upper: &[UpperRows], mut visit: impl FnMut(usize, usize, Place)) {
+    let mut row = 0;
+    for (task, rows) in upper.iter().enumerate() {
+        let mut offset = 0;
+        for &length in &rows.lengths {
+            for &column in &rows.columns[offset..offset + length] {
+                let place =
+                    Place { task: row_index(task), offset: row_index(offset), is_below: false };
+                visit(row, column as usize, place);
+                offset += 1;
             }
+            row += 1;
         }
     }
-    block
+}
+
+/// Copies the upper triangle of a diagonal block to the lower one: symmetric in every bit.
+fn make_symmetric(block: &mut ModeBlock) {
+    for r in 0..MODES {
+        for c in 0..r {
+            block[r][c] = block[c][r];
+        }
+    }
+}
+
+#[inline(always)]
+fn transposed_block(block: &ModeBlock) -> ModeBlock {
+    let mut out = [[0.0; MODES]; MODES];
+    for r in 0..MODES {
+        for c in 0..MODES {
+            out[r][c] = block[c][r];
+        }
+    }
+    out
 }

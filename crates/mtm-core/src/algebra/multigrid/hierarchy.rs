@@ -286,7 +286,7 @@ impl<const N: usize, P: Precision> Level<N, P> {
         let coarse = parts.timed(
             "Galerkin product",
             || galerkin(a, &p, &transposed),
-            |coarse| (a_bytes + p_bytes + coarse.columns.len() * 8 * MODES * MODES, coarse.flops),
+            |coarse| (a_bytes + p_bytes + coarse.columns.len() * 8 * MODES * MODES, coarse.flops()),
         );
         let coarse_scaling = Scaling::new(&coarse);
         level.transfer = Some(parts.timed(
