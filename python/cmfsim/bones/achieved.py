@@ -457,8 +457,8 @@ def _targets(
     missing = [name for name in parts if name not in postoperative]
     if missing:
         raise RegistrationInputError(
-            f"there is no post-operative surface of {', '.join(missing)}: give one for each of "
-            f"{', '.join(parts)}, or one surface of the whole bone"
+            f"these segments have no post-operative surface: {', '.join(missing)}; give one for "
+            f"each of {', '.join(parts)}, or one surface of the whole bone"
         )
     for name in parts:
         check_instance(f"post-operative surface of {name!r}", postoperative[name], SurfaceData)

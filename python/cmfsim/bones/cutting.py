@@ -140,7 +140,7 @@ def cut_bones(
             np.array_equal(getattr(level, n), getattr(first, n)) for n in ("spacing", "origin")
         )
         if not same:
-            raise CaseInputError(f"bone {name!r} lies on another grid than {next(iter(bones))!r}")
+            raise CaseInputError(f"bone {name!r} is not on the same grid as {next(iter(bones))!r}")
     placed = _placed(procedures, landmarks or {})
     findings = [f for p in placed for f in p.findings]
     pieces: dict[str, Levels] = {name: level.single for name, level in bones.items()}
@@ -274,7 +274,9 @@ def _names_of_cut(procedure: Procedure, cut: Cut, pieces: Iterable[str]) -> tupl
         )
     rest_name = cut.rest or source
     if cut.segment in pieces or (rest_name != source and rest_name in pieces):
-        raise CaseInputError(f"{procedure.kind} makes {cut.segment!r}, which exists already")
+        raise CaseInputError(
+            f"{procedure.kind} makes {cut.segment!r}, but a segment of this name already exists"
+        )
     return source, rest_name
 
 
@@ -285,7 +287,7 @@ def _fragment_findings(
     if moved:
         yield Finding.note(
             "osteotomy-crumbs",
-            f"fragments that the cut separated from {names[0]!r}: {len(moved)}, "
+            f"fragments were separated by the cut from {names[0]!r}: {len(moved)}, "
             f"{sum(moved):.0f} mm³ in all; they stay with {names[1]!r}",
             where=kind,
             why="they would move with a bone to which they are not connected",

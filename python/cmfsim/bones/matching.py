@@ -114,10 +114,10 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
     if fit.rms > options.max_rms or share < options.least_share:
         raise RegistrationError(
             f"segment {name!r} does not fit the post-operative bone: {fit.rms:.2f} mm rms over "
-            f"{share:.0%} of its vertices, with the size that fits best (allowed "
-            f"{options.max_rms:g} mm, at least {options.least_share:.0%}); check that the scans "
-            "are aligned, that the segment is cut as it was in the operation, and that the scan "
-            "shows the whole bone; a larger trim ignores plates and new bone"
+            f"{share:.0%} of its vertices, at the best size (allowed {options.max_rms:g} mm, at "
+            f"least {options.least_share:.0%}); check that the scans are aligned, that the "
+            "segment is cut as it was in the operation, and that the scan shows the whole bone; "
+            "a larger trim ignores plates and new bone"
         )
     _LOG.info("segment %s: %.3f mm rms, %.0f %% kept", name, fit.rms, 100 * share)
     return fit

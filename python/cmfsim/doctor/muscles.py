@@ -45,10 +45,10 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
     if not evidence.skull_landmarks:
         yield Finding.error(
             "muscles-without-landmarks",
-            "muscles are asked for, and no skull landmarks could be read",
+            "the case has [muscles], but no skull landmarks could be read",
             where=where,
-            why="the template is fitted to the patient by them",
-            fix="add [landmarks] skull, or leave out [muscles]",
+            why="skull landmarks fit the template to the patient",
+            fix="add [landmarks] skull, or remove [muscles]",
         )
         return
     try:
@@ -93,7 +93,7 @@ def _moduli(evidence: Evidence, given: CaseMuscles, template: MuscleTemplate) ->
             str(error),
             where=case.where("tissue"),
             why="the fat of [tissue] lies between the muscles",
-            fix="use a young (MPa) that is plausible for fat, or leave out [tissue]",
+            fix="set young (MPa) to a value that is plausible for fat, or remove [tissue]",
         )
         return
     yield from moduli_findings(moduli, given.preset, case.where(place))

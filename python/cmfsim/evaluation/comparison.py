@@ -328,9 +328,9 @@ def _warps(landmarks: tuple[Landmarks, Landmarks] | None) -> _Warps:
 def _check_matched(matches: Matches, n_chosen: int) -> None:
     if not len(matches.vertices):
         raise RegistrationInputError(
-            f"none of {n_chosen} vertices has a partner: {matches.n_border} are matched "
-            f"to the border of the post-operative skin and {matches.n_far} are further away than "
-            "the limit; do both lie in one frame, and does the mask lie on the scanned face?"
+            f"none of {n_chosen} vertices has a partner: {matches.n_border} are matched to the "
+            f"border of the post-operative skin and {matches.n_far} are further away than the "
+            "limit; check that both are in one frame, and that the mask is on the scanned face"
         )
 
 
@@ -383,7 +383,7 @@ def _paired(ours: Landmarks, theirs: Landmarks) -> tuple[Floats, Floats, tuple[F
     if len(first) != len(second):
         raise LandmarkInputError(
             f"there are {len(first)} landmarks of one skin and {len(second)} of the other: both "
-            "need the same number, in the same order"
+            "must have the same number, in the same order"
         )
     return first, second, ()
 
@@ -422,7 +422,7 @@ def _as_choice(name: str, value: ArrayLike, count: int) -> NDArray[np.bool_]:
         chosen = np.zeros(count, dtype=bool)
         chosen[as_indices(name, value, count)] = True
     if not chosen.any():
-        raise CaseInputError(f"{name} holds no vertex")
+        raise CaseInputError(f"{name} contains no vertex")
     return chosen
 
 
@@ -467,8 +467,8 @@ def _findings(
                 "many-border-matches",
                 f"{matches.n_border} of {n_chosen} vertices are matched to the border of the "
                 "post-operative skin and left out",
-                why="the scan ends there, or the landmarks carry the skin past it",
-                fix="evaluate the face alone with mask='face', or a mask of what was simulated",
+                why="the scan ends there, or the landmarks map the skin past its end",
+                fix="evaluate only the face with mask='face', or use a mask of the simulated skin",
             )
         )
     folds = warp.folds(places) if warp is not None else None
@@ -477,9 +477,9 @@ def _findings(
             Finding.warning(
                 "correspondence-folds",
                 f"the map between the landmarks folds at {folds.count} of {n_chosen} vertices",
-                why="points paired there are not the same anatomy",
-                fix="check the landmarks: one may be swapped with another, or lie on a different "
-                "point of the face",
+                why="points that are paired there do not correspond anatomically",
+                fix="check the landmarks: one may be swapped with another, or placed at a "
+                "different point of the face",
             )
         )
     return found

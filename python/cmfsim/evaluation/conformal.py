@@ -61,7 +61,7 @@ def calibrate(scores: ArrayLike, coverage: float) -> BandFactor:
     if n < needed:
         raise CalibrationError(
             f"a coverage of {share:.4g} needs at least {needed} calibration cases, and there are "
-            f"{n}: add cases, or ask for at most {n / (n + 1):.4g}"
+            f"{n}: add cases, or request at most {n / (n + 1):.4g}"
         )
     if not np.isfinite(values).all() or values[0] < 0.0:
         bad = int(np.flatnonzero(~(np.isfinite(values) & (values >= 0.0)))[0])

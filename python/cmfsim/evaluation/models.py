@@ -191,7 +191,7 @@ def compare_models(  # noqa: PLR0913 (options by name)
         if len(moved[name]) != len(skin.vertices):
             raise CaseInputError(
                 f"prediction {name!r} has {len(moved[name])} vertices, the pre-operative skin "
-                f"{len(skin.vertices)}: the same are needed, in the same order"
+                f"{len(skin.vertices)}: both must have the same vertices in the same order"
             )
     if thickening is not None:
         moved = {name: moved_outward(skin, at, thickening) for name, at in moved.items()}

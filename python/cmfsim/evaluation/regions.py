@@ -20,8 +20,9 @@ Place = tuple[float, float]
 PAIRS = ("exocanthion", "endocanthion", "alare", "cheilion")
 REGIONS: Mapping[str, str] = MappingProxyType(
     {
-        "face": "from the brow to below the chin, a little wider than the eyes",
-        "lower face": "the same from below the lower eyelids on: what jaws move, without the eyes",
+        "face": "from the brow to below the chin, slightly wider than the eyes",
+        "lower face": "the part of the face below the lower eyelids: what the jaws move, "
+        "without the eyes",
         "nose": "from nasion to subnasale, with the wings",
         "upper lip": "from subnasale to the line of the mouth, between its corners",
         "lower lip": "from the line of the mouth half way down to pogonion",
@@ -171,19 +172,19 @@ def _check_face(at: Mapping[str, Floats]) -> None:
     for pair in PAIRS:
         if at[f"{pair}_L"][0] <= at[f"{pair}_R"][0]:
             raise LandmarkInputError(
-                f"{pair}_L lies to the right of {pair}_R: exchange their names (left is the "
+                f"{pair}_L lies to the right of {pair}_R: swap their names (left is the "
                 "patient's left)"
             )
     order = ("nasion", "subnasale", "labiale_superius", "labiale_inferius", "pogonion")
     for above, below in itertools.pairwise(order):
         if at[above][1] <= at[below][1]:
             raise LandmarkInputError(
-                f"{above} lies below {below}: are the landmarks in the frame of the skin, and "
-                "their names in their places?"
+                f"{above} lies below {below}: check that the landmarks are in the frame of the "
+                "skin, and that no names are swapped"
             )
     if at["pronasale"][2] <= 0.5 * (at["exocanthion_L"][2] + at["exocanthion_R"][2]):
         raise LandmarkInputError(
-            "pronasale lies behind the eyes: left and right are exchanged, or the frame mirrors"
+            "pronasale lies behind the eyes: left and right are swapped, or the frame is mirrored"
         )
 
 

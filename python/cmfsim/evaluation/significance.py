@@ -15,8 +15,9 @@ __all__ = ["PAIRED_BY", "PairedTest", "wilcoxon_test"]
 PAIRED_BY = ("vertex", "patient")
 CAVEATS = {
     "vertex": (
-        "neighbouring vertices move together and are not independent samples: p describes this one "
-        "face, not what to expect of the next patient, and falls with every refinement of the mesh"
+        "neighbouring vertices move together and are not independent samples: p describes this "
+        "one face, says nothing about the next patient, and falls with every refinement of the "
+        "mesh"
     ),
     "patient": "",
 }
@@ -110,7 +111,8 @@ def wilcoxon_test(first: ArrayLike, second: ArrayLike, *, by: str = "vertex") ->
     a, b = as_floats("first errors", first), as_floats("second errors", second)
     if a.ndim != 1 or a.shape != b.shape or not len(a):
         raise CaseInputError(
-            f"errors have shapes {a.shape} and {b.shape}: (n,) both, in pairs, with n above 0"
+            f"errors have shapes {a.shape} and {b.shape}: both must be (n,), in pairs, with n "
+            "above 0"
         )
     difference = a - b
     n_used = int(np.count_nonzero(difference))

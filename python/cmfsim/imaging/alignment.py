@@ -138,14 +138,14 @@ def register_volumes(
     if overlap < options.least_overlap:
         raise RegistrationError(
             f"only {overlap:.0%} of the mask lies in the moving volume (correlation there "
-            f"{similarity:.2f}): at least {options.least_overlap:.0%} is needed; bring the volumes "
-            "closer with `initial`, or draw the mask where both were scanned"
+            f"{similarity:.2f}): at least {options.least_overlap:.0%} is needed; bring the "
+            "volumes closer with `initial`, or restrict the mask to what both scans show"
         )
     if similarity < options.least_similarity:
         raise RegistrationError(
             f"the volumes do not match after registration: correlation {similarity:.2f}, needed "
-            f"{options.least_similarity:g}; start closer with `initial`, mask out what was moved, "
-            "and see whether both show the same person"
+            f"{options.least_similarity:g}; start closer with `initial`, mask out what was "
+            "moved, and check that both show the same person"
         )
     return VolumeAlignment(inverse(to_moving), information, similarity, overlap, tuple(iterations))
 
@@ -177,7 +177,7 @@ def _checked_mask(mask: ImageData | None, fixed: ImageData) -> Mask:
     same = mask.values.shape == fixed.values.shape and np.allclose(mask.lowest, fixed.lowest)
     if not (same and np.allclose(mask.spacing, fixed.spacing)):
         raise RegistrationInputError(
-            f"the mask lies on another grid ({mask.values.shape} at {mask.lowest.tolist()} mm) "
+            f"the mask is on another grid ({mask.values.shape} at {mask.lowest.tolist()} mm) "
             f"than the fixed volume ({fixed.values.shape} at {fixed.lowest.tolist()} mm)"
         )
     chosen = np.asfortranarray(mask.values != 0)
@@ -195,7 +195,7 @@ def _range(name: str, values: NDArray[Any]) -> tuple[float, float]:
     low, high = (float(v) for v in np.percentile(values, CLIPPED))
     if not low < high:
         raise RegistrationInputError(
-            f"{name} is {low:g} nearly everywhere (in the mask): there is nothing to register by"
+            f"{name} is {low:g} nearly everywhere (in the mask), so it cannot be registered"
         )
     return low, high
 

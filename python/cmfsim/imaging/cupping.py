@@ -64,8 +64,8 @@ def without_cupping(work: Working) -> tuple[Volume, tuple[Finding, ...]]:
         "is typical of cone-beam scanners; the values were scaled between air and soft tissue to "
         "compensate",
         where="image",
-        why="one threshold finds too much bone near the skin and too little in the middle",
-        fix="check bone by eye; a CT of a fan-beam scanner has no such loss",
+        why="a single threshold finds too much bone near the skin and too little in the middle",
+        fix="check the bone visually; a CT from a fan-beam scanner does not have this effect",
     )
     return corrected, (finding,)
 

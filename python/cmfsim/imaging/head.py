@@ -157,8 +157,8 @@ def _check_head(work: Working, inside: Mask) -> None:
     if volume < LEAST_HEAD:
         raise ImageInputError(
             f"the largest object in the image that could be a head has {volume:.0f} cm³: a face "
-            f"has at least {LEAST_HEAD:g}; is the head cut off, empty (a phantom), or the scale "
-            "wrong?"
+            f"has at least {LEAST_HEAD:g}; check whether the head is cut off or hollow (a "
+            "phantom), and whether the scale is right"
         )
 
 

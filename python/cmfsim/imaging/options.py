@@ -77,7 +77,7 @@ class SegmentOptions:
         if not -1000.0 < self.skin_threshold < self.least_bone < metal:
             raise ImageInputError(
                 f"thresholds are skin {self.skin_threshold:g}, bone {self.least_bone:g}, metal "
-                f"{metal:g} HU: they must ascend and lie above −1000"
+                f"{metal:g} HU: they must increase in this order and be above −1000"
             )
         if self.rescale is not None:
             slope, intercept = self.rescale

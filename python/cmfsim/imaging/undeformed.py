@@ -61,8 +61,8 @@ def undeformed_mask(
     missing = [name for name in CRANIAL_LANDMARKS if name not in landmarks]
     if missing:
         raise LandmarkInputError(
-            f"landmarks lack {', '.join(missing)}: the plane above the jaws runs through "
-            f"{', '.join(CRANIAL_LANDMARKS)}"
+            f"landmarks lack {', '.join(missing)}: they define the plane above the jaws, which "
+            f"runs through {', '.join(CRANIAL_LANDMARKS)}"
         )
     points = as_rows(
         "landmarks", np.array([as_floats(name, landmarks[name]) for name in CRANIAL_LANDMARKS]), 3
@@ -73,16 +73,17 @@ def undeformed_mask(
     normal = axes[2] if axes[2, 2] > 0.0 else -axes[2]
     if sizes[1] < 0.1 * sizes[0]:
         raise LandmarkInputError(
-            f"the landmarks {', '.join(CRANIAL_LANDMARKS)} lie nearly on one line: no plane runs "
-            "through them alone"
+            f"the landmarks {', '.join(CRANIAL_LANDMARKS)} are nearly on one line, so they do "
+            "not define a plane"
         )
     x, y, z = image.axes()
     height = (x - centre[0]) * normal[0] + (y - centre[1]) * normal[1] + (z - centre[2]) * normal[2]
     bone = (image.values > threshold) & (height > 0.0)
     if not bone.any():
         raise RegistrationInputError(
-            f"the image has no voxel above {threshold:g} HU on the upper side of the plane through "
-            f"{', '.join(CRANIAL_LANDMARKS)}: is it in HU, and are both in one frame?"
+            f"the image has no voxel above {threshold:g} HU on the upper side of the plane "
+            f"through {', '.join(CRANIAL_LANDMARKS)}: check that it is in HU, and that image and "
+            "landmarks are in one frame"
         )
     near = distance(np.asfortranarray(bone), image.spacing, margin) <= margin
     return image.with_values((near & (height > 0.0)).astype(np.uint8))

@@ -144,7 +144,7 @@ class Case:
         if (self.image is None) == (self.surfaces is None):
             raise CaseInputError("a case has either an image or surfaces")
         if self.achieved and self.plan:
-            raise CaseInputError("a plan is given or achieved, not both")
+            raise CaseInputError("a plan is either given or achieved, not both")
         for name in ("plan", "node_kinds", "lines"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
@@ -190,7 +190,7 @@ class Case:
         """
         document = read_tables(Path(path)).only("plan")
         if not list(document.table("plan")):
-            document.fail("plan", "has no motion: tables [plan.SEGMENT] are needed")
+            document.fail("plan", "has no motion: add tables [plan.SEGMENT]")
         return replace(self, plan=plan_of(document, Path(path).parent), achieved=False)
 
     def where(self, key: str) -> str:
@@ -224,8 +224,8 @@ def as_case(case: CaseOrPath) -> Case:
     if isinstance(case, str | os.PathLike):
         return Case.load(case)
     raise CaseInputError(
-        f"the case is of type {type(case).__name__}: give a Case, or the path of a case.toml or of "
-        "the folder that holds it"
+        f"the case is of type {type(case).__name__}: give a Case, or the path of a case.toml or "
+        "of the folder that contains it"
     )
 
 
@@ -236,8 +236,8 @@ def _case_file(path: Path) -> Path:
     file = path / CASE_FILE
     if not file.exists():
         raise CaseInputError(
-            f"{path.resolve()}: is a folder without a {CASE_FILE}: name the case file, or the "
-            "folder that holds it"
+            f"{path.resolve()}: is a folder without a {CASE_FILE}: give the path of the case "
+            "file, or of the folder that contains it"
         )
     return file
 

@@ -53,7 +53,7 @@ class Cohort:
     def __post_init__(self) -> None:
         as_text("cohort name", self.name)
         if not self.cases:
-            raise CaseInputError("a cohort needs a case")
+            raise CaseInputError("a cohort needs at least one case")
         for model in self.models:
             check_one_of("model", model, MODELS)
 

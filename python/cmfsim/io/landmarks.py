@@ -145,7 +145,7 @@ def _known_labels(
         f"{len(renamed)} labels are spelled differently: {', '.join(renamed[:4])}{more}",
         where=where,
         why="the second spelling is used",
-        fix="nothing needs to be done; one spelling is easier to find",
+        fix="nothing needs to be done, but a single spelling is easier to find",
     )
     return MappingProxyType({labels[label]: point for label, point in points.items()}), [finding]
 
@@ -285,7 +285,7 @@ def _landmark_file(
                 code="landmark-frame-unstated",
                 what=f"the file does not state its frame: read as {chosen}, {origin}",
                 where=path.name,
-                why="RAS read as LPS turns the head by half a turn about its long axis",
+                why="reading RAS as LPS rotates the head by 180° about its long axis",
                 fix='state it: "coordinateSystem": "LPS" (.mrk.json), # CoordinateSystem = LPS '
                 "(.fcsv),"
                 ' or frame = "LPS" under [landmarks]',
@@ -298,7 +298,7 @@ def _landmark_file(
                 "landmark-unset",
                 f"{len(unset)} points were never placed and are skipped: {names}",
                 where=path.name,
-                why="whatever is placed from them uses its default or is refused",
+                why="items placed from them use their defaults or are refused",
                 fix="place them in 3D Slicer, or delete them",
             )
         )

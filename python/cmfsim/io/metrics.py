@@ -183,7 +183,7 @@ def write_metrics(path: str | os.PathLike[str], metrics: Any) -> None:
 def _call(path: Path, metrics: Any, method: str) -> Any:
     if not callable(getattr(metrics, method, None)):
         raise CaseInputError(
-            f"{path.name}: a {type(metrics).__name__} has no {method}(): give what compare_skins, "
-            "compare_models, achieved_plan or error_table return"
+            f"{path.name}: a {type(metrics).__name__} has no {method}(): give a result of "
+            "compare_skins, compare_models, achieved_plan or error_table"
         )
     return getattr(metrics, method)()

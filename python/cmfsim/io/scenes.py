@@ -162,7 +162,8 @@ def read_plan(path: str | os.PathLike[str], scene: Scene) -> dict[str, NDArray[A
         for name in scene.segments:
             if name not in table:
                 raise CaseInputError(
-                    f"[plan] lacks segment {name!r}: give it translation = [0, 0, 0] if it stays"
+                    f"[plan] lacks segment {name!r}: give it translation = [0, 0, 0] if it does "
+                    "not move"
                 )
         return {name: _motion(name, table, path.parent) for name in scene.segments}
 
@@ -198,7 +199,7 @@ def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray
     }
     for member in members:
         if member not in known:
-            raise CaseInputError(f"has the array {member!r}, which is none of this scene's")
+            raise CaseInputError(f"has the array {member!r}, which does not belong to this scene")
     return Scene(
         nodes=member_of(members, "nodes"),
         tets=member_of(members, "tets"),

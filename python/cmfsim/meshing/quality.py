@@ -182,8 +182,8 @@ def mesh_findings(report: MeshReport) -> tuple[Finding, ...]:
                 "mesh-poor-tet",
                 f"tet {worst['tet']} has a dihedral angle of {report.min_dihedral:.1f}°",
                 where=f"mesh, at ({x:.1f}, {y:.1f}, {z:.1f}) mm",
-                why="its deformation is inaccurate, and the system is less well conditioned",
-                fix="change edge_length a little, or set refinements = 0",
+                why="its deformation is inaccurate, and it worsens the conditioning of the system",
+                fix="change edge_length slightly, or set refinements = 0",
             )
         )
     if report.dropped_parts:
@@ -194,7 +194,7 @@ def mesh_findings(report: MeshReport) -> tuple[Finding, ...]:
                 "all were removed",
                 where="mesh",
                 why="they are not attached to anything",
-                fix="none is needed; check the thresholds if a part of the face is missing",
+                fix="nothing to do; check the thresholds if a part of the face is missing",
             )
         )
     return tuple(findings)

@@ -116,7 +116,7 @@ def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tup
     if not (level > 0.0).any():
         raise MeshInputError(
             "no soft tissue lies in front of the posterior plane: check its point and normal, "
-            "and that skin and bones are of one patient"
+            "and that skin and bones are from one patient"
         )
     findings = tuple(_without_hollows(level, bone, grid, region))
     return grid.with_values(level), findings
@@ -190,5 +190,5 @@ def _without_hollows(
         f"{volume / 1000.0:.1f} cm³ behind bone were removed from the tissue",
         where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
         why="the cranial cavity and closed sinuses do not deform with the face",
-        fix="none is needed; lower foramen_radius if tissue of the face is missing",
+        fix="nothing to do; lower foramen_radius if tissue of the face is missing",
     )

@@ -351,7 +351,7 @@ def _findings(
     if not volumes:
         yield Finding.warning(
             "muscles-none",
-            "no muscle was given: every tet is fat",
+            "no muscle was given, so every tet is fat",
             why="The tissue is homogeneous and isotropic.",
         )
     for (name, volume), was_turned, (surface, fibres) in zip(
@@ -368,15 +368,16 @@ def _findings(
                 "muscle-open",
                 f"the surface of {name} is not closed: {surface.n_border_edges} border edges",
                 where=name,
-                why="Inside is where the winding number exceeds one half, which bridges holes.",
+                why="Points with a winding number above one half count as inside, which bridges "
+                "holes.",
             )
         if volume.inside == 0.0:
             yield Finding.warning(
                 "muscle-missed",
-                f"{name} holds no sample of any tet",
+                f"{name} contains no sample of any tet",
                 where=name,
                 why="It does not affect the tissue: it lies outside the mesh, or encloses nothing.",
-                fix="Check its frame and that its surface is closed; or take more samples.",
+                fix="Check its frame and that its surface is closed, or use more samples.",
             )
         elif volume.enclosed is not None:
             lost = 1.0 - volume.inside / volume.enclosed
@@ -391,6 +392,6 @@ def _findings(
                 "muscle-sheet",
                 f"{name} is a sheet: second extent {fibres.sheet_ratio:.2f} of the first",
                 where=name,
-                why="Its outline hardly shows the direction of its fibres.",
-                fix="Give the course of its fibres.",
+                why="The direction of its fibres can hardly be determined from its outline.",
+                fix="Add fibre lines (course) for this muscle.",
             )

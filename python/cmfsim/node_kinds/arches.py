@@ -107,8 +107,8 @@ def _nothing_slides(missing: Sequence[str]) -> Finding:
         f"no sliding region at the teeth: landmarks {', '.join(missing)} are missing, and the "
         "image does not show teeth apart from bone",
         where="landmarks",
-        why="lips and cheeks would stick to the teeth",
-        fix="place them, give regions, or set sliding = false",
+        why="lips and cheeks would be attached to the teeth",
+        fix="place them, define regions, or set sliding = false",
     )
 
 
@@ -118,8 +118,8 @@ def _from_teeth(missing: Sequence[str]) -> Finding:
         f"landmarks {', '.join(missing)} are missing: the sliding regions were placed from the "
         "teeth that the image shows",
         where="landmarks",
-        why="the depth of the vestibule is then accurate to about 3 mm",
-        fix="place the landmarks if lips or cheeks matter",
+        why="the depth of the vestibule is accurate only to about 3 mm",
+        fix="place the landmarks if lips or cheeks are important",
     )
 
 

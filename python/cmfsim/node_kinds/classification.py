@@ -276,7 +276,7 @@ def _checked_names(
 ) -> tuple[str, ...]:
     if not segments:
         raise CaseInputError(
-            "there is no bone segment: the tissue would not be attached to anything"
+            "there is no bone segment, so the tissue would not be attached to anything"
         )
     for segment in segments:
         check_instance("segment", segment, BoneSegment)
@@ -361,7 +361,7 @@ def _noticed(
             f"({counts[f'sliding on {name}']} slide on it)",
             where=name,
             why="its motion does not reach the tissue",
-            fix="look at the picture; raise bone_distance, or leave it out of the plan",
+            fix="check the picture; increase bone_distance, or remove the segment from the plan",
         )
         for name in kinds.segments
         if name in moved and not counts[f"joined on {name}"]
@@ -376,7 +376,7 @@ def _noticed(
                 "are needed",
                 where="node kinds",
                 why="the tissue could drift as a whole, so there is no unique solution",
-                fix="give fixed_planes (posterior), or raise bone_distance",
+                fix="give fixed_planes (posterior), or increase bone_distance",
             )
         )
     return findings

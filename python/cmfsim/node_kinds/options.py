@@ -150,8 +150,8 @@ class KindOptions:
             as_number(name, getattr(self, name))
         if not 0.0 <= as_number("lifted", self.lifted) <= MOST_LIFTED:
             raise CaseInputError(
-                f"lifted is {self.lifted:g} mm: 0 (none) to {MOST_LIFTED:g} is allowed, since the "
-                "orbits lie above"
+                f"lifted is {self.lifted:g} mm: 0 (none) to {MOST_LIFTED:g} is allowed, because "
+                "the orbits are above"
             )
         if not 0.0 <= as_number("facing", self.facing) <= 1.0:
             raise CaseInputError(f"facing is {self.facing:g}: 0 to 1 is allowed")

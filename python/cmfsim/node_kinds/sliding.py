@@ -71,9 +71,9 @@ def _far_sheet(name: str, on_sheet: int, within: int) -> Finding:
         f"of {within} nodes on {name!r} at the arch only {on_sheet} lie within {SHEET_DEPTH:g} mm "
         "of its contact sheet; the others are joined",
         where=f"segment {name}",
-        why="lips and cheeks would stick to the teeth there",
-        fix="check the arch's landmarks and the bone in anatomy.png, or set contact_surface = "
-        '"bone" in [node_kinds]',
+        why="lips and cheeks would be attached to the teeth there",
+        fix="check the landmarks of the arch and the bone in anatomy.png, or set "
+        'contact_surface = "bone" in [node_kinds]',
     )
 
 

@@ -105,9 +105,7 @@ def picture_landmarks(
 
     panels = [View(name, f"{kind}, {name}") for kind in points for name in views]
     count = sum(len(names) for names in wrong.values())
-    words = [
-        f"Blue balls: landmarks. Red cubes with red names: doubtful ones ({count}) to look at."
-    ]
+    words = [f"Blue balls: landmarks. Red cubes with red names: doubtful ones ({count}) to check."]
     draw(path, panels, corners, size, paint, columns=len(views), words=words)
 
 

@@ -228,7 +228,7 @@ def _check_settings(calibration: Calibration, settings: Mapping[str, Any]) -> No
     ]
     raise CalibrationError(
         f"the calibration was made under other settings: {'; '.join(differing)}; calibrate with "
-        "cases that were predicted under the settings of this one"
+        "cases that were predicted with the settings of this prediction"
     )
 
 
@@ -241,9 +241,9 @@ def _factors(
 ) -> dict[str, BandFactor]:
     if not regions:
         raise CalibrationError(
-            "a calibrated band holds regions of the face, and the case has no skin landmarks that "
-            f"place them: add {', '.join(SKIN_LANDMARKS)} to [landmarks], or have cmfsim "
-            "landmarks propose them"
+            "a calibrated band needs the regions of the face, but the case has no skin "
+            f"landmarks to place them: add {', '.join(SKIN_LANDMARKS)} to [landmarks], or let "
+            "cmfsim landmarks propose them"
         )
     if options.group is not None and options.group not in calibration.groups:
         known = ", ".join(repr(group) for group in calibration.groups)

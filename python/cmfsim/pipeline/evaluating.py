@@ -206,7 +206,8 @@ def evaluate(
     postoperative = read_postoperative(case)
     if postoperative.skin is None:
         raise CaseInputError(
-            f"{case.where('postoperative')}: there is no face to compare with: add skin or image"
+            f"{case.where('postoperative')}: the case has no face to compare with: add skin or "
+            "image"
         )
     options = BuildOptions(
         progress=progress,
@@ -233,8 +234,8 @@ def evaluate(
     if fit_thickness:
         if unmoved is None:
             raise CaseInputError(
-                "a change of thickness is fitted where nothing was operated on, and "
-                f"{why[0].what if why else 'there is no such place'}: leave out --fit-thickness"
+                "a change of thickness is fitted where nothing was operated on, but "
+                f"{why[0].what if why else 'there is no such place'}: omit --fit-thickness"
             )
         depth = compared.depth()
         thickness = fitted_thickness(unmoved.signed, depth[unmoved.vertices])
@@ -289,7 +290,7 @@ class _Compared:
         except RegistrationError as error:
             return None, (_not_shown(str(error)),)
         if found is None:
-            return None, (_not_shown("the tissue that was simulated ends below the forehead"),)
+            return None, (_not_shown("the simulated tissue ends below the forehead"),)
         return found, ()
 
     def depth(self) -> Floats:
@@ -302,11 +303,11 @@ class _Compared:
 def _landmarks_unused() -> Finding:
     return Finding.note(
         "landmarks-after-unused",
-        "the landmarks of the face after the operation are not used: those before it were found "
-        "automatically",
+        "the landmarks of the post-operative face are not used, because the pre-operative ones "
+        "were found automatically",
         where="postoperative.landmarks",
-        why="Distances are those to the closest point, which does not see skin that slid along "
-        "itself; an error of a proposed landmark would count as an error of the prediction.",
+        why="Distances are those to the closest point, which ignores skin that slid along "
+        "itself. An error of a proposed landmark would count as an error of the prediction.",
         fix="Place the skin landmarks before the operation as well, and name the file under "
         "[landmarks].",
     )
@@ -317,8 +318,8 @@ def _not_shown(reason: str) -> Finding:
         "not-operated-none",
         f"the error where nothing was operated on is not known: {reason}",
         where="postoperative",
-        why="Errors of registration, swelling and weight cannot be separated from those of a "
-        "model.",
+        why="Errors of registration, swelling and weight cannot be separated from the error of "
+        "a model.",
         fix="Use scans that both show the forehead and temples.",
     )
 

@@ -262,7 +262,7 @@ def _warn_of_removed(output: Path, names: Sequence[str]) -> None:
     if not names:
         return
     _log.warning(
-        "%s: removed %d files of another plan, other inputs or another version: %s",
+        "%s: removed %d files that belong to another plan, other inputs or another version: %s",
         output,
         len(names),
         ", ".join(_statements(names)),

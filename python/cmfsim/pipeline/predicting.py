@@ -223,7 +223,7 @@ def build_patient(
     for name, found in patient.summary["inputs"].items():
         if hashes.get(name, found) != found:
             raise CaseInputError(
-                f"{name}: changed while the case was running; run it again once nothing writes to "
-                "this file"
+                f"{name}: changed while the case was running; run the case again when no other "
+                "program writes to this file"
             )
     return replace(patient, summary={**patient.summary, "inputs_key": key, "plan_key": about})

@@ -65,7 +65,7 @@ def check_extras(needs: Iterator[_Need] | Sequence[_Need]) -> None:
     reasons = "; ".join(dict.fromkeys(f"{need.module}: {need.purpose}" for need in missing))
     line = f"{reasons}; install with: pip install 'cmfsim[{extras}]'"
     if all(need.is_optional for need in missing):
-        _log.warning("done without: %s", line)
+        _log.warning("skipped: %s", line)
         return
     raise CaseInputError(f"packages are missing: {line}")
 
@@ -75,19 +75,19 @@ def _needs(case: Case, *, report: bool, evaluation: bool) -> Iterator[_Need]:
     images = [case.image, None if after is None else after.image]
     if any(image is not None for image in images):
         yield _Need("SimpleITK", "imaging", "reads images")
-    yield _Need("scipy", "imaging", "works on the grid of the tissue")
-    yield _Need("skimage", "imaging", "makes surfaces of the grid")
+    yield _Need("scipy", "imaging", "computes on the grid of the tissue")
+    yield _Need("skimage", "imaging", "makes surfaces from the grid")
     if case.image is not None or case.osteotomies:
-        yield _Need("fast_simplification", "imaging", "makes surfaces of bone coarser")
+        yield _Need("fast_simplification", "imaging", "coarsens surfaces of bone")
     for path in _surface_files(case):
         yield _Need("meshio", "mesh", "reads surfaces and meshes")
         if path.lower().endswith(".vtp"):
             yield _Need("pyvista", "mesh", "reads VTP")
     if report:
-        yield _Need("jinja2", "report", "makes the report (or: --no-report)")
+        yield _Need("jinja2", "report", "writes the report (or use --no-report)")
         yield _Need("pyvista", "mesh", "draws 3-D pictures", is_optional=True)
     if evaluation:
-        yield _Need("scipy", "report", "tests differences between models")
+        yield _Need("scipy", "report", "tests the differences between models")
         yield _Need("matplotlib", "report", "draws the chart of errors", is_optional=not report)
 
 

@@ -250,8 +250,8 @@ def _separated_again(apart: Mapping[str, float]) -> Finding:
         f"they moved by {np.mean(list(apart.values())):.1f} mm on average, {apart[name]:.1f} mm at "
         f"most ({name})",
         where="bone",
-        why="by shape alone, the cut between the tooth rows is some millimetres off",
-        fix="place skull landmarks by hand where a millimetre matters",
+        why="with shape alone, the cut between the tooth rows is some millimetres off",
+        fix="place skull landmarks by hand if a millimetre matters",
     )
 
 
@@ -260,8 +260,8 @@ def _not_separated_again() -> Finding:
         "jaws-not-separated-again",
         "the landmarks found separate the jaws less well than shape does: they are inconsistent",
         where="bone",
-        why="the cut between the tooth rows may be some millimetres off, and with it the landmarks "
-        "of teeth and jaw",
+        why="the cut between the tooth rows may be some millimetres off, and so may the "
+        "landmarks of teeth and jaw",
         fix="place the landmarks of the skull by hand and name the file under [landmarks]",
     )
 

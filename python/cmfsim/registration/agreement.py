@@ -138,11 +138,11 @@ def leave_one_out(
     if len(labels) != n or len(set(labels)) != n:
         raise LandmarkInputError(
             f"{len(labels)} names, {len(set(labels))} of them different, for {n} landmarks: give "
-            "one to each"
+            "each landmark its own name"
         )
     if n < LEAST_LANDMARKS:
         raise LandmarkInputError(
-            f"{n} landmarks: {LEAST_LANDMARKS} are needed for one to be judged by the others"
+            f"{n} landmarks: {LEAST_LANDMARKS} are needed to check each against the others"
         )
     about = s - s.mean(axis=0)
     about = about / np.linalg.norm(about, axis=1).max()
@@ -153,8 +153,8 @@ def leave_one_out(
     if freedom.min() < LEAST_FREEDOM:
         name = labels[int(np.argmin(freedom))]
         raise LandmarkInputError(
-            f"without {name} the other {n - 1} landmarks lie in one plane and cannot judge it: "
-            "add some"
+            f"without {name} the other {n - 1} landmarks are in one plane and cannot be used to "
+            "check it: add more"
         )
     g = null @ np.linalg.solve(null.T @ kernel @ null, null.T)
     error = (g @ (y - y.mean(axis=0))) / np.diag(g)[:, None]

@@ -169,8 +169,8 @@ def _spelling(keys: Mapping[str, Mapping[str, str]], shared: Iterable[str]) -> l
             "landmark-spelling",
             f"{len(different)} labels are spelled differently: {_listed(different)}",
             where="landmarks",
-            why="they are taken as the same landmarks",
-            fix="spell them alike in both files",
+            why="they are treated as the same landmarks",
+            fix="use the same spelling in both files",
         )
     ]
 
@@ -190,7 +190,7 @@ def _extra(keys: Mapping[str, Mapping[str, str]], *, strict: bool) -> list[Findi
                 what,
                 where=f"landmarks of the {name}",
                 why="they are not used",
-                fix=f"if they should be used, place them in the {other} as well",
+                fix=f"to use them, place them in the {other} as well",
             )
         )
     return findings
@@ -233,7 +233,7 @@ def _check_sides(names: tuple[str, ...], source: Floats, target: Floats) -> None
         every = len(swapped) == n_pairs and n_pairs > 1
         raise LandmarkInputError(
             f"left and right are swapped {where} in {_listed(swapped)}: swap the labels _L and _R"
-            + ("; or all of it is mirrored: export it again" if every else " of these")
+            + ("; if the whole head is mirrored, export it again" if every else " of these")
         )
     mirror = np.array([-1.0, 1.0, 1.0])
     try:

@@ -112,6 +112,7 @@ def inversion_finding(tensors: MassTensors, displacements: ArrayLike) -> tuple[i
         f"{ratios[worst]:.2g} of its volume",
         where=f"({x:.1f}, {y:.1f}, {z:.1f}) mm before the operation",
         why="tissue cannot turn inside out: forces and displacements around these tets are wrong",
-        fix="a smaller motion, or larger tets where bones squeeze a thin layer; instead of "
-        'kinematics = "corotational" also "hyperelastic", which resists inversion longer',
+        fix="use a smaller motion, or larger tets where bones squeeze a thin layer; if "
+        'kinematics is "corotational", also try "hyperelastic", which resists inversion '
+        "longer",
     )

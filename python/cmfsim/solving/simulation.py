@@ -263,7 +263,7 @@ def _contact_findings(solution: Solution) -> list[dict[str, str]]:
             f"{solution.contact_gap:.1e} mm and nodes {solution.contact_unbalanced:.1e} mm out of "
             "balance",
             where="contact",
-            why="this exceeds the tolerance, though it is too small to see on a face",
+            why="this exceeds the tolerance, but is too small to be visible in the face",
             fix="allow more contact_iterations or a larger contact_tolerance, or smooth the "
             "surface",
         )
@@ -274,8 +274,9 @@ def _contact_findings(solution: Solution) -> list[dict[str, str]]:
             f"one-sided contact stopped after {solution.touching_rounds} rounds with tissue "
             f"{solution.penetration:.1e} mm deep in other tissue or bone",
             where="contact",
-            why="further rounds might have changed what touches",
-            fix="look at the lips in the result; a smaller motion or a smoother surface converges",
+            why="further rounds might change which nodes are in contact",
+            fix="check the lips in the result; a smaller motion or a smoother surface is more "
+            "likely to converge",
         )
         findings.append(told(found))
     return findings

@@ -74,7 +74,7 @@ def study_table(report: StudyReport) -> ErrorTable:
     patients = [outcome for outcome in report.outcomes if outcome.evaluation]
     if not patients:
         raise CaseInputError(
-            f"{report.cohort.name}: no case was compared with the face after its operation"
+            f"{report.cohort.name}: no case was compared with its post-operative face"
         )
     for outcome in patients:
         found = {**outcome.evaluation["models"], NO_CHANGE: outcome.evaluation["no_change"]}

@@ -114,7 +114,7 @@ def surface_of_level(
     values = level.single
     low, high = block_of(values > 0.0)
     if not (high > low).all():
-        raise CaseInputError(f"{name!r} has no voxel inside: its surface would be empty")
+        raise CaseInputError(f"{name!r} has no voxel inside, so its surface would be empty")
     measure = third_party("skimage.measure", "surfaces of levels are made", "imaging")
     # Only the block that holds the piece, with a border of outside, so that the surface closes.
     low = np.maximum(low - 1, 0)
@@ -175,7 +175,7 @@ def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> 
     inside = segment.level.values > 0.0
     first, past = block_of(inside)
     if not (past > first).all():
-        raise CaseInputError(f"{segment.name!r} has no voxel inside: its surface would be empty")
+        raise CaseInputError(f"{segment.name!r} has no voxel inside, so its surface would be empty")
     # A border that the blur cannot reach across, so that the surface closes within the block.
     rim = np.ceil(BLUR_REACH * sigma).astype(int) + 2
     low, high = first - rim, past + rim

@@ -67,7 +67,7 @@ class Anatomy(Frozen):
                 and np.array_equal(level.spacing, self.skin.spacing)
             )
             if not same:
-                raise CaseInputError(f"{name} lies on another grid than the skin")
+                raise CaseInputError(f"{name} is not on the same grid as the skin")
         object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))
         object.__setattr__(self, "surfaces", MappingProxyType(dict(self.surfaces)))
 

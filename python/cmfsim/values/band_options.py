@@ -55,11 +55,11 @@ class BandOptions:
         for model in models:
             if found.model != model:
                 raise CalibrationError(
-                    f"the calibration is of model {found.model}, and the prediction of {model}: "
-                    f"predict with --model {found.model}, or calibrate with {model}"
+                    f"the calibration is for model {found.model}, but the prediction uses "
+                    f"{model}: predict with --model {found.model}, or calibrate with {model}"
                 )
         if found.coverage is not None and not math.isclose(found.coverage, self.coverage):
             raise CalibrationError(
-                f"the calibration is for a coverage of {found.coverage:g}, and {self.coverage:g} "
-                "is asked for"
+                f"the calibration is for a coverage of {found.coverage:g}, but {self.coverage:g} "
+                "was requested"
             )

@@ -101,7 +101,7 @@ class CalibrationCase:
             if not (math.isfinite(value) and value >= 0.0):
                 raise CalibrationError(
                     f"score of {region!r} in case {self.case!r} is {value!r}: a finite number "
-                    "from 0 on is needed; leave out regions that were not compared"
+                    "from 0 on is needed; omit regions that were not compared"
                 )
         object.__setattr__(self, "scores", MappingProxyType(dict(self.scores)))
 
@@ -138,7 +138,7 @@ class Calibration:
     def __post_init__(self) -> None:
         check_one_of("model", self.model, MODELS)
         if not self.cases:
-            raise CalibrationError("a calibration needs at least one case: it has none")
+            raise CalibrationError("a calibration needs at least one case, but it has none")
         seen: set[str] = set()
         for case in self.cases:
             if case.case in seen:

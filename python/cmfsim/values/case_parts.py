@@ -313,7 +313,7 @@ class CaseMotion(Frozen):
         words = ["typed in RAS"] if self.frame == "RAS" else []
         turns = self.matrix is not None and not np.array_equal(self.matrix[:3, :3], np.eye(3))
         if turns and self.centre is None:
-            words.append("turned about the origin of the coordinates: no centre is given")
+            words.append("rotated about the origin of the coordinates, because no centre is given")
         return "; ".join(words)
 
 
@@ -391,9 +391,9 @@ class CasePostoperative:
 
     def __post_init__(self) -> None:
         if self.image is not None and (self.skin is not None or self.bones):
-            raise CaseInputError("after the operation there are surfaces or an image, not both")
+            raise CaseInputError("post-operative data are either surfaces or an image, not both")
         if self.image is None and self.skin is None and not self.bones:
-            raise CaseInputError("after the operation there is a skin, an image, or a bone")
+            raise CaseInputError("post-operative data need a skin, an image or a bone")
         check_one_of("units", self.units, tuple(UNITS))
         if self.frame is not None:
             check_one_of("frame", self.frame, FRAMES)

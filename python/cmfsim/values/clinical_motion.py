@@ -207,7 +207,7 @@ def clinical_motion(
     wx, wy, wz = (turn.angle * turn.axis).tolist()
     point, place = _reference(segment, landmarks or {}, points)
     if point is None and centre is not None:
-        point, place = np.asarray(centre, dtype=np.float64), "centre of the turn"
+        point, place = np.asarray(centre, dtype=np.float64), "centre of rotation"
     if point is None and turn.angle > NOTHING:
         point, place = np.zeros(3), "origin of the coordinates (no landmark or surface is known)"
     at = np.zeros(3) if point is None else point

@@ -79,7 +79,9 @@ def rigid_motion(
     # The largest component first: a length below 1e-154 would underflow when squared.
     largest = float(np.abs(k).max())
     if largest == 0.0:
-        raise BoundaryInputError("axis is (0, 0, 0): give the direction of the axis, any length")
+        raise BoundaryInputError(
+            "axis is (0, 0, 0): give the direction of the axis; any length above 0 is allowed"
+        )
     k = k / largest
     k = k / math.sqrt(float(k @ k))
     sine, cosine = _sine_cosine(theta)

@@ -248,7 +248,7 @@ class Scene(Frozen):
         for name, segment in self.segments.items():
             if name not in plan:
                 raise CaseInputError(
-                    f"plan lacks segment {name!r}: give the identity matrix if it stays"
+                    f"plan lacks segment {name!r}: give the identity matrix if it does not move"
                 )
             motion = plan[name]
             if isinstance(motion, MovedSurface):

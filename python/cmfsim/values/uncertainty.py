@@ -80,16 +80,16 @@ ADDED = (
 # What no derivative gives, and what stands for it.
 NOT_COVERED = (
     (
-        "bilateral or unilateral contact, and the extent of the sliding region: discrete choices; "
-        "predict again with the other one to see its effect"
+        "bilateral or unilateral contact, and the extent of the sliding region: these are "
+        "discrete choices; predict again with the other one to see its effect"
     ),
     (
-        "errors of single landmarks: cmfsim sensitivity draws them; the muscle fraction and "
-        "direction stand for them here"
+        "errors of single landmarks: cmfsim sensitivity draws them; here, the muscle fraction "
+        "and direction represent them"
     ),
     (
-        "segmentation threshold of bone, contact of the lips, and how the form of the model errs "
-        "more in one place than in another: only a calibration shows their effect"
+        "segmentation threshold of bone, contact of the lips, and errors of the model's form "
+        "that are larger in one place than in another: only a calibration shows their effect"
     ),
 )
 

@@ -157,7 +157,7 @@ def test_view_says_what_it_cannot_show(folder, tmp_path, capsys, monkeypatch):
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     for what, said in [
         (tmp_path / "none", "no such file"),
-        (tmp_path, "nothing of cmfsim"),
+        (tmp_path, "nothing to display"),
         (tmp_path / "a.txt", r"\.stl"),
         (tmp_path / "other.npz", "neither a scene nor a result"),
     ]:

@@ -57,8 +57,8 @@ _EXCHANGED_NAMES = Finding.note(
     "the parts called superficial lie behind and inside those called deep: the atlas seems to have "
     "exchanged them",
     where="masseter_superficial, masseter_deep (FMA49001 to FMA49005)",
-    why="only the names are affected: each keeps its own place and direction",
-    fix="keep it in mind where a name is read as anatomy",
+    why="only the names are affected: each part keeps its position and direction",
+    fix="remember this when you interpret the names anatomically",
 )
 
 
@@ -188,8 +188,10 @@ def _verified(folder: Path, *, must_be_known: bool) -> list[Finding]:
     what = f"{len(other)} of {len(HASHES)} files do not have the known SHA-256 hashes: {named}"
     fix = f"download them again from {WHERE}"
     if must_be_known:
-        raise CaseInputError(f"{folder.name}: {what}; {fix}, or import with verification off")
-    why = "another release has other coordinates, and files may have been damaged"
+        raise CaseInputError(
+            f"{folder.name}: {what}; {fix}, or import without verification (--any-files)"
+        )
+    why = "other releases have different coordinates, and files may have been damaged"
     return [Finding.warning("bodyparts3d-other-file", what, where=folder.name, why=why, fix=fix)]
 
 
@@ -210,7 +212,7 @@ def _part(folder: Path, concept: str) -> _Part:
                 where=concept,
                 why="generalised winding numbers bridge small gaps; the edge of the muscle is "
                 "blurred",
-                fix="look at the muscle; repair it by hand if it matters",
+                fix="check the muscle; repair it by hand if it is important",
             ),
         )
     return _Part(concept, raw, surface, repaired.volume, is_sound, findings)
@@ -237,7 +239,7 @@ def _both_sides(
         f"mirrored from the {sides[0]} one ({good.concept}: {good.volume:.0f} mm³)",
         where=f"{pair.name}_{'R' if left_is_better else 'L'}",
         why="part of it is missing from its file",
-        fix="look at the muscle; nothing to do",
+        fix="nothing to do; check the muscle",
     )
     surfaces = (good.surface, mirrored) if left_is_better else (mirrored, good.surface)
     return surfaces, [finding]

@@ -157,7 +157,7 @@ def _kept(found: list[Floats]) -> tuple[Floats, ...]:
     lines = tuple(line for line in found if len(line) >= LEAST_POINTS)
     if len(lines) < 2:
         raise MeshInputError(
-            f"{len(lines)} fibre lines meet two faces of the muscle: two are needed; is it "
-            "closed, and the normal that of the sheet?"
+            f"{len(lines)} fibre lines meet two faces of the muscle: two are needed; check that "
+            "it is closed, and that the normal is that of the sheet"
         )
     return lines

@@ -212,11 +212,12 @@ def missing_landmarks(
             f"{len(missing)} of the template's {len(template.landmarks)} landmarks are missing: "
             f"{listed}; muscles are placed by the other {len(used)}",
             where=where,
-            why=f"fewer than {FEW_LANDMARKS} scale and turn the muscles, but do not shape them"
+            why=f"fewer than {FEW_LANDMARKS} landmarks scale and rotate the muscles, but do not "
+            "fit their shape"
             if few
-            else "muscles near them follow their neighbours; with six landmarks in all, well "
-            "spread, the predicted skin changes by about 0.3 mm",
-            fix="place them, or take a homogeneous model",
+            else "muscles near the missing landmarks follow their neighbours; with only six "
+            "landmarks, well spread, the predicted skin changes by about 0.3 mm",
+            fix="place them, or use a homogeneous model",
         ),
     )
 
@@ -226,7 +227,7 @@ def _agreement(matched: LandmarkMatch) -> tuple[LandmarkAgreement | None, list[F
     try:
         left_out = leave_one_out(matched.source, matched.target, matched.names)
     except LandmarkError as error:
-        what = f"no landmark can be judged by the others: {error}"
+        what = f"landmarks cannot be compared with one another: {error}"
         why = "a misplaced landmark would go unnoticed"
         finding = Finding.note(
             "template-landmarks-few", what, where="landmarks", why=why, fix="place more"
@@ -241,8 +242,8 @@ def _agreement(matched: LandmarkMatch) -> tuple[LandmarkAgreement | None, list[F
         "template-landmarks-disagree",
         f"{len(away)} landmarks are far from where the others place them: {listed}",
         where="landmarks",
-        why="each pulls the muscles near it along, and makes its neighbours look misplaced",
-        fix="look at the first in both heads; place it again, or leave it out, and morph again",
+        why="each pulls nearby muscles along, and makes its neighbours look misplaced",
+        fix="check the first one in both heads; place it again or omit it, and morph again",
     )
     return left_out, [finding]
 
@@ -282,5 +283,5 @@ def _fold_finding(folds: Mapping[str, int], worst: tuple[float, str, Floats]) ->
         f"severely in {name} (Jacobian {smallest:.2g})",
         where=f"template, at ({where}) mm",
         why="muscles overlap themselves there, and their fibres point in wrong directions",
-        fix="look at the landmarks near there, or smooth the map",
+        fix="check the landmarks nearby, or smooth the map",
     )

@@ -284,7 +284,7 @@ def check_output(case: Case, is_written: Callable[[str], bool] = is_model_file) 
             continue
         if path.samefile(written):
             raise CaseInputError(
-                f"{path}: the results would replace this input; give another output folder"
+                f"{path}: the results would replace this input; choose another output folder"
             )
 
 

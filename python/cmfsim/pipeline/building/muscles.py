@@ -53,7 +53,7 @@ def placed_muscles(
     if not skull:
         raise LandmarkInputError(
             f"{name}: muscles are placed from skull landmarks, and the case has none: add "
-            "[landmarks] skull, or take a homogeneous model"
+            "[landmarks] skull, or use a homogeneous model"
         )
     begun = time.perf_counter()
     muscles = MuscleTemplate.load(given.template).morph(skull, smoothing=given.smoothing)

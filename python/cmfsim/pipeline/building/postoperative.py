@@ -76,7 +76,8 @@ def read_postoperative(case: Case) -> Postoperative:
     given = case.postoperative
     if given is None:
         raise CaseInputError(
-            f"{case.file.name}: there is nothing to compare with: add [postoperative] skin or image"
+            f"{case.file.name}: the case has nothing to compare with: add [postoperative] skin "
+            "or image"
         )
     findings: list[Finding] = []
     landmarks: dict[str, Floats] = {}
@@ -130,9 +131,9 @@ def _laid_on(case: Case, bones: Mapping[str, SurfaceData]) -> Floats:
     fit = icp(after, still, initial=start, trim=TRIM, max_iterations=MOST_STEPS)
     if fit.rms > LARGEST_RMS:
         raise RegistrationError(
-            f"{name} after the operation lies {fit.rms:.1f} mm rms from that before it, where it "
-            f"fits best (allowed {LARGEST_RMS:g} mm): align the surfaces yourself, by the skull "
-            "above the jaws, and write aligned = true"
+            f"{name} after the operation is {fit.rms:.1f} mm rms from that before it at the best "
+            f"fit (allowed {LARGEST_RMS:g} mm): align the surfaces yourself by the skull above "
+            "the jaws, and write aligned = true"
         )
     _log.info("%s after the operation aligned with the one before: %.2f mm rms", name, fit.rms)
     return fit.matrix

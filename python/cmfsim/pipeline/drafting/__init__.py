@@ -91,8 +91,8 @@ def _drafted(
         reasons += [f"{image.label}: {image.error}" for image in found.images if image.error]
         more = f" ({'; '.join(reasons[:5])})" if reasons else ""
         raise CaseInputError(
-            f"{folder}: holds neither a CT nor surfaces that can be read{more}. Looked for: DICOM, "
-            "NRRD, NIfTI, MetaImage, STL, PLY, OBJ, VTP, VTK, .seg.nrrd, .mrml and .mrb"
+            f"{folder}: contains neither a CT nor surfaces that can be read{more}. Looked for: "
+            "DICOM, NRRD, NIfTI, MetaImage, STL, PLY, OBJ, VTP, VTK, .seg.nrrd, .mrml and .mrb"
         )
-    progress("deciding what each file is")
+    progress("identifying the files")
     return draft_case(found, unpacked, folder.resolve().name or "case")

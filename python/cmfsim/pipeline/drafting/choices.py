@@ -222,6 +222,6 @@ def _choose_frame(marks: Marks, box: Floats | None) -> None:
         marks.frame = "LPS" if fits["LPS"] else "RAS"
         return
     marks.questions["frame"] = (
-        f"{names}: states no frame, and lies in the head's box either way: which is it?",
+        f"{names}: states no frame, and is inside the head's box either way: which frame is it?",
         ('"LPS": x to the patient\'s left, y to the back', '"RAS": x to the right, y to the front'),
     )

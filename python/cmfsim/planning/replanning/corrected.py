@@ -87,7 +87,7 @@ def corrected_planning(
     places, distances, errors = [], [], []
     for number, exact in enumerate(_solved(bare, drawn)):
         if progress is not None:
-            progress(f"solving plans nearby to correct the operator ({number + 1} of {plans})")
+            progress(f"solving nearby plans to correct the operator ({number + 1} of {plans})")
         if exact is not None:
             places.append(numbers.of(drawn[number]))
             distances.append(plan_distance(bare, drawn[number]))

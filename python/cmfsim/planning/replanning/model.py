@@ -198,11 +198,11 @@ def _check_scene(scene: Scene) -> None:
     """Refuses a scene of which no product gives the face."""
     if scene.options.kinematics != "linear":
         raise CaseInputError(
-            f"the case has {scene.options.kinematics} kinematics, in which no product of a matrix "
-            'gives the face: set kinematics = "linear", or predict each plan'
+            f"the case has {scene.options.kinematics} kinematics, for which the face is not a "
+            'matrix product: set kinematics = "linear", or predict each plan'
         )
     if not scene.segments:
-        raise CaseInputError("no segment of bone moves: add an osteotomy or a plan to the case")
+        raise CaseInputError("no bone segment moves: add an osteotomy or a plan to the case")
     for name, motion in scene.plan.items():
         if isinstance(motion, MovedSurface) or np.shape(motion) != (4, 4):
             raise CaseInputError(

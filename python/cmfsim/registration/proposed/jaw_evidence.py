@@ -92,14 +92,14 @@ def _impossible(sites: Mapping[str, Floats], volume: float, size: float) -> Iter
     distance = jaw_distance({n: p for n, p in sites.items() if not n.startswith("_")})
     if distance > FAR_JAW:
         yield (
-            f"its sites lie {size * distance:.0f} mm from those of a closed mouth (up to "
+            f"its sites are {size * distance:.0f} mm from those of a closed mouth (up to "
             f"{size * FAR_JAW:.0f} mm for an open one)"
         )
     opening = _opening(sites)
     if opening < -DEEPEST_BITE:
-        yield f"its incisors stand {-size * opening:.0f} mm above the edge of the upper ones"
+        yield f"its incisors are {-size * opening:.0f} mm above the edge of the upper ones"
     elif opening > WIDEST:
-        yield f"its incisors stand {size * opening:.0f} mm below the upper ones"
+        yield f"its incisors are {size * opening:.0f} mm below the upper ones"
     low, high = POSSIBLE_VOLUMES
     if not low <= volume <= high:
         yield (
@@ -128,9 +128,7 @@ def _doubts(
         )
     if left_out:
         worst = max(left_out, key=lambda name: left_out[name])
-        yield (
-            f"sites of the jaw do not fit one another ({worst} by {size * left_out[worst]:.0f} mm)"
-        )
+        yield (f"sites of the jaw are inconsistent ({worst} by {size * left_out[worst]:.0f} mm)")
 
 
 def _opening(sites: Mapping[str, Floats]) -> float:

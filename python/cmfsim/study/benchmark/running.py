@@ -126,8 +126,9 @@ def run_benchmark(
     pending = population.named(PENDING)
     if pending:
         raise CaseInputError(
-            f"{', '.join(pending[:5])}{'…' if len(pending) > 5 else ''}: not made yet; run cmfsim "
-            "virtual-patients --count again, so that all methods are scored on the same patients"
+            f"{', '.join(pending[:5])}{'…' if len(pending) > 5 else ''}: not yet made; run "
+            "cmfsim virtual-patients --count again, so that all methods are scored on the same "
+            "patients"
         )
     patients = patients_of(place, population, [part])
     if not patients:
@@ -135,8 +136,8 @@ def run_benchmark(
     predictions = place / PREDICTIONS
     if part in band_parts:
         raise CaseInputError(
-            f"the part {part!r} is scored, and bands are calibrated on it, which proves "
-            "nothing; score another part, or name other band_parts"
+            f"the part {part!r} would be used both for scoring and for calibrating the bands, "
+            "which proves nothing; score another part, or choose other band_parts"
         )
     calibrating = patients_of(place, population, band_parts)
     jobs = _jobs(patients, predictions, entries, band)
@@ -146,7 +147,7 @@ def run_benchmark(
         learned_entries(patients_of(place, population, [TRAIN]), patients, predictions)
     methods = _methods(predictions)
     if not methods:
-        raise CaseInputError(f"{predictions}: no method has a folder there (docs/benchmark.md)")
+        raise CaseInputError(f"{predictions}: contains no folder of a method (docs/benchmark.md)")
     results = [_result(predictions, method, patients, calibrating) for method in methods]
     table = BenchmarkTable(
         part,

@@ -91,8 +91,8 @@ class SkinPrediction:
         places = as_rows("skin", skin, 3)
         if len(places) != len(self.vertices):
             raise CaseInputError(
-                f"{len(self.vertices)} vertices, but the patient's skin.ply has {len(places)}: was "
-                "the population made again, with another seed or resolution?"
+                f"{len(self.vertices)} vertices, but the patient's skin.ply has {len(places)}: "
+                "check whether the population was made again with another seed or resolution"
             )
         away = np.linalg.norm(self.vertices - places, axis=1)
         bad = np.flatnonzero(away > SAME_PLACE)
