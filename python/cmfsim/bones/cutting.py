@@ -95,7 +95,7 @@ def cut_bones(
     bones : mapping of str to ImageData
         Levels (positive inside) on one grid: "cranium" and "mandible" for the standard procedures.
     procedures : sequence of Procedure, or mapping of procedure name to options
-        Standard ones are made from top to bottom, then the others in their order.
+        Standard procedures are applied from top to bottom, then the others in their order.
     landmarks : mapping of str to (3,) float64, mm, optional
         Skull landmarks, LPS; needed where procedures are given by name.
     options : CutOptions, optional
@@ -117,7 +117,7 @@ def cut_bones(
     -----
     The level of a piece is the minimum of the bone's level and the planes' signed distances, and
     that of the rest the minimum of the bone's level and their negative: no voxel is lost or counted
-    twice, and the cut lies on the plane to a fraction of a voxel.
+    twice, and the cut is on the plane to a fraction of a voxel.
 
     Examples
     --------
@@ -166,7 +166,7 @@ def cut_bones(
 def segments_from_surfaces(
     levels: Mapping[str, ImageData], surfaces: Mapping[str, SurfaceData]
 ) -> tuple[BoneSegment, ...]:
-    """Bone segments from surfaces that are given: nothing is cut.
+    """Bone segments from given surfaces; nothing is cut.
 
     Parameters
     ----------
@@ -287,7 +287,7 @@ def _fragment_findings(
     if moved:
         yield Finding.note(
             "osteotomy-crumbs",
-            f"fragments were separated by the cut from {names[0]!r}: {len(moved)}, "
+            f"fragments that the cut separated from {names[0]!r}: {len(moved)}, "
             f"{sum(moved):.0f} mm³ in all; they stay with {names[1]!r}",
             where=kind,
             why="they would move with a bone to which they are not connected",

@@ -44,11 +44,12 @@ class MatchOptions:
         The search also starts this far to each side along each axis, for segments that moved far
         enough to be matched to neighbouring bone; 0: only from the place before the operation.
     max_angle : float, degrees
-        Between normals of partners: prevents matches of the inner side of a bone to its outer side.
+        Largest angle between normals of partners: prevents matching the inner to the outer side of
+        a bone.
     max_rms : float, mm
-        Of the partners at the end; a worse fit is an error.
+        RMS distance of the partners at the end; a worse fit is an error.
     least_share : float
-        Of the vertices that must have a partner at the end.
+        Share of the vertices that must have a partner at the end.
 
     Raises
     ------

@@ -42,7 +42,7 @@ Choice: TypeAlias = ArrayLike | str | None
 
 @dataclass(frozen=True, eq=False)
 class SkinComparison:
-    """How far a predicted skin lies from the post-operative one.
+    """Distances of a predicted skin from the post-operative one.
 
     Attributes
     ----------
@@ -58,14 +58,14 @@ class SkinComparison:
     statistics : DistanceStatistics
         From the prediction to the post-operative skin.
     back_signed : (b,) float64, mm
-        The other way: distance of post-operative vertices from their partners on the prediction,
-        with the same sign: negative where the prediction lies behind.
+        The other direction: distance of post-operative vertices from their partners on the
+        prediction, with the same sign: negative where the prediction lies behind.
     back_vertices : (b,) uint32
         Those vertices.
     backward : DistanceStatistics or None
         Of `back_signed`; None if no post-operative vertex faces the evaluated part.
     symmetric : DistanceStatistics or None
-        Of both directions, each with half the weight.
+        Of both directions with equal weight.
     regions : mapping of str to DistanceStatistics
         From the prediction to the post-operative skin, by region; regions without an evaluated
         vertex are left out.
@@ -76,9 +76,10 @@ class SkinComparison:
     n_masked : int
         Vertices of the prediction outside the mask.
     n_border, n_far : int
-        Left out: partner on the border of the post-operative skin; further away than the limit.
+        Excluded vertices: with a partner on the border of the post-operative skin; with a partner
+        beyond the limit.
     back_border, back_far : int
-        The same for the way back.
+        The same in the other direction.
     findings : tuple of Finding
     """
 
@@ -123,12 +124,12 @@ class SkinComparison:
 
     @property
     def p90(self) -> float:
-        """|Distance| that nine tenths of the vertices do not pass, mm."""
+        """90th percentile of |distance|, mm."""
         return self.statistics.p90
 
     @property
     def p95(self) -> float:
-        """The same for 95 %, mm."""
+        """95th percentile of |distance|, mm."""
         return self.statistics.p95
 
     @property
@@ -212,25 +213,25 @@ def compare_skins(
     Parameters
     ----------
     simulated, postoperative : SurfaceData or Surface
-        Skins in one frame with outward normals; they may be open, at the neck for one.
+        Skins in one frame with outward normals; they may be open, for example at the neck.
     landmarks : (landmarks, landmarks), optional
         Of the simulated and of the post-operative skin: mappings of name to place, matched by name
         (`match_landmarks`), or (n, 3) arrays in one order, mm.
     method : str, optional
         "landmarks": a thin-plate spline through the landmarks carries the simulated skin near the
         post-operative one, and the point closest to the carried vertex is its partner (Kim et al.
-        2010, section 3.2). "closest": the point closest to the vertex itself. Default: the first
-        where there are landmarks.
+        2010, section 3.2). "closest": the point closest to the vertex itself. Default: the first if
+        there are landmarks.
     mask : (n,) bool, (k,) indices or "face", optional
         The vertices of the simulated skin to evaluate, such as those that the simulation could
         move; "face" takes the face by its landmarks. Default: all.
     regions : mapping of str to (n,) bool or (k,) indices, optional
-        Parts to be told apart. Default: `skin_regions` where the landmarks have their names.
+        Regions to report separately. Default: `skin_regions` if the landmarks have the usual names.
     exclude_borders : bool
-        Whether to leave out vertices whose partner lies on the border of the other skin: there it
-        ends, and the distance says where the scan was cut.
+        Whether to exclude vertices whose partner lies on the border of the other skin, where the
+        distance depends on where the scan was cut.
     max_distance : float, mm, optional
-        Leaves out, and counts, what is further apart. Default: nothing.
+        Vertices further apart are excluded and counted. Default: no limit.
 
     Returns
     -------

@@ -65,13 +65,13 @@ def skin_regions(
     points : (n, 3) float64, mm
         Vertices of a skin, in any frame.
     landmarks : mapping of str to (3,) float64, mm
-        The fourteen of `SKIN_LANDMARKS` on the same skin; others are left alone.
+        The fourteen of `SKIN_LANDMARKS` on the same skin; others are ignored.
 
     Returns
     -------
     dict of str to (n,) bool
         "face", "lower face", "nose", "upper lip", "lower lip", "chin", "left cheek", "right cheek".
-        All but the first two are apart from each other.
+        All but the first two are disjoint.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def skin_regions(
 def unmoved_regions(
     points: ArrayLike, landmarks: Mapping[str, ArrayLike]
 ) -> dict[str, NDArray[np.bool_]]:
-    """Which points of a skin lie where operations on the jaws move nothing.
+    """The points of a skin in regions that operations on the jaws do not move.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def unmoved_regions(
     Returns
     -------
     dict of str to (n,) bool
-        "forehead", "left temple", "right temple", apart from each other and from the face's.
+        "forehead", "left temple", "right temple", disjoint from each other and from the face.
 
     Raises
     ------

@@ -36,7 +36,7 @@ class PairedTest:
     n : int
         Pairs.
     n_equal : int
-        Pairs without a difference, which the test leaves out.
+        Pairs without a difference, which the test excludes.
     statistic : float
         The smaller sum of ranks.
     p : float
@@ -46,7 +46,7 @@ class PairedTest:
     effect : float
         Rank-biserial correlation, −1 (the first is larger in each pair) to 1 (smaller in each).
     caveat : str
-        What p does not say; to be printed with it.
+        The limits of p; to be printed with it.
     """
 
     by: str
@@ -81,7 +81,7 @@ def wilcoxon_test(first: ArrayLike, second: ArrayLike, *, by: str = "vertex") ->
     first, second : (n,) float64, mm
         Errors of two models at the same vertices, or mean errors of the same patients.
     by : str
-        "vertex" or "patient": which caveat belongs to the outcome.
+        "vertex" or "patient": decides the caveat of the outcome.
 
     Returns
     -------

@@ -45,7 +45,7 @@ class ErrorTable:
     patients, models, regions : tuple of str
         "whole" is the first region.
     cells : mapping of (patient, region, model) to DistanceStatistics
-        A region that a patient has no vertex in is absent, and so is a model that failed.
+        Regions in which a patient has no vertex are absent, and so are models that failed.
     """
 
     patients: tuple[str, ...]

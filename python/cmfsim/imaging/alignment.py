@@ -25,12 +25,12 @@ CLIPPED = (0.2, 99.8)
 
 @dataclass(frozen=True, eq=False)
 class VolumeAlignment:
-    """Where a volume lies in the frame of another.
+    """Position of a volume in the frame of another.
 
     Attributes
     ----------
     matrix : (4, 4) float64, mm
-        Takes places of the moving volume to the fixed one.
+        Maps points of the moving volume to the fixed one.
     information : float
         Mutual information of both over the mask at the end, nats.
     similarity : float
@@ -66,18 +66,18 @@ def register_volumes(
     initial: ArrayLike | None = None,
     options: AlignmentOptions | None = None,
 ) -> VolumeAlignment:
-    """The rigid motion that takes a moving volume onto a fixed one.
+    """The rigid motion that aligns a moving volume with a fixed one.
 
     Parameters
     ----------
     moving, fixed : ImageData
         Scans of one head; their values need not be in the same unit.
     mask : ImageData, optional
-        On the grid of `fixed`, not 0 where both show the same: the skull that the operation left
-        alone (`undeformed_mask`). Without it the whole of `fixed`, moved jaws and skin included,
-        has a say.
+        On the grid of `fixed`, not 0 where both show the same: the skull that the operation did not
+        change (`undeformed_mask`). Without it, all of `fixed` is used, including moved jaws and
+        skin.
     initial : (4, 4) float64, mm, optional
-        Rigid motion to start from; else both stay where their files say.
+        Rigid motion to start from; by default the positions stated in the files.
     options : AlignmentOptions, optional
 
     Returns
@@ -96,9 +96,9 @@ def register_volumes(
     Notes
     -----
     Mutual information after Mattes et al. (2003), by SimpleITK, from coarse to fine. The result is
-    the same for any number of threads. The step is scaled by the inertia of the mask: a turn
-    and a shift that move its points equally far count the same, without which the turn of a round
-    skull converges slowly.
+    the same for any number of threads. The step is scaled by the inertia of the mask: a turn and a
+    shift that move its points equally far count the same; otherwise the rotation of a round skull
+    would converge slowly.
 
     Examples
     --------

@@ -48,10 +48,10 @@ def segment_head(
     Parameters
     ----------
     image : ImageData
-        A CT in LPS; in HU, or in a scale that its histogram gives away (a finding says so).
+        A CT in LPS, in HU or in a scale that its histogram reveals (reported as a finding).
     options : SegmentOptions, optional
     landmarks : mapping of str to (3,) float64, mm, optional
-        Of the skull, LPS: they tell the mandible from the rest. Without them its shape does.
+        Of the skull, LPS. They separate the mandible from the rest; without them, its shape does.
     progress : callable, optional
         Called with the name of each stage: "grid", "metal", "skin", "bone", "jaw", "air".
 

@@ -24,7 +24,7 @@ def undeformed_mask(
     threshold: float = 250.0,
     margin: float = 4.0,
 ) -> ImageData:
-    """The skull above the jaws, which surgery of the jaws leaves alone, with a margin round it.
+    """A mask of the skull above the jaws, which jaw surgery does not change, with a margin.
 
     Parameters
     ----------
@@ -33,15 +33,15 @@ def undeformed_mask(
     landmarks : mapping of str to (3,) float64, mm
         Of the skull: "suborbital_L", "suborbital_R", "supraglenoid_L", "supraglenoid_R".
     threshold : float, HU
-        Bone lies above.
+        Bone is above this.
     margin : float, mm
         Round the bone: the metric needs both sides of its surface.
 
     Returns
     -------
     ImageData
-        uint8, 1 in the mask, on the grid of the image. For a Le Fort III or an operation of the
-        vault draw a mask by hand.
+        uint8, 1 in the mask, on the grid of the image. For a Le Fort III or an operation on the
+        vault, draw a mask by hand.
 
     Raises
     ------

@@ -76,7 +76,7 @@ TABLES = (
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A patient: what to read, where to cut, what moves, and how to solve.
+    """A patient: input files, cuts, plan and solver options.
 
     Attributes
     ----------
@@ -97,18 +97,18 @@ class Case:
     plan : mapping of str to CaseMotion
         Segments that it does not name stay.
     achieved : bool
-        The plan is what the operation achieved, read off the bones after it; `plan` is empty.
+        The plan is measured on the post-operative bones; `plan` is empty.
     node_kinds : mapping of str to plain values
         Options of the stage that classifies nodes.
     tissue : TissueData
         Fat: everywhere in a homogeneous model, between the muscles in the others.
     muscles : CaseMuscles or None
-        None leaves them out of what `cmfsim build` makes.
+        None: `cmfsim build` makes a model without muscles.
     solver : SolverOptions
     band : CaseBand
     postoperative : CasePostoperative or None
     note : str
-        What readers of its report should know, such as that the patient is made by code.
+        A remark for readers of the report, such as that the patient is synthetic.
     lines : mapping of str to int
         The line of each dotted key in the case file, for findings.
 
@@ -164,7 +164,7 @@ class Case:
         Raises
         ------
         FileNotFoundError
-            The case file does not exist. Files that it names are not looked for.
+            The case file does not exist. The files that it names are not checked.
         CaseError
             (also `ValueError`) Not TOML, an unknown key, a value of another type or out of range:
             with file, line and key.

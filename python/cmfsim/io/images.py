@@ -122,9 +122,9 @@ def read_image_file(path: str | os.PathLike[str], *, series: str | None = None) 
 
 
 def write_image(image: ImageData, path: str | os.PathLike[str]) -> None:
-    """Nothing; the image is in a file, whose name ends in .nrrd, .nii, .nii.gz or .mha.
+    """Writes an image to a file whose name ends in .nrrd, .nii, .nii.gz or .mha.
 
-    It is written under another name first, so that a failure leaves an older file whole.
+    It is written under another name first, so that a failure leaves an older file intact.
 
     Raises
     ------

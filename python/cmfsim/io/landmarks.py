@@ -79,7 +79,7 @@ def read_landmarks(path: str | os.PathLike[str], *, frame: str | None = None) ->
     path : path
     frame : str, optional
         "LPS" or "RAS", for a file that does not state its frame; a statement in the file wins.
-        Without both, the format's own rule holds and a warning is logged.
+        Without both, the rule of the format applies and a warning is logged.
 
     Returns
     -------
@@ -173,7 +173,7 @@ def write_landmarks(
 ) -> None:
     """Writes landmarks as a `.mrk.json` file of 3D Slicer, LPS mm.
 
-    An existing file is replaced in one step; `read_landmarks` gives the same numbers back.
+    An existing file is replaced in one step; `read_landmarks` returns the same numbers.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def write_landmarks(
         Ends in `.mrk.json`.
     landmarks : mapping of str to (3,) float64, mm
     descriptions : mapping of str to str, optional
-        What 3D Slicer shows with a point, by label.
+        Description that 3D Slicer shows with each point, by label.
 
     Raises
     ------

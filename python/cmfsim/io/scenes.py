@@ -62,7 +62,7 @@ TISSUE_TEXTS = ("kind", "law", "preset", "mixing")
 
 
 def read_scene(path: str | os.PathLike[str]) -> Scene:
-    """The scene in a file: one `.npz`, or a `.toml` beside its mesh and surfaces.
+    """The scene in a file: one `.npz`, or a `.toml` next to its mesh and surfaces.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def read_plan(path: str | os.PathLike[str], scene: Scene) -> dict[str, NDArray[A
         One table per segment under `plan`: `translation`, `angle` (degrees), `axis`, `centre`; or
         `matrix` (4 × 4); or `moved_surface` with `surface` (files beside this one).
     scene : Scene
-        Its segments are those that the plan may name; those that it leaves out are an error.
+        The plan must name all of its segments and no others.
 
     Returns
     -------

@@ -30,7 +30,7 @@ def signed_level(surface: SurfaceData, grid: ImageData) -> ImageData:
     Parameters
     ----------
     surface : SurfaceData
-        Closed; inside is where its winding number exceeds one half, so that overlapping parts and
+        Closed; points whose winding number exceeds one half are inside, so overlapping parts and
         small holes do no harm.
     grid : ImageData
         Its values are not used.
@@ -77,7 +77,7 @@ def anatomy_from_surfaces(
     bones : mapping of str to SurfaceData
         Closed, outward; they may overlap one another and the skin.
     spacing : float, mm
-        Of the grid; about a third of the edge length of the mesh to come.
+        Of the grid; about a third of the edge length of the later mesh.
 
     Returns
     -------

@@ -41,10 +41,11 @@ class MeshReport:
     worst : tuple of mapping
         The ten tets of smallest dihedral angle: `tet`, `min_dihedral` (degrees), `centroid` (mm).
     dropped_parts : int
-        Bodies too small to keep, and `dropped_volume` (mm³) their volume.
+        Bodies that were removed because they were too small; `dropped_volume` (mm³) is their
+        volume.
     dropped_volume : float, mm³
     dropped_tets : int
-        Poor tets at the surface that were left out.
+        Poor tets at the surface that were removed.
     """
 
     n_nodes: int
@@ -102,13 +103,13 @@ class MeshReport:
 
 
 def mesh_report(mesh: TetMesh, making: Mapping[str, Any] | None = None) -> MeshReport:
-    """The quality of a mesh, with what its making said where it is known.
+    """The quality of a mesh, with the figures of its creation if they are known.
 
     Parameters
     ----------
     mesh : TetMesh
     making : mapping, optional
-        What `_core.stuff_image` returns beside the mesh.
+        The values that `_core.stuff_image` returns together with the mesh.
 
     Returns
     -------

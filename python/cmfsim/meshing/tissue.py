@@ -40,7 +40,7 @@ class TissueRegion:
     lower, upper : float or None, mm
         Heights (S axis) that bound the region.
     foramen_radius : float, mm
-        Hollows behind openings up to this radius are no tissue.
+        Hollows behind openings up to this radius are not tissue.
 
     Examples
     --------
@@ -79,7 +79,7 @@ class TissueRegion:
 
 
 def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tuple[Finding, ...]]:
-    """The level image of the soft tissue in front of the posterior plane, and what was left out.
+    """The level image of the soft tissue in front of the posterior plane, and findings.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tup
     Raises
     ------
     MeshError
-        (also `ValueError`) Nothing of the head lies in the region.
+        (also `ValueError`) No part of the head is in the region.
 
     Examples
     --------

@@ -31,12 +31,12 @@ HALF_MOLAR = 5.0
 
 @dataclass(frozen=True)
 class DentalArches:
-    """The dental arches of a head, and the segments that bear them.
+    """The dental arches of a head, and the segments that carry them.
 
     Attributes
     ----------
     by_jaw : mapping of str to DentalArch
-        "upper" and "lower"; empty where neither landmarks nor teeth tell.
+        "upper" and "lower"; empty if neither landmarks nor teeth locate them.
     bearers : mapping of str to frozenset of int
         Of each jaw, the numbers of the segments that tissue slides on.
     findings : tuple of Finding
@@ -68,7 +68,7 @@ def dental_arches(
     Raises
     ------
     CaseError
-        (also `ValueError`) Landmarks that span no arch.
+        (also `ValueError`) Landmarks that do not span an arch.
 
     Examples
     --------

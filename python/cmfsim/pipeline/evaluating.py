@@ -47,7 +47,7 @@ WILCOXON_NOTE = (
 
 @dataclass(frozen=True, eq=False)
 class CaseEvaluation:
-    """How well models predict one patient.
+    """The comparison of models with one patient's outcome.
 
     Attributes
     ----------
@@ -55,14 +55,14 @@ class CaseEvaluation:
     postoperative : Postoperative
     comparison : ModelComparison
     key : str
-        Of everything that the result depends on: inputs, models, version.
+        A digest of everything on which the result depends: inputs, models, version.
     failed : mapping of str to str
-        Why a model has no prediction, by its name.
+        The reason why a model has no prediction, by its name.
     unmoved : SkinComparison or None
         The face before against the face after where nothing was operated on; None where the scans
         do not show it.
     thickness : ThicknessChange or None
-        The change of the soft tissue's thickness that was fitted there, where that was asked for.
+        The change of the soft tissue's thickness that was fitted there, if requested.
     fitted : ModelComparison or None
         The comparison with that change applied to every prediction, and to no change.
     notes : tuple of Finding
@@ -112,7 +112,7 @@ class CaseEvaluation:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What was noticed of the face after the operation, and of the comparison with it."""
+        """Findings on the post-operative face and on the comparison with it."""
         compared = [f for c in self.comparison.comparisons.values() for f in c.findings]
         return tuple(dict.fromkeys([*self.postoperative.findings, *self.notes, *compared]))
 
@@ -161,10 +161,10 @@ def evaluate(
     on_findings: OnFindings | None = None,
     fit_thickness: bool = False,
 ) -> CaseEvaluation:
-    """The predictions of several models for a case, compared with what came after.
+    """The predictions of several models for a case, compared with the post-operative face.
 
-    Errors are taken over the face where the case has skin landmarks before and after, else over
-    all of the skin (Kim et al. 2010, section 3.2).
+    Errors are computed over the face if the case has skin landmarks before and after, otherwise
+    over all of the skin (Kim et al. 2010, section 3.2).
 
     Parameters
     ----------

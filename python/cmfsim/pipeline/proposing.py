@@ -50,18 +50,18 @@ def propose_landmarks(
     *,
     templates: Sequence[TemplateHead] = (),
 ) -> ProposedLandmarks:
-    """The landmarks of a head without hand work: each site where its own definition holds.
+    """The landmarks of a head, found automatically by the definition of each site.
 
-    The head's plane of symmetry and the fit of a synthetic cranium give its pose; each site is
+    The head's plane of symmetry and the fit of a synthetic cranium give its pose. Each site is
     found in the views from front and side by its definition, on either side and independently of
-    the jaw's posture; heads whose landmarks are known correct the definitions' bias as far as the
-    head resembles them. It takes a few seconds.
+    the jaw's posture. Heads whose landmarks are known correct the bias of the definitions, as far
+    as the head resembles them. It takes a few seconds.
 
     Parameters
     ----------
     bones : mapping of str to SurfaceData
-        LPS mm, upright within about 30°. The lower jaw is what is called "mandible"; without one,
-        sites of the jaws are missing.
+        LPS mm, upright within about 30°. The lower jaw must be called "mandible"; without it, sites
+        of the jaws are missing.
     skin : SurfaceData, optional
         Without it, no landmark of the skin is found.
     templates : sequence of TemplateHead, optional
@@ -76,7 +76,7 @@ def propose_landmarks(
     Raises
     ------
     LandmarkError
-        (also `ValueError`) The bones show no face, or lie otherwise than LPS says.
+        (also `ValueError`) The bones show no face, or are not in LPS.
     CaseError
         scipy is missing.
 

@@ -37,7 +37,7 @@ class LandmarkMatch:
         As the source spells them, in its order.
     source, target : (n, 3) float64, mm
     findings : tuple of Finding
-        Landmarks that were left out, labels that are spelled differently.
+        Landmarks that were ignored, labels that are spelled differently.
     """
 
     names: tuple[str, ...]
@@ -60,7 +60,8 @@ def match_landmarks(
     """The landmarks that both sets have, in the order of the source.
 
     Labels match if they differ only in capitals, spaces, hyphens and underscores. Sides are
-    compared wherever the sets lie: a pair `…_L`, `…_R` swapped in one of them is an error.
+    compared in any position of the sets: a pair `…_L`, `…_R` that is swapped in one of them is an
+    error.
 
     Parameters
     ----------

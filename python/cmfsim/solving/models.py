@@ -73,7 +73,7 @@ def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
 def predict_patient(
     patient: PatientModel, model: str = "M+S", *, solver: StaticSolver | None = None
 ) -> Prediction:
-    """The face that a model predicts for a patient who is built already.
+    """The face that a model predicts for a patient who is already built.
 
     Parameters
     ----------
@@ -81,8 +81,8 @@ def predict_patient(
     model : str
         "H", "M", "H+S" or "M+S".
     solver : StaticSolver, optional
-        Of `model_scene(patient, model)`, whatever its plan, where one is made already: a new plan
-        then takes no factorisation.
+        Of `model_scene(patient, model)`, with any plan, if it already exists: a new plan then needs
+        no factorisation.
 
     Returns
     -------

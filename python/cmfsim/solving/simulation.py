@@ -45,7 +45,7 @@ def scene_solver(scene: Scene) -> StaticSolver:
     Raises
     ------
     MeshError, MaterialError, BoundaryError, ContactError, SolverError
-        (the input errors also `ValueError`) What the core finds wrong with the scene.
+        (the input errors also `ValueError`) A problem that the core finds in the scene.
 
     Examples
     --------
@@ -126,20 +126,20 @@ def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneRes
     ----------
     scene : Scene
     solver : StaticSolver, optional
-        Of this scene, whatever its plan, where `scene_solver` has made one already.
+        Of this scene, with any plan, if `scene_solver` has already made one.
 
     Returns
     -------
     SceneResult
-        Where large deformation leaves tets inverted, `summary["inverted_tets"]` counts them and
-        `summary["findings"]` says which is worst and what to do. In linear kinematics the count is
-        None: it would mean nothing there.
+        If large deformation leaves tets inverted, `summary["inverted_tets"]` counts them and
+        `summary["findings"]` states which is worst and what to do. In linear kinematics the count
+        is None, because it would have no meaning.
 
     Raises
     ------
     MeshError, MaterialError, BoundaryError, ContactError, SolverError
-        (the input errors also `ValueError`) What is wrong with the scene, or that the solution did
-        not converge and how far it came.
+        (the input errors also `ValueError`) The scene is invalid, or the solution did not converge;
+        the error states the figures reached.
 
     Examples
     --------

@@ -142,11 +142,11 @@ def detailed_surface(name: str, level: ImageData) -> SurfaceData | None:
 
 
 def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> SurfaceData:
-    """The surface that mucosa slides on: that of the bone without relief finer than tets resolve.
+    """The surface on which mucosa slides: the bone without relief finer than the tets.
 
     Tissue does not reach between teeth, and a node that slides over crowns and gaps flips between
-    their sides. So the signed distance from the bone is blurred (Gaussian) before its surface is
-    taken. Nodes keep their own distance from it where `gap` is "rest".
+    their sides. The signed distance from the bone is therefore blurred (Gaussian) before its
+    surface is extracted. Nodes keep their own distance from it if `gap` is "rest".
 
     Parameters
     ----------

@@ -12,12 +12,12 @@ __all__ = ["BandOptions"]
 
 @dataclass(frozen=True)
 class BandOptions:
-    """What a band is asked for.
+    """The options of a band.
 
     Attributes
     ----------
     coverage : float
-        Share of cases that are to lie within it, region by region: above 0, below 1.
+        Share of cases that should lie within it, region by region: above 0, below 1.
     calibration : Calibration or None
         None makes an uncalibrated band.
     group : str or None
@@ -38,7 +38,7 @@ class BandOptions:
             )
 
     def check(self, models: Sequence[str]) -> None:
-        """Refuses a calibration that is not of the models, or not for the coverage.
+        """Refuses a calibration that is not for these models or this coverage.
 
         Parameters
         ----------

@@ -326,7 +326,7 @@ class CaseMuscles:
     template : Path or str
         The folder of a template, or the name of one that comes with the package.
     smoothing : float
-        Of the thin-plate spline that carries the template to the patient; 0 meets every landmark.
+        Of the thin-plate spline that maps the template to the patient; 0 matches every landmark.
     preset : str
         Constants of fat and muscle.
     mixing : str

@@ -58,7 +58,7 @@ NUMBERED = re.compile(r"_\d+$")
 
 @dataclass(frozen=True, eq=False)
 class ClinicalMotion:
-    """How one segment moves, in a surgeon's numbers.
+    """The motion of one segment in clinical terms.
 
     Attributes
     ----------
@@ -68,13 +68,13 @@ class ClinicalMotion:
     pitch, yaw, roll : float, degrees
         Positive: front up, front to the left, left side up.
     point : (3,) float64, mm, LPS, or None
-        The point before the motion; None where a motion without a turn has the same numbers
+        The point before the motion; None if a motion without rotation has the same numbers
         everywhere.
     place : str
-        What lies there, such as "upper incisors (supradentale)".
+        Name of the point, such as "upper incisors (supradentale)".
     residual : float or None, mm
-        Of a motion given vertex by vertex: what the nearest rigid motion, which the numbers
-        describe, leaves of it (RMS over the vertices). None for a rigid motion.
+        For a motion given vertex by vertex: its deviation from the nearest rigid motion, which the
+        numbers describe (RMS over the vertices). None for a rigid motion.
     source : str
         Where the motion comes from and how it was understood; may be empty.
     """
@@ -156,7 +156,7 @@ def clinical_motion(
     centre: ArrayLike | None = None,
     source: str = "",
 ) -> ClinicalMotion:
-    """The motion of a segment in a surgeon's numbers, measured at its teeth where these are known.
+    """The motion of a segment in clinical terms, measured at its teeth if these are known.
 
     The point is that of the segment's landmark (maxilla and midface: supradentale; mandible and
     mandible_body: infradentale, else pogonion; chin: pogonion, else menton; rami: gonion); without
@@ -238,7 +238,7 @@ def planned_motion(
     shift: ArrayLike = (0.0, 0.0, 0.0),
     turn: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Floats:
-    """The rigid motion with a surgeon's numbers at a point: the inverse of `clinical_motion`.
+    """The rigid motion with given clinical numbers at a point: the inverse of `clinical_motion`.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ SHEET_DEPTH = 2.5
 
 @dataclass(frozen=True, eq=False)
 class DentalArch(Frozen):
-    """Where the teeth of one jaw stand.
+    """The position of the teeth of one jaw.
 
     Attributes
     ----------

@@ -171,7 +171,7 @@ class MuscleModuli:
 
 @dataclass(frozen=True)
 class TissueModuli:
-    """What differs from a preset's constants: fat, all muscles, single muscles.
+    """Moduli that differ from a preset: of fat, all muscles, or single muscles.
 
     Attributes
     ----------
@@ -179,12 +179,12 @@ class TissueModuli:
     muscle : MuscleModuli
         Of every muscle.
     muscles : mapping of str to MuscleModuli
-        Of single muscles, by name such as "masseter_L"; before those of `muscle`.
+        Of single muscles, by name such as "masseter_L"; they take precedence over `muscle`.
 
     Notes
     -----
-    Under prescribed displacements a linear model depends on ratios of moduli alone: all of them
-    scaled by one factor change no displacement.
+    Under prescribed displacements, a linear model depends only on ratios of moduli: scaling all of
+    them by one factor changes no displacement.
 
     Examples
     --------

@@ -164,7 +164,7 @@ def test_view_says_what_it_cannot_show(folder, tmp_path, capsys, monkeypatch):
         assert main(["view", str(what)]) == 2
         assert re.search(said, capsys.readouterr().err), what
     assert main(["view", str(folder), "--model", "H+S"]) == 2
-    assert "holds models H, M, M+S" in capsys.readouterr().err
+    assert "contains the models H, M, M+S" in capsys.readouterr().err
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     if os.name == "posix" and os.uname().sysname == "Linux":

@@ -117,7 +117,7 @@ def test_a_calibrated_band_has_the_factor_of_its_region(patient, plain, tmp_path
     [
         ({"model": "M"}, {}, "is for model M, but the prediction uses M\\+S"),
         ({"settings": {"contact": "unilateral"}}, {}, "contact is 'unilateral' there"),
-        ({"coverage": 0.8}, {}, "is for a coverage of 0.8, and 0.9 is asked for"),
+        ({"coverage": 0.8}, {}, "is for a coverage of 0.8, but 0.9 was requested"),
         ({}, {"coverage": 0.97}, "at least 33 calibration cases, and there are 19"),
         ({}, {"group": "g7"}, "has no group 'g7'; it has: 'g0', 'g1'"),
         ({}, {"group": "g1", "coverage": 0.95}, "region face: .* at least 19"),
@@ -174,7 +174,7 @@ def test_the_command_line_states_a_band_and_what_it_is_worth(
     assert main([*command, "--calibration", str(path), "-q"]) == 0
     text = capsys.readouterr().out
     assert "90 % by region, calibrated with calibration.json (made up)" in text
-    assert "n = 19, holds 77 to 98 % of further cases" in text
+    assert "n = 19, covers 77 to 98 % of further cases" in text
     assert read_prediction(output)["band"]["state"] == "calibrated"
     assert main([*command, "--band", "--json", "-q"]) == 0
     answer = json.loads(capsys.readouterr().out)

@@ -618,7 +618,7 @@ def test_the_error_is_stated_and_warned_of_beyond_what_was_tried(opened, errors,
     ) in state.inner_text()
     type_number(opened, "forwards", -28)
     until(opened, "document.querySelector('#error-state.warning')")
-    assert "farther than any plan that was tried" in state.inner_text()
+    assert "farther than any plan that was tested" in state.inner_text()
 
 
 def test_teeth_that_pass_through_each_other_are_warned_of(opened, planning):

@@ -37,13 +37,13 @@ class LipSeam:
     ----------
     surface : SurfaceData or None
         An open sheet from corner to corner of the mouth, from in front of the skin to a little past
-        the teeth; its normals look towards the upper lip. None where nothing shows where it is.
+        the teeth; its normals point towards the upper lip. None if it could not be located.
     source : str
         "gap" (the image shows the lips apart), "crease" (of the skin), "landmarks", "file", or
         "none".
     summary : mapping
-        What build.json states: source, width of the mouth, thickness of the lips, height of the gap
-        between them, and distances of the skin landmarks from the seam; mm.
+        The values for build.json: source, width of the mouth, thickness of the lips, height of the
+        gap between them, and distances of the skin landmarks from the seam; mm.
     findings : tuple of Finding
     """
 

@@ -86,11 +86,11 @@ def import_bodyparts3d(
     verify: bool = True,
     progress: Progress | None = None,
 ) -> MuscleTemplate:
-    """The template that the OBJ files of BodyParts3D 3.0 make: 65 muscles, bones and teeth.
+    """The template from the OBJ files of BodyParts3D 3.0: 65 muscles, bones and teeth.
 
-    Vertices in the same place are made one, debris is dropped, gaps are closed, and a muscle that
-    has lost a part on one side is mirrored from the other; each is a finding. Nothing is
-    downloaded: get the files from the repository that `WHERE` in this file names.
+    Coincident vertices are merged, debris is dropped, gaps are closed, and a muscle that lacks a
+    part on one side is mirrored from the other; each repair is a finding. Nothing is downloaded:
+    get the files from the repository that `WHERE` in this file names.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def import_bodyparts3d(
     verify : bool
         Whether files must have the known SHA-256 hashes; otherwise differences are warnings.
     progress : callable, optional
-        Is told what is read.
+        Called with the name of each file that is read.
 
     Returns
     -------

@@ -38,7 +38,7 @@ MOST_NAMES = 6
 
 
 def check_template(template: TemplateData | str | os.PathLike[str]) -> tuple[Finding, ...]:
-    """Everything that is wrong with a template, each with its place, reason and fix.
+    """All problems of a template, each with its place, reason and fix.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def check_template(template: TemplateData | str | os.PathLike[str]) -> tuple[Fin
     Returns
     -------
     tuple of Finding
-        Errors keep it from being used; warnings make its muscles doubtful.
+        Errors prevent its use; warnings make its muscles doubtful.
 
     Raises
     ------

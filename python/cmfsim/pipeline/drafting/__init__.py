@@ -29,16 +29,16 @@ def init_case(
     force: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> CaseDraft:
-    """Writes a `case.toml` for what lies in a folder, and states what each file was taken for.
+    """Writes a `case.toml` for the files in a folder, and states what each file was taken for.
 
     Parameters
     ----------
     path : path
         A folder, or a scene of 3D Slicer (`.mrml`, `.mrb`): its folder becomes the case's.
     force : bool
-        Whether a case file that is there is replaced.
+        Whether an existing case file is replaced.
     progress : callable
-        Called with what is being done.
+        Called with the name of each stage.
 
     Returns
     -------
@@ -47,9 +47,9 @@ def init_case(
     Raises
     ------
     FileNotFoundError
-        There is nothing of this name.
+        The path does not exist.
     CaseError
-        (also `ValueError`) A case file is there; nothing in the folder makes a case; several
+        (also `ValueError`) A case file exists already; the folder has no usable files; several
         scenes; a scene that is damaged, or whose transforms are not rigid.
 
     Examples

@@ -34,7 +34,7 @@ EXAMPLE = """# No plan was found. To move a segment, state how it moves, such as
 
 @dataclass
 class CaseDraft:
-    """A case file that was not written yet.
+    """A case file that has not been written yet.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class CaseDraft:
     questions : list of str
         What a person has to decide before the case can be used.
     files : dict of str to callable
-        What has to be written beside it, by path; each is called with the path.
+        Functions that write further files, by path; each is called with the path.
     """
 
     text: str = ""

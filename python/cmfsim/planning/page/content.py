@@ -57,7 +57,7 @@ class PageContent:
     arrays : mapping of str to array
         float32, float16 and uint32.
     findings : tuple of Finding
-        What was simplified or left out.
+        Findings on what was simplified or omitted.
     """
 
     values: Mapping[str, Any]
@@ -93,8 +93,8 @@ def page_content(
     Raises
     ------
     CaseError
-        (also `ValueError`) More nodes on the skin than a page can hold; fast-simplification is
-        missing where a surface has to be simplified.
+        (also `ValueError`) More nodes on the skin than a page can have; fast-simplification is
+        missing and a surface has to be simplified.
 
     Examples
     --------

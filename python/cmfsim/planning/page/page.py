@@ -50,8 +50,8 @@ def page_text(
     case_file : str
         The name of the case file in the command that solves a plan exactly.
     is_served : bool
-        Whether the page asks the program that served it for exact solutions; else it connects to
-        nothing.
+        Whether the page requests exact solutions from the program that serves it; otherwise it
+        makes no connection.
 
     Returns
     -------
@@ -111,7 +111,7 @@ def page_text(
 def write_planning_page(
     path: str | os.PathLike[str], content: PageContent, *, case_file: str = "case.toml"
 ) -> int:
-    """Writes a planning page, replacing an older one in one step; its size in bytes.
+    """The size in bytes of a planning page, written to a file in one step.
 
     Raises
     ------

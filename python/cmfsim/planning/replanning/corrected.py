@@ -37,18 +37,18 @@ def corrected_planning(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> PlanningModel:
-    """The planning model with its operator corrected by exact solutions, where that pays.
+    """The planning model with its operator corrected by exact solutions, if this lowers the error.
 
-    Plans are drawn as `expected_error` draws them, but others, and all from the whole range. What
-    the operator misses there is interpolated between them (`PlanCorrection`). The correction is
-    left out where it does not lower the error at plans that it was not fitted to.
+    Plans are drawn as in `expected_error`, but they are different plans and all from the whole
+    range. The error of the operator is interpolated between them (`PlanCorrection`). The correction
+    is not used if it does not lower the error at plans to which it was not fitted.
 
     Parameters
     ----------
     planning : PlanningModel
     plans : int
-        How many are solved exactly. Below 8 they tell nothing about the plans between them, and
-        nothing is corrected; 0 solves none.
+        Number of plans solved exactly. Fewer than 8 are not enough to interpolate, and nothing is
+        corrected; 0 solves none.
     shift : float, mm
     turn : float, degrees
         The range of the plans: along each axis, and about any axis.
@@ -59,7 +59,8 @@ def corrected_planning(
     Returns
     -------
     PlanningModel
-        The same model, unless tissue slides, enough plans could be solved, and correcting pays.
+        The same model, unless tissue slides, enough plans could be solved, and the correction
+        helps.
 
     Raises
     ------

@@ -49,7 +49,7 @@ class BenchmarkTable:
     ----------
     part : str
     patients : tuple of str
-        Who are scored.
+        The scored patients.
     without_truth : tuple of str
         Patients of the part whose truth could not be computed.
     results : tuple of MethodResult

@@ -317,7 +317,7 @@ def test_learning_never_sees_the_test(folder):
     """A patient in both is an error; the truth of the test part changes no prediction."""
     population = cmfsim.Population.load(folder)
     train, test = (patients_of(folder, population, [part]) for part in ("train", "test"))
-    with pytest.raises(CaseInputError, match="D003: in the training part"):
+    with pytest.raises(CaseInputError, match="D003: not predicted, because they are in"):
         learned_entries([*train, test[0]], test, folder / "predictions")
     learned_entries(train, test, folder / "predictions")
     files = sorted((folder / "predictions" / "pls").glob("*.npz"))
