@@ -1,4 +1,4 @@
-"""The options by which commands are asked for a band."""
+"""The command-line options for a band."""
 
 import argparse
 from pathlib import Path

@@ -9,7 +9,7 @@ __all__ = ["band_lines"]
 
 
 def band_lines(band: Mapping[str, Any] | None) -> list[str]:
-    """The band of a prediction, with what it is worth; nothing where there is none.
+    """The band of a prediction and its reliability; no lines if there is no band.
 
     Parameters
     ----------

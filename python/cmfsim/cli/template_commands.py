@@ -136,7 +136,7 @@ def show(options: argparse.Namespace) -> int:
 
 
 def _beside(output: Path, report: dict[str, Any]) -> dict[str, Any] | None:
-    """The report where it has a place: beside a folder's files, not in an archive."""
+    """The report, if it has a place: next to the files of a folder, not in an archive."""
     return None if output.suffix == ".npz" else report
 
 

@@ -22,7 +22,7 @@ MUSCLE_KEYS = ("muscles.young_along", "muscles.young_across", "muscles.poisson")
 
 
 def check_muscles(evidence: Evidence) -> Iterator[Finding]:
-    """Findings about the template of a case, and its landmarks beside the patient's."""
+    """Findings about the template of a case, and its landmarks compared with the patient's."""
     given = evidence.case.muscles
     if given is None:
         return

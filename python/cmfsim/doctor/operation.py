@@ -19,8 +19,8 @@ from cmfsim.values.finding import Finding
 
 __all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of"]
 
-# Depth by which a moved bone may pass the skin at rest before it is said, mm: skin goes with the
-# bone, and an ordinary advancement exceeds the thickness of tissue over the piriform rim.
+# Depth by which a moved bone may pass the undeformed skin before it is reported, mm: skin goes with
+# the bone, and an ordinary advancement exceeds the thickness of tissue over the piriform rim.
 THROUGH_SKIN = 2.0
 # How far outside a bone its neighbourhood is asked for tissue, mm.
 BESIDE_BONE = 0.5
@@ -168,7 +168,7 @@ def check_plan(
 
 
 def _check_frame(evidence: Evidence, name: str, matrix: Floats) -> Iterator[Finding]:
-    """Numbers without a frame beside surfaces that are not in LPS, which would be assumed."""
+    """Findings on numbers without a frame, read as LPS, if the surfaces are not in LPS."""
     case, read = evidence.case, evidence.transforms.get(name)
     stated = case.plan[name].frame is not None
     if read is not None:
@@ -233,7 +233,7 @@ def _check_through_skin(
 
 
 def _check_tissue(evidence: Evidence, name: str, piece: Floats) -> Iterator[Finding]:
-    """A moving bone with no soft tissue beside it, in the region that is meshed."""
+    """Findings on a moving bone without adjacent soft tissue in the meshed region."""
     skin = evidence.skin
     if skin is None:
         return

@@ -12,7 +12,7 @@ from cmfsim.values.motion import decompose_motion
 
 __all__ = ["FAR", "TOO_FAR", "SizedMotion", "check_motion_size", "check_tiny", "check_turn"]
 
-# Motions of bone above which a plan is unusual, and above which it cannot be meant; mm and degrees.
+# Motions of bone above which a plan is unusual, and above which it is implausible; mm and degrees.
 # The largest relocation in Table 2 of the paper is 12.6 mm; distraction reaches 30 mm.
 FAR, TOO_FAR = 20.0, 60.0
 TURNED, TOO_TURNED = 20.0, 60.0

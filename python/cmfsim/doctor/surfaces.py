@@ -42,7 +42,7 @@ def check_image(evidence: Evidence) -> Iterator[Finding]:
 
 
 def check_surfaces(evidence: Evidence) -> Iterator[Finding]:
-    """Findings about each surface by itself."""
+    """Findings about each surface separately."""
     bodies = [evidence.skin] if evidence.skin else []
     for body in [*bodies, *evidence.bones.values()]:
         yield from _check_body(body)

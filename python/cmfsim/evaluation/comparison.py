@@ -68,7 +68,7 @@ class SkinComparison:
         Of both directions with equal weight.
     regions : mapping of str to DistanceStatistics
         From the prediction to the post-operative skin, by region; regions without an evaluated
-        vertex are left out.
+        vertex are omitted.
     region_vertices : mapping of str to (r,) uint32
         The evaluated vertices in each.
     share : float
@@ -467,7 +467,7 @@ def _findings(
             Finding.note(
                 "many-border-matches",
                 f"{matches.n_border} of {n_chosen} vertices are matched to the border of the "
-                "post-operative skin and left out",
+                "post-operative skin and excluded",
                 why="the scan ends there, or the landmarks map the skin past its end",
                 fix="evaluate only the face with mask='face', or use a mask of the simulated skin",
             )

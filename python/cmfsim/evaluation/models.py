@@ -1,4 +1,4 @@
-"""Several predictions of one patient beside each other, and beside leaving the face as it was."""
+"""Comparison of several predictions of one patient with each other and with no change."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ __all__ = ["NO_CHANGE", "WHOLE", "Improvement", "ModelComparison", "compare_mode
 
 # The pre-operative skin taken as a prediction: what any model must beat.
 NO_CHANGE = "no change"
-# Name of the whole evaluated part beside the names of regions.
+# Name of the whole evaluated part, next to the names of regions.
 WHOLE = "whole"
 
 

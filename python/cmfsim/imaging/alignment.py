@@ -89,7 +89,7 @@ def register_volumes(
     RegistrationError
         A mask on another grid, empty or too small, values without contrast, an initial matrix that
         is not rigid (also `ValueError`); volumes that do not overlap, no convergence, volumes that
-        do not look alike at the end.
+        do not match at the end.
     ImageError
         SimpleITK is missing.
 

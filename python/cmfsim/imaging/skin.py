@@ -170,7 +170,7 @@ def _filled_in_layers(tissue: Mask) -> Mask:
 
 
 def _without_couch(tissue: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, Mask]:
-    """What is left without that which shows alike in all slices; and that."""
+    """The mask without the parts that are the same in all slices, and these parts."""
     part = tissue.mean(axis=2)
     always = part > IN_ALL_SLICES
     # The head changes from slice to slice: what shows in some slices tells where it is.
@@ -234,7 +234,7 @@ def _core(tissue: Mask, spacing: NDArray[np.float64]) -> Mask:
 def _beyond_scalp(
     tissue: Mask, bone: Mask, y: NDArray[np.float64], spacing: NDArray[np.float64]
 ) -> Mask:
-    """What lies behind or beside the skull's vault, farther from it than the scalp is thick."""
+    """The parts behind or next to the skull's vault, farther away than the scalp is thick."""
     nothing = np.zeros_like(tissue)
     layers = np.flatnonzero(bone.any(axis=(0, 1)))
     if not len(layers) or bone[:, :, -1].any():

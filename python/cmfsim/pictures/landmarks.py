@@ -61,7 +61,7 @@ def picture_landmarks(
     views : sequence of str
         Of "front", "left", "right": those to draw.
     size : (int, int), pixels, optional
-        Of the picture; 700 by 700 for each view if left out.
+        Of the picture; default: 700 by 700 for each view.
 
     Raises
     ------

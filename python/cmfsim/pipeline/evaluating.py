@@ -40,8 +40,9 @@ from cmfsim.values.surface_data import SurfaceData
 __all__ = ["EVALUATION_FILE", "CaseEvaluation", "evaluate", "evaluation_key"]
 
 WILCOXON_NOTE = (
-    "Wilcoxon's signed-rank test vertex by vertex, as the paper has it: neighbouring vertices are "
-    "not independent, so its p values are far too small; look at the size of the difference."
+    "Wilcoxon's signed-rank test vertex by vertex, as the paper has it: neighbouring vertices "
+    "are not independent, so its p values are far too small; judge by the size of the "
+    "difference."
 )
 
 

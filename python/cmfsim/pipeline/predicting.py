@@ -53,7 +53,7 @@ def predict(
     progress : callable, optional
         Called with the name of each stage as it begins.
     check : bool
-        Whether the doctor looks at the case first; an error that it finds ends the work.
+        Whether the doctor checks the case first; an error that it finds ends the work.
     band : BandOptions, optional
         Adds a band around the face, as the prediction's `band`.
 

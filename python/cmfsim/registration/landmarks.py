@@ -23,7 +23,7 @@ LEAST_DISTANCE = 0.01
 PLANAR_THICKNESS = 1e-3
 # A mirrored set fits at least this much better after mirroring: share of the rms distance.
 MIRRORED_SHARE = 0.5
-# Names that a message lists before it says how many more there are.
+# Number of names that a message lists before it states how many more there are.
 LISTED = 6
 
 

@@ -185,7 +185,7 @@ def _alerts(findings: Sequence[Finding], left_out: str) -> list[Alert]:
 
 
 def _note_section(prediction: Values) -> list[Section]:
-    """What the case's own note says of it."""
+    """The section with the case's own note."""
     note = prediction.get("note")
     return [Section("About this case", (Note(note, "warning"),))] if note else []
 
@@ -211,7 +211,7 @@ def _prediction_section(
 
 
 def _band_sections(shown: Values, pictures: Mapping[str, bytes]) -> list[Section]:
-    """How far to trust the model that is shown, where that was asked for."""
+    """The section on how far to trust the model that is shown, if requested."""
     return [band_section(shown["band"], _picture("band", pictures))] if "band" in shown else []
 
 
@@ -257,7 +257,7 @@ def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
 
 
 def _achieved(achieved: Values | None) -> list[Note | Table | Figure]:
-    """How well each segment was laid on the bone after the operation."""
+    """The table of how well each segment was registered to the post-operative bone."""
     if achieved is None:
         return []
     rows = tuple(

@@ -1,4 +1,4 @@
-"""What a report says, without its looks: sections of notes, tables and figures."""
+"""The content of a report without its layout: sections of notes, tables and figures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""The report of a study: every case by every model, beside the paper's own patients."""
+"""The report of a study: every case by every model, compared with the paper's patients."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

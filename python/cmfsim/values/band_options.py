@@ -1,4 +1,4 @@
-"""What a band around a prediction is asked for."""
+"""The options of a band around a prediction."""
 
 import math
 from collections.abc import Sequence

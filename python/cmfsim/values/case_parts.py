@@ -190,7 +190,7 @@ class CaseLips:
         "auto": from the gap or crease that the skin shows, else from landmarks; "landmarks"; or the
         file of a surface between the lips, its normals towards the upper lip.
     depth : float, mm
-        How far the seam goes on past the teeth, between their rows.
+        How far the seam continues past the teeth, between their rows.
     height : float, mm
         How far from the seam the lips reach.
     """

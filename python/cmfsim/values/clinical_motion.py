@@ -172,7 +172,7 @@ def clinical_motion(
     landmarks : mapping of str to (3,) float64, mm, optional
         Skull landmarks.
     vertices : (v, 3) float64, mm, optional
-        Of the segment's surface, before the motion; those of a MovedSurface if left out.
+        Of the segment's surface, before the motion; default: those of a MovedSurface.
     centre : (3,) float64, mm, optional
         Of the turn, where neither landmark nor surface is known.
     source : str

@@ -82,8 +82,8 @@ class Prediction(Frozen):
         What was solved.
     result : SceneResult
     summary : mapping
-        Counts, timings, versions, hashes, and what was left out because the scene did not need it:
-        plain values, ready for JSON.
+        Counts, timings, versions, hashes, and the stages that were skipped because the scene did
+        not need them: plain values, ready for JSON.
     predicted_by : callable, optional
         The function that made this prediction from a patient and a model.
     band : SkinBand or None

@@ -22,7 +22,7 @@ def without_clefts(
     moved: Collection[str],
     width: float,
 ) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
-    """The mesh without what lies in the clefts beside segments that move, and a finding for it.
+    """The mesh without the tets in the clefts next to moving segments, and a finding about them.
 
     Parameters
     ----------

@@ -157,7 +157,7 @@ def removed_finding(name: str, where: str, patch: RemovedBone, severity: str) ->
 
 
 def _stray_finding(name: str, where: str, patch: StrayPatch, *, is_still: bool) -> Finding:
-    """A piece of a segment that its motion does not lay on the bone after the operation."""
+    """The warning about a piece of a segment that is off the post-operative bone."""
     at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
     piece = f"{patch.area / 100.0:.1f} cm² of {name} about ({at}) mm"
     if patch.has_bone:

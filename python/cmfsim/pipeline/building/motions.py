@@ -1,4 +1,4 @@
-"""How the bone segments of a case move: as its plan says, and parted where a motion is torn."""
+"""The motions of the bone segments of a case; a segment is cut where its motion is torn."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def _by_shape(
 def _achieved_bones(
     case: Case, segments: tuple[BoneSegment, ...], after: Postoperative
 ) -> PlannedBones:
-    """The segments with the motions that the bones after the operation tell (paper 3, Figure 5).
+    """The segments with the motions measured on the post-operative bones (paper 3, Figure 5).
 
     A bone with the same triangles after says where each vertex went, less what vertices slid along
     it; any other segment is laid on the bone of its name, or on all of them.

@@ -194,7 +194,7 @@ def _taken(find: LandmarkFind, kind: str) -> Taken:
     count = len(set(find.read.points) & set(known))
     why = f"{count} of its {len(find.read.points)} labels are those of {kind} landmarks"
     if kind == "after":
-        why = f"skin landmarks, and its name says after the operation ({count} labels)"
+        why = f"skin landmarks, and its name says it is from after the operation ({count} labels)"
     frame = find.read.frame if find.read.stated else ""
     name = "skin landmarks after the operation" if kind == "after" else f"{kind} landmarks"
     return Taken(

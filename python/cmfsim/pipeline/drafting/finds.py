@@ -144,7 +144,7 @@ class LandmarkFind:
 
 @dataclass(frozen=True, eq=False)
 class TransformFind:
-    """A transform file that stands alone: what it moves, its name says."""
+    """A separate transform file; its name identifies what it moves."""
 
     label: str
     role: NameRole

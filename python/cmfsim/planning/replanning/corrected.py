@@ -22,7 +22,7 @@ __all__ = ["CORRECTIONS", "corrected_planning"]
 
 # Plans that are solved for a correction.
 CORRECTIONS = 96
-# Fewer solved plans tell nothing about those between them.
+# With fewer solved plans, interpolation between them is meaningless.
 LEAST_PLANS = 8
 # Solutions at once: each takes memory for its own vectors.
 MOST_AT_ONCE = 4

@@ -146,9 +146,9 @@ def planning_model(
     patient : PatientModel or Prediction
         The result of `build_model`, or a prediction.
     model : str, optional
-        "H", "M", "H+S" or "M+S"; that of the prediction, or "M+S", if left out.
+        "H", "M", "H+S" or "M+S"; default: that of the prediction, or "M+S".
     reference : mapping of str to (4, 4) float64, mm, optional
-        The plan about which contact is continued; the patient's own if left out.
+        The plan about which contact is linearised; default: the patient's own.
 
     Returns
     -------
