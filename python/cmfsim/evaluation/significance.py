@@ -105,7 +105,7 @@ def wilcoxon_test(first: ArrayLike, second: ArrayLike, *, by: str = "vertex") ->
     >>> found.p, found.effect
     (0.125, 1.0)
     >>> found.caveat
-    '4 pairs cannot give p below 0.125, whatever the models do'
+    '4 pairs cannot give p below 0.125, regardless of the models'
     """
     check_one_of("by", by, PAIRED_BY)
     a, b = as_floats("first errors", first), as_floats("second errors", second)
@@ -119,7 +119,7 @@ def wilcoxon_test(first: ArrayLike, second: ArrayLike, *, by: str = "vertex") ->
     caveat = CAVEATS[by]
     least = 2.0 ** (1 - n_used)
     if by == "patient" and least > LEVEL:
-        caveat = f"{n_used} pairs cannot give p below {min(least, 1.0):g}, whatever the models do"
+        caveat = f"{n_used} pairs cannot give p below {min(least, 1.0):g}, regardless of the models"
     statistic, p, effect = 0.0, 1.0, 0.0
     if n_used:
         stats = third_party("scipy.stats", "the signed-rank test is made", "report")

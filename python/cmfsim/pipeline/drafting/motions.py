@@ -165,8 +165,7 @@ def _unusual(name: str, find: SurfaceFind, words: str) -> tuple[str, tuple[str, 
     if name == "cranium":
         return "the scene moves the cranium relative to the skin: is that planned?", (
             f"it {words}",
-            "remove this table if the cranium does not move, or rename it and write the matrix "
-            "below",
+            "remove this table if the cranium stays, or rename it and write the matrix below",
         )
     words_of = [link for link in find.chain if any(w in link.lower() for w in ("regist", "align"))]
     if words_of:
