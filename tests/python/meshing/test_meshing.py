@@ -86,7 +86,7 @@ def test_two_bodies_stay_two_and_both_are_there():
     assert made.report.dropped_parts == 1
     assert 250.0 < made.report.dropped_volume < 600.0
     assert [f.code for f in made.findings] == ["mesh-specks-dropped"]
-    assert "left out      1 parts" in made.report.as_text()
+    assert "removed       1 parts" in made.report.as_text()
 
 
 def test_a_sheet_thinner_than_the_edge_is_kept_by_refinement():

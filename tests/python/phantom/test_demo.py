@@ -31,7 +31,7 @@ def folder(tmp_path_factory):
 
 def test_the_demo_reports_every_model(folder):
     page = (folder / "out/report.html").read_text(encoding="utf-8")
-    assert "No patient: a synthetic head" in page
+    assert "Not a patient, but a synthetic head" in page
     for model in ("H", "M", "M+S"):
         summary = json.loads((folder / "out" / model / "prediction.json").read_text("utf-8"))
         assert summary["model"] == model
