@@ -30,7 +30,7 @@ BELOW_SKIN = 6.0
 # Smaller losses between the rim and the middle of the head are fat, muscle and brain, HU: clinical
 # CTs show the middle brighter, for fat lies below the skin.
 LEAST_LOSS = 90.0
-# Fewer voxels tell nothing.
+# Fewer voxels are not conclusive.
 LEAST_VOXELS = 500
 AIR_LEVEL = -300.0
 # No correction goes further than this, HU: what is that dark is no soft tissue.

@@ -28,7 +28,7 @@ from cmfsim.values.tissue_data import MIXINGS, TissueData
 __all__ = ["INSIDE_TESTS", "Mixture", "MuscleVolume", "equivalent_material"]
 
 INSIDE_TESTS = ("winding", "normal")
-# Part of a closed muscle that may lie outside the mesh before a finding says so.
+# Fraction of a closed muscle that may be outside the mesh before a finding reports it.
 LOST_PART = 0.02
 
 _log = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ from cmfsim.values.surface_data import SurfaceData
 __all__ = ["sliding_nodes"]
 
 # Share of the nodes at an arch that lie on its sheet at least: half or more on three heads, and the
-# others on lingual faces and the palate. Fewer nodes than so many on a segment tell nothing.
+# others on lingual faces and the palate. Fewer nodes than this on a segment are not conclusive.
 LEAST_SHARE, MANY = 0.25, 50
 # How far past half-way to the other arch tissue slides behind the teeth, mm: on the ramus above it
 # temporalis ends.

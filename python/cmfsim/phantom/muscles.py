@@ -243,7 +243,7 @@ def _skin(tissue: Tissue) -> Field:
 
 
 def _placed(tissue: Tissue, points: Floats, place: Floats) -> Floats:
-    """Course points put between skin and bone, as `courses` says."""
+    """Course points placed between skin and bone, as described in `courses`."""
     depth = np.where(place > 1.0, place, 0.0)
     share = np.where(place > 1.0, 0.0, place)
     moves = place > 0.0

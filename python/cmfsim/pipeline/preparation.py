@@ -17,7 +17,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _Need:
-    """A module of an extra, and what it does; some are done without."""
+    """A module of an extra, and its purpose; some are optional."""
 
     module: str
     extra: str
@@ -57,7 +57,7 @@ def prepare(
 
 
 def check_extras(needs: Iterator[_Need] | Sequence[_Need]) -> None:
-    """Refuses to begin without modules that are needed, and warns of those done without."""
+    """Refuses to begin without required modules, and warns of missing optional ones."""
     missing = [need for need in dict.fromkeys(needs) if not _is_there(need.module)]
     if not missing:
         return

@@ -1,7 +1,7 @@
 """What a prediction is uncertain about: each source with its prior, and where that comes from.
 
 A prior is a standard deviation. Moduli have it on their logarithm, since they are positive and
-spread over orders of magnitude; the rest is linear. "assumed" says that no publication was found
+spread over orders of magnitude; the rest is linear. "assumed" means that no publication was found
 that gives the figure.
 """
 

@@ -1,7 +1,7 @@
 """A muscle template from BodyParts3D, release 3.0: a real head's muscles, bones and teeth.
 
 BodyParts3D (Mitsuhashi et al. 2009) is licensed under CC BY-SA 2.1 JP. Its files are not part of
-this package; `WHERE` says where a user downloads them.
+this package; `WHERE` states where to download them.
 """
 
 import hashlib

@@ -1,8 +1,8 @@
 """Fibre lines of flat muscles, drawn by anatomy's rule on the surface that an atlas has of them.
 
-The outline of a sheet does not tell where its fibres run; its attachments do. Lines are straight in
-the view along the sheet's thin axis, where anatomy describes them, and follow the middle of the
-muscle in depth.
+The outline of a sheet does not determine its fibres; its attachments do. Lines are straight in the
+view along the sheet's thin axis, where anatomy describes them, and follow the middle of the muscle
+in depth.
 """
 
 import numpy as np

@@ -223,7 +223,7 @@ def missing_landmarks(
 
 
 def _agreement(matched: LandmarkMatch) -> tuple[LandmarkAgreement | None, list[Finding]]:
-    """How well the landmarks agree, and which stand out; None where they are too few to tell."""
+    """The agreement of the landmarks, and the outliers; None if there are too few landmarks."""
     try:
         left_out = leave_one_out(matched.source, matched.target, matched.names)
     except LandmarkError as error:
