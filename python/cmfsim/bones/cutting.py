@@ -32,7 +32,7 @@ SURFACES_AT_ONCE = 2
 
 @dataclass(frozen=True)
 class CutOptions:
-    """How bones are cut.
+    """Options of cutting bones.
 
     Attributes
     ----------

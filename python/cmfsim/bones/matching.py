@@ -33,7 +33,7 @@ MOST_STEPS = 300
 
 @dataclass(frozen=True)
 class MatchOptions:
-    """How a bone segment is registered to the post-operative bone.
+    """Options of the registration of a bone segment to the post-operative bone.
 
     Attributes
     ----------
@@ -149,7 +149,7 @@ def _sized_start(
 
 
 def _shifts(options: MatchOptions) -> list[Floats]:
-    """Where a search starts: at the segment's place, and to each side of it."""
+    """Starting positions of a search: at the segment's position, and to each side of it."""
     shifts = [np.zeros(3)]
     if options.reach > 0.0:
         shifts += [sign * options.reach * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]

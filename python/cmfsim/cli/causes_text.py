@@ -1,4 +1,4 @@
-"""What is no error of any model, as the terminal states it."""
+"""Terminal text on errors that do not come from any model."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""What will go wrong with a case, said before any work is done: each with why and how to fix it.
+"""Problems of a case, reported before any work is done, each with its reason and its fix.
 
 `diagnose` reads the files of a case and looks; it changes and writes nothing. `evidence` is what
 was read, `placement` asks whether it lies where it should, `surfaces` whether it is sound,

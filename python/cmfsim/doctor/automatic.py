@@ -1,4 +1,4 @@
-"""That landmarks will be found when the case is built, and what cannot be checked before."""
+"""The note that landmarks will be found during the build, and what cannot be checked before."""
 
 from collections.abc import Iterator
 

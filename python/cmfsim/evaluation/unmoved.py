@@ -33,7 +33,7 @@ MOST_CHANGE = 0.5
 
 @dataclass(frozen=True)
 class ThicknessChange:
-    """How much thicker the soft tissue became, as one share of its depth.
+    """The change of the soft tissue's thickness, as one fraction of its depth.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""How two volumes are brought together."""
+"""Options of the registration of two volumes."""
 
 import itertools
 from dataclasses import dataclass

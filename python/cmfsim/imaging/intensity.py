@@ -1,4 +1,4 @@
-"""Which numbers of a CT are air, soft tissue and bone, and the way from them to HU."""
+"""The values of air, soft tissue and bone in a CT, and their conversion to HU."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -64,7 +64,7 @@ BLOCK = 3
 
 @dataclass(frozen=True)
 class Calibration:
-    """The way to HU: `slope`·value + `offset`, and what was found out on it."""
+    """The conversion to HU, `slope`·value + `offset`, with findings."""
 
     slope: float
     offset: float

@@ -1,4 +1,4 @@
-"""What a person may set in the segmentation of a head."""
+"""Options of the segmentation of a head."""
 
 from dataclasses import dataclass
 

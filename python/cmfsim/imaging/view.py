@@ -1,4 +1,4 @@
-"""What of the head the image leaves out, and whether it shows it the right way round."""
+"""Checks of whether the image shows the whole head, and with the right orientation."""
 
 import numpy as np
 

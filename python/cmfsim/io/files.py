@@ -1,4 +1,4 @@
-"""What every reader and writer of the package does: names in errors, documents, safe replacement.
+"""Shared by all readers and writers: names in errors, documents, safe replacement.
 
 Files come from strangers: paths may not lead out of a folder, sizes are checked before memory is
 taken. A file is written under a temporary name and renamed, so a run that fails leaves the old one

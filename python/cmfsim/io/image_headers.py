@@ -1,4 +1,4 @@
-"""What the header of an image file may state: shared checks of numbers, sizes, places and names.
+"""Shared checks of image headers: numbers, sizes, positions and names.
 
 A header may crash or mislead a reader: numbers of a thousand digits, infinite places, sizes beyond
 any memory, data files in other folders, sheared axes that are silently made orthogonal. Each format

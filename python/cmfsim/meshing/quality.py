@@ -1,4 +1,4 @@
-"""What a mesh is worth: shapes, volume and boundary, in figures that a report can print."""
+"""The quality of a mesh: shapes, volume and boundary, in figures that a report can print."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -173,7 +173,7 @@ def report_of_part(part: TetMesh, whole: MeshReport) -> MeshReport:
 
 
 def mesh_findings(report: MeshReport) -> tuple[Finding, ...]:
-    """What a person should know of a mesh: poor tets, and specks that were left out."""
+    """Findings on a mesh: poor tets, and specks that were removed."""
     findings = []
     if report.min_dihedral < LEAST_DIHEDRAL:
         worst = report.worst[0]

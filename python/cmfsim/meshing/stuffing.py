@@ -20,7 +20,7 @@ MAX_REFINEMENTS = 3
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How tissue is filled with tets.
+    """Options of filling tissue with tets.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Which part of a head is soft tissue to be meshed: outside the bones, in front of a plane."""
+"""The part of a head that is meshed as soft tissue: outside the bones, in front of a plane."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Which node of a mesh is fixed, joined, sliding or free.
+"""Classification of the nodes of a mesh: fixed, joined, sliding or free.
 
 A node lies on a bone if it is near the bone's surface *and* its part of the boundary faces that
 surface: where skin is thinner than a tet is long, nearness alone would take skin for interface.

@@ -1,4 +1,4 @@
-"""Which fixed nodes lie where a surgeon lifts the periosteum above a Le Fort I cut."""
+"""Fixed nodes where a surgeon lifts the periosteum above a Le Fort I cut."""
 
 from collections.abc import Collection, Sequence
 

@@ -1,4 +1,4 @@
-"""Where tissue slides: on teeth and mucosa of the two dental arches, or in given regions."""
+"""The sliding regions: on teeth and mucosa of the two dental arches, or as given."""
 
 from collections.abc import Mapping, Sequence
 

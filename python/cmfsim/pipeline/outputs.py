@@ -1,4 +1,4 @@
-"""What commands on cases write: predictions with pictures, errors, and the report of both.
+"""The outputs of commands on cases: predictions with pictures, errors, and their report.
 
 All files of a command take their places together at its end: whoever reads the folder finds the
 results of one run. What belongs to another plan, or to other inputs or another version, goes.

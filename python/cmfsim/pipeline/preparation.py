@@ -1,4 +1,4 @@
-"""What a command finds out before it works: the packages it needs, and that it can write."""
+"""Checks of a command before it works: required packages, and a writable output."""
 
 import logging
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""What the error of an evaluation consists of: what no model makes, and what a model does."""
+"""The parts of the error of an evaluation: those of the scans, and those of a model."""
 
 from collections.abc import Mapping
 from typing import Any

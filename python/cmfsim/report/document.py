@@ -73,7 +73,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Alert:
-    """What a reader should know first: one line, with what it sums up folded below it.
+    """A message at the top of a report: one line, with the details collapsed below it.
 
     Attributes
     ----------

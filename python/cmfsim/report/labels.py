@@ -1,4 +1,4 @@
-"""What figures and methods are called in a report, with their units."""
+"""The labels of figures and methods in a report, with their units."""
 
 from collections.abc import Mapping
 

@@ -69,7 +69,7 @@ def _middles(
 
 
 def inversion_finding(tensors: MassTensors, displacements: ArrayLike) -> tuple[int, Finding | None]:
-    """How many tets rest inverted, and the warning that says so where there are any.
+    """The number of tets inverted at equilibrium, and a warning if there are any.
 
     Linear kinematics has no use for it: its tets keep their strain however they turn, and a
     negative volume is an error of the linear model rather than of the solution.

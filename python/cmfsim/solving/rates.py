@@ -1,4 +1,4 @@
-"""How a solved face changes with what is uncertain: derivatives by one linear solve each.
+"""Derivatives of a solved face with respect to uncertain parameters, by one linear solve each.
 
 Of a material constant p, K ∂u/∂p = −(∂K/∂p) u: the right-hand side is a difference of internal
 forces at the solved u, and the factor or preconditioner is that of the solution. Sliding contact is

@@ -66,7 +66,7 @@ def scene_solver(scene: Scene) -> StaticSolver:
 
 
 def _boundary(scene: Scene) -> Boundary:
-    """What holds and moves the nodes of a scene."""
+    """The boundary conditions of a scene."""
     segments = scene.segments.items()
     sliding = {name: s.sliding for name, s in segments if np.size(s.sliding)}
     # A scene without one-sided contact does not pay for it.

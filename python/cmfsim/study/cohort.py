@@ -51,7 +51,7 @@ class CaseJob:
 
 @dataclass(frozen=True)
 class CaseOutcome:
-    """What became of one case.
+    """The outcome of one case.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What a study writes: the tables and figures of Kim et al. (2010), its values, and its report."""
+"""Outputs of a study: tables and figures of Kim et al. (2010), values, and report."""
 
 import json
 import re

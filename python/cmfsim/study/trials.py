@@ -1,4 +1,4 @@
-"""How much a prediction depends on where the skull landmarks were placed (Kim et al. 2010, 3.3)."""
+"""The dependence of a prediction on the placement of skull landmarks (Kim et al. 2010, 3.3)."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -58,7 +58,7 @@ _DECIMATING = _OneAtATime()
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """How the surface of a level is made.
+    """Options of the surface of a level.
 
     Attributes
     ----------

@@ -155,7 +155,7 @@ class CaseLandmarks:
 
 @dataclass(frozen=True)
 class CaseMesh:
-    """How the soft tissue is meshed, or where its tets come from.
+    """Options of the mesh of the soft tissue, or the source of its tets.
 
     Attributes
     ----------
@@ -267,7 +267,7 @@ class CaseOsteotomy:
 
 @dataclass(frozen=True, eq=False)
 class CaseMotion(Frozen):
-    """How one segment moves: a matrix, a transform file, or a surface before and after.
+    """The motion of one segment: a matrix, a transform file, or a surface before and after.
 
     Attributes
     ----------
@@ -319,7 +319,7 @@ class CaseMotion(Frozen):
 
 @dataclass(frozen=True)
 class CaseMuscles:
-    """Where the muscles come from, and how the material of the tets is sampled from them.
+    """The source of the muscles, and the options of sampling the material of the tets from them.
 
     Attributes
     ----------
@@ -358,7 +358,7 @@ class CaseMuscles:
 
 @dataclass(frozen=True)
 class CasePostoperative:
-    """What is known after the operation.
+    """The post-operative data.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What a model predicts for a patient: the value that evaluation and report are made from."""
+"""The prediction of a model for a patient, on which evaluation and report are based."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far to trust a predicted skin: a band around it, calibrated or not."""
+"""A band around a predicted skin, calibrated or not, which shows how far to trust it."""
 
 from __future__ import annotations
 

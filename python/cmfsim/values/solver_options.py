@@ -17,7 +17,7 @@ CONTACTS = ("bilateral", "unilateral")
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """How a scene is solved; the defaults are those of `MassTensors` and `StaticSolver`.
+    """Options of solving a scene; the defaults are those of `MassTensors` and `StaticSolver`.
 
     Attributes
     ----------

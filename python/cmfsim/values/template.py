@@ -27,7 +27,7 @@ def is_template_name(name: object) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class TemplateData(Frozen):
-    """What a template holds, with its names checked.
+    """The contents of a template, with its names checked.
 
     `MuscleTemplate` is what works with it, and describes the attributes.
     """

@@ -1,4 +1,4 @@
-"""What a prediction is uncertain about: each source with its prior, and where that comes from.
+"""The sources of uncertainty of a prediction, each with its prior and its origin.
 
 A prior is a standard deviation. Moduli have it on their logarithm, since they are positive and
 spread over orders of magnitude; the rest is linear. "assumed" means that no publication was found

@@ -43,7 +43,7 @@ GRID, SKIN_SPACING = 0.25, 0.375
 
 @dataclass(frozen=True)
 class PatientOutcome:
-    """What became of a patient, and how many of the population are done.
+    """The outcome of a patient, and the number of finished patients.
 
     Attributes
     ----------

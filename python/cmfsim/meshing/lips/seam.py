@@ -1,4 +1,4 @@
-"""Where the lips meet: the sheet along which the tissue of a closed mouth is separated."""
+"""The seam between the lips: the sheet along which the tissue of a closed mouth is separated."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""What is wrong with a muscle template: files, surfaces, sides, landmarks, each with its fix."""
+"""Problems of a muscle template: files, surfaces, sides, landmarks, each with its fix."""
 
 import os
 from collections.abc import Iterator
@@ -71,7 +71,7 @@ def check_template(template: TemplateData | str | os.PathLike[str]) -> tuple[Fin
 
 
 def check_contents(template: TemplateData) -> tuple[Finding, ...]:
-    """What is wrong with the contents of a template, after what was noticed while it was read."""
+    """Problems of the contents of a template, after the findings of its reading."""
     skull = _searchable(template.skull)
     return (
         *template.findings,

@@ -1,4 +1,4 @@
-"""What is checked of a case while it is built, since the doctor could not know it before."""
+"""Checks of a case during the build, which the doctor cannot make before."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace

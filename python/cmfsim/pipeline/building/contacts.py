@@ -1,4 +1,4 @@
-"""What tissue slides on in a case: the sheet of each arch, or the blurred bone."""
+"""The surfaces on which tissue slides in a case: the sheet of each arch, or the blurred bone."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Where the tissue ends near what moves: at planes that fix it, and at borders of the image."""
+"""Ends of the tissue near moving bone: at planes that fix it, and at borders of the image."""
 
 from collections.abc import Collection, Iterator, Sequence
 

@@ -1,4 +1,4 @@
-"""Which bodies of a mesh are held, and the mesh without those that are not."""
+"""The constrained bodies of a mesh, and the mesh without the others."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What the files of a case hold: anatomy, landmarks, motions, and the hashes of them all."""
+"""The contents of the files of a case: anatomy, landmarks, motions, and their hashes."""
 
 from __future__ import annotations
 

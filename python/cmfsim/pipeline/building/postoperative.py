@@ -1,4 +1,4 @@
-"""What is known after the operation, brought into the frame of the data before it."""
+"""Post-operative data, registered to the frame of the pre-operative data."""
 
 import logging
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""How a case is built: what a caller asks for, and the stages as they pass."""
+"""The options of a build, and its stages as they run."""
 
 import time
 from collections.abc import Collection, Iterable

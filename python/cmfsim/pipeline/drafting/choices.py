@@ -1,4 +1,4 @@
-"""Which image is the CT before the operation, and which landmarks are on skull and skin."""
+"""The choice of the pre-operative CT, and of the landmarks of skull and skin."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

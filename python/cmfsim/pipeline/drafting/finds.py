@@ -1,4 +1,4 @@
-"""What lies in a folder: surfaces, images, landmarks and transforms, each read and measured."""
+"""The contents of a folder: surfaces, images, landmarks and transforms, each read and measured."""
 
 import os
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Which segment moves how: the plan of a case, from a scene's transforms or from files."""
+"""The motions of the segments: the plan of a case, from a scene's transforms or from files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""What a file or a node of a scene is called, and which part of a head that is."""
+"""The part of a head that the name of a file or of a scene's node refers to."""
 
 import itertools
 import re

@@ -1,4 +1,4 @@
-"""Which surfaces a case is made of, their unit and their frame, with the reasons."""
+"""The surfaces of a case, their unit and their frame, with the reasons."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,7 +32,7 @@ PIECES_OF = {
 
 @dataclass(frozen=True)
 class Question:
-    """What a person has to decide about a key.
+    """A decision about a key that a person has to make.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""How far the plan operator deviates from exact solutions, away from its reference plan."""
+"""The deviation of the plan operator from exact solutions, away from its reference plan."""
 
 import time
 from collections.abc import Mapping

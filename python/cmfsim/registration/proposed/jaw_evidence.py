@@ -1,4 +1,4 @@
-"""What the sites of jaws and tooth rows rest on: whether the lower jaw can be what is taken for it.
+"""Evidence on whether the part taken for the lower jaw can be the lower jaw.
 
 A mandible that was told from the skull by shape alone may hold a part of the maxilla, or be the
 maxilla. Its sites are then found where they are not, each with its usual error: what gives this
@@ -45,7 +45,7 @@ ROW_SIDE, ROW_BACK = 50.0, 52.0
 
 @dataclass(frozen=True)
 class JawEvidence:
-    """What speaks against the jaw of a head.
+    """Evidence against the jaw of a head.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ def jaw_evidence(
     pose: Pose,
     left_out: Mapping[str, float],
 ) -> JawEvidence:
-    """What speaks against a jaw.
+    """Evidence against a jaw.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How far a proposed landmark may be off, what speaks against it, and what the image leaves out."""
+"""The expected error of a proposed landmark, doubts about it, and parts missing from the image."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

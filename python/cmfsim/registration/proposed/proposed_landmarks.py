@@ -1,4 +1,4 @@
-"""What landmarks were proposed for a head, how far each may be off, and which are missing."""
+"""The landmarks proposed for a head, with their expected errors, and those that are missing."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

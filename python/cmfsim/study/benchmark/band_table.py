@@ -1,4 +1,4 @@
-"""What the bands of methods held, as text: covered patients, and how many were to be expected."""
+"""The coverage of the bands of methods, as text: covered patients, and the expected number."""
 
 from collections.abc import Sequence
 

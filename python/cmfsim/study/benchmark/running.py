@@ -38,7 +38,7 @@ PREDICTIONS, RESULTS = "predictions", "benchmark"
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What a benchmark found, and the files that say so.
+    """The results of a benchmark, and their files.
 
     Attributes
     ----------
