@@ -487,7 +487,11 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     )
     for name, known in (("elements", ELEMENTS), ("kinematics", KINEMATICS)):
         frontier.add_argument(
-            f"--{name}", choices=known, nargs="+", default=known, help="of the grid (default all)"
+            f"--{name}",
+            choices=known,
+            nargs="+",
+            default=known,
+            help=f"{name} of the grid (default all)",
         )
     frontier.add_argument(
         "--factors",
